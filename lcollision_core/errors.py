@@ -1,0 +1,27 @@
+"""The errors that users see: each message is one sentence saying what, where, and what to do."""
+
+from __future__ import annotations
+
+
+class LCollisionError(Exception):
+    """Base of every error that a user can mend; its text is fit to be shown as it is."""
+
+
+class ShapeError(LCollisionError, ValueError):
+    """An array has another shape or dtype than the function documents."""
+
+
+class MeshFileError(LCollisionError):
+    """A file cannot be read as a mesh or a pose set, or cannot be written."""
+
+
+class PoseSetError(LCollisionError):
+    """Meshes cannot form one pose set: their topology differs, or a pose is not usable."""
+
+
+class MissingExtraError(LCollisionError):
+    """An optional dependency is not installed; the message names the extra that brings it."""
+
+
+class CancelledError(LCollisionError):
+    """The caller's cancel token was set; nothing was left half-written."""

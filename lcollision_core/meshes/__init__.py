@@ -1,0 +1,1 @@
+"""What a pose is: topology, files, pose sets, alignment and the built-in body."""

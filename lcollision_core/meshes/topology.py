@@ -1,0 +1,144 @@
+"""The connectivity that all poses of a set share."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from lcollision_core.errors import PoseSetError, ShapeError
+
+IntArray = npt.NDArray[np.int32]
+FloatArray = npt.NDArray[np.float64]
+
+
+class Topology:
+    """An immutable triangle connectivity and what follows from it alone.
+
+    Parameters
+    ----------
+    faces : (F, 3) integer array, vertex indices from 0, three different ones a face
+    n_vertices : V, at least the largest index plus one
+
+    Raises
+    ------
+    ShapeError : `faces` is no (F, 3) integer array or is empty.
+    PoseSetError : an index is out of range, or a face names a vertex twice.
+    """
+
+    def __init__(self, faces: npt.ArrayLike, n_vertices: int) -> None:
+        checked = np.asarray(faces)
+        if checked.ndim != 2 or checked.shape[1] != 3 or checked.dtype.kind not in "iu":
+            raise ShapeError(
+                f"faces must be an (F, 3) integer array, got {checked.dtype} {checked.shape}"
+            )
+        if len(checked) == 0:
+            raise ShapeError("the mesh has no faces")
+        out_of_range = np.flatnonzero(((checked < 0) | (checked >= n_vertices)).any(axis=1))
+        if len(out_of_range):
+            face = int(out_of_range[0])
+            raise PoseSetError(
+                f"face {face} names vertices {checked[face].tolist()}, "
+                f"but there are {n_vertices} vertices (0 to {n_vertices - 1})"
+            )
+        repeated = np.flatnonzero(
+            (checked == np.roll(checked, 1, axis=1)).any(axis=1),
+        )
+        if len(repeated):
+            face = int(repeated[0])
+            raise PoseSetError(f"face {face} names a vertex twice: {checked[face].tolist()}")
+        self.faces: IntArray = np.array(checked, dtype=np.int32, order="C")
+        self.faces.flags.writeable = False
+        self.n_vertices = int(n_vertices)
+
+    @property
+    def n_faces(self) -> int:
+        """F, the number of triangles."""
+        return len(self.faces)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both have the same vertex count and the same faces in the same order."""
+        if not isinstance(other, Topology):
+            return NotImplemented
+        return self.n_vertices == other.n_vertices and np.array_equal(self.faces, other.faces)
+
+    def __hash__(self) -> int:
+        return hash((self.n_vertices, self.faces.tobytes()))
+
+    @cached_property
+    def _directed_edges(self) -> IntArray:
+        return np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]])
+
+    @cached_property
+    def _edges_and_counts(self) -> tuple[IntArray, npt.NDArray[np.intp]]:
+        unique, counts = np.unique(np.sort(self._directed_edges, axis=1), axis=0, return_counts=True)
+        unique = unique.astype(np.int32)
+        unique.flags.writeable = False
+        return unique, counts
+
+    @property
+    def edges(self) -> IntArray:
+        """(E, 2) undirected edges, each row ascending, rows in lexicographic order."""
+        return self._edges_and_counts[0]
+
+    @property
+    def boundary_edges(self) -> IntArray:
+        """(B, 2) edges with one face: the rims of holes."""
+        return self.edges[self._edges_and_counts[1] == 1]
+
+    @property
+    def non_manifold_edges(self) -> IntArray:
+        """(M, 2) edges with more than two faces."""
+        return self.edges[self._edges_and_counts[1] > 2]
+
+    @property
+    def is_watertight(self) -> bool:
+        """Whether every edge has two faces that run along it in opposite directions."""
+        if not bool((self._edges_and_counts[1] == 2).all()):
+            return False
+        directed = self._directed_edges.astype(np.int64)
+        keys = directed[:, 0] * self.n_vertices + directed[:, 1]
+        return len(np.unique(keys)) == len(keys)
+
+    @cached_property
+    def adjacency(self) -> sparse.csr_matrix:
+        """(V, V) symmetric 0/1 matrix, CSR with sorted indices: the one-rings."""
+        i, j = self.edges.T
+        ones = np.ones(2 * len(i), dtype=np.float64)
+        matrix = sparse.coo_matrix(
+            (ones, (np.concatenate([i, j]), np.concatenate([j, i]))),
+            shape=(self.n_vertices, self.n_vertices),
+        ).tocsr()
+        matrix.sort_indices()
+        return matrix
+
+    @cached_property
+    def vertex_components(self) -> tuple[int, IntArray]:
+        """The number of connected components and each vertex's component, (V,) from 0.
+
+        A vertex in no face is a component of its own.
+        """
+        count, labels = csgraph.connected_components(self.adjacency, directed=False)
+        return int(count), np.asarray(labels, dtype=np.int32)
+
+    @property
+    def unused_vertices(self) -> IntArray:
+        """Indices of the vertices that no face names."""
+        used = np.zeros(self.n_vertices, dtype=bool)
+        used[self.faces] = True
+        return np.flatnonzero(~used).astype(np.int32)
+
+    @property
+    def euler_characteristic(self) -> int:
+        """V - E + F over the vertices that a face names; 2 for a sphere."""
+        return self.n_vertices - len(self.unused_vertices) - len(self.edges) + self.n_faces
+
+    def edge_lengths(self, vertices: npt.NDArray[Any]) -> FloatArray:
+        """(E,) lengths of `edges` for one pose, `vertices` (V, 3), in its unit."""
+        start, end = np.asarray(vertices, dtype=np.float64)[self.edges.T]
+        lengths: FloatArray = np.linalg.norm(end - start, axis=1)
+        return lengths
