@@ -1,0 +1,291 @@
+"""Poses of one reference mesh to deformation features and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.acap.compiled import compiled
+from lcollision_core.acap.consistency import component_roots, consistent_logarithms
+from lcollision_core.acap.features import (
+    N_FEATURES,
+    gradients_from_features,
+    pull_back,
+    push_forward,
+)
+from lcollision_core.acap.gradients import deformation_gradients, fit_rings
+from lcollision_core.acap.reconstruct import BLOCK_POSES, factor_poisson
+from lcollision_core.acap.rotations import polar_factors, quaternion_of
+from lcollision_core.acap.weights import cotangent_weights
+from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+
+if TYPE_CHECKING:
+    import torch
+
+WEIGHT_FLOOR = 0.1
+NORMAL_WEIGHT = 1.0
+
+
+@dataclass(frozen=True)
+class EncodedPoses:
+    """Deformation features of some poses, and how consistent their rotations are.
+
+    Attributes
+    ----------
+    features : (B, V, 9) float64 array, unscaled
+    n_jumps : (B,) int64 array, edges whose two rotation vectors are more than pi apart
+    """
+
+    features: FloatArray
+    n_jumps: npt.NDArray[np.int64]
+
+
+class AcapCodec:
+    """The map between poses and ACAP features for one reference mesh; immutable, thread-safe.
+
+    Parameters
+    ----------
+    topology : the connectivity of all poses
+    rest_vertices : (V, 3) array, the reference, in heights
+
+    Raises
+    ------
+    ShapeError : `rest_vertices` has another shape, or is not finite.
+    """
+
+    def __init__(self, topology: Topology, rest_vertices: npt.NDArray[Any]) -> None:
+        if np.shape(rest_vertices) != (topology.n_vertices, 3):
+            raise ShapeError(
+                f"the reference has shape {np.shape(rest_vertices)}, but the topology needs "
+                f"({topology.n_vertices}, 3)"
+            )
+        rest = np.array(rest_vertices, dtype=np.float64)
+        if not np.isfinite(rest).all():
+            raise ShapeError("the reference has a vertex that is not finite")
+        rest.flags.writeable = False
+        self.topology = topology
+        self.rest_vertices: FloatArray = rest
+        weights = cotangent_weights(topology, rest, WEIGHT_FLOOR)
+        self._roots = component_roots(topology, rest)
+        self._fit = fit_rings(topology, rest, weights, NORMAL_WEIGHT)
+        self._poisson = factor_poisson(topology, rest, self._fit, weights, self._roots)
+        self._rest_offset = self._poisson.rest_mean[self._poisson.component]
+
+    def encode(self, vertices: npt.NDArray[Any], n_threads: int | None = None) -> EncodedPoses:
+        """Compute the deformation features of poses that are aligned to the reference.
+
+        Parameters
+        ----------
+        vertices : (B, V, 3) array, in heights; where a pose lies does not matter, how it is
+            turned does
+        n_threads : threads to spread the poses over, numba's own number by default
+
+        Returns
+        -------
+        encoded : EncodedPoses
+
+        Raises
+        ------
+        ShapeError : another shape.
+        """
+        poses = self._checked(vertices, 3, "vertices")
+        features = np.empty((len(poses), self.topology.n_vertices, N_FEATURES))
+        n_jumps = np.zeros(len(poses), dtype=np.int64)
+
+        def encode_one(start: int, stop: int) -> None:
+            for pose in range(start, stop):
+                n_jumps[pose] = _encode_pose(
+                    poses[pose],
+                    self.topology.faces,
+                    self._fit.ring_start,
+                    self._fit.ring,
+                    self._fit.ring_solution,
+                    self._fit.normal_solution,
+                    self._fit.kept_identity,
+                    self._roots,
+                    features[pose],
+                )
+
+        _spread(encode_one, len(poses), 1, n_threads)
+        return EncodedPoses(features, n_jumps)
+
+    def decode(self, features: npt.NDArray[Any], n_threads: int | None = None) -> FloatArray:
+        """Rebuild the poses of deformation features.
+
+        Parameters
+        ----------
+        features : (B, V, 9) array, unscaled
+        n_threads : threads to spread the poses over, numba's own number by default
+
+        Returns
+        -------
+        vertices : (B, V, 3) float64 array, in heights, in the reference's frame: features do not
+            know where a pose lies, so each connected component's mean vertex is put where the
+            reference has it. Every pose gets the same bits however many are decoded together.
+
+        Raises
+        ------
+        ShapeError : another shape.
+        """
+        fields = self._checked(features, N_FEATURES, "features")
+        vertices = np.empty((len(fields), self.topology.n_vertices, 3))
+
+        def decode_block(start: int, stop: int) -> None:
+            gradients = np.empty((stop - start, self.topology.n_vertices, 3, 3))
+            for pose in range(start, stop):
+                gradients_from_features(fields[pose], gradients[pose - start])
+            self._poisson.solve(gradients, vertices[start:stop])
+            vertices[start:stop] += self._rest_offset
+
+        _spread(decode_block, len(fields), BLOCK_POSES, n_threads)
+        return vertices
+
+    def decode_jvp(
+        self,
+        features: npt.NDArray[Any],
+        tangents: npt.NDArray[Any],
+        n_threads: int | None = None,
+    ) -> FloatArray:
+        """Differentiate one decoded pose along several changes of its features.
+
+        Parameters
+        ----------
+        features : (V, 9) array, where
+        tangents : (m, V, 9) array, the changes
+        n_threads : threads to spread the changes over, numba's own number by default
+
+        Returns
+        -------
+        moved : (m, V, 3) float64 array, the vertices' derivatives
+
+        Raises
+        ------
+        ShapeError : another shape.
+        """
+        at = self._checked(np.asarray(features)[None], N_FEATURES, "features")[0]
+        along = self._checked(tangents, N_FEATURES, "tangents")
+        moved = np.empty((len(along), self.topology.n_vertices, 3))
+
+        def push_block(start: int, stop: int) -> None:
+            gradients = np.empty((stop - start, self.topology.n_vertices, 3, 3))
+            push_forward(at, along[start:stop], gradients)
+            self._poisson.solve(gradients, moved[start:stop])
+
+        _spread(push_block, len(along), BLOCK_POSES, n_threads)
+        return moved
+
+    def decode_vjp(
+        self,
+        features: npt.NDArray[Any],
+        by_vertices: npt.NDArray[Any],
+        n_threads: int | None = None,
+    ) -> FloatArray:
+        """Turn a loss's derivative by decoded vertices into the one by the features.
+
+        Parameters
+        ----------
+        features : (B, V, 9) array, where
+        by_vertices : (B, V, 3) array, derivative of each pose's loss by its vertices
+        n_threads : threads to spread the poses over, numba's own number by default
+
+        Returns
+        -------
+        by_features : (B, V, 9) float64 array
+
+        Raises
+        ------
+        ShapeError : another shape, or differing numbers of poses.
+        """
+        at = self._checked(features, N_FEATURES, "features")
+        given = self._checked(by_vertices, 3, "by_vertices")
+        if len(at) != len(given):
+            raise ShapeError(f"features hold {len(at)} poses but by_vertices {len(given)}")
+        by_features = np.empty(at.shape)
+
+        def pull_block(start: int, stop: int) -> None:
+            by_gradients = np.empty((stop - start, self.topology.n_vertices, 3, 3))
+            self._poisson.solve_transposed(given[start:stop], by_gradients)
+            for pose in range(start, stop):
+                pull_back(at[pose], by_gradients[pose - start], by_features[pose])
+
+        _spread(pull_block, len(at), BLOCK_POSES, n_threads)
+        return by_features
+
+    def decode_torch(self, features: torch.Tensor) -> torch.Tensor:
+        """Decode a tensor, differentiably: see `torch_decode.decode_torch`."""
+        from lcollision_core.acap.torch_decode import decode_torch
+
+        return decode_torch(self, features)
+
+    def _checked(self, array: npt.NDArray[Any], width: int, name: str) -> FloatArray:
+        shape = np.shape(array)
+        if len(shape) != 3 or shape[1:] != (self.topology.n_vertices, width):
+            raise ShapeError(
+                f"{name} must have shape (B, {self.topology.n_vertices}, {width}), got {shape}"
+            )
+        return np.ascontiguousarray(array, dtype=np.float64)
+
+
+def _spread(
+    work: Callable[[int, int], None], n_items: int, block: int, n_threads: int | None
+) -> None:
+    """Call `work(start, stop)` for fixed blocks of the items, on threads where there are several.
+
+    The blocks do not depend on the number of threads, so neither do the results.
+    """
+    blocks = [(start, min(start + block, n_items)) for start in range(0, n_items, block)]
+    wanted = numba.config.NUMBA_NUM_THREADS if n_threads is None else n_threads
+    if min(wanted, len(blocks)) <= 1:
+        for start, stop in blocks:
+            work(start, stop)
+        return
+    with ThreadPoolExecutor(min(wanted, len(blocks))) as pool:
+        for future in [pool.submit(work, start, stop) for start, stop in blocks]:
+            future.result()
+
+
+@compiled
+def _encode_pose(
+    vertices: FloatArray,
+    faces: IntArray,
+    ring_start: IntArray,
+    ring: IntArray,
+    ring_solution: FloatArray,
+    normal_solution: FloatArray,
+    kept_identity: FloatArray,
+    roots: IntArray,
+    features: FloatArray,
+) -> int:
+    """Write the (V, 9) features of one pose and return its number of jumping edges."""
+    n_vertices = len(vertices)
+    gradients = np.empty((n_vertices, 3, 3))
+    deformation_gradients(
+        vertices,
+        faces,
+        ring_start,
+        ring,
+        ring_solution,
+        normal_solution,
+        kept_identity,
+        gradients,
+    )
+    quaternions = np.empty((n_vertices, 4))
+    rotation = np.empty((3, 3))
+    stretch = np.empty((3, 3))
+    for i in range(n_vertices):
+        polar_factors(gradients[i], rotation, stretch)
+        quaternion_of(rotation, quaternions[i])
+        features[i, 3] = stretch[0, 0]
+        features[i, 4] = stretch[0, 1]
+        features[i, 5] = stretch[0, 2]
+        features[i, 6] = stretch[1, 1]
+        features[i, 7] = stretch[1, 2]
+        features[i, 8] = stretch[2, 2]
+    return consistent_logarithms(quaternions, ring_start, ring, roots, features[:, :3])

@@ -1,0 +1,113 @@
+"""The nine numbers per vertex: log R and the upper triangle of S, and what they do to T = R S."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lcollision_core.acap.compiled import compiled
+from lcollision_core.acap.rotations import exponential, exponential_coefficients
+from lcollision_core.meshes.topology import FloatArray
+
+N_FEATURES = 9
+N_ROTATION = 3
+IDENTITY_FEATURE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+"""(log R, S_xx, S_xy, S_xz, S_yy, S_yz, S_zz) of a vertex that does not deform."""
+
+
+@compiled
+def _stretch_product(r: FloatArray, s: FloatArray, product: FloatArray) -> None:
+    """Write R S, the six numbers `s` being the upper triangle of S row by row."""
+    for a in range(3):
+        product[a, 0] = r[a, 0] * s[0] + r[a, 1] * s[1] + r[a, 2] * s[2]
+        product[a, 1] = r[a, 0] * s[1] + r[a, 1] * s[3] + r[a, 2] * s[4]
+        product[a, 2] = r[a, 0] * s[2] + r[a, 1] * s[4] + r[a, 2] * s[5]
+
+
+@compiled
+def gradients_from_features(features: FloatArray, gradients: FloatArray) -> None:
+    """Write T_i = exp(log R_i) S_i; features (V, 9), gradients (V, 3, 3)."""
+    rotation = np.empty((3, 3))
+    for i in range(len(features)):
+        exponential(features[i, 0], features[i, 1], features[i, 2], rotation)
+        _stretch_product(rotation, features[i, 3:], gradients[i])
+
+
+@compiled
+def push_forward(features: FloatArray, tangents: FloatArray, gradients: FloatArray) -> None:
+    """Write the derivatives of T along several changes of the features of one pose.
+
+    Parameters
+    ----------
+    features : (V, 9) float64 array
+    tangents : (m, V, 9) float64 array
+    gradients : (m, V, 3, 3) float64 array, overwritten
+
+    Notes
+    -----
+    d exp(a) = [J da]_x exp(a) with the left Jacobian
+    J = I + (1 - cos t)/t^2 [a]_x + (t - sin t)/t^3 [a]_x^2, t = |a|.
+    """
+    rotation = np.empty((3, 3))
+    turned = np.empty((3, 3))
+    for i in range(len(features)):
+        x, y, z = features[i, 0], features[i, 1], features[i, 2]
+        exponential(x, y, z, rotation)
+        _, b, c = exponential_coefficients(x * x + y * y + z * z)
+        _stretch_product(rotation, features[i, 3:], turned)
+        for along in range(len(tangents)):
+            tangent, out = tangents[along, i], gradients[along, i]
+            u, v, w = tangent[0], tangent[1], tangent[2]
+            k0, k1, k2 = y * w - z * v, z * u - x * w, x * v - y * u
+            p0 = u + b * k0 + c * (y * k2 - z * k1)
+            p1 = v + b * k1 + c * (z * k0 - x * k2)
+            p2 = w + b * k2 + c * (x * k1 - y * k0)
+            _stretch_product(rotation, tangent[3:], out)
+            for column in range(3):
+                t0, t1, t2 = turned[0, column], turned[1, column], turned[2, column]
+                out[0, column] += p1 * t2 - p2 * t1
+                out[1, column] += p2 * t0 - p0 * t2
+                out[2, column] += p0 * t1 - p1 * t0
+
+
+@compiled
+def pull_back(features: FloatArray, by_gradient: FloatArray, by_feature: FloatArray) -> None:
+    """Write a loss's derivative by the features, given the one by T: `push_forward` transposed.
+
+    Parameters
+    ----------
+    features : (V, 9) float64 array
+    by_gradient : (V, 3, 3) float64 array
+    by_feature : (V, 9) float64 array, overwritten
+    """
+    rotation = np.empty((3, 3))
+    turned = np.empty((3, 3))
+    h = np.empty((3, 3))
+    for i in range(len(features)):
+        x, y, z = features[i, 0], features[i, 1], features[i, 2]
+        exponential(x, y, z, rotation)
+        _, b, c = exponential_coefficients(x * x + y * y + z * z)
+        _stretch_product(rotation, features[i, 3:], turned)
+        g = by_gradient[i]
+        p0, p1, p2 = 0.0, 0.0, 0.0
+        for k in range(3):
+            p0 += turned[1, k] * g[2, k] - turned[2, k] * g[1, k]
+            p1 += turned[2, k] * g[0, k] - turned[0, k] * g[2, k]
+            p2 += turned[0, k] * g[1, k] - turned[1, k] * g[0, k]
+        # The transposed left Jacobian is the left Jacobian of -a.
+        k0, k1, k2 = y * p2 - z * p1, z * p0 - x * p2, x * p1 - y * p0
+        by_feature[i, 0] = p0 - b * k0 + c * (y * k2 - z * k1)
+        by_feature[i, 1] = p1 - b * k1 + c * (z * k0 - x * k2)
+        by_feature[i, 2] = p2 - b * k2 + c * (x * k1 - y * k0)
+        for a in range(3):
+            for column in range(3):
+                h[a, column] = (
+                    rotation[0, a] * g[0, column]
+                    + rotation[1, a] * g[1, column]
+                    + rotation[2, a] * g[2, column]
+                )
+        by_feature[i, 3] = h[0, 0]
+        by_feature[i, 4] = h[0, 1] + h[1, 0]
+        by_feature[i, 5] = h[0, 2] + h[2, 0]
+        by_feature[i, 6] = h[1, 1]
+        by_feature[i, 7] = h[1, 2] + h[2, 1]
+        by_feature[i, 8] = h[2, 2]

@@ -1,0 +1,297 @@
+"""From deformation gradients back to vertices: one factorisation, then substitutions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import linalg
+
+from lcollision_core.acap.compiled import compiled
+from lcollision_core.acap.gradients import RingFit
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+
+BLOCK_POSES = 8
+"""Poses that share one pass over the factor; more gain little and fall out of the cache."""
+
+
+@dataclass(frozen=True)
+class Poisson:
+    """L p' = b(T) of step 5, factored.
+
+    L is the weighted Laplacian of the reference with one vertex pinned per connected component;
+    afterwards each component's mean vertex is put where the reference has it, which makes the
+    solution the pseudo-inverse of the unpinned L, a symmetric operator.
+
+    Attributes
+    ----------
+    position : (V,) int32 array, each vertex's place in the order of elimination; pinned ones
+        come after all n free ones
+    column_start, row, lower : unit lower triangle of L = lower diag(D) lower^T in CSC form,
+        without its diagonal
+    inverse_pivot : (n,) float64 array, 1 / D
+    map_start, map_vertex, map_spoke : the rows of b: b_i is the sum of T_j s_ij over the
+        one-ring and i itself; (V + 1,) and (nnz,) int32, s (nnz, 3) float64
+    component : (V,) int32 array
+    rest_mean : (n_components, 3) float64 array, each component's mean reference vertex
+    component_size : (n_components,) float64 array, vertices in each
+    """
+
+    position: IntArray
+    column_start: IntArray
+    row: IntArray
+    lower: FloatArray
+    inverse_pivot: FloatArray
+    map_start: IntArray
+    map_vertex: IntArray
+    map_spoke: FloatArray
+    component: IntArray
+    rest_mean: FloatArray
+    component_size: FloatArray
+
+    def solve(self, gradients: FloatArray, vertices: FloatArray) -> None:
+        """Write the poses of up to `BLOCK_POSES` fields of deformation gradients.
+
+        Parameters
+        ----------
+        gradients : (n, V, 3, 3) float64 array
+        vertices : (n, V, 3) float64 array, overwritten; each component's mean is 0
+        """
+        right_sides = np.empty((len(self.position), 3 * len(gradients)))
+        for pose, field in enumerate(gradients):
+            _load(
+                field,
+                self.map_start,
+                self.map_vertex,
+                self.map_spoke,
+                self.position,
+                3 * pose,
+                right_sides,
+            )
+        self._substitute(right_sides)
+        for pose, out in enumerate(vertices):
+            _unload(right_sides, 3 * pose, self.position, self.component, self.component_size, out)
+
+    def solve_transposed(self, by_vertices: FloatArray, by_gradients: FloatArray) -> None:
+        """Write a loss's derivative by T from the one by the vertices: `solve` transposed.
+
+        Parameters
+        ----------
+        by_vertices : (n, V, 3) float64 array
+        by_gradients : (n, V, 3, 3) float64 array, overwritten
+        """
+        right_sides = np.empty((len(self.position), 3 * len(by_vertices)))
+        for pose, out in enumerate(by_vertices):
+            totals = np.zeros_like(self.rest_mean)
+            np.add.at(totals, self.component, out)
+            centred = out - (totals / self.component_size[:, None])[self.component]
+            right_sides[self.position, 3 * pose : 3 * pose + 3] = centred
+        self._substitute(right_sides)
+        for pose, out in enumerate(by_gradients):
+            _load_transposed(
+                right_sides,
+                3 * pose,
+                self.map_start,
+                self.map_vertex,
+                self.map_spoke,
+                self.position,
+                out,
+            )
+
+    def _substitute(self, right_sides: FloatArray) -> None:
+        kernel = _substitute_three if right_sides.shape[1] == 3 else _substitute_many
+        kernel(self.column_start, self.row, self.lower, self.inverse_pivot, right_sides)
+
+
+@compiled
+def _load(
+    gradients: FloatArray,
+    map_start: IntArray,
+    map_vertex: IntArray,
+    map_spoke: FloatArray,
+    position: IntArray,
+    column: int,
+    right_sides: FloatArray,
+) -> None:
+    for i in range(len(gradients)):
+        x, y, z = 0.0, 0.0, 0.0
+        for k in range(map_start[i], map_start[i + 1]):
+            j = map_vertex[k]
+            s0, s1, s2 = map_spoke[k, 0], map_spoke[k, 1], map_spoke[k, 2]
+            x += gradients[j, 0, 0] * s0 + gradients[j, 0, 1] * s1 + gradients[j, 0, 2] * s2
+            y += gradients[j, 1, 0] * s0 + gradients[j, 1, 1] * s1 + gradients[j, 1, 2] * s2
+            z += gradients[j, 2, 0] * s0 + gradients[j, 2, 1] * s1 + gradients[j, 2, 2] * s2
+        p = position[i]
+        right_sides[p, column] = x
+        right_sides[p, column + 1] = y
+        right_sides[p, column + 2] = z
+
+
+@compiled
+def _load_transposed(
+    solution: FloatArray,
+    column: int,
+    map_start: IntArray,
+    map_vertex: IntArray,
+    map_spoke: FloatArray,
+    position: IntArray,
+    by_gradients: FloatArray,
+) -> None:
+    by_gradients[:] = 0.0
+    for i in range(len(position)):
+        p = position[i]
+        for k in range(map_start[i], map_start[i + 1]):
+            j = map_vertex[k]
+            for a in range(3):
+                for b in range(3):
+                    by_gradients[j, a, b] += solution[p, column + a] * map_spoke[k, b]
+
+
+@compiled
+def _unload(
+    solution: FloatArray,
+    column: int,
+    position: IntArray,
+    component: IntArray,
+    component_size: FloatArray,
+    vertices: FloatArray,
+) -> None:
+    mean = np.zeros((len(component_size), 3))
+    for i in range(len(position)):
+        for a in range(3):
+            vertices[i, a] = solution[position[i], column + a]
+            mean[component[i], a] += vertices[i, a]
+    for i in range(len(position)):
+        for a in range(3):
+            vertices[i, a] -= mean[component[i], a] / component_size[component[i]]
+
+
+@compiled
+def _substitute_three(
+    column_start: IntArray,
+    row: IntArray,
+    lower: FloatArray,
+    inverse_pivot: FloatArray,
+    right_sides: FloatArray,
+) -> None:
+    """`_substitute_many` for one pose, its three columns held in registers: half the time."""
+    n_free = len(inverse_pivot)
+    for j in range(n_free):
+        x, y, z = right_sides[j, 0], right_sides[j, 1], right_sides[j, 2]
+        for p in range(column_start[j], column_start[j + 1]):
+            i, factor = row[p], lower[p]
+            right_sides[i, 0] -= factor * x
+            right_sides[i, 1] -= factor * y
+            right_sides[i, 2] -= factor * z
+    for j in range(n_free - 1, -1, -1):
+        pivot = inverse_pivot[j]
+        x, y, z = right_sides[j, 0] * pivot, right_sides[j, 1] * pivot, right_sides[j, 2] * pivot
+        for p in range(column_start[j], column_start[j + 1]):
+            i, factor = row[p], lower[p]
+            x -= factor * right_sides[i, 0]
+            y -= factor * right_sides[i, 1]
+            z -= factor * right_sides[i, 2]
+        right_sides[j, 0], right_sides[j, 1], right_sides[j, 2] = x, y, z
+    right_sides[n_free:] = 0.0
+
+
+@compiled
+def _substitute_many(
+    column_start: IntArray,
+    row: IntArray,
+    lower: FloatArray,
+    inverse_pivot: FloatArray,
+    right_sides: FloatArray,
+) -> None:
+    """Solve for all columns in place; the rows of pinned vertices, which come last, get 0."""
+    n_free, width = len(inverse_pivot), right_sides.shape[1]
+    for j in range(n_free):
+        for p in range(column_start[j], column_start[j + 1]):
+            i, factor = row[p], lower[p]
+            for c in range(width):
+                right_sides[i, c] -= factor * right_sides[j, c]
+    for j in range(n_free - 1, -1, -1):
+        pivot = inverse_pivot[j]
+        for c in range(width):
+            right_sides[j, c] *= pivot
+        for p in range(column_start[j], column_start[j + 1]):
+            i, factor = row[p], lower[p]
+            for c in range(width):
+                right_sides[j, c] -= factor * right_sides[i, c]
+    right_sides[n_free:] = 0.0
+
+
+def factor_poisson(
+    topology: Topology,
+    rest_vertices: FloatArray,
+    fit: RingFit,
+    edge_weights: FloatArray,
+    pinned: IntArray,
+) -> Poisson:
+    """Factor the reconstruction of step 5 of Gao et al. 2019 for one reference.
+
+    Parameters
+    ----------
+    topology : the connectivity, with E edges
+    rest_vertices : (V, 3) float64 array, the reference p
+    fit : the one-rings in CSR form
+    edge_weights : (E,) float64 array c_ij > 0
+    pinned : (n_components,) int32 array, one vertex of each connected component
+
+    Returns
+    -------
+    poisson : Poisson
+    """
+    n_vertices = topology.n_vertices
+    weight = edge_weights[fit.ring_edge]
+    owner = np.repeat(np.arange(n_vertices), np.diff(fit.ring_start))
+    spoke = 0.5 * weight[:, None] * (rest_vertices[owner] - rest_vertices[fit.ring])
+    own_spoke = np.zeros((n_vertices, 3))
+    np.add.at(own_spoke, owner, spoke)
+    rows = np.concatenate([owner, np.arange(n_vertices)])
+    order = np.argsort(rows, kind="stable")
+    map_start = np.searchsorted(rows[order], np.arange(n_vertices + 1)).astype(np.int32)
+    map_vertex = np.concatenate([fit.ring, np.arange(n_vertices, dtype=np.int32)])[order]
+    map_spoke = np.concatenate([spoke, own_spoke])[order]
+
+    off_diagonal = sparse.csr_matrix(
+        (weight, fit.ring, fit.ring_start), shape=(n_vertices, n_vertices)
+    )
+    diagonal = np.bincount(owner, weight, minlength=n_vertices)
+    laplacian = sparse.diags(diagonal) - off_diagonal
+    free = np.setdiff1d(np.arange(n_vertices), pinned)
+    position = np.empty(n_vertices, dtype=np.int32)
+    position[pinned] = np.arange(len(free), n_vertices)
+    if len(free):
+        # Positive definite, so that no pivoting is needed and U = D lower^T.
+        factors = linalg.splu(
+            laplacian.tocsc()[free][:, free].tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        position[free] = factors.perm_c
+        strict = sparse.tril(factors.L, -1).tocsc()
+        strict.sort_indices()
+        pivots = factors.U.diagonal()
+    else:
+        strict, pivots = sparse.csc_matrix((0, 0)), np.empty(0)
+
+    count, component = topology.vertex_components
+    size = np.bincount(component, minlength=count).astype(np.float64)
+    totals = np.zeros((count, 3))
+    np.add.at(totals, component, rest_vertices)
+    return Poisson(
+        position=position,
+        column_start=strict.indptr.astype(np.int32),
+        row=strict.indices.astype(np.int32),
+        lower=strict.data,
+        inverse_pivot=1.0 / pivots,
+        map_start=map_start,
+        map_vertex=map_vertex.astype(np.int32),
+        map_spoke=map_spoke,
+        component=component,
+        rest_mean=totals / size[:, None],
+        component_size=size,
+    )
