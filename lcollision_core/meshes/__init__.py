@@ -1,1 +1,34 @@
 """What a pose is: topology, files, pose sets, alignment and the built-in body."""
+
+from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.files import (
+    MAX_FACES,
+    READABLE_SUFFIXES,
+    WRITABLE_SUFFIXES,
+    Mesh,
+    read_mesh,
+    write_mesh,
+)
+from lcollision_core.meshes.pose_set import (
+    PoseSet,
+    read_pose_set,
+    write_pose_set,
+)
+from lcollision_core.meshes.topology import Topology
+from lcollision_core.meshes.units import height, up_axis
+
+__all__ = [
+    "MAX_FACES",
+    "READABLE_SUFFIXES",
+    "WRITABLE_SUFFIXES",
+    "Mesh",
+    "PoseSet",
+    "Topology",
+    "atomic_write",
+    "height",
+    "read_mesh",
+    "read_pose_set",
+    "up_axis",
+    "write_mesh",
+    "write_pose_set",
+]

@@ -1,0 +1,212 @@
+"""Mesh files: OBJ, PLY, OFF, STL, GLB and glTF, in and out without touching the vertex order."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError
+from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.formats import gltf, obj, off, ply, stl
+from lcollision_core.meshes.formats.polygons import (
+    MAX_FACES,
+    MAX_FILE_BYTES,
+    Polygons,
+    triangulate,
+)
+from lcollision_core.meshes.topology import Topology
+
+READABLE_SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
+"""Extensions that `read_mesh` reads, in lower case."""
+
+_ENCODERS: dict[str, Callable[[npt.NDArray[Any], npt.NDArray[np.int32]], bytes]] = {
+    ".obj": obj.encode,
+    ".ply": ply.encode,
+    ".off": off.encode,
+    ".stl": stl.encode,
+    ".glb": gltf.encode,
+}
+WRITABLE_SUFFIXES = tuple(_ENCODERS)
+"""Extensions that `write_mesh` writes, in lower case."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """One triangle mesh as it is in its file.
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64 array, read-only, in the file's order and unit
+    topology : its faces
+    source : the file that it was read from
+    notes : sentences on what was done on reading, such as the triangulation of quads
+    """
+
+    vertices: npt.NDArray[np.float64]
+    topology: Topology
+    source: Path
+    notes: tuple[str, ...] = ()
+
+    @property
+    def faces(self) -> npt.NDArray[np.int32]:
+        """(F, 3) int32 array, vertex indices from 0, read-only."""
+        return self.topology.faces
+
+
+def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None) -> Mesh:
+    """Read one triangle mesh; its extension, in any case, says the format.
+
+    No vertex is merged, moved, reordered or dropped. STL is the exception, as it stores no shared
+    vertices: corners at equal coordinates become one vertex, numbered by first appearance.
+    Polygons are cut into fans of triangles and `Mesh.notes` says so.
+
+    Parameters
+    ----------
+    path : an .obj, .ply, .off, .stl, .glb or .gltf file
+    topology : the connectivity that an STL file is expected to have: when its triangles fit, they
+        are put back into this vertex order. A mesh with the same faces shares the object.
+
+    Returns
+    -------
+    the mesh
+
+    Raises
+    ------
+    MeshFileError : the file is missing, empty, truncated, damaged or no mesh, holds more than
+        `MAX_FACES` faces or vertices, a coordinate is not finite, or a face names a vertex that
+        does not exist or names one twice. The sentence names the file and the element.
+    """
+    source = Path(path)
+    try:
+        polygons = _read_polygons(source, topology)
+        vertices = np.ascontiguousarray(polygons.vertices)
+        faces, notes = triangulate(polygons)
+        _require_usable(vertices, faces)
+        found = Topology(faces, len(vertices))
+    except (MeshFileError, PoseSetError) as error:
+        raise MeshFileError(f"{path} cannot be read: {error}") from error
+    vertices.flags.writeable = False
+    if topology is not None and found == topology:
+        found = topology
+    return Mesh(vertices, found, source, polygons.notes + notes)
+
+
+def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
+    suffix = path.suffix.lower()
+    try:
+        # A pipe would block on opening, a folder's own error is a riddle.
+        if path.exists() and not path.is_file():
+            kind = "a folder" if path.is_dir() else "not a plain file"
+            raise MeshFileError(f"it is {kind}; name a mesh file")
+        with path.open("rb") as file:
+            if suffix not in READABLE_SUFFIXES:
+                raise MeshFileError(
+                    f"{suffix or 'a name without extension'} is no mesh format known here; "
+                    f"use one of {', '.join(READABLE_SUFFIXES)}"
+                )
+            size = os.fstat(file.fileno()).st_size
+            if size == 0:
+                raise MeshFileError("it is empty; export the mesh again")
+            if suffix == ".obj":
+                return obj.read(file, size)
+            if suffix == ".ply":
+                return ply.read(file, size)
+            if suffix == ".off":
+                return off.read(file, size)
+            if suffix == ".stl":
+                return stl.read(file, size, topology)
+            return gltf.read(file, path)
+    except FileNotFoundError as error:
+        raise MeshFileError("there is no such file; check the name") from error
+    except PermissionError as error:
+        raise MeshFileError("permission is denied; change the file's permissions") from error
+    except OSError as error:
+        reason = "the name is too long" if error.errno == errno.ENAMETOOLONG else error.strerror
+        raise MeshFileError(f"{reason or error}; check the file") from error
+    except MemoryError as error:
+        raise MeshFileError("it needs more memory than there is; decimate the mesh") from error
+
+
+def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> None:
+    if len(vertices) == 0:
+        raise MeshFileError("it holds no vertices; export the mesh again")
+    if len(faces) == 0:
+        raise MeshFileError("it holds vertices but no faces; export it as a triangle mesh")
+    for count, what in ((len(faces), "faces"), (len(vertices), "vertices")):
+        if count > MAX_FACES:
+            raise MeshFileError(
+                f"it holds {count} {what}, at most {MAX_FACES} can be read; decimate the mesh"
+            )
+    vertex = first_not_finite(vertices)
+    if vertex is not None:
+        raise MeshFileError(
+            f"vertex {vertex} (from 0) is at {vertices[vertex].tolist()}, which is not finite; "
+            f"export the mesh again"
+        )
+
+
+def first_not_finite(vertices: npt.NDArray[Any]) -> int | None:
+    """Return the first vertex of (V, 3) `vertices` with a NaN or an infinity, if there is one."""
+    finite = np.isfinite(vertices)
+    if finite.all():
+        return None
+    return int(np.flatnonzero(~finite.all(axis=1))[0])
+
+
+def write_mesh(
+    path: str | os.PathLike[str], vertices: npt.NDArray[Any], faces: npt.NDArray[Any]
+) -> None:
+    """Write one triangle mesh whole or not at all; the extension, in any case, says the format.
+
+    OBJ and OFF are written with the shortest decimals that read back as the same numbers, PLY in
+    binary with the precision of `vertices`; STL and GLB keep float32 by their nature.
+
+    Parameters
+    ----------
+    path : an .obj, .ply, .off, .stl or .glb file in an existing folder
+    vertices : (V, 3) array; float32 is written as such, anything else as float64
+    faces : (F, 3) integer array, indices from 0
+
+    Raises
+    ------
+    ShapeError : an array has another shape, or a vertex is not finite.
+    PoseSetError : a face names a vertex that does not exist.
+    MeshFileError : the extension is unknown or the file cannot be written.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in _ENCODERS:
+        raise MeshFileError(
+            f"{path} cannot be written: {suffix or 'a name without extension'} is no mesh format "
+            f"known here; use one of {', '.join(WRITABLE_SUFFIXES)}"
+        )
+    points = np.asarray(vertices)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ShapeError(f"vertices must be a (V, 3) array, got {points.shape}")
+    if points.dtype != np.float32:
+        points = points.astype(np.float64)
+    points = points.astype(points.dtype.newbyteorder("="), copy=False)
+    vertex = first_not_finite(points)
+    if vertex is not None:
+        raise ShapeError(f"vertex {vertex} is at {points[vertex].tolist()}, which is not finite")
+    data = _ENCODERS[suffix](points, Topology(faces, len(points)).faces)
+    with atomic_write(path) as file:
+        file.write(data)
+
+
+__all__ = [
+    "MAX_FACES",
+    "MAX_FILE_BYTES",
+    "READABLE_SUFFIXES",
+    "WRITABLE_SUFFIXES",
+    "Mesh",
+    "first_not_finite",
+    "read_mesh",
+    "write_mesh",
+]

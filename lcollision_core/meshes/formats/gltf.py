@@ -1,0 +1,107 @@
+"""glTF 2.0, as .glb or .gltf, through trimesh."""
+
+from __future__ import annotations
+
+import json
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.formats.polygons import (
+    Polygons,
+    read_rest,
+    require_plausible_count,
+)
+
+_GLB_MAGIC = b"glTF"
+
+
+def read(file: BinaryIO, path: Path) -> Polygons:
+    """Read the one triangle mesh of a scene, placed by its node.
+
+    Parameters
+    ----------
+    file : open binary file at its start
+    path : where it is; a .gltf may name a buffer file beside it
+
+    Returns
+    -------
+    the triangles, vertices in the file's order
+
+    Raises
+    ------
+    MeshFileError : the file is damaged, or holds no mesh or several.
+    """
+    import trimesh
+    from trimesh.resolvers import FilePathResolver
+
+    data = read_rest(file)
+    _require_one_mesh(data)
+    kind = "glb" if data.startswith(_GLB_MAGIC) else "gltf"
+    try:
+        with np.errstate(all="ignore"):
+            scene = trimesh.load_scene(
+                BytesIO(data),
+                file_type=kind,
+                resolver=FilePathResolver(path),
+                process=False,
+                skip_materials=True,
+            )
+            shown = [scene.graph[node] for node in scene.graph.nodes_geometry]
+            meshes = [(place, scene.geometry[name]) for place, name in shown]
+    # On a damaged file trimesh raises whatever its line at hand raises; nothing of ours runs here.
+    except Exception as error:
+        raise MeshFileError("it is a damaged or unsupported glTF file; export it again") from error
+    if len(meshes) != 1 or not isinstance(meshes[0][1], trimesh.Trimesh):
+        raise MeshFileError(f"it shows {len(meshes)} meshes, one of triangles is needed")
+    transform, mesh = meshes[0]
+    vertices = np.array(mesh.vertices, dtype=np.float64)
+    if not np.array_equal(transform, np.eye(4)):
+        vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
+    return Polygons.triangles(vertices, np.array(mesh.faces, dtype=np.int64))
+
+
+def _require_one_mesh(data: bytes) -> None:
+    """Look at the description alone, before trimesh takes memory for what it announces."""
+    text = data
+    if data.startswith(_GLB_MAGIC):
+        length = int.from_bytes(data[12:16], "little")
+        text = data[20 : 20 + length]
+        if len(text) < max(length, 1):
+            raise MeshFileError("it is a truncated GLB file; export it again")
+    try:
+        scene = json.loads(text)
+        counts = [int(accessor.get("count", 0)) for accessor in scene.get("accessors", [])]
+        n_primitives = sum(len(mesh["primitives"]) for mesh in scene.get("meshes", []))
+    except (
+        ValueError,
+        OverflowError,
+        AttributeError,
+        TypeError,
+        KeyError,
+        RecursionError,
+    ) as error:
+        raise MeshFileError("it holds no readable glTF description; export it again") from error
+    for count in counts:
+        # An accessor of indices counts corners, three a face.
+        require_plausible_count(-(-count // 3), "faces")
+    if n_primitives != 1:
+        raise MeshFileError(f"it holds {n_primitives} meshes or parts, one is needed; export one")
+
+
+def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
+    """Write triangles as GLB, float32.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float32 or float64 array; glTF keeps float32 only
+    faces : (F, 3) int32 array, indices from 0
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    return bytes(trimesh.Scene(mesh).export(file_type="glb", include_normals=False))

@@ -1,0 +1,176 @@
+"""Wavefront OBJ.
+
+An own reader, because the vertex order and count must survive: trimesh splits a vertex where its
+texture coordinates or normals differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_few
+from lcollision_core.meshes.formats.text import decimals
+
+_SHORTEST_FACE = len(b"f 1 2 3\n")
+_BLOCK_LINES = 1 << 18
+
+
+def read(file: BinaryIO, size: int) -> Polygons:
+    """Read `v` and `f` lines; texture coordinates, normals, groups and materials are passed over.
+
+    Parameters
+    ----------
+    file : open binary file at its start
+    size : its size in bytes
+
+    Returns
+    -------
+    the polygons, vertices in the file's order
+
+    Raises
+    ------
+    MeshFileError : a vertex or face is not readable, named by its number from 0.
+    """
+    require_few(file, b"\nf", _SHORTEST_FACE, size)
+    data = read_rest(file)
+    if b"\0" in data:
+        raise MeshFileError("it is not a text file, so no OBJ; export the mesh again")
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if b"\\" in data:
+        data = data.replace(b"\\\n", b" ")
+    vertex_lines: list[bytes] = []
+    face_lines: list[bytes] = []
+    vertices_before: list[int] = []
+    for line in data.split(b"\n"):
+        start = line[:2]
+        if start not in (b"v ", b"f "):
+            words = line.split(None, 1)
+            if not words or words[0] not in (b"v", b"f"):
+                continue
+            line = words[0] + b" " + (words[1] if len(words) > 1 else b"")
+            start = line[:2]
+        if start == b"v ":
+            vertex_lines.append(line)
+        else:
+            face_lines.append(line)
+            vertices_before.append(len(vertex_lines))
+    if b"#" in data:
+        vertex_lines = [line.partition(b"#")[0] for line in vertex_lines]
+        face_lines = [line.partition(b"#")[0] for line in face_lines]
+    sizes, corners = _parse_faces(face_lines, vertices_before)
+    return Polygons(_parse_vertices(vertex_lines), sizes, corners)
+
+
+def _table(lines: Sequence[bytes]) -> list[bytes] | None:
+    """Return the words of all lines, or None unless every line has as many words as the first."""
+    words = b" ".join(lines).split()
+    columns = len(lines[0].split())
+    keyword = lines[0][:1]
+    # Keywords at every row's start, and as many as there are lines, leave no room for ragged rows.
+    aligned = len(words) == columns * len(lines) and words[::columns].count(keyword) == len(lines)
+    return words if aligned else None
+
+
+def _parse_vertices(lines: list[bytes]) -> npt.NDArray[np.float64]:
+    vertices = np.empty((len(lines), 3), dtype=np.float64)
+    for start in range(0, len(lines), _BLOCK_LINES):
+        block = lines[start : start + _BLOCK_LINES]
+        words = _table(block)
+        columns = len(block[0].split())
+        if words is not None and columns >= 4:
+            try:
+                for axis in range(3):
+                    vertices[start : start + len(block), axis] = list(
+                        map(float, words[axis + 1 :: columns])
+                    )
+                continue
+            except ValueError:
+                pass  # The walk below finds out which vertex it was.
+        for vertex, line in enumerate(block, start):
+            coordinates = line.split()[1:4]
+            if len(coordinates) < 3:
+                raise MeshFileError(
+                    f"vertex {vertex} (from 0) has {len(coordinates)} coordinates, three are needed"
+                )
+            try:
+                vertices[vertex] = list(map(float, coordinates))
+            except ValueError as error:
+                raise MeshFileError(
+                    f"vertex {vertex} (from 0) has a coordinate that is no number: "
+                    f"{b' '.join(coordinates)[:60]!r}"
+                ) from error
+    return vertices
+
+
+def _parse_faces(
+    lines: list[bytes], vertices_before: list[int]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    all_sizes = [np.empty(0, dtype=np.int64)]
+    all_corners = [np.empty(0, dtype=np.int64)]
+    for start in range(0, len(lines), _BLOCK_LINES):
+        block = lines[start : start + _BLOCK_LINES]
+        words = _table(block)
+        if words is not None:
+            columns = len(words) // len(block)
+            del words[::columns]
+            sizes = np.full(len(block), columns - 1, dtype=np.int64)
+        else:
+            rows = [line.split()[1:] for line in block]
+            sizes = np.array([len(row) for row in rows], dtype=np.int64)
+            words = [word for row in rows for word in row]
+        try:
+            if any(b"/" in line for line in block):
+                words = [word.partition(b"/")[0] for word in words]
+            corners = np.array(list(map(int, words)), dtype=np.int64)
+        except (ValueError, OverflowError) as error:
+            raise MeshFileError(_first_bad_face(block, start)) from error
+        owner = np.repeat(np.arange(start, start + len(block)), sizes)
+        zero = np.flatnonzero(corners == 0)
+        if len(zero):
+            raise MeshFileError(
+                f"face {owner[zero[0]]} (from 0) names vertex 0, but OBJ counts vertices from 1"
+            )
+        if (corners < 0).any():
+            counted = np.array(vertices_before, dtype=np.int64)[owner]
+            outside = np.flatnonzero(corners < -counted)
+            if len(outside):
+                raise MeshFileError(
+                    f"face {owner[outside[0]]} (from 0) names vertex {corners[outside[0]]}, "
+                    f"but only {counted[outside[0]]} vertices come before it"
+                )
+            corners = np.where(corners < 0, counted + corners, corners - 1)
+        else:
+            corners -= 1
+        all_sizes.append(sizes)
+        all_corners.append(corners)
+    return np.concatenate(all_sizes), np.concatenate(all_corners)
+
+
+def _first_bad_face(block: list[bytes], start: int) -> str:
+    for face, line in enumerate(block, start):
+        for word in line.split()[1:]:
+            try:
+                np.int64(int(word.partition(b"/")[0]))
+            except (ValueError, OverflowError):
+                return f"face {face} (from 0) has a corner that is no vertex number: {word[:30]!r}"
+    return "a face has a corner that is no vertex number"
+
+
+def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
+    """Write triangles as OBJ text, each number as the shortest decimal that reads back the same.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float32 or float64 array
+    faces : (F, 3) int32 array, indices from 0 (written from 1)
+    """
+    rows = "v %s %s %s\n" * len(vertices) % decimals(vertices)
+    return (
+        rows + "f %d %d %d\n" * len(faces) % tuple((faces.astype(np.int64) + 1).ravel().tolist())
+    ).encode("ascii")

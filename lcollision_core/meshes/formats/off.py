@@ -1,0 +1,106 @@
+"""Object File Format (OFF), text form."""
+
+from __future__ import annotations
+
+import re
+from itertools import chain
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_plausible_count
+from lcollision_core.meshes.formats.text import decimals, numbers
+
+_HEADER = re.compile(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?C?N?OFF\b([^\n]*)", re.IGNORECASE)
+_COUNTS = re.compile(rb"(?:\s*(?:#[^\n]*\n)?)*(-?\d+)\s+(-?\d+)")
+_HEAD_BYTES = 1 << 16
+
+
+def read(file: BinaryIO, size: int) -> Polygons:  # noqa: ARG001
+    """Read the vertices and faces; colours, normals and texture coordinates are passed over.
+
+    Parameters
+    ----------
+    file : open binary file at its start
+    size : its size in bytes
+
+    Returns
+    -------
+    the polygons, vertices in the file's order
+
+    Raises
+    ------
+    MeshFileError : the header is no OFF header, or a vertex or face is missing or not readable.
+    """
+    head = file.read(_HEAD_BYTES).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    header = _HEADER.match(head)
+    if header is None or b"BINARY" in header[1].upper():
+        raise MeshFileError("it does not start with OFF as a text OFF file does")
+    counts = _COUNTS.match(head, header.start(1))
+    if counts is None:
+        raise MeshFileError("the counts of vertices and faces are missing after OFF")
+    n_vertices, n_faces = int(counts[1]), int(counts[2])
+    require_plausible_count(n_vertices, "vertices")
+    require_plausible_count(n_faces, "faces")
+    file.seek(0)
+    data = read_rest(file).replace(b"\r\n", b"\n").replace(b"\r", b"\n")[counts.end() :]
+    # The rest of the line of counts is the number of edges, which readers ignore.
+    data = data.partition(b"\n")[2]
+    if b"#" in data:
+        data = re.sub(rb"#[^\n]*", b"", data)
+    rows = [row for line in data.split(b"\n") if (row := line.split())]
+    if len(rows) < n_vertices + n_faces:
+        raise MeshFileError(
+            f"it announces {n_vertices} vertices and {n_faces} faces but has only {len(rows)} "
+            f"lines for them; it is truncated"
+        )
+    vertex_rows = rows[:n_vertices]
+    short = next((i for i, row in enumerate(vertex_rows) if len(row) < 3), None)
+    if short is not None:
+        raise MeshFileError(
+            f"vertex {short} (from 0) has {len(vertex_rows[short])} coordinates, three are needed"
+        )
+    flat = list(chain.from_iterable(row[:3] for row in vertex_rows))
+    vertices = numbers(flat, "the vertices").reshape(-1, 3)
+    sizes, corners = _faces(rows[n_vertices : n_vertices + n_faces])
+    return Polygons(vertices, sizes, corners)
+
+
+def _faces(rows: list[list[bytes]]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    sizes = np.empty(len(rows), dtype=np.int64)
+    corners: list[int] = []
+    for face, row in enumerate(rows):
+        try:
+            size = int(row[0])
+            named = list(map(int, row[1 : 1 + max(size, 0)]))
+        except ValueError as error:
+            raise MeshFileError(
+                f"face {face} (from 0) has a corner that is no vertex number"
+            ) from error
+        if size < 0 or len(named) < size:
+            raise MeshFileError(
+                f"face {face} (from 0) announces {size} corners but has {len(named)}"
+            )
+        sizes[face] = size
+        corners += named
+    try:
+        return sizes, np.array(corners, dtype=np.int64)
+    except OverflowError as error:
+        raise MeshFileError("a face has a vertex number that is far too large") from error
+
+
+def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
+    """Write triangles as OFF text, each number as the shortest decimal that reads back the same.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float32 or float64 array
+    faces : (F, 3) int32 array, indices from 0
+    """
+    header = f"OFF\n{len(vertices)} {len(faces)} 0\n"
+    rows = "%s %s %s\n" * len(vertices) % decimals(vertices)
+    return (header + rows + "3 %d %d %d\n" * len(faces) % tuple(faces.ravel().tolist())).encode(
+        "ascii"
+    )

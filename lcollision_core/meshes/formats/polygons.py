@@ -1,0 +1,147 @@
+"""What every mesh format holds, and the limits that every reader keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+
+MAX_FACES = 10_000_000
+"""The most faces, and the most vertices, that a mesh file may hold.
+
+Far above any posed body, and low enough that a file at the limit fits into memory. Counts are
+compared with it before anything of that size is allocated.
+"""
+
+MAX_FILE_BYTES = 1 << 30
+"""The largest mesh file that is opened, in bytes."""
+
+_CHUNK_BYTES = 1 << 24
+
+
+@dataclass(frozen=True)
+class Polygons:
+    """The content of a mesh file before triangulation.
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64 array, in the file's order
+    sizes : (P,) int64 array, corners of each polygon
+    corners : (sum of sizes,) int64 array, vertex indices from 0, one polygon after the other
+    notes : sentences on what was done to the file's content
+    """
+
+    vertices: npt.NDArray[np.float64]
+    sizes: npt.NDArray[np.int64]
+    corners: npt.NDArray[np.int64]
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def triangles(
+        cls,
+        vertices: npt.NDArray[np.float64],
+        faces: npt.NDArray[np.int64],
+        notes: tuple[str, ...] = (),
+    ) -> Polygons:
+        """Wrap (V, 3) vertices and (F, 3) faces."""
+        return cls(vertices, np.full(len(faces), 3, dtype=np.int64), faces.reshape(-1), notes)
+
+
+def triangulate(polygons: Polygons) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+    """Cut every polygon into the fan of triangles round its first corner.
+
+    The cut depends on the order of the corners alone, never on their positions, so that all poses
+    of a set are cut alike.
+
+    Parameters
+    ----------
+    polygons : the content of a file
+
+    Returns
+    -------
+    faces : (F, 3) int64 array, in the order of the polygons
+    notes : a sentence for each kind of polygon that was cut
+
+    Raises
+    ------
+    MeshFileError : a polygon has fewer than three corners.
+    """
+    sizes = polygons.sizes
+    too_small = np.flatnonzero(sizes < 3)
+    if len(too_small):
+        face = int(too_small[0])
+        raise MeshFileError(f"face {face} (from 0) has {sizes[face]} corners, three are needed")
+    quads = int((sizes == 4).sum())
+    larger = int((sizes > 4).sum())
+    if not quads and not larger:
+        return polygons.corners.reshape(-1, 3), ()
+    notes = []
+    if quads:
+        notes.append(
+            "1 quad was triangulated" if quads == 1 else f"{quads} quads were triangulated"
+        )
+    if larger:
+        notes.append(
+            "1 polygon of more than four corners was triangulated"
+            if larger == 1
+            else f"{larger} polygons of more than four corners were triangulated"
+        )
+    triangles_each = sizes - 2
+    first_corner = np.repeat(np.cumsum(sizes) - sizes, triangles_each)
+    first_triangle = np.repeat(np.cumsum(triangles_each) - triangles_each, triangles_each)
+    step = np.arange(len(first_corner)) - first_triangle
+    fan = np.stack([first_corner, first_corner + step + 1, first_corner + step + 2], axis=1)
+    return polygons.corners[fan], tuple(notes)
+
+
+def require_plausible_count(count: int, what: str) -> None:
+    """Raise `MeshFileError` when a file announces fewer than none, or more than `MAX_FACES`."""
+    if count < 0:
+        raise MeshFileError(f"it announces {count} {what}; the file is damaged")
+    if count > MAX_FACES:
+        raise MeshFileError(
+            f"it holds {count} {what}, at most {MAX_FACES} can be read; decimate the mesh"
+        )
+
+
+def read_rest(file: BinaryIO) -> bytes:
+    """Read what is left of an open file, or raise `MeshFileError` above `MAX_FILE_BYTES`."""
+    data = file.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
+        raise MeshFileError(
+            f"it is larger than {MAX_FILE_BYTES >> 20} MiB; decimate the mesh or split the file"
+        )
+    return data
+
+
+def require_few(file: BinaryIO, keyword: bytes, shortest_face: int, size: int) -> None:
+    """Refuse a text file in which `keyword` opens more than `MAX_FACES` faces.
+
+    Counts in chunks, so that a file of gigabytes is refused in little memory; the file's position
+    is left at its start.
+
+    Parameters
+    ----------
+    file : open binary file at its start
+    keyword : bytes that occur once a face
+    shortest_face : the fewest bytes that one face can take, which spares small files the count
+    size : the file's size in bytes
+    """
+    if size <= shortest_face * MAX_FACES:
+        return
+    count = 0
+    tail = b""
+    while chunk := file.read(_CHUNK_BYTES):
+        joined = tail + chunk
+        count += joined.count(keyword)
+        if count > MAX_FACES:
+            raise MeshFileError(
+                f"it holds more than {MAX_FACES} faces, the most that can be read; "
+                f"decimate the mesh"
+            )
+        tail = joined[len(joined) - len(keyword) + 1 :]
+    file.seek(0)

@@ -1,0 +1,128 @@
+"""STL, binary and text: triangles that repeat their corners' coordinates."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.formats.polygons import (
+    Polygons,
+    read_rest,
+    require_few,
+    require_plausible_count,
+)
+from lcollision_core.meshes.formats.text import numbers
+from lcollision_core.meshes.topology import Topology
+
+_HEADER_BYTES = 84
+_TRIANGLE = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_SHORTEST_FACET = len(b"facet vertex0 0 0 vertex0 0 0 vertex0 0 0 endfacet")
+_JOINED = "STL stores no shared vertices; corners at equal coordinates were joined"
+_REORDERED = "STL stores no shared vertices; corners were put back into the set's vertex order"
+
+
+def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygons:
+    """Read the triangles and give them shared vertices.
+
+    Parameters
+    ----------
+    file : open binary file at its start
+    size : its size in bytes
+    topology : the connectivity that the triangles are expected to have, in its order of faces.
+        When all corners that it calls one vertex agree, its vertex order is restored. Otherwise
+        vertices are numbered as they first appear, equal coordinates being one vertex.
+
+    Returns
+    -------
+    the triangles, in the file's order
+
+    Raises
+    ------
+    MeshFileError : the file is truncated or no STL.
+    """
+    head = file.read(_HEADER_BYTES)
+    n_triangles = int.from_bytes(head[80:], "little") if len(head) == _HEADER_BYTES else -1
+    is_text = head.lstrip()[:5].lower() == b"solid"
+    expected = _HEADER_BYTES + n_triangles * _TRIANGLE.itemsize
+    # A binary file may say "solid" too, so its exact size decides first.
+    if n_triangles >= 0 and (expected == size or (not is_text and expected < size)):
+        require_plausible_count(n_triangles, "triangles")
+        body = file.read(n_triangles * _TRIANGLE.itemsize)
+        corners = np.frombuffer(body, dtype=_TRIANGLE)["corners"].astype(np.float64)
+    elif is_text:
+        file.seek(0)
+        require_few(file, b"endfacet", _SHORTEST_FACET, size)
+        corners = _text_corners(read_rest(file))
+    elif n_triangles >= 0:
+        require_plausible_count(n_triangles, "triangles")
+        raise MeshFileError(
+            f"it announces {n_triangles} triangles, which take {expected} bytes, but has {size}; "
+            f"it is truncated, or no STL file"
+        )
+    else:
+        raise MeshFileError(f"it has {size} bytes, too few for an STL file; export the mesh again")
+    points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0: equal coordinates, equal bytes
+    return _with_order_of(points, topology) or _joined(points)
+
+
+def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
+    lowered = data.lower()
+    rows = re.findall(rb"\bvertex\s([^\n\r]*)", lowered)
+    n_facets = lowered.count(b"endfacet")
+    if len(rows) != 3 * n_facets or b"endsolid" not in lowered:
+        raise MeshFileError(
+            f"it has {n_facets} complete triangles and {len(rows)} corners, and "
+            f"{'an' if b'endsolid' in lowered else 'no'} end line; it is truncated or damaged"
+        )
+    words = [row.split() for row in rows]
+    ragged = next((i for i, row in enumerate(words) if len(row) != 3), None)
+    if ragged is not None:
+        raise MeshFileError(
+            f"corner {ragged % 3} of triangle {ragged // 3} (from 0) has "
+            f"{len(words[ragged])} coordinates, three are needed"
+        )
+    return numbers([word for row in words for word in row], "the corners")
+
+
+def _with_order_of(points: npt.NDArray[np.float64], topology: Topology | None) -> Polygons | None:
+    if topology is None or len(points) != 3 * topology.n_faces or len(topology.unused_vertices):
+        return None
+    order = topology.faces.reshape(-1)
+    vertices = np.empty((topology.n_vertices, 3), dtype=np.float64)
+    vertices[order] = points
+    if not np.array_equal(vertices[order], points):
+        return None
+    return Polygons.triangles(vertices, topology.faces.astype(np.int64), (_REORDERED,))
+
+
+def _joined(points: npt.NDArray[np.float64]) -> Polygons:
+    keys = np.ascontiguousarray(points).view(np.dtype((np.void, points.itemsize * 3))).reshape(-1)
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    by_appearance = np.argsort(first, kind="stable")
+    number = np.empty(len(first), dtype=np.int64)
+    number[by_appearance] = np.arange(len(first))
+    faces = number[inverse.reshape(-1)].reshape(-1, 3)
+    return Polygons.triangles(points[first[by_appearance]], faces, (_JOINED,))
+
+
+def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
+    """Write triangles as binary STL, float32, in the order of `faces`.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float32 or float64 array; STL keeps float32 only
+    faces : (F, 3) int32 array, indices from 0
+    """
+    triangles = np.zeros(len(faces), dtype=_TRIANGLE)
+    corners = vertices.astype(np.float32)[faces]
+    triangles["corners"] = corners
+    exact = corners.astype(np.float64)
+    normals = np.cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    triangles["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    header = b"binary STL".ljust(80, b"\0") + len(faces).to_bytes(4, "little")
+    return header + triangles.tobytes()

@@ -1,0 +1,51 @@
+"""Numbers as text: shortest decimals out, checked numbers in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+
+
+def decimals(values: npt.NDArray[Any]) -> tuple[str, ...]:
+    """Return each number as the shortest decimal that reads back as the same number.
+
+    Parameters
+    ----------
+    values : float32 or float64 array of any shape; float32 numbers get float32's short decimals
+
+    Returns
+    -------
+    one string a number, in C order
+    """
+    flat = values.ravel()
+    return tuple(map(str, flat if flat.dtype == np.float32 else flat.tolist()))
+
+
+def numbers(words: Sequence[bytes], what: str) -> npt.NDArray[np.float64]:
+    """Parse decimals.
+
+    Parameters
+    ----------
+    words : the decimals
+    what : plural noun for the message, such as "the vertices"
+
+    Raises
+    ------
+    MeshFileError : a word is no number.
+    """
+    try:
+        return np.array(list(map(float, words)), dtype=np.float64)
+    except ValueError:
+        for word in words:
+            try:
+                float(word)
+            except ValueError as error:
+                raise MeshFileError(
+                    f"{what} hold {word[:30]!r}, which is no number; export the mesh again"
+                ) from error
+        raise

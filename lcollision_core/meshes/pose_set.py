@@ -1,0 +1,417 @@
+"""Pose sets: many poses of one body, meshes that share their faces."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, ShapeError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.files import READABLE_SUFFIXES, first_not_finite, read_mesh
+from lcollision_core.meshes.npz import MAX_ITEMS, read_npz, write_npz
+from lcollision_core.meshes.topology import Topology
+
+FORMAT_VERSION = 1
+"""The version that `write_pose_set` stores; later ones are refused."""
+
+
+@dataclass(frozen=True)
+class PoseSet:
+    """N poses of one mesh.
+
+    Attributes
+    ----------
+    vertices : (N, V, 3) float32 or float64 array, read-only, in the files' unit; pose 0 is the
+        reference
+    topology : the faces that all poses share
+    names : N names, the mesh files' or "pose 12"
+    source : the folder or file that it was read from, if it was
+    notes : sentences on what was done on reading
+    near_exclusion : fraction of the height below which pairs are near, not colliding
+    up_axis : 0, 1 or 2 for x, y or z; None where the longest side of the reference decides
+    vertex_labels : (V,) array of strings, the body part of each vertex, if known
+
+    Raises
+    ------
+    ShapeError : the arrays do not fit together.
+    """
+
+    vertices: npt.NDArray[Any]
+    topology: Topology
+    names: tuple[str, ...]
+    source: Path | None = None
+    notes: tuple[str, ...] = ()
+    near_exclusion: float = 0.0
+    up_axis: int | None = None
+    vertex_labels: npt.NDArray[np.str_] | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.vertices.shape
+        if len(shape) != 3 or shape[1:] != (self.topology.n_vertices, 3) or shape[0] == 0:
+            raise ShapeError(
+                f"vertices must be (N, {self.topology.n_vertices}, 3) with N > 0, got {shape}"
+            )
+        if self.vertices.dtype not in (np.float32, np.float64):
+            raise ShapeError(f"vertices must be float32 or float64, got {self.vertices.dtype}")
+        if len(self.names) != shape[0]:
+            raise ShapeError(f"{shape[0]} poses need as many names, got {len(self.names)}")
+        if self.up_axis not in (None, 0, 1, 2):
+            raise ShapeError(f"up_axis must be 0, 1, 2 or None, got {self.up_axis}")
+        if not 0.0 <= self.near_exclusion < 1.0:
+            raise ShapeError(f"near_exclusion must be in [0, 1), got {self.near_exclusion}")
+        if self.vertex_labels is not None and self.vertex_labels.shape != shape[1:2]:
+            raise ShapeError(f"vertex_labels must be ({shape[1]},), got {self.vertex_labels.shape}")
+        self.vertices.flags.writeable = False
+
+    def __len__(self) -> int:
+        """N, the number of poses."""
+        return len(self.vertices)
+
+    @property
+    def faces(self) -> npt.NDArray[np.int32]:
+        """(F, 3) int32 array, vertex indices from 0, read-only."""
+        return self.topology.faces
+
+
+def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """Return a sorting key under which mesh2 comes before mesh10."""
+    parts = re.split(r"([0-9]+)", name.casefold())
+    # Digits stand at the odd places; numbers sort before letters.
+    return [
+        (0, int(part), "") if place % 2 else (1, 0, part) for place, part in enumerate(parts)
+    ], name
+
+
+def read_pose_set(
+    path: str | os.PathLike[str],
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> PoseSet:
+    """Read a pose set and refuse it at the first defect.
+
+    Parameters
+    ----------
+    path : a folder of mesh files of one format, read in natural order, or an .npz file with
+        `vertices` (N, V, 3) and `faces` (F, 3), also called `V` and `F`
+    progress : called with (poses done, poses in all)
+    cancel : polled between poses
+
+    Returns
+    -------
+    the pose set; a folder's vertices are float64, an .npz file's keep their precision
+
+    Raises
+    ------
+    MeshFileError : the folder or a file cannot be read.
+    PoseSetError : a pose has another vertex count or other faces than the first, or a triangle
+        of the first has no area.
+    CancelledError : `cancel` was set.
+    """
+
+    def refuse(defect: LCollisionError) -> None:
+        raise defect
+
+    pose_set = collect_poses(Path(path), refuse, progress, cancel).pose_set
+    if pose_set is None:
+        raise MeshFileError(f"{path} holds no poses; name another folder or file")
+    return pose_set
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What `collect_poses` found.
+
+    Attributes
+    ----------
+    pose_set : the poses that fit together, None where there are none
+    n_found : the poses that were there, usable or not
+    same_topology : whether all that could be read share their faces
+    """
+
+    pose_set: PoseSet | None
+    n_found: int
+    same_topology: bool
+
+
+def collect_poses(
+    path: Path,
+    report: Callable[[LCollisionError], None],
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> Collected:
+    """Read all poses that fit together and report each defect.
+
+    Parameters
+    ----------
+    path : as for `read_pose_set`
+    report : told of each defect; when it raises, reading ends there
+    progress, cancel : as for `read_pose_set`
+    """
+    if path.is_dir():
+        collected = _collect_folder(path, report, progress, cancel)
+    elif path.suffix.lower() == ".npz":
+        collected = _collect_npz(path, report, progress)
+    else:
+        if path.suffix.lower() in READABLE_SUFFIXES and path.exists():
+            defect = f"{path} is one mesh, not a pose set; name its folder"
+        elif path.exists():
+            defect = f"{path} is no pose set; name a folder of meshes or an .npz file"
+        else:
+            defect = f"{path} does not exist; name a folder of meshes or an .npz file"
+        report(MeshFileError(defect))
+        return Collected(None, 0, same_topology=False)
+    if collected.pose_set is not None:
+        reference = collected.pose_set
+        flat = degenerate_faces(reference.topology, reference.vertices[0])
+        if len(flat):
+            face = int(flat[0])
+            report(
+                PoseSetError(
+                    f"face {face} (from 0) of the reference, pose 0 ({reference.names[0]}), has no "
+                    f"area: its vertices {reference.faces[face].tolist()} lie on a line, as do "
+                    f"those of {len(flat) - 1} other faces; remove such faces from all poses"
+                )
+            )
+    return collected
+
+
+def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    """Return the faces without area.
+
+    Parameters
+    ----------
+    topology : F faces
+    vertices : (V, 3) array, one pose
+
+    Returns
+    -------
+    (D,) indices of the faces whose height over their longest side is below 1e-12 of that side:
+    float64's rounding, in any unit
+    """
+    a, b, c = (np.asarray(vertices, dtype=np.float64)[corner] for corner in topology.faces.T)
+    longest_squared = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], 0)
+    twice_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.flatnonzero(twice_area <= 1e-12 * longest_squared).astype(np.int32)
+
+
+def _collect_folder(
+    path: Path,
+    report: Callable[[LCollisionError], None],
+    progress: Progress,
+    cancel: CancelToken | None,
+) -> Collected:
+    try:
+        entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
+    except OSError as error:
+        report(MeshFileError(f"{path} cannot be listed: {error.strerror or error}"))
+        return Collected(None, 0, same_topology=False)
+    files = [entry for entry in entries if entry.suffix.lower() in READABLE_SUFFIXES]
+    files.sort(key=lambda file: natural_key(file.name))
+    formats = Counter(file.suffix.lower() for file in files)
+    if len(formats) != 1:
+        held = ", ".join(f"{count} {suffix}" for suffix, count in sorted(formats.items()))
+        report(
+            MeshFileError(
+                f"{path} holds meshes of several formats ({held}); keep one format in a folder"
+                if formats
+                else f"{path} holds no mesh; a pose set is a folder of .obj, .ply, .off or .stl"
+            )
+        )
+        return Collected(None, len(files), same_topology=False)
+    notes: Counter[str] = Counter()
+    names: list[str] = []
+    topology: Topology | None = None
+    vertices = np.empty((0, 0, 3))
+    same_topology = True
+    for pose, file in enumerate(files):
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        try:
+            mesh = read_mesh(file, topology=topology)
+            if topology is None:
+                topology = mesh.topology
+                vertices = _empty_poses(path, len(files), topology.n_vertices, np.float64)
+            defect = _disagreement(pose, file.name, mesh.topology, topology)
+        except MeshFileError as error:
+            report(error)
+            continue
+        if defect is None:
+            vertices[len(names)] = mesh.vertices
+            names.append(file.name)
+            notes.update(mesh.notes)
+        else:
+            same_topology = False
+            report(PoseSetError(defect))
+        progress(pose + 1, len(files))
+    if topology is None:
+        return Collected(None, len(files), same_topology=False)
+    sentences = [
+        note if times == len(names) else f"{note} (in {times} of {len(names)} files)"
+        for note, times in notes.items()
+    ]
+    n_ignored = len(entries) - len(files)
+    if n_ignored:
+        ignored = sorted(entry.name for entry in entries if entry not in set(files))
+        sentences.append(f"{n_ignored} other entries were ignored: {', '.join(ignored[:5])}")
+    pose_set = PoseSet(vertices[: len(names)], topology, tuple(names), path, tuple(sentences))
+    return Collected(pose_set, len(files), same_topology)
+
+
+def _disagreement(pose: int, name: str, found: Topology, expected: Topology) -> str | None:
+    advice = "remove it or export it with the set's topology"
+    if found.n_vertices != expected.n_vertices:
+        return (
+            f"pose {pose} ({name}) has {found.n_vertices} vertices, "
+            f"the set has {expected.n_vertices}; {advice}"
+        )
+    if found.n_faces != expected.n_faces:
+        return (
+            f"pose {pose} ({name}) has {found.n_faces} faces, "
+            f"the set has {expected.n_faces}; {advice}"
+        )
+    different = np.flatnonzero((found.faces != expected.faces).any(axis=1))
+    if len(different):
+        face = int(different[0])
+        return (
+            f"pose {pose} ({name}) has {found.faces[face].tolist()} as face {face}, "
+            f"the set has {expected.faces[face].tolist()}; {advice}"
+        )
+    return None
+
+
+def _empty_poses(path: Path, n: int, n_vertices: int, dtype: type) -> npt.NDArray[Any]:
+    if n * n_vertices * 3 > MAX_ITEMS:
+        raise MeshFileError(
+            f"{path} holds {n} poses of {n_vertices} vertices, more than {MAX_ITEMS} "
+            f"coordinates; keep fewer poses or decimate them"
+        )
+    return np.empty((n, n_vertices, 3), dtype=dtype)
+
+
+def _collect_npz(
+    path: Path, report: Callable[[LCollisionError], None], progress: Progress
+) -> Collected:
+    nothing = Collected(None, 0, same_topology=False)
+    try:
+        arrays = read_npz(path)
+        vertices, faces = _meshes_of(arrays)
+        topology = Topology(faces, vertices.shape[1])
+        extras = _extras_of(arrays, vertices.shape)
+    except LCollisionError as error:
+        report(MeshFileError(f"{path} cannot be read as a pose set: {error}"))
+        return nothing
+    names = extras.pop("names") or tuple(f"pose {pose}" for pose in range(len(vertices)))
+    usable = np.isfinite(vertices).all(axis=(1, 2))
+    for pose in np.flatnonzero(~usable):
+        vertex = first_not_finite(vertices[pose])
+        report(
+            PoseSetError(
+                f"pose {pose} ({names[pose]}) of {path} has vertex {vertex} (from 0) at "
+                f"{vertices[pose, vertex].tolist()}, which is not finite; remove that pose"
+            )
+        )
+    if not usable.any():
+        return Collected(None, len(vertices), same_topology=True)
+    kept = np.flatnonzero(usable)
+    if len(kept) < len(vertices):
+        vertices = vertices[kept]
+        names = tuple(names[pose] for pose in kept)
+    progress(len(usable), len(usable))
+    return Collected(
+        PoseSet(vertices, topology, names, path, **extras), len(usable), same_topology=True
+    )
+
+
+def _meshes_of(arrays: dict[str, npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    found = []
+    for names in (("vertices", "V"), ("faces", "F")):
+        name = next((name for name in names if name in arrays), None)
+        if name is None:
+            held = ", ".join(sorted(arrays)[:8]) or "nothing"
+            raise MeshFileError(f"it has no array {names[0]!r} or {names[1]!r}, it holds {held}")
+        found.append(arrays[name])
+    vertices, faces = found
+    if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:
+        raise MeshFileError(f"vertices must be (N, V, 3) with N, V > 0, got {vertices.shape}")
+    if vertices.dtype.kind != "f" or vertices.dtype.itemsize not in (4, 8):
+        raise MeshFileError(f"vertices must be float32 or float64, got {vertices.dtype}")
+    native = np.float32 if vertices.dtype.itemsize == 4 else np.float64
+    return np.ascontiguousarray(vertices, dtype=native), faces
+
+
+def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> dict[str, Any]:
+    def scalar(name: str, kinds: str) -> Any:
+        value = arrays[name]
+        if value.shape != () or value.dtype.kind not in kinds:
+            raise MeshFileError(f"{name} must be one number, got {value.dtype} {value.shape}")
+        return value.item()
+
+    def strings(name: str, length: int) -> npt.NDArray[Any]:
+        value = arrays[name]
+        if value.shape != (length,) or value.dtype.kind != "U":
+            raise MeshFileError(
+                f"{name} must be ({length},) strings, got {value.dtype} {value.shape}"
+            )
+        return value
+
+    extras: dict[str, Any] = {"names": None}
+    if "format_version" in arrays and scalar("format_version", "iu") > FORMAT_VERSION:
+        raise MeshFileError(
+            f"it has format version {scalar('format_version', 'iu')}, this program reads up to "
+            f"{FORMAT_VERSION}; update the program"
+        )
+    if "names" in arrays:
+        extras["names"] = tuple(strings("names", shape[0]).tolist())
+    if "notes" in arrays:
+        extras["notes"] = tuple(strings("notes", arrays["notes"].size).tolist())
+    if "near_exclusion" in arrays:
+        extras["near_exclusion"] = float(scalar("near_exclusion", "fiu"))
+        if not 0.0 <= extras["near_exclusion"] < 1.0:
+            raise MeshFileError(f"near_exclusion must be in [0, 1), got {extras['near_exclusion']}")
+    if "up_axis" in arrays:
+        extras["up_axis"] = scalar("up_axis", "iu")
+        if extras["up_axis"] not in (0, 1, 2):
+            raise MeshFileError(f"up_axis must be 0, 1 or 2, got {extras['up_axis']}")
+    if "vertex_labels" in arrays:
+        extras["vertex_labels"] = strings("vertex_labels", shape[1])
+    return extras
+
+
+def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
+    """Write a pose set as .npz, whole or not at all; equal sets give equal bytes.
+
+    Parameters
+    ----------
+    path : an .npz file in an existing folder
+    pose_set : what to write; its `source` is not kept
+
+    Raises
+    ------
+    MeshFileError : the extension is not .npz or the file cannot be written.
+    """
+    if Path(path).suffix.lower() != ".npz":
+        raise MeshFileError(f"{path} cannot be written: a pose set is an .npz file; rename it")
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "format_version": np.array(FORMAT_VERSION),
+        "vertices": pose_set.vertices,
+        "faces": pose_set.faces,
+        "names": np.array(pose_set.names, dtype=np.str_),
+        "near_exclusion": np.array(pose_set.near_exclusion),
+    }
+    if pose_set.notes:
+        arrays["notes"] = np.array(pose_set.notes, dtype=np.str_)
+    if pose_set.up_axis is not None:
+        arrays["up_axis"] = np.array(pose_set.up_axis)
+    if pose_set.vertex_labels is not None:
+        arrays["vertex_labels"] = pose_set.vertex_labels
+    with atomic_write(path) as file:
+        write_npz(file, arrays)
