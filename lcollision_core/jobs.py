@@ -11,7 +11,7 @@ Progress = Callable[[int, int], None]
 """Called with (done, total), in items of the work's own unit, from the thread that works."""
 
 
-def no_progress(done: int, total: int) -> None:  # noqa: ARG001
+def no_progress(done: int, total: int) -> None:
     """Report to nobody: the default of functions that take a `Progress`."""
 
 

@@ -1,0 +1,325 @@
+"""Exact self-collision of poses that share one topology."""
+
+from __future__ import annotations
+
+import os
+import queue
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact.kernels import (
+    LEAF_SIZE,
+    FaceTree,
+    Found,
+    NearVertices,
+    PoseWork,
+    add_vertex_energy,
+    search_pose,
+)
+from lcollision_core.contact.near import near_vertices
+from lcollision_core.contact.tree import allocate_work, build_tree
+from lcollision_core.errors import ShapeError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.topology import Topology
+
+IntArray = npt.NDArray[np.int32]
+FloatArray = npt.NDArray[np.float64]
+
+DEPTH_TOLERANCE = 1e-9
+"""Depth in heights up to which two faces touch; beyond it they collide."""
+
+_FIRST_ROOM = 256
+"""Pairs that a thread has room for at first; it grows to what a pose needs and stays there."""
+
+_POSES_A_TASK = 8
+"""Poses that a thread takes at a time: little waiting at the end, and a prompt cancel."""
+
+
+@dataclass(frozen=True, slots=True)
+class SelfCollisions:
+    """All colliding pairs of one pose. Lengths are in heights.
+
+    Attributes
+    ----------
+    pairs : (P, 2) int32, face indices, the smaller first, rows in ascending order
+    penetration_depth : (P,) float64, PD of each pair, > 1e-9
+    near_pairs, near_penetration_depth : (Q, 2) and (Q,), the same of the pairs within the near
+        exclusion: folds of the skin, which count neither for the verdict nor for the energy
+    vertex_energy : (V,) float64, PDe of Algorithm 1 in squared heights
+    """
+
+    pairs: IntArray
+    penetration_depth: FloatArray
+    near_pairs: IntArray
+    near_penetration_depth: FloatArray
+    vertex_energy: FloatArray
+
+    @property
+    def colliding(self) -> bool:
+        """Whether the pose intersects itself."""
+        return len(self.pairs) > 0
+
+    @property
+    def energy(self) -> float:
+        """PDe-sum, the penetration energy of the pose, in squared heights."""
+        return float(self.vertex_energy.sum())
+
+
+@dataclass(frozen=True, slots=True)
+class BatchCollisions:
+    """What `CollisionDetector.detect_batch` finds in B poses.
+
+    Attributes
+    ----------
+    n_pairs : (B,) int64, colliding pairs
+    n_near_pairs : (B,) int64, pairs within the near exclusion
+    vertex_energy : (B, V) float64, PDe of Algorithm 1 in squared heights
+    """
+
+    n_pairs: npt.NDArray[np.int64]
+    n_near_pairs: npt.NDArray[np.int64]
+    vertex_energy: FloatArray
+
+    @property
+    def colliding(self) -> npt.NDArray[np.bool_]:
+        """(B,) whether each pose intersects itself."""
+        return self.n_pairs > 0
+
+
+class CollisionDetector:
+    """Finds where poses of one topology intersect themselves, exactly.
+
+    Two faces collide when they share no vertex and their penetration depth exceeds
+    `DEPTH_TOLERANCE`. A detector may be used by several threads at once.
+
+    Parameters
+    ----------
+    topology : of all poses
+    reference : (V, 3) array, a typical pose: the tree is built on it, and its height, the
+        longest side of its bounding box, is the unit of every result
+    near_exclusion : pairs with an edge path of at most this length between them on the
+        reference, in heights, are counted apart; 0 excludes nothing
+
+    Raises
+    ------
+    ShapeError : `reference` is not a finite (V, 3) array with an extent, or `near_exclusion`
+        is negative.
+    """
+
+    def __init__(
+        self, topology: Topology, reference: npt.ArrayLike, *, near_exclusion: float = 0.0
+    ) -> None:
+        vertices = np.asarray(reference, dtype=np.float64)
+        if vertices.shape != (topology.n_vertices, 3):
+            raise ShapeError(
+                f"the reference must have shape ({topology.n_vertices}, 3), got {vertices.shape}"
+            )
+        if not np.isfinite(vertices).all():
+            raise ShapeError(f"{_first_not_finite(vertices)} of the reference is not finite")
+        if not near_exclusion >= 0.0:
+            raise ShapeError(f"the near exclusion must be 0 or more heights, got {near_exclusion}")
+        self.topology = topology
+        self.near_exclusion = float(near_exclusion)
+        self.height = float(np.ptp(vertices, axis=0).max())
+        if self.height == 0.0:
+            raise ShapeError("all vertices of the reference are in one point")
+        self._tree: FaceTree = build_tree(vertices, topology.faces)
+        self._near: NearVertices = near_vertices(
+            topology, vertices, self.near_exclusion * self.height
+        )
+        self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()
+
+    def detect(self, vertices: npt.ArrayLike) -> SelfCollisions:
+        """Find all colliding pairs of one pose.
+
+        Parameters
+        ----------
+        vertices : (V, 3) array in the unit of the reference
+
+        Raises
+        ------
+        ShapeError : another shape, or a vertex that is not finite.
+        """
+        pose = self._checked(np.asarray(vertices)[None])[0]
+        with self._searcher() as searcher:
+            n_found = searcher.search(pose, first_only=False)
+            found = searcher.found
+            vertex_energy = np.zeros(self.topology.n_vertices)
+            add_vertex_energy(self._tree, found, n_found, vertex_energy)
+            pairs = np.sort(self._tree.slot_face[found.slots[:n_found]], axis=1)
+            depth = np.sqrt(found.squared_depth[:n_found])
+            is_near = found.is_near[:n_found].copy()
+        order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+        pairs, depth, is_near = pairs[order], depth[order], is_near[order]
+        return SelfCollisions(
+            pairs=pairs[~is_near],
+            penetration_depth=depth[~is_near],
+            near_pairs=pairs[is_near],
+            near_penetration_depth=depth[is_near],
+            vertex_energy=vertex_energy,
+        )
+
+    def detect_batch(
+        self,
+        vertices: npt.ArrayLike,
+        *,
+        workers: int | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> BatchCollisions:
+        """Find the energies and the number of colliding pairs of many poses.
+
+        Parameters
+        ----------
+        vertices : (B, V, 3) array in the unit of the reference
+        workers : threads, default one per available core; the result does not depend on it
+        progress, cancel : called and asked every few poses
+
+        Raises
+        ------
+        ShapeError : another shape, or a vertex that is not finite.
+        CancelledError : `cancel` was set.
+        """
+        poses = self._checked(vertices)
+        n_pairs = np.zeros(len(poses), dtype=np.int64)
+        n_near_pairs = np.zeros(len(poses), dtype=np.int64)
+        vertex_energy = np.zeros(poses.shape[:2])
+
+        def search(searcher: _Searcher, pose: int) -> None:
+            n_found = searcher.search(poses[pose], first_only=False)
+            add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
+            n_near_pairs[pose] = np.count_nonzero(searcher.found.is_near[:n_found])
+            n_pairs[pose] = n_found - n_near_pairs[pose]
+
+        self._for_each(len(poses), search, workers, progress, cancel)
+        return BatchCollisions(n_pairs, n_near_pairs, vertex_energy)
+
+    def are_colliding(
+        self,
+        vertices: npt.ArrayLike,
+        *,
+        workers: int | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> npt.NDArray[np.bool_]:
+        """Tell which poses intersect themselves, stopping at the first pair of each.
+
+        Parameters and errors are those of `detect_batch`; returns a (B,) bool array.
+        """
+        poses = self._checked(vertices)
+        colliding = np.zeros(len(poses), dtype=np.bool_)
+
+        def search(searcher: _Searcher, pose: int) -> None:
+            n_found = searcher.search(poses[pose], first_only=True)
+            # The search ends at a pair that counts, so the last one found tells.
+            colliding[pose] = n_found > 0 and not searcher.found.is_near[n_found - 1]
+
+        self._for_each(len(poses), search, workers, progress, cancel)
+        return colliding
+
+    def _checked(self, vertices: npt.ArrayLike) -> npt.NDArray[np.floating]:
+        poses = np.asarray(vertices)
+        if poses.dtype.kind != "f":
+            poses = poses.astype(np.float64)
+        if poses.ndim != 3 or poses.shape[1:] != (self.topology.n_vertices, 3):
+            raise ShapeError(
+                f"poses must have {self.topology.n_vertices} vertices of 3 coordinates, "
+                f"got an array of shape {poses.shape}"
+            )
+        return poses
+
+    def _for_each(
+        self,
+        n_poses: int,
+        search: Callable[[_Searcher, int], None],
+        workers: int | None,
+        progress: Progress,
+        cancel: CancelToken | None,
+    ) -> None:
+        starts = range(0, n_poses, _POSES_A_TASK)
+
+        def work(start: int) -> int:
+            if cancel is not None:
+                cancel.raise_if_cancelled()
+            stop = min(start + _POSES_A_TASK, n_poses)
+            with self._searcher() as searcher:
+                for pose in range(start, stop):
+                    search(searcher, pose)
+            return stop
+
+        pool = ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="contact")
+        try:
+            for stop in pool.map(work, starts):
+                progress(stop, n_poses)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    @contextmanager
+    def _searcher(self) -> Iterator[_Searcher]:
+        """Lend the work arrays of one thread, kept from search to search."""
+        try:
+            searcher = self._idle.get_nowait()
+        except queue.Empty:
+            searcher = _Searcher(self._tree, self._near, self.topology, self.height)
+        try:
+            yield searcher
+        finally:
+            self._idle.put(searcher)
+
+
+class _Searcher:
+    """One thread's work arrays and the search with them."""
+
+    def __init__(
+        self, tree: FaceTree, near: NearVertices, topology: Topology, height: float
+    ) -> None:
+        self._tree = tree
+        self._near = near
+        self._inverse_height = 1.0 / height
+        self._work: PoseWork = allocate_work(tree)
+        self._pose = np.empty((topology.n_vertices, 3))
+        self.found = _room_for(_FIRST_ROOM)
+
+    def search(self, pose: npt.NDArray[np.floating], *, first_only: bool) -> int:
+        """Fill `found` with the pairs of one pose (V, 3) and return how many there are."""
+        np.copyto(self._pose, pose)
+        if not np.isfinite(self._pose).all():
+            raise ShapeError(f"{_first_not_finite(self._pose)} is not finite")
+        while True:
+            n_found: int = search_pose(
+                self._pose,
+                self._inverse_height,
+                DEPTH_TOLERANCE,
+                self._tree,
+                self._near,
+                self._work,
+                first_only,
+                self.found,
+                LEAF_SIZE,
+            )
+            if n_found <= len(self.found.slots):
+                return n_found
+            self.found = _room_for(2 * n_found)
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _room_for(n_pairs: int) -> Found:
+    return Found(
+        slots=np.empty((n_pairs, 2), dtype=np.int32),
+        squared_depth=np.empty(n_pairs),
+        is_near=np.empty(n_pairs, dtype=np.bool_),
+    )
+
+
+def _first_not_finite(vertices: FloatArray) -> str:
+    vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+    return f"vertex {vertex}"

@@ -1,0 +1,486 @@
+"""The compiled inner loops: refit the tree to a pose, find candidates, keep those that penetrate.
+
+They release the GIL and write into arrays that the caller keeps, so threads work on poses side
+by side and nothing is allocated per pose. Boxes are float32 and rounded outwards: twice as many
+fit into a vector instruction, and no pair is lost. Depths are float64.
+
+All compiled code is in this file because Numba notices that a cached function is stale by the
+date of the file it stands in, and by nothing else.
+"""
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, uint64
+
+IntArray = npt.NDArray[np.int32]
+
+LEAF_SIZE = 8
+"""Faces in a leaf of the tree: as many as one vector instruction compares."""
+
+PARALLEL_SINE_SQUARED = 1e-20
+"""Edges whose angle has a squared sine below this span no direction of their own.
+
+Relative, so the same at every scale. Any direction gives an upper bound of the depth, so the
+tolerance only has to keep out cross products that are rounding noise.
+"""
+
+
+BOX_PADDING = np.float32(2.5e-7)
+"""Padding of a box, relative to the pose's reach: two float32 roundings, 2 x 2^-24, and some."""
+
+_LEAF = np.uint64(LEAF_SIZE)
+_LEAF_CORNERS = np.uint64(3 * LEAF_SIZE)
+_LEAF_BOXES = np.uint64(6 * LEAF_SIZE)
+
+
+class FaceTree(NamedTuple):
+    """A binary tree over the faces, whose leaves hold `LEAF_SIZE` slots of faces each.
+
+    Nodes are stored parents before children, so a refit walks them backwards. S is the number
+    of slots, a multiple of `LEAF_SIZE`; n the number of nodes.
+
+    Attributes
+    ----------
+    slot_face : (S,) int32, the face in each slot, -1 in the unused slots of the last leaf
+    corners : (3 S,) int32, leaf by leaf the first corners of its faces, then the second, then
+        the third, as vertex indices; -1 in unused slots
+    left, right : (n,) int32, the children of a node, -1 at a leaf
+    leaf : (n,) int32, the number of the leaf, -1 at an inner node
+    size : (n,) int32, faces below the node
+    """
+
+    slot_face: IntArray
+    corners: IntArray
+    left: IntArray
+    right: IntArray
+    leaf: IntArray
+    size: IntArray
+
+
+class NearVertices(NamedTuple):
+    """For each vertex the vertices within the near exclusion of it, itself among them.
+
+    ``vertex[start[v]:start[v + 1]]`` are those of v, ascending; `vertex` is empty where nothing
+    is excluded.
+    """
+
+    start: IntArray
+    vertex: IntArray
+
+
+class PoseWork(NamedTuple):
+    """What is computed anew for each pose, kept between poses.
+
+    Attributes
+    ----------
+    triangles : (S, 3, 3) float64, corners in heights about the middle of the pose
+    boxes : (6 S,) float32, leaf by leaf the lower x of its slots, lower y, lower z, upper x, ...
+    node_boxes : (n, 6) float32, lower x, y, z, upper x, y, z
+    stack : (depth bound, 2) int32, pairs of nodes still to be visited
+    """
+
+    triangles: npt.NDArray[np.float64]
+    boxes: npt.NDArray[np.float32]
+    node_boxes: npt.NDArray[np.float32]
+    stack: IntArray
+
+
+class Found(NamedTuple):
+    """Room for the penetrating pairs of one pose, filled from the front.
+
+    Attributes
+    ----------
+    slots : (P, 2) int32, the slots of the two faces
+    squared_depth : (P,) float64, in squared heights
+    is_near : (P,) bool
+    """
+
+    slots: IntArray
+    squared_depth: npt.NDArray[np.float64]
+    is_near: npt.NDArray[np.bool_]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pair_depth_squared(triangles, a, b, tolerance):
+    """Return the squared depth of triangles a and b, or 0 where it is at most `tolerance`.
+
+    Parameters
+    ----------
+    triangles : (T, 3, 3) float64 array of corners
+    a, b : indices into `triangles`
+    tolerance : depth up to which triangles touch rather than penetrate, same unit
+    """
+    tolerance_squared = tolerance * tolerance
+    best = np.inf
+
+    # The normal of each triangle in turn. Its own corners project to one point, the origin.
+    for side in range(2):
+        p = a if side == 0 else b
+        q = b if side == 0 else a
+        ox, oy, oz = triangles[p, 0, 0], triangles[p, 0, 1], triangles[p, 0, 2]
+        ux, uy, uz = triangles[p, 1, 0] - ox, triangles[p, 1, 1] - oy, triangles[p, 1, 2] - oz
+        vx, vy, vz = triangles[p, 2, 0] - ox, triangles[p, 2, 1] - oy, triangles[p, 2, 2] - oz
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        length_squared = nx * nx + ny * ny + nz * nz
+        edges_squared = (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz)
+        if length_squared <= PARALLEL_SINE_SQUARED * edges_squared:
+            continue
+        q0 = (
+            nx * (triangles[q, 0, 0] - ox)
+            + ny * (triangles[q, 0, 1] - oy)
+            + nz * (triangles[q, 0, 2] - oz)
+        )
+        q1 = (
+            nx * (triangles[q, 1, 0] - ox)
+            + ny * (triangles[q, 1, 1] - oy)
+            + nz * (triangles[q, 1, 2] - oz)
+        )
+        q2 = (
+            nx * (triangles[q, 2, 0] - ox)
+            + ny * (triangles[q, 2, 1] - oy)
+            + nz * (triangles[q, 2, 2] - oz)
+        )
+        overlap = min(max(q0, max(q1, q2)), -min(q0, min(q1, q2)))
+        if overlap <= 0.0 or overlap * overlap <= tolerance_squared * length_squared:
+            return 0.0
+        best = min(best, overlap * overlap / length_squared)
+
+    # Edge of a by edge of b. Both ends of an edge project to one point, so each triangle's
+    # interval is spanned by that point and the opposite corner.
+    for i in range(3):
+        i_next = i + 1 if i < 2 else 0
+        i_opposite = i_next + 1 if i_next < 2 else 0
+        ox, oy, oz = triangles[a, i, 0], triangles[a, i, 1], triangles[a, i, 2]
+        ux = triangles[a, i_next, 0] - ox
+        uy = triangles[a, i_next, 1] - oy
+        uz = triangles[a, i_next, 2] - oz
+        wx = triangles[a, i_opposite, 0] - ox
+        wy = triangles[a, i_opposite, 1] - oy
+        wz = triangles[a, i_opposite, 2] - oz
+        u_squared = ux * ux + uy * uy + uz * uz
+        for j in range(3):
+            j_next = j + 1 if j < 2 else 0
+            j_opposite = j_next + 1 if j_next < 2 else 0
+            sx, sy, sz = triangles[b, j, 0], triangles[b, j, 1], triangles[b, j, 2]
+            vx = triangles[b, j_next, 0] - sx
+            vy = triangles[b, j_next, 1] - sy
+            vz = triangles[b, j_next, 2] - sz
+            dx, dy, dz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            length_squared = dx * dx + dy * dy + dz * dz
+            v_squared = vx * vx + vy * vy + vz * vz
+            if length_squared <= PARALLEL_SINE_SQUARED * u_squared * v_squared:
+                continue
+            a_opposite = dx * wx + dy * wy + dz * wz
+            b_edge = dx * (sx - ox) + dy * (sy - oy) + dz * (sz - oz)
+            b_opposite = (
+                dx * (triangles[b, j_opposite, 0] - ox)
+                + dy * (triangles[b, j_opposite, 1] - oy)
+                + dz * (triangles[b, j_opposite, 2] - oz)
+            )
+            overlap = min(
+                max(0.0, a_opposite) - min(b_edge, b_opposite),
+                max(b_edge, b_opposite) - min(0.0, a_opposite),
+            )
+            if overlap <= 0.0 or overlap * overlap <= tolerance_squared * length_squared:
+                return 0.0
+            best = min(best, overlap * overlap / length_squared)
+
+    return best if best < np.inf else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_depths(triangles, tolerances, depths):
+    """Write the depth of triangles 2i and 2i + 1 to depths[i], 0 up to tolerances[i]."""
+    for pair in range(len(depths)):
+        depths[pair] = np.sqrt(
+            _pair_depth_squared(triangles, 2 * pair, 2 * pair + 1, tolerances[pair])
+        )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _refit(pose, inverse_height, tree, work):
+    """Fill `work` for one pose.
+
+    Coordinates are taken from the middle of the pose's bounding box, so that a pose far from
+    the origin loses no precision to its distance.
+    """
+    middle = np.empty(3)
+    reach = 0.0
+    for c in range(3):
+        low = np.inf
+        high = -np.inf
+        for v in range(len(pose)):
+            low = min(low, pose[v, c])
+            high = max(high, pose[v, c])
+        middle[c] = 0.5 * (low + high)
+        reach = max(reach, 0.5 * (high - low) * inverse_height)
+    padding = np.float32(reach) * BOX_PADDING
+
+    boxes = work.boxes
+    for slot in range(len(tree.slot_face)):
+        leaf = slot // LEAF_SIZE
+        lane = slot % LEAF_SIZE
+        first = tree.corners[leaf * 3 * LEAF_SIZE + lane]
+        second = tree.corners[leaf * 3 * LEAF_SIZE + LEAF_SIZE + lane]
+        third = tree.corners[leaf * 3 * LEAF_SIZE + 2 * LEAF_SIZE + lane]
+        base = leaf * 6 * LEAF_SIZE + lane
+        for c in range(3):
+            if first < 0:
+                boxes[base + c * LEAF_SIZE] = np.inf
+                boxes[base + (3 + c) * LEAF_SIZE] = -np.inf
+                continue
+            p = (pose[first, c] - middle[c]) * inverse_height
+            q = (pose[second, c] - middle[c]) * inverse_height
+            r = (pose[third, c] - middle[c]) * inverse_height
+            work.triangles[slot, 0, c] = p
+            work.triangles[slot, 1, c] = q
+            work.triangles[slot, 2, c] = r
+            boxes[base + c * LEAF_SIZE] = np.float32(min(p, min(q, r))) - padding
+            boxes[base + (3 + c) * LEAF_SIZE] = np.float32(max(p, max(q, r))) + padding
+
+    node_boxes = work.node_boxes
+    for node in range(len(tree.left) - 1, -1, -1):
+        if tree.leaf[node] >= 0:
+            base = tree.leaf[node] * 6 * LEAF_SIZE
+            for c in range(3):
+                lower = boxes[base + c * LEAF_SIZE]
+                upper = boxes[base + (3 + c) * LEAF_SIZE]
+                for k in range(1, LEAF_SIZE):
+                    lower = min(lower, boxes[base + c * LEAF_SIZE + k])
+                    upper = max(upper, boxes[base + (3 + c) * LEAF_SIZE + k])
+                node_boxes[node, c] = lower
+                node_boxes[node, 3 + c] = upper
+        else:
+            a = tree.left[node]
+            b = tree.right[node]
+            for c in range(3):
+                node_boxes[node, c] = min(node_boxes[a, c], node_boxes[b, c])
+                node_boxes[node, 3 + c] = max(node_boxes[a, 3 + c], node_boxes[b, 3 + c])
+
+
+@njit(inline="always", error_model="numpy")
+def _overlap(boxes, a, b):
+    return (
+        (boxes[a, 0] <= boxes[b, 3])
+        & (boxes[b, 0] <= boxes[a, 3])
+        & (boxes[a, 1] <= boxes[b, 4])
+        & (boxes[b, 1] <= boxes[a, 4])
+        & (boxes[a, 2] <= boxes[b, 5])
+        & (boxes[b, 2] <= boxes[a, 5])
+    )
+
+
+@njit(inline="always", error_model="numpy")
+def _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
+    """1 where the boxes overlap and the faces share no vertex, else 0, without a branch."""
+    n = _LEAF
+    g0 = corners[c]
+    g1 = corners[c + n]
+    g2 = corners[c + n + n]
+    return (
+        np.int32(x0 <= boxes[x + uint64(3) * n])
+        & np.int32(boxes[x] <= x1)
+        & np.int32(y0 <= boxes[x + uint64(4) * n])
+        & np.int32(boxes[x + n] <= y1)
+        & np.int32(z0 <= boxes[x + uint64(5) * n])
+        & np.int32(boxes[x + n + n] <= z1)
+        & np.int32(f0 != g0)
+        & np.int32(f0 != g1)
+        & np.int32(f0 != g2)
+        & np.int32(f1 != g0)
+        & np.int32(f1 != g1)
+        & np.int32(f1 != g2)
+        & np.int32(f2 != g0)
+        & np.int32(f2 != g1)
+        & np.int32(f2 != g2)
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_near(corners, slot_a, slot_b, near):
+    """Whether some corner of one face is near some corner of the other."""
+    if len(near.vertex) == 0:
+        return False
+    base_a = slot_a // LEAF_SIZE * 3 * LEAF_SIZE + slot_a % LEAF_SIZE
+    base_b = slot_b // LEAF_SIZE * 3 * LEAF_SIZE + slot_b % LEAF_SIZE
+    for i in range(3):
+        v = corners[base_a + i * LEAF_SIZE]
+        for j in range(3):
+            w = corners[base_b + j * LEAF_SIZE]
+            low = near.start[v]
+            high = near.start[v + 1]
+            while low < high:
+                probe = (low + high) // 2
+                if near.vertex[probe] < w:
+                    low = probe + 1
+                else:
+                    high = probe
+            if low < near.start[v + 1] and near.vertex[low] == w:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _search_leaves(
+    tree, work, near, leaf_a, leaf_b, box_b, tolerance, first_only, found, n_found, leaf_size
+):
+    """Append the pairs that penetrate between two leaves, or within one.
+
+    Returns the number found so far, and whether a search for the first may stop. `leaf_size` is
+    `LEAF_SIZE`, handed in because a loop of constant length is unrolled rather than vectorised.
+    """
+    corners = tree.corners
+    boxes = work.boxes
+    corner_base = uint64(leaf_b) * _LEAF_CORNERS
+    box_base = uint64(leaf_b) * _LEAF_BOXES
+    for i in range(LEAF_SIZE):
+        own = uint64(leaf_a) * _LEAF_BOXES + uint64(i)
+        x0 = boxes[own]
+        y0 = boxes[own + _LEAF]
+        z0 = boxes[own + uint64(2) * _LEAF]
+        x1 = boxes[own + uint64(3) * _LEAF]
+        y1 = boxes[own + uint64(4) * _LEAF]
+        z1 = boxes[own + uint64(5) * _LEAF]
+        if not (
+            (x0 <= box_b[3])
+            & (box_b[0] <= x1)
+            & (y0 <= box_b[4])
+            & (box_b[1] <= y1)
+            & (z0 <= box_b[5])
+            & (box_b[2] <= z1)
+        ):
+            continue
+        own = uint64(leaf_a) * _LEAF_CORNERS + uint64(i)
+        f0 = corners[own]
+        f1 = corners[own + _LEAF]
+        f2 = corners[own + uint64(2) * _LEAF]
+        # Nearly all rows hold neighbours only: look at a row at once, at its faces if need be.
+        some = np.int32(0)
+        for k in range(uint64(leaf_size)):
+            c = corner_base + k
+            x = box_base + k
+            some |= _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1)
+        if some == 0:
+            continue
+        slot_a = leaf_a * LEAF_SIZE + i
+        for j in range(i + 1 if leaf_a == leaf_b else 0, LEAF_SIZE):
+            c = corner_base + uint64(j)
+            x = box_base + uint64(j)
+            if _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1) == 0:
+                continue
+            slot_b = leaf_b * LEAF_SIZE + j
+            squared_depth = _pair_depth_squared(work.triangles, slot_a, slot_b, tolerance)
+            if squared_depth == 0.0:
+                continue
+            is_near = _is_near(corners, slot_a, slot_b, near)
+            if n_found < len(found.slots):
+                found.slots[n_found, 0] = slot_a
+                found.slots[n_found, 1] = slot_b
+                found.squared_depth[n_found] = squared_depth
+                found.is_near[n_found] = is_near
+            n_found += 1
+            if first_only and not is_near:
+                return n_found, True
+    return n_found, False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def search_pose(pose, inverse_height, tolerance, tree, near, work, first_only, found, leaf_size):
+    """Find the pairs of faces that share no vertex and penetrate each other in one pose.
+
+    Parameters
+    ----------
+    pose : (V, 3) float64 array, finite
+    inverse_height : factor from the pose's unit to heights
+    tolerance : depth in heights up to which two faces touch rather than penetrate
+    tree, near, work : of one topology; `work` is overwritten
+    first_only : end the search at the first pair that is not near
+    found : `Found`, overwritten
+    leaf_size : `LEAF_SIZE`
+
+    Returns
+    -------
+    n_found : how many pairs there are. Those beyond the room in `found` were counted and not
+        stored: call again with more room.
+    """
+    _refit(pose, inverse_height, tree, work)
+    boxes = work.node_boxes
+    stack = work.stack
+    n_found = 0
+    stack[0, 0] = 0
+    stack[0, 1] = 0
+    height = 1
+    while height > 0:
+        height -= 1
+        a = stack[height, 0]
+        b = stack[height, 1]
+        if tree.leaf[a] >= 0 and tree.leaf[b] >= 0:
+            n_found, stop = _search_leaves(
+                tree,
+                work,
+                near,
+                tree.leaf[a],
+                tree.leaf[b],
+                boxes[b],
+                tolerance,
+                first_only,
+                found,
+                n_found,
+                leaf_size,
+            )
+            if stop:
+                return n_found
+            continue
+        if a == b:
+            one = tree.left[a]
+            two = tree.right[a]
+            stack[height, 0] = one
+            stack[height, 1] = one
+            stack[height + 1, 0] = two
+            stack[height + 1, 1] = two
+            height += 2
+            if _overlap(boxes, one, two):
+                stack[height, 0] = one
+                stack[height, 1] = two
+                height += 1
+            continue
+        # Open the larger node of the two.
+        if tree.leaf[b] >= 0 or (tree.leaf[a] < 0 and tree.size[a] >= tree.size[b]):
+            one = tree.left[a]
+            two = tree.right[a]
+            other = b
+        else:
+            one = tree.left[b]
+            two = tree.right[b]
+            other = a
+        if _overlap(boxes, one, other):
+            stack[height, 0] = one
+            stack[height, 1] = other
+            height += 1
+        if _overlap(boxes, two, other):
+            stack[height, 0] = two
+            stack[height, 1] = other
+            height += 1
+    return n_found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_vertex_energy(tree, found, n_found, vertex_energy):
+    """Add a sixth of each pair's squared depth to its six vertices: Algorithm 1 of the paper.
+
+    Near pairs add nothing. `vertex_energy` (V,) float64, in squared heights, is added to.
+    """
+    for pair in range(n_found):
+        if found.is_near[pair]:
+            continue
+        share = found.squared_depth[pair] / 6.0
+        for side in range(2):
+            slot = found.slots[pair, side]
+            base = slot // LEAF_SIZE * 3 * LEAF_SIZE + slot % LEAF_SIZE
+            for c in range(3):
+                vertex_energy[tree.corners[base + c * LEAF_SIZE]] += share

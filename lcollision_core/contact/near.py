@@ -1,0 +1,45 @@
+"""Which vertices lie within the near exclusion of each other, along the reference mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from lcollision_core.contact.kernels import NearVertices
+from lcollision_core.meshes.topology import Topology
+
+_SOURCES_AT_ONCE = 256
+"""Rows of the dense distance block that SciPy returns; bounds the memory to 256 V numbers."""
+
+
+def near_vertices(
+    topology: Topology, vertices: npt.NDArray[np.float64], distance: float
+) -> NearVertices:
+    """Collect for each vertex those reached by an edge path of at most `distance`.
+
+    Parameters
+    ----------
+    topology : of the mesh
+    vertices : (V, 3) float64 array, the reference
+    distance : >= 0, in the unit of `vertices`; 0 excludes nothing
+    """
+    if distance <= 0.0:
+        return NearVertices(
+            start=np.zeros(topology.n_vertices + 1, dtype=np.int32),
+            vertex=np.empty(0, dtype=np.int32),
+        )
+    i, j = topology.edges.T
+    # SciPy takes a stored zero for a missing edge; a duplicate vertex is an edge of length 0.
+    lengths = np.maximum(topology.edge_lengths(vertices), np.finfo(np.float64).tiny)
+    graph = sparse.coo_matrix((lengths, (i, j)), shape=2 * (topology.n_vertices,)).tocsr()
+    counts = np.zeros(topology.n_vertices + 1, dtype=np.int64)
+    reached: list[npt.NDArray[np.int32]] = []
+    for first in range(0, topology.n_vertices, _SOURCES_AT_ONCE):
+        sources = np.arange(first, min(first + _SOURCES_AT_ONCE, topology.n_vertices))
+        distances = csgraph.dijkstra(graph, directed=False, indices=sources, limit=distance)
+        rows, columns = np.nonzero(distances <= distance)
+        counts[sources + 1] = np.bincount(rows, minlength=len(sources))
+        reached.append(columns.astype(np.int32))
+    return NearVertices(start=np.cumsum(counts).astype(np.int32), vertex=np.concatenate(reached))
