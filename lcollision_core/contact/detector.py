@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import queue
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +23,7 @@ from lcollision_core.contact.kernels import (
 from lcollision_core.contact.near import near_vertices
 from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.errors import ShapeError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.meshes.topology import Topology
 
 IntArray = npt.NDArray[np.int32]
@@ -305,11 +304,6 @@ class _Searcher:
             if n_found <= len(self.found.slots):
                 return n_found
             self.found = _room_for(2 * n_found)
-
-
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _room_for(n_pairs: int) -> Found:

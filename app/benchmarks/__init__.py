@@ -1,0 +1,1 @@
+"""What ``lcollision benchmark`` measures; nothing here is needed to run the program."""

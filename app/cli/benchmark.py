@@ -1,0 +1,71 @@
+"""``lcollision benchmark``: the measurements that the README quotes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from app.cli.console import note, print_json, progress_bar
+
+app = typer.Typer(help="Measure what the README quotes.", no_args_is_help=True)
+
+
+@app.command("detection")
+def detection(
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--data", metavar="PATH", help="A pose set; may be repeated. Default: the bundled one."
+        ),
+    ] = None,
+    n_poses: Annotated[
+        int, typer.Option("-n", min=1, metavar="N", help="Poses of each set to time.")
+    ] = 20,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+) -> None:
+    """Time exact self-collision against python-fcl and coal (extra `bench`)."""
+    from app.benchmarks.detection import missing_peers, time_detection
+    from lcollision_core.bundled import bundled_file
+    from lcollision_core.jobs import available_cores
+    from lcollision_core.meshes import read_pose_set
+
+    for peer in missing_peers():
+        note(f"{peer} is not installed and left out; pip install 'lcollision[bench]' brings it")
+    rows: list[dict[str, Any]] = []
+    for path in data or [bundled_file("poses", "body.npz")]:
+        poses = read_pose_set(path)
+        with progress_bar(f"Timing {path.name}") as progress:
+            timings = time_detection(poses, n_poses, available_cores(), progress)
+        rows += [asdict(timing) for timing in timings]
+    if as_json:
+        print_json(rows)
+    else:
+        _print(rows)
+
+
+def _print(rows: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None)
+    for heading in ("vertices", "tool", "threads", "mode", "ms per pose", "x ours", "agrees"):
+        table.add_column(heading, justify="left" if heading in {"tool", "mode"} else "right")
+    ours = {
+        row["vertices"]: row["ms_per_pose"]
+        for row in reversed(rows)
+        if row["tool"] == "lcollision" and row["threads"] == 1 and row["mode"] == "all"
+    }
+    for row in rows:
+        table.add_row(
+            str(row["vertices"]),
+            row["tool"],
+            str(row["threads"]),
+            row["mode"],
+            f"{row['ms_per_pose']:.2f}",
+            f"{row['ms_per_pose'] / ours[row['vertices']]:.1f}",
+            "yes" if row["agrees"] else "NO",
+        )
+    Console().print(table)

@@ -1,0 +1,48 @@
+"""What all commands share: progress on a terminal, one JSON document, notes on standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+from lcollision_core.jobs import Progress, no_progress
+
+
+def print_json(document: Any) -> None:
+    """Print one JSON document, the only thing that ``--json`` puts on standard output."""
+    typer.echo(json.dumps(document, indent=2, allow_nan=False))
+
+
+def note(sentence: str) -> None:
+    """Tell the user something beside the answer, on standard error."""
+    typer.echo(f"lcollision: {sentence}", err=True)
+
+
+@contextmanager
+def progress_bar(task: str) -> Iterator[Progress]:
+    """Give a `Progress` that draws a bar on a terminal, and nothing in a pipe."""
+    if not sys.stderr.isatty():
+        yield no_progress
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = (
+        rich_progress.TextColumn(task),
+        rich_progress.BarColumn(),
+        rich_progress.MofNCompleteColumn(),
+        rich_progress.TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with rich_progress.Progress(*columns, console=console, transient=True) as bars:
+        bar = bars.add_task(task, total=None)
+
+        def show(done: int, total: int) -> None:
+            bars.update(bar, completed=done, total=total)
+
+        yield show

@@ -1,0 +1,129 @@
+"""``lcollision dataset``: check a pose set, or make one of the built-in body."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from app.cli.console import note, print_json, progress_bar
+
+app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no_args_is_help=True)
+
+
+class BodyKind(StrEnum):
+    """The pose sets of the built-in body."""
+
+    BODY = "body"
+    BODY_SWING = "body-swing"
+    BODY_JUMP = "body-jump"
+
+
+@app.command("check")
+def check(
+    path: Annotated[Path, typer.Argument(help="A folder of meshes or an .npz file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+    near_exclusion: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            metavar="X",
+            help="Count pairs this near along the surface apart, in heights. "
+            "Default: what the set says.",
+        ),
+    ] = None,
+) -> None:
+    """Report the topology, size, defects and self-collisions of a pose set.
+
+    Exits with 1 when the set cannot be used as it is.
+    """
+    from lcollision_core.contact import CollisionDetector
+    from lcollision_core.meshes import inspect_pose_set
+
+    with progress_bar("Reading poses") as progress:
+        inspection = inspect_pose_set(path, progress)
+    report: dict[str, Any] = {
+        "poses": inspection.n_poses,
+        "vertices": 0,
+        "faces": 0,
+        "same_topology": inspection.same_topology,
+        "watertight": False,
+        "colliding_poses": 0,
+        "problems": list(inspection.problems),
+        "near_exclusion": near_exclusion or 0.0,
+        "colliding": [],
+    }
+    poses = inspection.pose_set
+    if poses is not None:
+        exclusion = poses.near_exclusion if near_exclusion is None else near_exclusion
+        detector = CollisionDetector(poses.topology, poses.vertices[0], near_exclusion=exclusion)
+        with progress_bar("Finding self-collisions") as progress:
+            found = detector.detect_batch(poses.vertices, progress=progress)
+        report |= {
+            "vertices": poses.topology.n_vertices,
+            "faces": poses.topology.n_faces,
+            "watertight": poses.topology.is_watertight,
+            "colliding_poses": int(found.colliding.sum()),
+            "near_exclusion": exclusion,
+            "colliding": [
+                {
+                    "pose": name,
+                    "pairs": int(found.n_pairs[pose]),
+                    "near_pairs": int(found.n_near_pairs[pose]),
+                    "energy": float(found.vertex_energy[pose].sum()),
+                }
+                for pose, name in enumerate(poses.names)
+                if found.colliding[pose]
+            ],
+        }
+    if as_json:
+        print_json(report)
+    else:
+        _print(path, report)
+    if not inspection.usable:
+        raise typer.Exit(1)
+
+
+def _print(path: Path, report: dict[str, Any]) -> None:
+    surface = "watertight" if report["watertight"] else "not watertight"
+    typer.echo(
+        f"{path}: {report['poses']} poses of {report['vertices']} vertices and "
+        f"{report['faces']} faces, {surface}"
+    )
+    for problem in report["problems"]:
+        typer.echo(f"  problem: {problem}")
+    typer.echo(f"  {report['colliding_poses']} poses intersect themselves")
+    for pose in report["colliding"]:
+        typer.echo(
+            f"    {pose['pose']}: {pose['pairs']} pairs, "
+            f"energy {pose['energy']:.3g} squared heights"
+        )
+
+
+@app.command("make")
+def make(
+    kind: Annotated[BodyKind, typer.Argument(help="Which pose set to make.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="OUT.npz", help="The file to write.")
+    ],
+    n_vertices: Annotated[
+        int | None,
+        typer.Option("--vertices", min=500, max=12000, metavar="N", help="Vertices of the mesh."),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, metavar="S", help="0 gives the authored poses, others vary them.")
+    ] = 0,
+) -> None:
+    """Make a pose set of the built-in body: 71 poses, a swing dance, or a jump."""
+    from lcollision_core.meshes import require_writable, write_pose_set
+    from lcollision_core.meshes.body import make_body
+
+    require_writable(output, ".npz")
+    with progress_bar("Posing the body") as progress:
+        body = make_body(kind.value, n_vertices=n_vertices, seed=seed, progress=progress)
+    write_pose_set(output, body.pose_set)
+    topology = body.pose_set.topology
+    note(f"wrote {len(body.pose_set)} poses of {topology.n_vertices} vertices to {output}")

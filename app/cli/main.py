@@ -1,0 +1,88 @@
+"""The commands, and what becomes of an error.
+
+Every command imports what it needs when it runs: ``lcollision --help`` loads no array library.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from enum import IntEnum
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from app.cli import benchmark, check, dataset
+from lcollision_core.errors import CancelledError, LCollisionError
+
+
+class ExitStatus(IntEnum):
+    """What the command's exit status says; scripts depend on these numbers."""
+
+    DONE = 0
+    ANSWER_IS_NO = 1
+    BAD_INPUT = 2
+    BUG = 3
+    INTERRUPTED = 130
+
+
+class _Commands(TyperGroup):
+    """Turns the errors that a user can mend into one sentence."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except CancelledError:
+            raise typer.Exit(ExitStatus.INTERRUPTED) from None
+        except LCollisionError as error:
+            typer.echo(f"lcollision: {error}", err=True)
+            raise typer.Exit(ExitStatus.BAD_INPUT) from None
+        except KeyboardInterrupt:
+            typer.echo("lcollision: interrupted", err=True)
+            raise typer.Exit(ExitStatus.INTERRUPTED) from None
+        except MemoryError:
+            typer.echo("lcollision: out of memory; give it smaller meshes or fewer poses", err=True)
+            raise typer.Exit(ExitStatus.BAD_INPUT) from None
+
+
+app = typer.Typer(
+    cls=_Commands,
+    name="lcollision",
+    help="Find where a body runs into itself, and move it free.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+app.command("check")(check.check)
+app.add_typer(dataset.app, name="dataset")
+app.add_typer(benchmark.app, name="benchmark")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"lcollision {version('lcollision')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _global_options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Say the version."),
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Run the command line and exit with an `ExitStatus`."""
+    try:
+        app()
+    except Exception:  # the last resort: a bug must not look like an answer
+        traceback.print_exc()
+        typer.echo("lcollision: this is a bug in lcollision; please report it", err=True)
+        sys.exit(ExitStatus.BUG)

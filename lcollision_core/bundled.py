@@ -1,0 +1,19 @@
+"""The files that ship with the program, wherever it is installed."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+
+def bundled_file(*parts: str) -> Path:
+    """Return the path of a file in ``resources/``.
+
+    Parameters
+    ----------
+    parts : folders and file name below ``resources/``, such as "poses", "body.npz"
+    """
+    path = Path(str(resources.files("resources").joinpath(*parts)))
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing from the installation; reinstall lcollision")
+    return path
