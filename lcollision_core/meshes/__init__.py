@@ -1,6 +1,13 @@
 """What a pose is: topology, files, pose sets, alignment and the built-in body."""
 
+from lcollision_core.meshes.alignment import Alignment, RigidTransform, align_rigid, fit_rigid
 from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.audit import (
+    MeshAudit,
+    PoseSetInspection,
+    audit_mesh,
+    inspect_pose_set,
+)
 from lcollision_core.meshes.files import (
     MAX_FACES,
     READABLE_SUFFIXES,
@@ -21,11 +28,19 @@ __all__ = [
     "MAX_FACES",
     "READABLE_SUFFIXES",
     "WRITABLE_SUFFIXES",
+    "Alignment",
     "Mesh",
+    "MeshAudit",
     "PoseSet",
+    "PoseSetInspection",
+    "RigidTransform",
     "Topology",
+    "align_rigid",
     "atomic_write",
+    "audit_mesh",
+    "fit_rigid",
     "height",
+    "inspect_pose_set",
     "read_mesh",
     "read_pose_set",
     "up_axis",

@@ -123,6 +123,14 @@ def read_pose_set(
     pose_set = collect_poses(Path(path), refuse, progress, cancel).pose_set
     if pose_set is None:
         raise MeshFileError(f"{path} holds no poses; name another folder or file")
+    flat = degenerate_faces(pose_set.topology, pose_set.vertices[0])
+    if len(flat):
+        face = int(flat[0])
+        raise PoseSetError(
+            f"{path} cannot be used: {len(flat)} faces of the reference, pose 0 "
+            f"({pose_set.names[0]}), have no area, the first is face {face} between vertices "
+            f"{pose_set.faces[face].tolist()}; remove them from all poses"
+        )
     return pose_set
 
 
@@ -169,18 +177,6 @@ def collect_poses(
             defect = f"{path} does not exist; name a folder of meshes or an .npz file"
         report(MeshFileError(defect))
         return Collected(None, 0, same_topology=False)
-    if collected.pose_set is not None:
-        reference = collected.pose_set
-        flat = degenerate_faces(reference.topology, reference.vertices[0])
-        if len(flat):
-            face = int(flat[0])
-            report(
-                PoseSetError(
-                    f"face {face} (from 0) of the reference, pose 0 ({reference.names[0]}), has no "
-                    f"area: its vertices {reference.faces[face].tolist()} lie on a line, as do "
-                    f"those of {len(flat) - 1} other faces; remove such faces from all poses"
-                )
-            )
     return collected
 
 

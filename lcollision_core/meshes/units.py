@@ -14,7 +14,8 @@ def _box(vertices: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) == 0:
         raise ShapeError(f"vertices must be a (V, 3) array with V > 0, got {vertices.shape}")
     points = np.asarray(vertices, dtype=np.float64)
-    return points.max(axis=0) - points.min(axis=0)
+    sides: npt.NDArray[np.float64] = points.max(axis=0) - points.min(axis=0)
+    return sides
 
 
 def height(vertices: npt.NDArray[Any]) -> float:

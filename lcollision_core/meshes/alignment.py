@@ -1,0 +1,197 @@
+"""Rigid alignment of poses to a reference, led by the parts that move least.
+
+The convention everywhere is `aligned = R @ p + t`, so that `p = R.T @ (aligned - t)`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import ShapeError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes.units import height
+
+FloatArray = npt.NDArray[np.float64]
+
+_MAX_ROUNDS = 100
+_WEIGHT_TOLERANCE = 1e-4
+# Of the median motion: small enough to follow the torso of a body whose limbs all move, large
+# enough that the weights of neighbouring vertices stay alike.
+_CALM = 0.5
+
+
+@dataclass(frozen=True)
+class RigidTransform:
+    """One rotation and translation, `aligned = rotation @ p + translation`.
+
+    Attributes
+    ----------
+    rotation : (3, 3) float64 array, determinant +1
+    translation : (3,) float64 array, in the meshes' unit
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+
+    def apply(self, vertices: npt.NDArray[Any]) -> FloatArray:
+        """Move (..., 3) points into the reference's frame."""
+        moved: FloatArray = np.asarray(vertices, np.float64) @ self.rotation.T + self.translation
+        return moved
+
+    def inverse(self) -> RigidTransform:
+        """Return the transform that leads back."""
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Poses in the reference's frame, and how to bring them back.
+
+    Attributes
+    ----------
+    vertices : (N, V, 3) float64 array, the aligned poses
+    rotations : (N, 3, 3) float64 array, determinants +1
+    translations : (N, 3) float64 array, `vertices[n] = original[n] @ rotations[n].T +
+        translations[n]`
+    weights : (V,) float64 array in [0, 1], largest 1: how much each vertex led the fit; to align
+        a further pose alike, give it to `fit_rigid`
+    """
+
+    vertices: FloatArray
+    rotations: FloatArray
+    translations: FloatArray
+    weights: FloatArray
+
+    def transform(self, pose: int) -> RigidTransform:
+        """Return what moved one pose into the reference's frame."""
+        return RigidTransform(self.rotations[pose], self.translations[pose])
+
+
+def fit_rigid(
+    vertices: npt.NDArray[Any],
+    reference: npt.NDArray[Any],
+    weights: npt.NDArray[Any] | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Fit the rotation and translation that bring poses nearest to a reference.
+
+    Minimises Σ_i w_i ‖R p_i + t - q_i‖² over rotations R, never reflections, and translations t,
+    without scale.
+
+    Parameters
+    ----------
+    vertices : (..., V, 3) finite array, the poses p
+    reference : (V, 3) finite array, q
+    weights : (V,) array w, non-negative with a positive sum; all alike where None
+
+    Returns
+    -------
+    rotations : (..., 3, 3) float64 array, determinants +1
+    translations : (..., 3) float64 array
+
+    Raises
+    ------
+    ShapeError : the arrays do not fit together, or the weights sum to nothing.
+
+    Notes
+    -----
+    Kabsch 1976, with the sign of Umeyama 1991. Points on a line leave the turn about that line
+    open; one of the best rotations is returned.
+    """
+    poses = np.asarray(vertices, dtype=np.float64)
+    target = np.asarray(reference, dtype=np.float64)
+    if target.ndim != 2 or target.shape[1] != 3 or len(target) == 0:
+        raise ShapeError(f"reference must be a (V, 3) array with V > 0, got {target.shape}")
+    if poses.shape[-2:] != target.shape:
+        raise ShapeError(f"vertices must be (..., {len(target)}, 3), got {poses.shape}")
+    share = np.ones(len(target)) if weights is None else np.asarray(weights, dtype=np.float64)
+    if share.shape != (len(target),) or not (share >= 0.0).all() or not share.sum() > 0.0:
+        raise ShapeError(
+            f"weights must be ({len(target)},), non-negative and not all zero, got {share.shape}"
+        )
+    share = share / share.sum()
+    pose_centres = share @ poses
+    target_centre = share @ target
+    weighted = share[:, None] * (target - target_centre)
+    # (3, V) @ (V, 3) for each pose: the covariance, reference by pose.
+    covariance = weighted.T @ (poses - pose_centres[..., None, :])
+    left, _, right = np.linalg.svd(covariance)
+    signs = np.ones(covariance.shape[:-1])
+    signs[..., 2] = np.sign(np.linalg.det(left @ right))
+    rotations: FloatArray = (left * signs[..., None, :]) @ right
+    translations: FloatArray = target_centre - np.einsum(
+        "...ij,...j->...i", rotations, pose_centres
+    )
+    return rotations, translations
+
+
+def align_rigid(
+    vertices: npt.NDArray[Any],
+    reference: npt.NDArray[Any],
+    cancel: CancelToken | None = None,
+) -> Alignment:
+    """Align all poses of a set to a reference, led by the parts that move least against it.
+
+    Starts from plain Kabsch and reweighs: a vertex counts 1 / (1 + (m / s)²), where m is its
+    root mean square distance to the reference over all poses and s half the median of m. All
+    poses share the weights, so that the same part of the body leads throughout: with weights of
+    their own, poses would follow now the legs and now the torso.
+
+    Parameters
+    ----------
+    vertices : (N, V, 3) finite array, the poses, in the files' unit
+    reference : (V, 3) finite array, usually pose 0
+    cancel : polled between rounds
+
+    Returns
+    -------
+    the aligned poses, the transforms and the weights
+
+    Raises
+    ------
+    ShapeError : the arrays do not fit together.
+    CancelledError : `cancel` was set.
+
+    Notes
+    -----
+    Iteratively reweighted least squares with Cauchy's weight function. On SCAPE and the jumping
+    sequence it keeps the calmest tenth of the body two and a half and 1.2 times calmer than plain
+    Kabsch, at the same error of ten principal components; weights for each pose alone made that
+    error a fifth to a third worse.
+    """
+    poses = np.asarray(vertices, dtype=np.float64)
+    if poses.ndim != 3 or len(poses) == 0:
+        raise ShapeError(f"vertices must be (N, V, 3) with N > 0, got {poses.shape}")
+    target = np.asarray(reference, dtype=np.float64)
+    rotations, translations = fit_rigid(poses, target)
+    # Below this, motion is rounding, and dividing by it would let rounding choose the weights.
+    least_motion = 1e-14 * height(target) + np.finfo(np.float64).tiny
+    weights = np.ones(len(target))
+    for _ in range(_MAX_ROUNDS):
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        motion = _mean_motion(poses, target, rotations, translations)
+        calm = max(_CALM * float(np.median(motion)), least_motion)
+        previous, weights = weights, 1.0 / (1.0 + (motion / calm) ** 2)
+        weights /= weights.max()
+        rotations, translations = fit_rigid(poses, target, weights)
+        if np.abs(weights - previous).max() < _WEIGHT_TOLERANCE:
+            break
+    aligned = poses @ rotations.transpose(0, 2, 1) + translations[:, None]
+    return Alignment(aligned, rotations, translations, weights)
+
+
+def _mean_motion(
+    poses: FloatArray, target: FloatArray, rotations: FloatArray, translations: FloatArray
+) -> FloatArray:
+    """Return each vertex's root mean square distance to the reference over the poses, (V,)."""
+    squared_sum = np.zeros(len(target))
+    # Pose by pose the temporaries stay in the cache: four times faster than all at once.
+    for pose, rotation, translation in zip(poses, rotations, translations, strict=True):
+        offset = pose @ rotation.T + (translation - target)
+        squared_sum += np.einsum("ij,ij->i", offset, offset)
+    motion: FloatArray = np.sqrt(squared_sum / len(poses))
+    return motion

@@ -1,0 +1,173 @@
+"""What is wrong with a mesh or a pose set, in plain sentences."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.pose_set import PoseSet, collect_poses, degenerate_faces
+from lcollision_core.meshes.topology import Topology
+
+
+@dataclass(frozen=True)
+class MeshAudit:
+    """The state of one mesh.
+
+    Attributes
+    ----------
+    watertight : every edge has two faces that run along it in opposite directions
+    boundary_edges : number of edges with one face
+    non_manifold_edges : number of edges with more than two faces
+    components : number of connected parts, unused vertices not counted
+    unused_vertices : indices of the vertices in no face, int32
+    degenerate_faces : indices of the faces without area, int32
+    duplicate_vertices : indices of the vertices at the position of an earlier one, int32
+    problems : a sentence for each kind of defect; several parts are no defect
+    """
+
+    watertight: bool
+    boundary_edges: int
+    non_manifold_edges: int
+    components: int
+    unused_vertices: npt.NDArray[np.int32]
+    degenerate_faces: npt.NDArray[np.int32]
+    duplicate_vertices: npt.NDArray[np.int32]
+    problems: tuple[str, ...]
+
+
+def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
+    """Look for the defects that make a collision verdict, or a deformation, doubtful.
+
+    Parameters
+    ----------
+    topology : the faces
+    vertices : (V, 3) array, one pose
+
+    Returns
+    -------
+    the counts and the sentences
+
+    Raises
+    ------
+    ShapeError : `vertices` does not fit `topology`.
+    """
+    points = np.asarray(vertices)
+    if points.shape != (topology.n_vertices, 3):
+        raise ShapeError(f"vertices must be ({topology.n_vertices}, 3), got {points.shape}")
+    watertight = topology.is_watertight
+    n_boundary = len(topology.boundary_edges)
+    n_non_manifold = len(topology.non_manifold_edges)
+    unused = topology.unused_vertices
+    degenerate = degenerate_faces(topology, points)
+    duplicates = _duplicates(points)
+    problems = []
+    if n_boundary:
+        problems.append(
+            f"the mesh is open: {_count(n_boundary, 'edge has', 'edges have')} one face"
+        )
+    if n_non_manifold:
+        problems.append(
+            f"the mesh is not manifold: {_count(n_non_manifold, 'edge has', 'edges have')} more "
+            f"than two faces, the first between vertices "
+            f"{' and '.join(map(str, topology.non_manifold_edges[0]))}"
+        )
+    if not watertight and not n_boundary and not n_non_manifold:
+        problems.append("the mesh has neighbouring faces that are wound in opposite senses")
+    if len(unused):
+        problems.append(
+            f"{_count(len(unused), 'vertex is', 'vertices are')} in no face, the first is "
+            f"vertex {unused[0]}"
+        )
+    if len(degenerate):
+        problems.append(
+            f"{_count(len(degenerate), 'face has', 'faces have')} no area, the first is "
+            f"face {degenerate[0]}"
+        )
+    if len(duplicates):
+        problems.append(
+            f"{_count(len(duplicates), 'vertex lies', 'vertices lie')} exactly on an earlier "
+            f"vertex, the first is vertex {duplicates[0]}"
+        )
+    return MeshAudit(
+        watertight=watertight,
+        boundary_edges=n_boundary,
+        non_manifold_edges=n_non_manifold,
+        components=topology.vertex_components[0] - len(unused),
+        unused_vertices=unused,
+        degenerate_faces=degenerate,
+        duplicate_vertices=duplicates,
+        problems=tuple(problems),
+    )
+
+
+def _count(number: int, one: str, several: str) -> str:
+    return f"{number} {one if number == 1 else several}"
+
+
+def _duplicates(points: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    order = np.lexsort(points.T)
+    ordered = points[order]
+    # lexsort is stable, so of equal vertices the lowest index comes first.
+    repeats = (ordered[1:] == ordered[:-1]).all(axis=1)
+    return np.sort(order[1:][repeats]).astype(np.int32)
+
+
+@dataclass(frozen=True)
+class PoseSetInspection:
+    """What there is at a path that should hold a pose set.
+
+    Attributes
+    ----------
+    pose_set : the poses that agree with the first readable one; None where none can be used
+    n_found : the poses that are there, usable or not
+    same_topology : whether all readable poses share their vertex count and faces
+    audit : the state of the reference, pose 0; None without poses
+    problems : a sentence for each defect, those of the reference among them
+    """
+
+    pose_set: PoseSet | None
+    n_found: int
+    same_topology: bool
+    audit: MeshAudit | None
+    problems: tuple[str, ...]
+
+
+def inspect_pose_set(
+    path: str | os.PathLike[str],
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> PoseSetInspection:
+    """Read what can be read of a pose set and list every defect instead of refusing at the first.
+
+    Parameters
+    ----------
+    path : a folder of meshes or an .npz file, as for `read_pose_set`
+    progress : called with (poses done, poses in all)
+    cancel : polled between poses
+
+    Returns
+    -------
+    the usable poses and the defects
+
+    Raises
+    ------
+    CancelledError : `cancel` was set.
+    """
+    defects: list[LCollisionError] = []
+    collected = collect_poses(Path(path), defects.append, progress, cancel)
+    audit = None
+    problems = [str(defect) for defect in defects]
+    pose_set = collected.pose_set
+    if pose_set is not None:
+        audit = audit_mesh(pose_set.topology, pose_set.vertices[0])
+        problems += [f"pose 0 ({pose_set.names[0]}): {problem}" for problem in audit.problems]
+    return PoseSetInspection(
+        pose_set, collected.n_found, collected.same_topology, audit, tuple(problems)
+    )
