@@ -13,6 +13,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from typing import Literal, TypeVar
 
@@ -84,17 +85,15 @@ def time_detection(
     agrees = dict.fromkeys(peers, True)
     verdicts = []
     for done, pose in enumerate(vertices):
-        seconds, found = _timed(lambda pose=pose: detector.detect(pose), REPEATS)
+        seconds, found = _timed(partial(detector.detect, pose), REPEATS)
         ours["all"].append(seconds)
         truth.append(found)
-        seconds, verdict = _timed(
-            lambda pose=pose: detector.are_colliding(pose[None], workers=1), REPEATS
-        )
+        seconds, verdict = _timed(partial(detector.are_colliding, pose[None], workers=1), REPEATS)
         ours["first"].append(seconds)
         verdicts.append(bool(verdict[0]) == found.colliding)
         expected = set(map(tuple, found.pairs.tolist()))
         for name, find in peers.items():
-            seconds, contacts = _timed(lambda find=find, pose=pose: find(pose, poses.faces))
+            seconds, contacts = _timed(partial(find, pose, poses.faces))
             theirs[name].append(seconds)
             agrees[name] &= _disjoint_pairs(contacts, poses.faces) == expected
         progress(done + 1, len(vertices))

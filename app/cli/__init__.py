@@ -1,5 +1,1 @@
-"""The command line, ``lcollision``; `main` is its entry point."""
-
-from app.cli.main import main
-
-__all__ = ["main"]
+"""The command line, ``lcollision``; its entry point is `app.cli.main.main`."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import note, print_json
+from app.cli.console import ExitStatus, note, print_json
 from lcollision_core.errors import LCollisionError
 
 
@@ -46,9 +46,9 @@ def check(
     if as_json:
         print_json(reports)
     if failed:
-        raise typer.Exit(2)
+        raise typer.Exit(ExitStatus.BAD_INPUT)
     if any(report["colliding"] for report in reports):
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
 def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:

@@ -6,11 +6,22 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from enum import IntEnum
 from typing import Any
 
 import typer
 
 from lcollision_core.jobs import Progress, no_progress
+
+
+class ExitStatus(IntEnum):
+    """What the command's exit status says; scripts depend on these numbers."""
+
+    DONE = 0
+    ANSWER_IS_NO = 1
+    BAD_INPUT = 2
+    BUG = 3
+    INTERRUPTED = 130
 
 
 def print_json(document: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import note, print_json, progress_bar
+from app.cli.console import ExitStatus, note, print_json, progress_bar
 
 app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no_args_is_help=True)
 
@@ -38,53 +38,48 @@ def check(
 ) -> None:
     """Report the topology, size, defects and self-collisions of a pose set.
 
-    Exits with 1 when the set cannot be used as it is.
+    Exits with 1 when the set cannot be trained on as it is: a pose is unusable, or a face of
+    the first has no area.
     """
     from lcollision_core.contact import CollisionDetector
+    from lcollision_core.errors import MeshFileError
     from lcollision_core.meshes import inspect_pose_set
 
     with progress_bar("Reading poses") as progress:
         inspection = inspect_pose_set(path, progress)
-    report: dict[str, Any] = {
-        "poses": inspection.n_poses,
-        "vertices": 0,
-        "faces": 0,
-        "same_topology": inspection.same_topology,
-        "watertight": False,
-        "colliding_poses": 0,
-        "problems": list(inspection.problems),
-        "near_exclusion": near_exclusion or 0.0,
-        "colliding": [],
-    }
     poses = inspection.pose_set
-    if poses is not None:
-        exclusion = poses.near_exclusion if near_exclusion is None else near_exclusion
-        detector = CollisionDetector(poses.topology, poses.vertices[0], near_exclusion=exclusion)
-        with progress_bar("Finding self-collisions") as progress:
-            found = detector.detect_batch(poses.vertices, progress=progress)
-        report |= {
-            "vertices": poses.topology.n_vertices,
-            "faces": poses.topology.n_faces,
-            "watertight": poses.topology.is_watertight,
-            "colliding_poses": int(found.colliding.sum()),
-            "near_exclusion": exclusion,
-            "colliding": [
-                {
-                    "pose": name,
-                    "pairs": int(found.n_pairs[pose]),
-                    "near_pairs": int(found.n_near_pairs[pose]),
-                    "energy": float(found.vertex_energy[pose].sum()),
-                }
-                for pose, name in enumerate(poses.names)
-                if found.colliding[pose]
-            ],
-        }
+    if poses is None or inspection.audit is None:
+        raise MeshFileError(inspection.problems[0])
+    exclusion = poses.near_exclusion if near_exclusion is None else near_exclusion
+    detector = CollisionDetector(poses.topology, poses.vertices[0], near_exclusion=exclusion)
+    with progress_bar("Finding self-collisions") as progress:
+        found = detector.detect_batch(poses.vertices, progress=progress)
+    report: dict[str, Any] = {
+        "poses": inspection.n_found,
+        "vertices": poses.topology.n_vertices,
+        "faces": poses.topology.n_faces,
+        "same_topology": inspection.same_topology,
+        "watertight": inspection.audit.watertight,
+        "colliding_poses": int(found.colliding.sum()),
+        "problems": list(inspection.problems),
+        "near_exclusion": exclusion,
+        "colliding": [
+            {
+                "pose": poses.names[pose],
+                "pairs": int(found.n_pairs[pose]),
+                "near_pairs": int(found.n_near_pairs[pose]),
+                "energy": float(found.vertex_energy[pose].sum()),
+            }
+            for pose in found.colliding.nonzero()[0]
+        ],
+    }
     if as_json:
         print_json(report)
     else:
         _print(path, report)
-    if not inspection.usable:
-        raise typer.Exit(1)
+    usable = len(poses) == inspection.n_found and not len(inspection.audit.degenerate_faces)
+    if not usable:
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
 def _print(path: Path, report: dict[str, Any]) -> None:
@@ -118,10 +113,13 @@ def make(
     ] = 0,
 ) -> None:
     """Make a pose set of the built-in body: 71 poses, a swing dance, or a jump."""
+    from lcollision_core.errors import MeshFileError
     from lcollision_core.meshes import require_writable, write_pose_set
     from lcollision_core.meshes.body import make_body
 
-    require_writable(output, ".npz")
+    if output.suffix.lower() != ".npz":
+        raise MeshFileError(f"{output} cannot be written: a pose set is an .npz file; rename it")
+    require_writable(output)
     with progress_bar("Posing the body") as progress:
         body = make_body(kind.value, n_vertices=n_vertices, seed=seed, progress=progress)
     write_pose_set(output, body.pose_set)

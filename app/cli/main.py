@@ -7,24 +7,14 @@ from __future__ import annotations
 
 import sys
 import traceback
-from enum import IntEnum
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from app.cli import benchmark, check, dataset
+from app.cli.console import ExitStatus
 from lcollision_core.errors import CancelledError, LCollisionError
-
-
-class ExitStatus(IntEnum):
-    """What the command's exit status says; scripts depend on these numbers."""
-
-    DONE = 0
-    ANSWER_IS_NO = 1
-    BAD_INPUT = 2
-    BUG = 3
-    INTERRUPTED = 130
 
 
 class _Commands(TyperGroup):

@@ -1,7 +1,7 @@
 """What a pose is: topology, files, pose sets, alignment and the built-in body."""
 
 from lcollision_core.meshes.alignment import Alignment, RigidTransform, align_rigid, fit_rigid
-from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.atomic import atomic_write, require_writable
 from lcollision_core.meshes.audit import (
     MeshAudit,
     PoseSetInspection,
@@ -43,6 +43,7 @@ __all__ = [
     "inspect_pose_set",
     "read_mesh",
     "read_pose_set",
+    "require_writable",
     "up_axis",
     "write_mesh",
     "write_pose_set",

@@ -33,16 +33,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     MeshFileError : the folder is missing or read-only, the disk is full, or `path` is a folder
         or a device.
     """
-    target = Path(os.path.realpath(path))
-    if target.is_dir():
-        raise MeshFileError(f"{path} cannot be written: it is a folder; add a file name")
-    # Renaming over a device such as /dev/null would replace it by a plain file.
-    if target.exists() and not target.is_file():
-        raise MeshFileError(f"{path} cannot be written: it is not a plain file; choose another")
-    if not target.parent.is_dir():
-        raise MeshFileError(
-            f"{path} cannot be written: there is no folder {target.parent}; create it first"
-        )
+    target = _plain_file_in_a_folder(path)
     unfinished = target.with_name(f".{target.name[:100]}.{secrets.token_hex(6)}.part")
     try:
         with unfinished.open("xb") as file:
@@ -57,3 +48,31 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     finally:
         with suppress(OSError):
             unfinished.unlink(missing_ok=True)
+
+
+def require_writable(path: str | os.PathLike[str]) -> None:
+    """Refuse a path that `atomic_write` could not write, before long work is done for it.
+
+    Raises
+    ------
+    MeshFileError : as for `atomic_write`.
+    """
+    folder = _plain_file_in_a_folder(path).parent
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise MeshFileError(
+            f"{path} cannot be written: {folder} is read-only; choose another place"
+        )
+
+
+def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
+        raise MeshFileError(f"{path} cannot be written: it is a folder; add a file name")
+    # Renaming over a device such as /dev/null would replace it by a plain file.
+    if target.exists() and not target.is_file():
+        raise MeshFileError(f"{path} cannot be written: it is not a plain file; choose another")
+    if not target.parent.is_dir():
+        raise MeshFileError(
+            f"{path} cannot be written: there is no folder {target.parent}; create it first"
+        )
+    return target

@@ -1,0 +1,25 @@
+"""A small colliding mesh, and the type of the fixture that runs the command line."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from typer.testing import Result
+
+STABBED = """\
+v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0.2 0.2 -0.1
+v 0.2 0.2 0.9
+v 0.3 0.2 0.9
+f 1 2 3
+f 4 5 6
+"""
+"""Two triangles, one of which reaches 0.1 through the other; the mesh is 1 high."""
+
+
+class Lcollision(Protocol):
+    """Runs the command line in this process."""
+
+    def __call__(self, *arguments: object) -> Result: ...

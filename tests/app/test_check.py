@@ -1,0 +1,143 @@
+"""``lcollision check``: its verdict, its JSON, its exit status, its sentences."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.app.support import STABBED, Lcollision
+
+
+def test_collision_is_reported_with_its_energy(lcollision: Lcollision, stabbed: Path) -> None:
+    result = lcollision("check", "--json", stabbed)
+    assert result.exit_code == 1
+    (report,) = json.loads(result.stdout)
+    assert report.pop("seconds") > 0
+    assert report.pop("energy") == pytest.approx(0.1**2)
+    assert report == {
+        "file": str(stabbed),
+        "vertices": 6,
+        "faces": 2,
+        "watertight": False,
+        "pairs": 1,
+        "near_pairs": 0,
+        "colliding": True,
+    }
+
+
+def test_energy_is_in_squared_heights_of_the_mesh(
+    lcollision: Lcollision, stabbed: Path, tmp_path: Path
+) -> None:
+    larger = tmp_path / "larger.obj"
+    scaled = [
+        " ".join(["v", *(str(100 * float(x)) for x in line.split()[1:])])
+        if line.startswith("v")
+        else line
+        for line in STABBED.splitlines()
+    ]
+    larger.write_text("\n".join(scaled))
+    reports = json.loads(lcollision("check", "--json", stabbed, larger).stdout)
+    assert reports[0]["energy"] == pytest.approx(reports[1]["energy"], rel=1e-12)
+
+
+def test_free_mesh_exits_with_zero(lcollision: Lcollision, apart: Path) -> None:
+    result = lcollision("check", apart)
+    assert result.exit_code == 0
+    assert "free of self-collisions" in result.stdout
+
+
+def test_several_files_come_in_order(lcollision: Lcollision, apart: Path, stabbed: Path) -> None:
+    result = lcollision("check", "--json", apart, stabbed, apart)
+    assert result.exit_code == 1
+    assert [report["colliding"] for report in json.loads(result.stdout)] == [False, True, False]
+
+
+def test_open_mesh_is_checked_with_a_warning(lcollision: Lcollision, apart: Path) -> None:
+    result = lcollision("check", "--json", apart)
+    assert "open" in result.stderr
+    assert str(apart) in result.stderr
+    assert len(json.loads(result.stdout)) == 1
+
+
+def test_near_pairs_are_counted_apart(lcollision: Lcollision, tmp_path: Path) -> None:
+    strip = tmp_path / "strip.obj"
+    # The faces 0 and 3 of a folded strip of four share no vertex; one edge joins them.
+    strip.write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nv 0.2 0.2 0.5\nv 0.3 0.2 -0.1\n"
+        "f 1 2 3\nf 2 4 3\nf 3 4 5\nf 4 6 5\n"
+    )
+    counted = json.loads(lcollision("check", "--json", strip).stdout)[0]
+    apart = lcollision("check", "--json", "--near-exclusion", 1, strip)
+    assert counted["pairs"] > 0
+    excluded = json.loads(apart.stdout)[0]
+    assert (excluded["pairs"], excluded["near_pairs"]) == (0, counted["pairs"])
+    assert apart.exit_code == 0
+
+
+BAD_FILES = {
+    "empty.obj": (b"", "it is empty"),
+    "garbage.obj": (bytes(range(256)) * 20, "garbage.obj"),
+    "garbage.ply": (bytes(range(256)) * 20, "garbage.ply"),
+    "nan.obj": (STABBED.replace("0.3", "nan").encode(), "vertex 5"),
+    "index.obj": (STABBED.replace("f 4 5 6", "f 4 5 7").encode(), "there are 6 vertices"),
+    "truncated.ply": (b"ply\nformat ascii 1.0\nelement vertex 3\n", "truncated.ply"),
+    "huge.ply": (
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n"
+        b"property float y\nproperty float z\nelement face 50000000\n"
+        b"property list uchar int vertex_indices\nend_header\n",
+        "50000000",
+    ),
+    "pose.docx": (b"PK", ".obj"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_file_gets_one_sentence_and_exit_status_2(
+    lcollision: Lcollision, tmp_path: Path, name: str
+) -> None:
+    content, expected = BAD_FILES[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    result = lcollision("check", path)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1
+    assert name in result.stderr
+    assert expected in result.stderr
+
+
+def test_missing_file_gets_one_sentence(lcollision: Lcollision, tmp_path: Path) -> None:
+    result = lcollision("check", tmp_path / "nowhere.obj")
+    assert result.exit_code == 2
+    assert len(result.stderr.splitlines()) == 1
+    assert "nowhere.obj" in result.stderr
+
+
+def test_good_files_are_reported_beside_a_bad_one(
+    lcollision: Lcollision, apart: Path, tmp_path: Path
+) -> None:
+    result = lcollision("check", "--json", tmp_path / "nowhere.obj", apart)
+    assert result.exit_code == 2
+    assert [report["file"] for report in json.loads(result.stdout)] == [str(apart)]
+
+
+def test_a_bug_does_not_look_like_an_answer() -> None:
+    code = (
+        "from app.cli.main import main\n"
+        "from lcollision_core import meshes\n"
+        "meshes.read_mesh = lambda path: 1 / 0\n"
+        "main()\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code, "check", "any.obj"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 3
+    assert "ZeroDivisionError" in result.stderr
+    assert "bug" in result.stderr

@@ -1,0 +1,53 @@
+"""The command line before any command runs: quick, light, and complete."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+
+def _loaded_modules(code: str) -> set[str]:
+    """Run code in a fresh interpreter and return the top-level modules that it loaded."""
+    report = "import sys; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    result = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True
+    )
+    return set(result.stdout.splitlines()[-1].split())
+
+
+HEAVY = {"numpy", "scipy", "numba", "torch", "trimesh", "vtkmodules", "pyvista", "PySide6"}
+
+
+def test_importing_the_command_line_loads_nothing_heavy() -> None:
+    loaded = _loaded_modules("import app.cli.main")
+    assert "typer" in loaded
+    assert loaded & HEAVY == set()
+
+
+def test_importing_the_core_loads_nothing_heavy() -> None:
+    loaded = _loaded_modules("import lcollision_core")
+    assert "lcollision_core" in loaded
+    assert loaded & HEAVY == set()
+
+
+def test_contact_and_meshes_load_neither_torch_nor_a_front_end() -> None:
+    loaded = _loaded_modules("import lcollision_core.contact, lcollision_core.meshes.body")
+    assert "numba" in loaded
+    assert loaded & {"torch", "anny", "vtkmodules", "pyvista", "PySide6"} == set()
+
+
+def test_help_names_every_command() -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "app", "--help"], capture_output=True, text=True, check=True
+    )
+    for command in ("check", "dataset", "benchmark"):
+        assert f"\n  {command}" in result.stdout
+
+
+def test_version_is_that_of_the_package() -> None:
+    from importlib.metadata import version
+
+    result = subprocess.run(
+        [sys.executable, "-m", "app", "--version"], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == f"lcollision {version('lcollision')}"
