@@ -11,6 +11,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.acap.bridges import component_bridges
 from lcollision_core.acap.compiled import compiled
 from lcollision_core.acap.consistency import component_roots, consistent_logarithms
 from lcollision_core.acap.features import (
@@ -29,7 +30,7 @@ from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 if TYPE_CHECKING:
     import torch
 
-WEIGHT_FLOOR = 0.1
+WEIGHT_FLOOR = 0.05
 NORMAL_WEIGHT = 1.0
 
 
@@ -54,28 +55,50 @@ class AcapCodec:
     ----------
     topology : the connectivity of all poses
     rest_vertices : (V, 3) array, the reference, in heights
+    anchor_weights : (V,) array >= 0 or None for equal weights; a decoded pose is put where its
+        weighted mean vertex is the reference's. With the weights of the poses' rigid alignment
+        a decoded pose lies where the aligned one lay.
 
     Raises
     ------
-    ShapeError : `rest_vertices` has another shape, or is not finite.
+    ShapeError : an array has another shape, is not finite, or a weight is negative.
     """
 
-    def __init__(self, topology: Topology, rest_vertices: npt.NDArray[Any]) -> None:
-        if np.shape(rest_vertices) != (topology.n_vertices, 3):
+    def __init__(
+        self,
+        topology: Topology,
+        rest_vertices: npt.NDArray[Any],
+        anchor_weights: npt.NDArray[Any] | None = None,
+    ) -> None:
+        n_vertices = topology.n_vertices
+        if np.shape(rest_vertices) != (n_vertices, 3):
             raise ShapeError(
                 f"the reference has shape {np.shape(rest_vertices)}, but the topology needs "
-                f"({topology.n_vertices}, 3)"
+                f"({n_vertices}, 3)"
             )
         rest = np.array(rest_vertices, dtype=np.float64)
         if not np.isfinite(rest).all():
             raise ShapeError("the reference has a vertex that is not finite")
         rest.flags.writeable = False
+        given = np.ones(n_vertices) if anchor_weights is None else anchor_weights
+        anchor = np.asarray(given, dtype=np.float64)
+        if anchor.shape != (n_vertices,) or not (np.isfinite(anchor) & (anchor >= 0.0)).all():
+            raise ShapeError(
+                f"anchor_weights must be ({n_vertices},) numbers of at least 0, "
+                f"got an array of shape {anchor.shape}"
+            )
         self.topology = topology
         self.rest_vertices: FloatArray = rest
         weights = cotangent_weights(topology, rest, WEIGHT_FLOOR)
+        bridges = component_bridges(topology, rest)
         self._roots = component_roots(topology, rest)
         self._fit = fit_rings(topology, rest, weights, NORMAL_WEIGHT)
-        self._poisson = factor_poisson(topology, rest, self._fit, weights, self._roots)
+        self._poisson = factor_poisson(
+            rest,
+            np.concatenate([topology.edges, bridges]),
+            np.concatenate([weights, np.ones(len(bridges))]),
+            anchor,
+        )
         self._rest_offset = self._poisson.rest_mean[self._poisson.component]
 
     def encode(self, vertices: npt.NDArray[Any], n_threads: int | None = None) -> EncodedPoses:
@@ -99,21 +122,18 @@ class AcapCodec:
         features = np.empty((len(poses), self.topology.n_vertices, N_FEATURES))
         n_jumps = np.zeros(len(poses), dtype=np.int64)
 
-        def encode_one(start: int, stop: int) -> None:
+        def encode_block(start: int, stop: int) -> None:
+            sharpened = self._sharpen(poses[start:stop])
             for pose in range(start, stop):
-                n_jumps[pose] = _encode_pose(
-                    poses[pose],
+                n_jumps[pose] = _features_of_pose(
+                    sharpened[pose - start],
                     self.topology.faces,
-                    self._fit.ring_start,
-                    self._fit.ring,
-                    self._fit.ring_solution,
-                    self._fit.normal_solution,
-                    self._fit.kept_identity,
+                    *self._fit.arrays,
                     self._roots,
                     features[pose],
                 )
 
-        _spread(encode_one, len(poses), 1, n_threads)
+        _spread(encode_block, len(poses), BLOCK_POSES, n_threads)
         return EncodedPoses(features, n_jumps)
 
     def decode(self, features: npt.NDArray[Any], n_threads: int | None = None) -> FloatArray:
@@ -127,8 +147,9 @@ class AcapCodec:
         Returns
         -------
         vertices : (B, V, 3) float64 array, in heights, in the reference's frame: features do not
-            know where a pose lies, so each connected component's mean vertex is put where the
-            reference has it. Every pose gets the same bits however many are decoded together.
+            know where a pose lies, so its mean vertex (weighted by the codec's `anchor_weights`)
+            is put where the reference has it. Every pose gets the same bits however many are
+            decoded together.
 
         Raises
         ------
@@ -224,6 +245,15 @@ class AcapCodec:
 
         return decode_torch(self, features)
 
+    def _sharpen(self, poses: FloatArray) -> FloatArray:
+        """Add to each pose what its round trip would lose, so that it loses it no more."""
+        gradients = np.empty((len(poses), self.topology.n_vertices, 3, 3))
+        for pose, field in zip(poses, gradients, strict=True):
+            deformation_gradients(pose, self.topology.faces, *self._fit.arrays, field)
+        rebuilt = np.empty_like(poses)
+        self._poisson.solve(gradients, rebuilt)
+        return 2.0 * poses - rebuilt
+
     def _checked(self, array: npt.NDArray[Any], width: int, name: str) -> FloatArray:
         shape = np.shape(array)
         if len(shape) != 3 or shape[1:] != (self.topology.n_vertices, width):
@@ -252,7 +282,7 @@ def _spread(
 
 
 @compiled
-def _encode_pose(
+def _features_of_pose(
     vertices: FloatArray,
     faces: IntArray,
     ring_start: IntArray,

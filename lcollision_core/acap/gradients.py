@@ -21,7 +21,6 @@ class RingFit:
     Attributes
     ----------
     ring_start, ring : (V + 1,) and (2E,) int32 arrays, the one-rings in CSR form
-    ring_edge : (2E,) int32 array, the undirected edge of each entry of `ring`
     ring_solution : (2E, 3) float64 array g_ij: T_i is the sum of (p'_i - p'_j) g_ij^T and the
         two parts below
     normal_solution : (V, 3) float64 array, g of the row of the normal
@@ -31,10 +30,20 @@ class RingFit:
 
     ring_start: IntArray
     ring: IntArray
-    ring_edge: IntArray
     ring_solution: FloatArray
     normal_solution: FloatArray
     kept_identity: FloatArray
+
+    @property
+    def arrays(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
+        """What `deformation_gradients` takes, in its order."""
+        return (
+            self.ring_start,
+            self.ring,
+            self.ring_solution,
+            self.normal_solution,
+            self.kept_identity,
+        )
 
 
 @compiled
@@ -104,7 +113,7 @@ def fit_rings(
     owner = np.repeat(np.arange(n_vertices), np.diff(start))
     low, high = np.minimum(owner, ring), np.maximum(owner, ring)
     keys = topology.edges[:, 0].astype(np.int64) * n_vertices + topology.edges[:, 1]
-    ring_edge = np.searchsorted(keys, low.astype(np.int64) * n_vertices + high).astype(np.int32)
+    ring_edge = np.searchsorted(keys, low.astype(np.int64) * n_vertices + high)
 
     weight = edge_weights[ring_edge]
     spoke = rest_vertices[owner] - rest_vertices[ring]
@@ -124,7 +133,6 @@ def fit_rings(
     return RingFit(
         ring_start=start,
         ring=ring,
-        ring_edge=ring_edge,
         ring_solution=np.einsum("rab,rb,r->ra", inverse[owner], spoke, weight),
         normal_solution=np.einsum("vab,vb,v->va", inverse, normals, row_weight),
         kept_identity=kept,

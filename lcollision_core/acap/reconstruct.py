@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse import linalg
+from scipy.sparse import csgraph, linalg
 
 from lcollision_core.acap.compiled import compiled
-from lcollision_core.acap.gradients import RingFit
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray
 
 BLOCK_POSES = 8
 """Poses that share one pass over the factor; more gain little and fall out of the cache."""
@@ -21,8 +20,7 @@ class Poisson:
     """L p' = b(T) of step 5, factored.
 
     L is the weighted Laplacian of the reference with one vertex pinned per connected component;
-    afterwards each component's mean vertex is put where the reference has it, which makes the
-    solution the pseudo-inverse of the unpinned L, a symmetric operator.
+    afterwards each component's weighted mean vertex is put where the reference has it.
 
     Attributes
     ----------
@@ -34,8 +32,8 @@ class Poisson:
     map_start, map_vertex, map_spoke : the rows of b: b_i is the sum of T_j s_ij over the
         one-ring and i itself; (V + 1,) and (nnz,) int32, s (nnz, 3) float64
     component : (V,) int32 array
-    rest_mean : (n_components, 3) float64 array, each component's mean reference vertex
-    component_size : (n_components,) float64 array, vertices in each
+    anchor : (V,) float64 array, weights that sum to 1 over each component
+    rest_mean : (n_components, 3) float64 array, where each component's weighted mean is put
     """
 
     position: IntArray
@@ -47,8 +45,8 @@ class Poisson:
     map_vertex: IntArray
     map_spoke: FloatArray
     component: IntArray
+    anchor: FloatArray
     rest_mean: FloatArray
-    component_size: FloatArray
 
     def solve(self, gradients: FloatArray, vertices: FloatArray) -> None:
         """Write the poses of up to `BLOCK_POSES` fields of deformation gradients.
@@ -56,7 +54,8 @@ class Poisson:
         Parameters
         ----------
         gradients : (n, V, 3, 3) float64 array
-        vertices : (n, V, 3) float64 array, overwritten; each component's mean is 0
+        vertices : (n, V, 3) float64 array, overwritten; each component's mean is 0, to
+            which `rest_mean` is to be added for poses, and nothing for derivatives
         """
         right_sides = np.empty((len(self.position), 3 * len(gradients)))
         for pose, field in enumerate(gradients):
@@ -71,7 +70,7 @@ class Poisson:
             )
         self._substitute(right_sides)
         for pose, out in enumerate(vertices):
-            _unload(right_sides, 3 * pose, self.position, self.component, self.component_size, out)
+            _unload(right_sides, 3 * pose, self.position, self.component, self.anchor, out)
 
     def solve_transposed(self, by_vertices: FloatArray, by_gradients: FloatArray) -> None:
         """Write a loss's derivative by T from the one by the vertices: `solve` transposed.
@@ -82,10 +81,10 @@ class Poisson:
         by_gradients : (n, V, 3, 3) float64 array, overwritten
         """
         right_sides = np.empty((len(self.position), 3 * len(by_vertices)))
-        for pose, out in enumerate(by_vertices):
+        for pose, given in enumerate(by_vertices):
             totals = np.zeros_like(self.rest_mean)
-            np.add.at(totals, self.component, out)
-            centred = out - (totals / self.component_size[:, None])[self.component]
+            np.add.at(totals, self.component, given)
+            centred = given - self.anchor[:, None] * totals[self.component]
             right_sides[self.position, 3 * pose : 3 * pose + 3] = centred
         self._substitute(right_sides)
         for pose, out in enumerate(by_gradients):
@@ -154,17 +153,17 @@ def _unload(
     column: int,
     position: IntArray,
     component: IntArray,
-    component_size: FloatArray,
+    anchor: FloatArray,
     vertices: FloatArray,
 ) -> None:
-    mean = np.zeros((len(component_size), 3))
+    mean = np.zeros((component.max() + 1, 3))
     for i in range(len(position)):
         for a in range(3):
             vertices[i, a] = solution[position[i], column + a]
-            mean[component[i], a] += vertices[i, a]
+            mean[component[i], a] += anchor[i] * vertices[i, a]
     for i in range(len(position)):
         for a in range(3):
-            vertices[i, a] -= mean[component[i], a] / component_size[component[i]]
+            vertices[i, a] -= mean[component[i], a]
 
 
 @compiled
@@ -223,75 +222,67 @@ def _substitute_many(
 
 
 def factor_poisson(
-    topology: Topology,
     rest_vertices: FloatArray,
-    fit: RingFit,
+    edges: IntArray,
     edge_weights: FloatArray,
-    pinned: IntArray,
+    anchor_weights: FloatArray,
 ) -> Poisson:
     """Factor the reconstruction of step 5 of Gao et al. 2019 for one reference.
 
     Parameters
     ----------
-    topology : the connectivity, with E edges
     rest_vertices : (V, 3) float64 array, the reference p
-    fit : the one-rings in CSR form
+    edges : (E, 2) integer array of different pairs i, j
     edge_weights : (E,) float64 array c_ij > 0
-    pinned : (n_components,) int32 array, one vertex of each connected component
+    anchor_weights : (V,) float64 array >= 0, the weights of the mean vertex; a component whose
+        weights are all 0 counts every vertex alike
 
     Returns
     -------
     poisson : Poisson
     """
-    n_vertices = topology.n_vertices
-    weight = edge_weights[fit.ring_edge]
-    owner = np.repeat(np.arange(n_vertices), np.diff(fit.ring_start))
-    spoke = 0.5 * weight[:, None] * (rest_vertices[owner] - rest_vertices[fit.ring])
+    n_vertices = len(rest_vertices)
+    start, end = edges.T
+    owner, other = np.concatenate([start, end]), np.concatenate([end, start])
+    weight = np.concatenate([edge_weights, edge_weights])
+    spoke = 0.5 * weight[:, None] * (rest_vertices[owner] - rest_vertices[other])
     own_spoke = np.zeros((n_vertices, 3))
     np.add.at(own_spoke, owner, spoke)
     rows = np.concatenate([owner, np.arange(n_vertices)])
     order = np.argsort(rows, kind="stable")
-    map_start = np.searchsorted(rows[order], np.arange(n_vertices + 1)).astype(np.int32)
-    map_vertex = np.concatenate([fit.ring, np.arange(n_vertices, dtype=np.int32)])[order]
-    map_spoke = np.concatenate([spoke, own_spoke])[order]
 
-    off_diagonal = sparse.csr_matrix(
-        (weight, fit.ring, fit.ring_start), shape=(n_vertices, n_vertices)
-    )
-    diagonal = np.bincount(owner, weight, minlength=n_vertices)
-    laplacian = sparse.diags(diagonal) - off_diagonal
+    graph = sparse.coo_matrix((weight, (owner, other)), shape=(n_vertices, n_vertices)).tocsr()
+    count, component = csgraph.connected_components(graph, directed=False)
+    _, pinned = np.unique(component, return_index=True)
     free = np.setdiff1d(np.arange(n_vertices), pinned)
     position = np.empty(n_vertices, dtype=np.int32)
     position[pinned] = np.arange(len(free), n_vertices)
-    if len(free):
-        # Positive definite, so that no pivoting is needed and U = D lower^T.
-        factors = linalg.splu(
-            laplacian.tocsc()[free][:, free].tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-        position[free] = factors.perm_c
-        strict = sparse.tril(factors.L, -1).tocsc()
-        strict.sort_indices()
-        pivots = factors.U.diagonal()
-    else:
-        strict, pivots = sparse.csc_matrix((0, 0)), np.empty(0)
+    laplacian = (sparse.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph).tocsc()
+    # Positive definite, so that no pivoting is needed and U = D lower^T.
+    factors = linalg.splu(
+        laplacian[free][:, free],
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    position[free] = factors.perm_c
+    strict = sparse.tril(factors.L, -1).tocsc()
 
-    count, component = topology.vertex_components
-    size = np.bincount(component, minlength=count).astype(np.float64)
-    totals = np.zeros((count, 3))
-    np.add.at(totals, component, rest_vertices)
+    totals = np.bincount(component, anchor_weights, minlength=count)
+    anchor = np.where(totals[component] > 0.0, anchor_weights, 1.0)
+    anchor /= np.bincount(component, anchor, minlength=count)[component]
+    rest_mean = np.zeros((count, 3))
+    np.add.at(rest_mean, component, anchor[:, None] * rest_vertices)
     return Poisson(
         position=position,
         column_start=strict.indptr.astype(np.int32),
         row=strict.indices.astype(np.int32),
         lower=strict.data,
-        inverse_pivot=1.0 / pivots,
-        map_start=map_start,
-        map_vertex=map_vertex.astype(np.int32),
-        map_spoke=map_spoke,
-        component=component,
-        rest_mean=totals / size[:, None],
-        component_size=size,
+        inverse_pivot=1.0 / factors.U.diagonal(),
+        map_start=np.searchsorted(rows[order], np.arange(n_vertices + 1)).astype(np.int32),
+        map_vertex=np.concatenate([other, np.arange(n_vertices)])[order].astype(np.int32),
+        map_spoke=np.concatenate([spoke, own_spoke])[order],
+        component=component.astype(np.int32),
+        anchor=anchor,
+        rest_mean=rest_mean,
     )
