@@ -29,6 +29,8 @@ Relative, so the same at every scale. Any direction gives an upper bound of the 
 tolerance only has to keep out cross products that are rounding noise.
 """
 
+SMALL_SINE_SQUARED = 1e-6
+"""Below this squared sine of their angle, two edges' cross product is freed of rounding."""
 
 BOX_PADDING = np.float32(2.5e-7)
 """Padding of a box, relative to the pose's reach: two float32 roundings, 2 x 2^-24, and some."""
@@ -105,6 +107,38 @@ class Found(NamedTuple):
     is_near: npt.NDArray[np.bool_]
 
 
+@njit(inline="always", error_model="numpy")
+def _across(ux, uy, uz, vx, vy, vz):
+    """Return the direction across two edges and its squared length, 0 where they are parallel."""
+    dx, dy, dz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length_squared = dx * dx + dy * dy + dz * dz
+    u_squared = ux * ux + uy * uy + uz * uz
+    v_squared = vx * vx + vy * vy + vz * vz
+    if length_squared <= SMALL_SINE_SQUARED * u_squared * v_squared:
+        if length_squared <= PARALLEL_SINE_SQUARED * u_squared * v_squared:
+            return 0.0, 0.0, 0.0, 0.0
+        # Rounding leans the product towards the edges by up to 2^-53 / sine. The edges then no
+        # longer project to points, which the overlaps count on, and long edges seem apart.
+        if u_squared >= v_squared:
+            lean = (dx * ux + dy * uy + dz * uz) / u_squared
+            dx, dy, dz = dx - lean * ux, dy - lean * uy, dz - lean * uz
+        else:
+            lean = (dx * vx + dy * vy + dz * vz) / v_squared
+            dx, dy, dz = dx - lean * vx, dy - lean * vy, dz - lean * vz
+        length_squared = dx * dx + dy * dy + dz * dz
+    return dx, dy, dz, length_squared
+
+
+@njit(inline="always", error_model="numpy")
+def _along(triangles, t, k, ox, oy, oz, dx, dy, dz):
+    """Return where corner k of triangle t lies along d, seen from o."""
+    return (
+        dx * (triangles[t, k, 0] - ox)
+        + dy * (triangles[t, k, 1] - oy)
+        + dz * (triangles[t, k, 2] - oz)
+    )
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _pair_depth_squared(triangles, a, b, tolerance):
     """Return the squared depth of triangles a and b, or 0 where it is at most `tolerance`.
@@ -125,26 +159,12 @@ def _pair_depth_squared(triangles, a, b, tolerance):
         ox, oy, oz = triangles[p, 0, 0], triangles[p, 0, 1], triangles[p, 0, 2]
         ux, uy, uz = triangles[p, 1, 0] - ox, triangles[p, 1, 1] - oy, triangles[p, 1, 2] - oz
         vx, vy, vz = triangles[p, 2, 0] - ox, triangles[p, 2, 1] - oy, triangles[p, 2, 2] - oz
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        length_squared = nx * nx + ny * ny + nz * nz
-        edges_squared = (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz)
-        if length_squared <= PARALLEL_SINE_SQUARED * edges_squared:
+        nx, ny, nz, length_squared = _across(ux, uy, uz, vx, vy, vz)
+        if length_squared == 0.0:
             continue
-        q0 = (
-            nx * (triangles[q, 0, 0] - ox)
-            + ny * (triangles[q, 0, 1] - oy)
-            + nz * (triangles[q, 0, 2] - oz)
-        )
-        q1 = (
-            nx * (triangles[q, 1, 0] - ox)
-            + ny * (triangles[q, 1, 1] - oy)
-            + nz * (triangles[q, 1, 2] - oz)
-        )
-        q2 = (
-            nx * (triangles[q, 2, 0] - ox)
-            + ny * (triangles[q, 2, 1] - oy)
-            + nz * (triangles[q, 2, 2] - oz)
-        )
+        q0 = _along(triangles, q, 0, ox, oy, oz, nx, ny, nz)
+        q1 = _along(triangles, q, 1, ox, oy, oz, nx, ny, nz)
+        q2 = _along(triangles, q, 2, ox, oy, oz, nx, ny, nz)
         overlap = min(max(q0, max(q1, q2)), -min(q0, min(q1, q2)))
         if overlap <= 0.0 or overlap * overlap <= tolerance_squared * length_squared:
             return 0.0
@@ -162,7 +182,6 @@ def _pair_depth_squared(triangles, a, b, tolerance):
         wx = triangles[a, i_opposite, 0] - ox
         wy = triangles[a, i_opposite, 1] - oy
         wz = triangles[a, i_opposite, 2] - oz
-        u_squared = ux * ux + uy * uy + uz * uz
         for j in range(3):
             j_next = j + 1 if j < 2 else 0
             j_opposite = j_next + 1 if j_next < 2 else 0
@@ -170,18 +189,12 @@ def _pair_depth_squared(triangles, a, b, tolerance):
             vx = triangles[b, j_next, 0] - sx
             vy = triangles[b, j_next, 1] - sy
             vz = triangles[b, j_next, 2] - sz
-            dx, dy, dz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            length_squared = dx * dx + dy * dy + dz * dz
-            v_squared = vx * vx + vy * vy + vz * vz
-            if length_squared <= PARALLEL_SINE_SQUARED * u_squared * v_squared:
+            dx, dy, dz, length_squared = _across(ux, uy, uz, vx, vy, vz)
+            if length_squared == 0.0:
                 continue
             a_opposite = dx * wx + dy * wy + dz * wz
             b_edge = dx * (sx - ox) + dy * (sy - oy) + dz * (sz - oz)
-            b_opposite = (
-                dx * (triangles[b, j_opposite, 0] - ox)
-                + dy * (triangles[b, j_opposite, 1] - oy)
-                + dz * (triangles[b, j_opposite, 2] - oz)
-            )
+            b_opposite = _along(triangles, b, j_opposite, ox, oy, oz, dx, dy, dz)
             overlap = min(
                 max(0.0, a_opposite) - min(b_edge, b_opposite),
                 max(b_edge, b_opposite) - min(0.0, a_opposite),
