@@ -15,6 +15,10 @@ class MeshFileError(LCollisionError):
     """A file cannot be read as a mesh or a pose set, or cannot be written."""
 
 
+class ModelFileError(LCollisionError):
+    """A file cannot be read as a model or as poses of a model, or cannot be written."""
+
+
 class PoseSetError(LCollisionError):
     """Meshes cannot form one pose set: their topology differs, or a pose is not usable."""
 

@@ -1,0 +1,260 @@
+"""The container of a model: one safetensors file of named sections, whole or refused.
+
+A section is a room's own: arrays and JSON metadata under one name. The file's tensors are called
+``section/array``; its one metadata entry, ``lcollision``, is a JSON document of the format
+version, the sections' metadata and a SHA-256 of all of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, BinaryIO, NoReturn
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError, ModelFileError
+from lcollision_core.meshes.atomic import atomic_write
+
+FORMAT_VERSION = 1
+"""The version that `write_model_file` stores; later ones are refused."""
+
+MAX_HEADER_BYTES = 16 * 2**20
+MAX_FILE_BYTES = 4 * 2**30
+
+_METADATA_KEY = "lcollision"
+_DTYPES = {
+    "F32": np.dtype(np.float32),
+    "F64": np.dtype(np.float64),
+    "I32": np.dtype(np.int32),
+    "I64": np.dtype(np.int64),
+    "U8": np.dtype(np.uint8),
+    "BOOL": np.dtype(np.bool_),
+}
+
+
+@dataclass(frozen=True)
+class Section:
+    """What one room keeps in a model file.
+
+    Attributes
+    ----------
+    arrays : read-only arrays by name, of float32, float64, int32, int64, uint8 or bool; floats
+        are finite
+    metadata : JSON values by name
+    """
+
+    arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "arrays", MappingProxyType(dict(self.arrays)))
+        object.__setattr__(self, "metadata", MappingProxyType(dict(self.metadata)))
+
+
+def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Section]) -> None:
+    """Write a model file, whole or not at all; equal sections give equal bytes.
+
+    Parameters
+    ----------
+    path : the file to write; its folder must exist
+    sections : by name; sections that this program does not know are written like any other
+
+    Raises
+    ------
+    ModelFileError : the file cannot be written, or a section holds what the format cannot, such
+        as a number that is not finite.
+    """
+    from safetensors.numpy import save
+
+    tensors = {}
+    for section_name, section in sections.items():
+        for name, array in section.arrays.items():
+            full_name = f"{section_name}/{name}"
+            _require_storable(full_name, array)
+            # ascontiguousarray alone would turn a single number into an array of one.
+            tensors[full_name] = np.ascontiguousarray(array).reshape(array.shape)
+    try:
+        described = _canonical_json(
+            {name: dict(section.metadata) for name, section in sections.items()}
+        )
+    except (TypeError, ValueError) as error:
+        raise ModelFileError(
+            f"{path} cannot be written: its metadata is no JSON ({error}); keep plain values there"
+        ) from error
+    document = _canonical_json(
+        {
+            "format_version": FORMAT_VERSION,
+            "sections": json.loads(described),
+            "sha256": _digest(FORMAT_VERSION, described, tensors),
+        }
+    )
+    encoded = save(tensors, metadata={_METADATA_KEY: document})
+    try:
+        with atomic_write(path) as file:
+            file.write(encoded)
+    except MeshFileError as error:
+        raise ModelFileError(str(error)) from error
+
+
+def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
+    """Read a model file; nothing in it is ever run.
+
+    Parameters
+    ----------
+    path : a file that `write_model_file` wrote
+
+    Returns
+    -------
+    the sections by name, those that this program does not know among them
+
+    Raises
+    ------
+    ModelFileError : the file is missing, empty, truncated, damaged, no model of this program, of
+        a later version, or larger than `MAX_FILE_BYTES`.
+    """
+    source = Path(path)
+    try:
+        # Opening a pipe would block, and a folder's own error is a riddle.
+        if not stat.S_ISREG(source.stat().st_mode):
+            kind = "a folder" if source.is_dir() else "not a plain file"
+            raise ModelFileError(f"{path} is no model: it is {kind}; name a model file")
+        with source.open("rb") as file:
+            return _read_open_file(file, path)
+    except FileNotFoundError as error:
+        raise ModelFileError(f"{path} does not exist; check the name") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ModelFileError(f"{path} cannot be read: {reason}; check the file") from error
+
+
+def _read_open_file(file: BinaryIO, path: str | os.PathLike[str]) -> dict[str, Section]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    size = os.fstat(file.fileno()).st_size
+    if size == 0:
+        raise ModelFileError(f"{path} is empty; copy or train the model again")
+    if size > MAX_FILE_BYTES:
+        raise ModelFileError(
+            f"{path} has {size} bytes, more than the {MAX_FILE_BYTES} of any model; check the name"
+        )
+    # The header first, so that a file of another kind is refused before it fills the memory.
+    header = _read_header(file, size, path)
+    file.seek(0)
+    content = file.read()
+    if len(content) != size or header.end_of_data != size:
+        raise ModelFileError(
+            f"{path} has {len(content)} bytes, but should have {header.end_of_data}: it was "
+            f"truncated or added to; copy or train the model again"
+        )
+    try:
+        tensors = load(content)
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        _refuse_damaged(path, error)
+    del content
+    document = header.document
+    described = _canonical_json(document["sections"])
+    if _digest(document["format_version"], described, tensors) != document["sha256"]:
+        _refuse_damaged(path)
+    arrays: dict[str, dict[str, npt.NDArray[Any]]] = {name: {} for name in document["sections"]}
+    for full_name, array in tensors.items():
+        section_name, _, name = full_name.partition("/")
+        if section_name not in arrays:
+            _refuse_damaged(path)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ModelFileError(
+                f"{path} is unusable: its {full_name} holds a number that is not finite; train "
+                f"the model again"
+            )
+        array.flags.writeable = False
+        arrays[section_name][name] = array
+    return {
+        name: Section(arrays[name], metadata) for name, metadata in document["sections"].items()
+    }
+
+
+@dataclass(frozen=True)
+class _Header:
+    """The JSON document of a model file, and where its last tensor ends, in bytes."""
+
+    document: dict[str, Any]
+    end_of_data: int
+
+
+def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _Header:
+    foreign = ModelFileError(
+        f"{path} is no model of this program; name a file that `lcollision train` wrote"
+    )
+    length = int.from_bytes(file.read(8), "little")
+    if size < 8 or length > MAX_HEADER_BYTES:
+        raise foreign
+    text = file.read(length)
+    if not text.startswith(b"{"):
+        raise foreign
+    if len(text) < length:
+        raise ModelFileError(f"{path} was truncated at {size} bytes; copy or train the model again")
+    try:
+        header = _parse_json(text.decode("utf-8"))
+        metadata = header.pop("__metadata__", {})
+        if _METADATA_KEY not in metadata:
+            raise foreign
+        document = _parse_json(metadata[_METADATA_KEY])
+        version = document["format_version"]
+        if isinstance(version, int) and version > FORMAT_VERSION:
+            raise ModelFileError(
+                f"{path} has format version {version}, this program reads up to "
+                f"{FORMAT_VERSION}; update the program"
+            )
+        if version != FORMAT_VERSION or isinstance(version, bool):
+            _refuse_damaged(path)
+        if not all(isinstance(section, dict) for section in document["sections"].values()):
+            _refuse_damaged(path)
+        unknown = {tensor["dtype"] for tensor in header.values()} - _DTYPES.keys()
+        if unknown or not isinstance(document["sha256"], str):
+            _refuse_damaged(path)
+        ends = [int(tensor["data_offsets"][1]) for tensor in header.values()]
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        _refuse_damaged(path, error)
+    return _Header(document, 8 + length + max(ends, default=0))
+
+
+def _refuse_damaged(path: str | os.PathLike[str], cause: Exception | None = None) -> NoReturn:
+    raise ModelFileError(f"{path} is damaged; copy or train the model again") from cause
+
+
+def _parse_json(text: str) -> Any:
+    def refuse(word: str) -> NoReturn:
+        raise ValueError(f"{word} is no JSON number")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def _canonical_json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, allow_nan=False, separators=(",", ":"))
+
+
+def _require_storable(full_name: str, array: npt.NDArray[Any]) -> None:
+    if array.dtype not in _DTYPES.values():
+        raise ModelFileError(f"a model cannot hold {full_name} of dtype {array.dtype}; convert it")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ModelFileError(
+            f"a model cannot hold {full_name}: it has a number that is not finite; train again"
+        )
+
+
+def _digest(version: int, described: str, tensors: Mapping[str, npt.NDArray[Any]]) -> str:
+    """Return the SHA-256 of all that the file says, whatever its bytes' order."""
+    digest = hashlib.sha256(f"{version}\n{described}\n".encode())
+    for name in sorted(tensors):
+        array = tensors[name]
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
+    return digest.hexdigest()
