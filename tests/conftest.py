@@ -6,8 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner, Result
 
+from app.cli.main import app
 from lcollision_core.meshes import PoseSet, read_pose_set
+from tests.app.support import Lcollision
 
 
 def _published_set(name: str) -> PoseSet:
@@ -30,3 +33,16 @@ def scape() -> PoseSet:
 def jumping() -> PoseSet:
     """Return the 150 frames of the MIT jumping sequence at 10 002 vertices."""
     return _published_set("jumping150.npz")
+
+
+@pytest.fixture
+def lcollision() -> Lcollision:
+    """Run ``lcollision ARGUMENTS``; the result has exit_code, stdout and stderr."""
+
+    def run(*arguments: object) -> Result:
+        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result
+
+    return run

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json
+from app.cli.console import ExitStatus, counted, note, print_json
 from lcollision_core.errors import LCollisionError
 
 
@@ -79,12 +79,14 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
 def _sentence(report: dict[str, Any]) -> str:
     if report["colliding"]:
         verdict = (
-            f"{report['pairs']} pairs of faces collide, "
+            f"colliding, {counted(report['pairs'], 'pair of faces', 'pairs of faces')}, "
             f"energy {report['energy']:.3g} squared heights"
         )
     else:
         verdict = "free of self-collisions"
-    folds = f", {report['near_pairs']} pairs in skin folds" if report["near_pairs"] else ""
+    folds = (
+        f", {counted(report['near_pairs'], 'pair')} in skin folds" if report["near_pairs"] else ""
+    )
     return (
         f"{report['file']}: {verdict}{folds} "
         f"({report['vertices']} vertices, {report['faces']} faces, {report['seconds']:.2f} s)"

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar
+from app.cli.console import ExitStatus, counted, note, print_json, progress_bar
 
 app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no_args_is_help=True)
 
@@ -85,15 +85,16 @@ def check(
 def _print(path: Path, report: dict[str, Any]) -> None:
     surface = "watertight" if report["watertight"] else "not watertight"
     typer.echo(
-        f"{path}: {report['poses']} poses of {report['vertices']} vertices and "
+        f"{path}: {counted(report['poses'], 'pose')} of {report['vertices']} vertices and "
         f"{report['faces']} faces, {surface}"
     )
     for problem in report["problems"]:
         typer.echo(f"  problem: {problem}")
-    typer.echo(f"  {report['colliding_poses']} poses intersect themselves")
+    n_colliding = report["colliding_poses"]
+    typer.echo(f"  {counted(n_colliding, 'pose intersects itself', 'poses intersect themselves')}")
     for pose in report["colliding"]:
         typer.echo(
-            f"    {pose['pose']}: {pose['pairs']} pairs, "
+            f"    {pose['pose']}: {counted(pose['pairs'], 'pair')}, "
             f"energy {pose['energy']:.3g} squared heights"
         )
 

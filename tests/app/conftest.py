@@ -5,23 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
-from app.cli.main import app
-from tests.app.support import STABBED, Lcollision
-
-
-@pytest.fixture
-def lcollision() -> Lcollision:
-    """Run ``lcollision ARGUMENTS``; the result has exit_code, stdout and stderr."""
-
-    def run(*arguments: object) -> Result:
-        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result
-
-    return run
+from tests.app.support import STABBED
 
 
 @pytest.fixture
