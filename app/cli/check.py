@@ -88,6 +88,6 @@ def _sentence(report: dict[str, Any]) -> str:
         f", {counted(report['near_pairs'], 'pair')} in skin folds" if report["near_pairs"] else ""
     )
     return (
-        f"{report['file']}: {verdict}{folds} "
+        f"{report['file']}: {verdict} "
         f"({report['vertices']} vertices, {report['faces']} faces, {report['seconds']:.2f} s)"
     )
