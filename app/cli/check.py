@@ -84,9 +84,8 @@ def _sentence(report: dict[str, Any]) -> str:
         )
     else:
         verdict = "free of self-collisions"
-    folds = (
-        f", {counted(report['near_pairs'], 'pair')} in skin folds" if report["near_pairs"] else ""
-    )
+    if report["near_pairs"]:
+        verdict += f", {counted(report['near_pairs'], 'pair')} in skin folds"
     return (
         f"{report['file']}: {verdict} "
         f"({report['vertices']} vertices, {report['faces']} faces, {report['seconds']:.2f} s)"
