@@ -1,0 +1,231 @@
+"""A figure: a pose as a person describes it, turned into joint angles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.meshes.body.skeleton import (
+    BONES,
+    MIRROR,
+    Skeleton,
+    turn_x,
+    turn_y,
+    turn_z,
+)
+
+FloatArray = npt.NDArray[np.float64]
+
+
+STRAIGHT = 0.998
+"""Share of its full length to which a standing leg stretches: a knee bent by seven degrees."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Joint angles of one arm, in degrees.
+
+    Attributes
+    ----------
+    lift : from hanging (0) to straight up (180); negative swings to the other side
+    plane : in which it is lifted: 0 sideways, 90 forward, more across the chest, less behind
+    turn : about its own length, inward positive; a hanging arm bends its elbow forward at 0
+    elbow : 0 straight
+    pronation : 0 thumb forward on a hanging arm, positive turns the palm back
+    wrist : towards the palm positive
+    shrug : lift of the shoulder beyond what follows from `lift`
+    """
+
+    lift: float
+    plane: float = 20.0
+    turn: float = 0.0
+    elbow: float = 15.0
+    pronation: float = 20.0
+    wrist: float = 5.0
+    shrug: float = 0.0
+
+
+@dataclass(frozen=True)
+class Leg:
+    """Joint angles of one leg, in degrees: flexion and spread of the hip, then downwards."""
+
+    flexion: float
+    spread: float = 5.0
+    turn: float = 5.0
+    knee: float = 5.0
+    ankle: float = 0.0
+    toes: float = 0.0
+
+
+@dataclass(frozen=True)
+class Foot:
+    """Where one foot stands; the leg's joint angles follow.
+
+    Attributes
+    ----------
+    out : of its ankle from the middle line, to its own side, metres
+    ahead : of its ankle before the pelvis at rest, metres
+    heading : of its toes, outward positive, degrees
+    heel : lift of the heel about the ball of the foot, degrees
+    height : of the sole above the floor, metres
+    """
+
+    out: float = 0.12
+    ahead: float = 0.0
+    heading: float = 8.0
+    heel: float = 0.0
+    height: float = 0.0
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One pose as it is authored.
+
+    Attributes
+    ----------
+    left_arm, right_arm : `Arm`
+    left_leg, right_leg : `Leg` for one that hangs free, `Foot` for one that stands
+    spine, neck : forward bend, lean to the left, turn to the left, degrees
+    drop, shift, ahead : of the pelvis: down from where the legs are straight, to the left, forward,
+        metres
+    lean, roll, turn : of the pelvis: forward, to the left, about the vertical to the left, degrees
+    rise : of the pelvis above where it is at rest, metres; where given, `drop` has no say
+    """
+
+    left_arm: Arm = Arm(14)
+    right_arm: Arm = Arm(14)
+    left_leg: Leg | Foot = Foot()
+    right_leg: Leg | Foot = Foot()
+    spine: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    neck: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    drop: float = 0.0
+    shift: float = 0.0
+    ahead: float = 0.0
+    lean: float = 0.0
+    roll: float = 0.0
+    turn: float = 0.0
+    rise: float | None = None
+
+    def pelvis(self, skeleton: Skeleton) -> tuple[FloatArray, FloatArray]:
+        """Orientation (3, 3) and location (3,) of the pelvis."""
+        orientation = turn_z(self.turn) @ turn_x(self.lean) @ turn_y(self.roll)
+        location = skeleton.positions[0] + [self.shift, -self.ahead, 0.0]
+        if self.rise is not None:
+            location[2] += self.rise
+            return orientation, location
+        heights = [
+            _straight_height(skeleton, orientation, location, leg, side)
+            for side, leg in (("left", self.left_leg), ("right", self.right_leg))
+            if isinstance(leg, Foot)
+        ]
+        location[2] = min(heights, default=location[2]) - self.drop
+        return orientation, location
+
+    def angles(self, skeleton: Skeleton) -> dict[str, float]:
+        """Joint angles by name, in degrees."""
+        angles: dict[str, float] = {}
+        for part, values in (("spine", self.spine), ("neck", self.neck)):
+            for name, value in zip(("bend", "side", "twist"), values, strict=True):
+                angles[f"{part} {name}"] = value
+        for side, arm in (("left", self.left_arm), ("right", self.right_arm)):
+            angles[f"{side} arm raise"] = arm.lift
+            angles[f"{side} arm plane"] = arm.plane
+            angles[f"{side} arm turn"] = arm.turn
+            angles[f"{side} elbow"] = arm.elbow
+            angles[f"{side} pronation"] = arm.pronation
+            angles[f"{side} wrist bend"] = arm.wrist
+            angles[f"{side} shrug"] = arm.shrug
+        for side, leg in (("left", self.left_leg), ("right", self.right_leg)):
+            if isinstance(leg, Foot):
+                own = _reach(skeleton, *self.pelvis(skeleton), leg, side)
+            else:
+                own = {
+                    "hip flexion": leg.flexion,
+                    "hip spread": leg.spread,
+                    "hip turn": leg.turn,
+                    "knee": leg.knee,
+                    "ankle": leg.ankle,
+                    "toes": leg.toes,
+                }
+            angles |= {f"{side} {name}": value for name, value in own.items()}
+        return angles
+
+
+def straight_rise(figure: Figure, skeleton: Skeleton) -> float:
+    """How far the pelvis rises above rest when `figure` stands on straight legs, metres."""
+    _, location = figure.pelvis(skeleton)
+    return float(location[2] + figure.drop - skeleton.positions[0][2])
+
+
+def _straight_height(
+    skeleton: Skeleton, orientation: FloatArray, location: FloatArray, foot: Foot, side: str
+) -> float:
+    """Height of the pelvis at which the leg to `foot` is all but straight."""
+    hip, ankle, length = _standing_leg(skeleton, orientation, location, foot, side)
+    level = np.hypot(*(hip - ankle)[:2])
+    rise = np.sqrt(max((STRAIGHT * length) ** 2 - level**2, (0.3 * length) ** 2))
+    return float(location[2] + ankle[2] + rise - hip[2])
+
+
+def _standing_leg(
+    skeleton: Skeleton, orientation: FloatArray, location: FloatArray, foot: Foot, side: str
+) -> tuple[FloatArray, FloatArray, float]:
+    """Hip (3,) and ankle (3,), seen in a mirror for the right leg, and the leg's length."""
+    reflect = np.eye(3) if side == "left" else MIRROR
+    hip, knee, ankle, ball = _leg_joints(skeleton)
+    length = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
+    place = np.array([foot.out, -foot.ahead, ankle[2] + foot.height])
+    heading = turn_z(foot.heading)
+    sole = heading @ turn_x(foot.heel)
+    target = place + heading @ (ball - ankle) + sole @ (ankle - ball)
+    offset = reflect @ orientation @ reflect @ (hip - skeleton.positions[0])
+    return reflect @ location + offset, target, length
+
+
+def _leg_joints(skeleton: Skeleton) -> list[FloatArray]:
+    names = ("thigh", "shin", "foot", "toes")
+    return [skeleton.positions[BONES.index(f"left {name}")] for name in names]
+
+
+def _reach(
+    skeleton: Skeleton, orientation: FloatArray, location: FloatArray, foot: Foot, side: str
+) -> dict[str, float]:
+    """Joint angles of a leg whose foot stands at `foot`: the cosine rule, knee over toes."""
+    reflect = np.eye(3) if side == "left" else MIRROR
+    orientation = reflect @ orientation @ reflect
+    hip, knee, ankle, _ = _leg_joints(skeleton)
+    thigh = float(np.linalg.norm(knee - hip))
+    shin = float(np.linalg.norm(ankle - knee))
+    sole = turn_z(foot.heading) @ turn_x(foot.heel)
+    start, target, _ = _standing_leg(
+        skeleton, reflect @ orientation @ reflect, location, foot, side
+    )
+    reach = orientation.T @ (target - start)
+    distance = min(float(np.linalg.norm(reach)), 0.9995 * (thigh + shin))
+    cosine = (thigh**2 + shin**2 - distance**2) / (2 * thigh * shin)
+    bend = np.pi - np.arccos(np.clip(cosine, -1.0, 1.0))
+    local = np.array([0.0, shin * np.sin(bend), -thigh - shin * np.cos(bend)])
+    heading = orientation.T @ turn_z(foot.heading) @ [0.0, -1.0, 0.0]
+    swing = _frame(reach, heading) @ _frame(local, np.array([0.0, -1.0, 0.0])).T
+    flexion, spread, turn = Rotation.from_matrix(swing).as_euler("XYZ", degrees=True)
+    lower = orientation @ swing @ turn_x(np.degrees(bend))
+    lift, tilt, _ = Rotation.from_matrix(lower.T @ sole).as_euler("XYZ", degrees=True)
+    return {
+        "hip flexion": -float(flexion),
+        "hip spread": -float(spread),
+        "hip turn": float(turn),
+        "knee": float(np.degrees(bend)),
+        "ankle": -float(lift),
+        "foot tilt": float(tilt),
+        "toes": max(0.0, foot.heel) if foot.height < 0.03 else 0.0,
+    }
+
+
+def _frame(along: FloatArray, towards: FloatArray) -> FloatArray:
+    first = along / np.linalg.norm(along)
+    second = towards - (towards @ first) * first
+    second /= np.linalg.norm(second)
+    return np.column_stack([first, second, np.cross(first, second)])
