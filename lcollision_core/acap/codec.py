@@ -12,20 +12,20 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.acap.bridges import component_bridges
-from lcollision_core.acap.compiled import compiled
 from lcollision_core.acap.consistency import component_roots, consistent_logarithms
 from lcollision_core.acap.features import (
     N_FEATURES,
+    N_ROTATION,
     gradients_from_features,
     pull_back,
     push_forward,
 )
 from lcollision_core.acap.gradients import deformation_gradients, fit_rings
 from lcollision_core.acap.reconstruct import BLOCK_POSES, factor_poisson
-from lcollision_core.acap.rotations import polar_factors, quaternion_of
+from lcollision_core.acap.rotations import split_gradients
 from lcollision_core.acap.weights import cotangent_weights
 from lcollision_core.errors import ShapeError
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+from lcollision_core.meshes.topology import FloatArray, Topology
 
 if TYPE_CHECKING:
     import torch
@@ -123,14 +123,16 @@ class AcapCodec:
         n_jumps = np.zeros(len(poses), dtype=np.int64)
 
         def encode_block(start: int, stop: int) -> None:
-            sharpened = self._sharpen(poses[start:stop])
-            for pose in range(start, stop):
-                n_jumps[pose] = _features_of_pose(
-                    sharpened[pose - start],
-                    self.topology.faces,
-                    *self._fit.arrays,
+            gradients = self._sharpened_gradients(poses[start:stop])
+            quaternions = np.empty((self.topology.n_vertices, 4))
+            for pose, field in enumerate(gradients, start):
+                split_gradients(field, quaternions, features[pose, :, N_ROTATION:])
+                n_jumps[pose] = consistent_logarithms(
+                    quaternions,
+                    self._fit.ring_start,
+                    self._fit.ring,
                     self._roots,
-                    features[pose],
+                    features[pose, :, :N_ROTATION],
                 )
 
         _spread(encode_block, len(poses), BLOCK_POSES, n_threads)
@@ -245,14 +247,17 @@ class AcapCodec:
 
         return decode_torch(self, features)
 
-    def _sharpen(self, poses: FloatArray) -> FloatArray:
-        """Add to each pose what its round trip would lose, so that it loses it no more."""
+    def _gradients(self, poses: FloatArray) -> FloatArray:
         gradients = np.empty((len(poses), self.topology.n_vertices, 3, 3))
         for pose, field in zip(poses, gradients, strict=True):
             deformation_gradients(pose, self.topology.faces, *self._fit.arrays, field)
+        return gradients
+
+    def _sharpened_gradients(self, poses: FloatArray) -> FloatArray:
+        """Take the gradients of each pose plus what its round trip would otherwise lose."""
         rebuilt = np.empty_like(poses)
-        self._poisson.solve(gradients, rebuilt)
-        return 2.0 * poses - rebuilt
+        self._poisson.solve(self._gradients(poses), rebuilt)
+        return self._gradients(2.0 * poses - rebuilt)
 
     def _checked(self, array: npt.NDArray[Any], width: int, name: str) -> FloatArray:
         shape = np.shape(array)
@@ -279,43 +284,3 @@ def _spread(
     with ThreadPoolExecutor(min(wanted, len(blocks))) as pool:
         for future in [pool.submit(work, start, stop) for start, stop in blocks]:
             future.result()
-
-
-@compiled
-def _features_of_pose(
-    vertices: FloatArray,
-    faces: IntArray,
-    ring_start: IntArray,
-    ring: IntArray,
-    ring_solution: FloatArray,
-    normal_solution: FloatArray,
-    kept_identity: FloatArray,
-    roots: IntArray,
-    features: FloatArray,
-) -> int:
-    """Write the (V, 9) features of one pose and return its number of jumping edges."""
-    n_vertices = len(vertices)
-    gradients = np.empty((n_vertices, 3, 3))
-    deformation_gradients(
-        vertices,
-        faces,
-        ring_start,
-        ring,
-        ring_solution,
-        normal_solution,
-        kept_identity,
-        gradients,
-    )
-    quaternions = np.empty((n_vertices, 4))
-    rotation = np.empty((3, 3))
-    stretch = np.empty((3, 3))
-    for i in range(n_vertices):
-        polar_factors(gradients[i], rotation, stretch)
-        quaternion_of(rotation, quaternions[i])
-        features[i, 3] = stretch[0, 0]
-        features[i, 4] = stretch[0, 1]
-        features[i, 5] = stretch[0, 2]
-        features[i, 6] = stretch[1, 1]
-        features[i, 7] = stretch[1, 2]
-        features[i, 8] = stretch[2, 2]
-    return consistent_logarithms(quaternions, ring_start, ring, roots, features[:, :3])

@@ -15,6 +15,9 @@ def compiled(function: Function) -> Function:
 
     The lock is released so that a batch spreads over ordinary threads: numba's own thread pool
     is not safe to enter from two threads at once on every platform, and the editor does that.
+
+    A compiled function calls only those of its own file: the cache is renewed when that file
+    changes, and would not see a change elsewhere.
     """
     return cast(
         Function, numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=False)(function)

@@ -11,7 +11,9 @@ from scipy.sparse import csgraph, csr_matrix
 from lcollision_core.acap.compiled import compiled
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
+_TURN = 2.0 * math.pi
 _AXIS_DEFINED_ABOVE = 1e-7
+_AXIS_TRUSTED_ABOVE = 0.7
 _N_LANDMARKS = 8
 
 
@@ -151,26 +153,68 @@ def spanning_order(
 
 @compiled
 def _choose_turn(q: FloatArray, near: FloatArray, log: FloatArray) -> None:
-    """Write the vector of the rotation `q` that is nearest to the vector `near`.
+    """Write the rotation vector of `q` whose axis and angle agree best with the vector `near`.
 
-    All vectors of one rotation lie on the line of its axis, 2 pi apart; the flip
-    (w, t) -> (-w, 2 pi - t) is one of them.
+    All vectors of one rotation lie on the line of its axis, 2 pi apart: the axis is flipped where
+    it opposes that of `near`, then whole turns are added until the angles agree to pi.
     """
     half_sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    turn = 2.0 * math.pi
+    wanted = math.sqrt(near[0] * near[0] + near[1] * near[1] + near[2] * near[2])
     if half_sine > _AXIS_DEFINED_ABOVE:
         angle = 2.0 * math.atan2(half_sine, q[0])
         x, y, z = q[1] / half_sine, q[2] / half_sine, q[3] / half_sine
-        wanted = x * near[0] + y * near[1] + z * near[2]
-        angle += turn * math.floor((wanted - angle) / turn + 0.5)
+        if x * near[0] + y * near[1] + z * near[2] < 0.0:
+            wanted = -wanted
+        angle += _TURN * math.floor((wanted - angle) / _TURN + 0.5)
         log[0], log[1], log[2] = angle * x, angle * y, angle * z
         return
-    # No axis to speak of: full turns about the parent's.
-    length = math.sqrt(near[0] * near[0] + near[1] * near[1] + near[2] * near[2])
-    turns = math.floor(length / turn + 0.5)
-    scale = turns * turn / length if turns > 0.0 else 0.0
+    # No axis to speak of: whole turns about that of `near`.
+    turns = math.floor(wanted / _TURN + 0.5)
+    scale = turns * _TURN / wanted if turns > 0.0 else 0.0
     for a in range(3):
         log[a] = scale * near[a] + 2.0 * q[1 + a]
+
+
+@compiled
+def _hand_down(
+    q: FloatArray, log: FloatArray, from_parent: FloatArray, carried: FloatArray
+) -> None:
+    """Write the vector that a vertex's children shall agree with.
+
+    It is the vertex's own, but near a whole turn, where the slightest sideways tilt turns the axis
+    away: there the parent's axis is passed on, or what lies beyond would be wound back.
+    """
+    half_sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    length = math.sqrt(log[0] * log[0] + log[1] * log[1] + log[2] * log[2])
+    scale = 0.0
+    if half_sine < _AXIS_TRUSTED_ABOVE and length > math.pi:
+        scale = length / math.sqrt(
+            from_parent[0] * from_parent[0]
+            + from_parent[1] * from_parent[1]
+            + from_parent[2] * from_parent[2]
+        )
+    for a in range(3):
+        carried[a] = scale * from_parent[a] if scale > 0.0 else log[a]
+
+
+@compiled
+def _count_jumps(logs: FloatArray, ring_start: IntArray, ring: IntArray) -> int:
+    """Count the edges whose angles differ by more than pi once their axes point the same way."""
+    n_jumps = 0
+    for vertex in range(len(logs)):
+        for k in range(ring_start[vertex], ring_start[vertex + 1]):
+            other = ring[k]
+            if other < vertex:
+                continue
+            here, there, along = 0.0, 0.0, 0.0
+            for a in range(3):
+                here += logs[vertex, a] * logs[vertex, a]
+                there += logs[other, a] * logs[other, a]
+                along += logs[vertex, a] * logs[other, a]
+            signed = math.sqrt(there) if along >= 0.0 else -math.sqrt(there)
+            if abs(math.sqrt(here) - signed) > math.pi:
+                n_jumps += 1
+    return n_jumps
 
 
 @compiled
@@ -181,7 +225,7 @@ def consistent_logarithms(
     roots: IntArray,
     logs: FloatArray,
 ) -> int:
-    """Choose each vertex's rotation vector nearest to its parent's in the spanning tree.
+    """Choose each vertex's rotation vector to agree with its parent's in the spanning tree.
 
     The root has three choices (its short way round, and a full turn more or less); the one with
     the least sum of squared rotation vectors over the component is kept.
@@ -195,13 +239,14 @@ def consistent_logarithms(
 
     Returns
     -------
-    n_jumps : edges whose two vectors are still more than pi apart
+    n_jumps : edges whose angles still differ by more than pi, their axes pointing the same way
     """
     n_vertices = len(quaternions)
     order = np.empty(n_vertices, dtype=np.int32)
     parent = np.empty(n_vertices, dtype=np.int32)
     spanning_order(quaternions, ring_start, ring, roots, order, parent)
     trial = np.empty((n_vertices, 3))
+    carried = np.empty((n_vertices, 3))
     start = np.empty(3)
     begin = 0
     while begin < n_vertices:
@@ -215,31 +260,23 @@ def consistent_logarithms(
         for extra in range(-1, 2):
             if half_sine <= _AXIS_DEFINED_ABOVE and extra != 0:
                 continue
-            length = 2.0 * math.atan2(half_sine, q[0]) + 2.0 * math.pi * extra
+            length = 2.0 * math.atan2(half_sine, q[0]) + _TURN * extra
             for a in range(3):
                 start[a] = length * q[1 + a] / half_sine if extra != 0 else 0.0
             _choose_turn(q, start, trial[root])
+            carried[root] = trial[root]
             total = 0.0
             for k in range(begin, end):
                 vertex = order[k]
                 if k > begin:
-                    _choose_turn(quaternions[vertex], trial[parent[vertex]], trial[vertex])
+                    near = carried[parent[vertex]]
+                    _choose_turn(quaternions[vertex], near, trial[vertex])
+                    _hand_down(quaternions[vertex], trial[vertex], near, carried[vertex])
                 for a in range(3):
                     total += trial[vertex, a] * trial[vertex, a]
             if total < least:
                 least = total
                 for k in range(begin, end):
-                    for a in range(3):
-                        logs[order[k], a] = trial[order[k], a]
+                    logs[order[k]] = trial[order[k]]
         begin = end
-    n_jumps = 0
-    for vertex in range(n_vertices):
-        for k in range(ring_start[vertex], ring_start[vertex + 1]):
-            other = ring[k]
-            if other > vertex:
-                squared = 0.0
-                for a in range(3):
-                    squared += (logs[vertex, a] - logs[other, a]) ** 2
-                if squared > math.pi * math.pi:
-                    n_jumps += 1
-    return n_jumps
+    return _count_jumps(logs, ring_start, ring)

@@ -2,16 +2,56 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from lcollision_core.acap.compiled import compiled
-from lcollision_core.acap.rotations import exponential, exponential_coefficients
 from lcollision_core.meshes.topology import FloatArray
 
 N_FEATURES = 9
 N_ROTATION = 3
+_SERIES_BELOW = 1e-2
 IDENTITY_FEATURE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
 """(log R, S_xx, S_xy, S_xz, S_yy, S_yz, S_zz) of a vertex that does not deform."""
+
+
+@compiled
+def exponential_coefficients(angle_squared: float) -> tuple[float, float, float]:
+    """Evaluate the functions of theta in the exponential map and its derivative.
+
+    They are sin(theta)/theta, (1 - cos(theta))/theta^2 and (theta - sin(theta))/theta^3; by their
+    Taylor series for small theta, where the quotients lose their digits.
+    """
+    if angle_squared < _SERIES_BELOW:
+        t = angle_squared
+        return (
+            1.0 - t / 6.0 * (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0))),
+            0.5 * (1.0 - t / 12.0 * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0)))),
+            (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0 * (1.0 - t / 110.0)))) / 6.0,
+        )
+    angle = math.sqrt(angle_squared)
+    sine = math.sin(angle)
+    return (
+        sine / angle,
+        (1.0 - math.cos(angle)) / angle_squared,
+        (angle - sine) / (angle_squared * angle),
+    )
+
+
+@compiled
+def exponential(x: float, y: float, z: float, rotation: FloatArray) -> None:
+    """Write the rotation matrix of the vector (x, y, z) = theta * axis, any theta (Rodrigues)."""
+    a, b, _ = exponential_coefficients(x * x + y * y + z * z)
+    rotation[0, 0] = 1.0 - b * (y * y + z * z)
+    rotation[0, 1] = b * x * y - a * z
+    rotation[0, 2] = b * x * z + a * y
+    rotation[1, 0] = b * x * y + a * z
+    rotation[1, 1] = 1.0 - b * (x * x + z * z)
+    rotation[1, 2] = b * y * z - a * x
+    rotation[2, 0] = b * x * z - a * y
+    rotation[2, 1] = b * y * z + a * x
+    rotation[2, 2] = 1.0 - b * (x * x + y * y)
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""Rotations of 3 x 3 matrices: polar factors, quaternions, exponential map and its derivative."""
+"""The rotations in 3 x 3 matrices: polar factors and quaternions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from lcollision_core.acap.compiled import compiled
 from lcollision_core.meshes.topology import FloatArray
 
 _JACOBI_SWEEPS = 12
-_SERIES_BELOW = 1e-2
 
 
 @compiled
@@ -129,38 +128,23 @@ def quaternion_of(r: FloatArray, quaternion: FloatArray) -> None:
 
 
 @compiled
-def exponential_coefficients(angle_squared: float) -> tuple[float, float, float]:
-    """Evaluate the functions of theta in the exponential map and its derivative.
+def split_gradients(gradients: FloatArray, quaternions: FloatArray, stretches: FloatArray) -> None:
+    """Write the rotation and the stretch of every vertex's deformation gradient T = R S.
 
-    They are sin(theta)/theta, (1 - cos(theta))/theta^2 and (theta - sin(theta))/theta^3; by their
-    Taylor series for small theta, where the quotients lose their digits.
+    Parameters
+    ----------
+    gradients : (V, 3, 3) float64 array, T
+    quaternions : (V, 4) float64 array, overwritten with R as in `quaternion_of`
+    stretches : (V, 6) float64 array, overwritten with the upper triangle of S row by row
     """
-    if angle_squared < _SERIES_BELOW:
-        t = angle_squared
-        return (
-            1.0 - t / 6.0 * (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0))),
-            0.5 * (1.0 - t / 12.0 * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0)))),
-            (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0 * (1.0 - t / 110.0)))) / 6.0,
-        )
-    angle = math.sqrt(angle_squared)
-    sine = math.sin(angle)
-    return (
-        sine / angle,
-        (1.0 - math.cos(angle)) / angle_squared,
-        (angle - sine) / (angle_squared * angle),
-    )
-
-
-@compiled
-def exponential(x: float, y: float, z: float, rotation: FloatArray) -> None:
-    """Write the rotation matrix of the vector (x, y, z) = theta * axis, any theta (Rodrigues)."""
-    a, b, _ = exponential_coefficients(x * x + y * y + z * z)
-    rotation[0, 0] = 1.0 - b * (y * y + z * z)
-    rotation[0, 1] = b * x * y - a * z
-    rotation[0, 2] = b * x * z + a * y
-    rotation[1, 0] = b * x * y + a * z
-    rotation[1, 1] = 1.0 - b * (x * x + z * z)
-    rotation[1, 2] = b * y * z - a * x
-    rotation[2, 0] = b * x * z - a * y
-    rotation[2, 1] = b * y * z + a * x
-    rotation[2, 2] = 1.0 - b * (x * x + y * y)
+    rotation = np.empty((3, 3))
+    stretch = np.empty((3, 3))
+    for i in range(len(gradients)):
+        polar_factors(gradients[i], rotation, stretch)
+        quaternion_of(rotation, quaternions[i])
+        stretches[i, 0] = stretch[0, 0]
+        stretches[i, 1] = stretch[0, 1]
+        stretches[i, 2] = stretch[0, 2]
+        stretches[i, 3] = stretch[1, 1]
+        stretches[i, 4] = stretch[1, 2]
+        stretches[i, 5] = stretch[2, 2]
