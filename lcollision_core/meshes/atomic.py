@@ -66,10 +66,16 @@ def require_writable(path: str | os.PathLike[str]) -> None:
 
 def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
     target = Path(os.path.realpath(path))
-    if target.is_dir():
+    try:
+        is_folder, is_device = target.is_dir(), target.exists() and not target.is_file()
+    except OSError as error:
+        raise MeshFileError(
+            f"{path} cannot be written: {error.strerror or error}; choose another name"
+        ) from error
+    if is_folder:
         raise MeshFileError(f"{path} cannot be written: it is a folder; add a file name")
     # Renaming over a device such as /dev/null would replace it by a plain file.
-    if target.exists() and not target.is_file():
+    if is_device:
         raise MeshFileError(f"{path} cannot be written: it is not a plain file; choose another")
     if not target.parent.is_dir():
         raise MeshFileError(

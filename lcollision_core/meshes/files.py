@@ -117,9 +117,9 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
             if suffix == ".obj":
                 return obj.read(file, size)
             if suffix == ".ply":
-                return ply.read(file, size)
+                return ply.read(file)
             if suffix == ".off":
-                return off.read(file, size)
+                return off.read(file)
             if suffix == ".stl":
                 return stl.read(file, size, topology)
             return gltf.read(file, path)

@@ -17,9 +17,6 @@ from lcollision_core.errors import MeshFileError
 MAX_ITEMS = 1_000_000_000
 """The most numbers that one array may hold: 8 GB of float64."""
 
-# The dates of zip entries, fixed so that equal arrays give equal bytes.
-_DATE = (1980, 1, 1, 0, 0, 0)
-
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -105,9 +102,8 @@ def write_npz(file: BinaryIO, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     file : open binary file
     arrays : plain arrays by name
     """
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+    # Coordinates hardly shrink further at higher levels. Entries opened by name carry no date.
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, array in arrays.items():
-            info = zipfile.ZipInfo(f"{name}.npy", date_time=_DATE)
-            info.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(info, "w", force_zip64=True) as entry:
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, np.asarray(array), allow_pickle=False)

@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_few
-from lcollision_core.meshes.formats.text import decimals
+from lcollision_core.meshes.formats.text import decimals, plain_integers
 
-_SHORTEST_FACE = len(b"f 1 2 3\n")
+_SHORTEST_LINE = len(b"f 1 2 3\n")
 _BLOCK_LINES = 1 << 18
 
 
@@ -36,7 +36,8 @@ def read(file: BinaryIO, size: int) -> Polygons:
     ------
     MeshFileError : a vertex or face is not readable, named by its number from 0.
     """
-    require_few(file, b"\nf", _SHORTEST_FACE, size)
+    require_few(file, b"\nf", "faces", _SHORTEST_LINE, size)
+    require_few(file, b"\nv ", "vertices", _SHORTEST_LINE, size)
     data = read_rest(file)
     if b"\0" in data:
         raise MeshFileError("it is not a text file, so no OBJ; export the mesh again")
@@ -115,41 +116,50 @@ def _parse_faces(
     all_corners = [np.empty(0, dtype=np.int64)]
     for start in range(0, len(lines), _BLOCK_LINES):
         block = lines[start : start + _BLOCK_LINES]
-        words = _table(block)
-        if words is not None:
-            columns = len(words) // len(block)
-            del words[::columns]
-            sizes = np.full(len(block), columns - 1, dtype=np.int64)
-        else:
-            rows = [line.split()[1:] for line in block]
-            sizes = np.array([len(row) for row in rows], dtype=np.int64)
-            words = [word for row in rows for word in row]
-        try:
-            if any(b"/" in line for line in block):
-                words = [word.partition(b"/")[0] for word in words]
-            corners = np.array(list(map(int, words)), dtype=np.int64)
-        except (ValueError, OverflowError) as error:
-            raise MeshFileError(_first_bad_face(block, start)) from error
+        sizes, named = _parse_plain_triangles(block) or _parse_any_faces(block, start)
         owner = np.repeat(np.arange(start, start + len(block)), sizes)
-        zero = np.flatnonzero(corners == 0)
+        zero = np.flatnonzero(named == 0)
         if len(zero):
             raise MeshFileError(
                 f"face {owner[zero[0]]} (from 0) names vertex 0, but OBJ counts vertices from 1"
             )
-        if (corners < 0).any():
+        if (named < 0).any():
             counted = np.array(vertices_before, dtype=np.int64)[owner]
-            outside = np.flatnonzero(corners < -counted)
+            outside = np.flatnonzero(named < -counted)
             if len(outside):
                 raise MeshFileError(
-                    f"face {owner[outside[0]]} (from 0) names vertex {corners[outside[0]]}, "
+                    f"face {owner[outside[0]]} (from 0) names vertex {named[outside[0]]}, "
                     f"but only {counted[outside[0]]} vertices come before it"
                 )
-            corners = np.where(corners < 0, counted + corners, corners - 1)
-        else:
-            corners -= 1
+            named = np.where(named < 0, counted + named + 1, named)
         all_sizes.append(sizes)
-        all_corners.append(corners)
+        all_corners.append(named - 1)
     return np.concatenate(all_sizes), np.concatenate(all_corners)
+
+
+def _parse_plain_triangles(
+    block: list[bytes],
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+    """Parse the bulk of all files, `f 1 2 3` lines alone; None where anything else occurs."""
+    numbers = plain_integers(b" ".join(block).replace(b"f", b" 0 "))
+    # A zero for each keyword, at every row's start and nowhere else: no row is ragged.
+    if numbers is None or len(numbers) != 4 * len(block):
+        return None
+    if numbers[::4].any() or (numbers == 0).sum() != len(block):
+        return None
+    return np.full(len(block), 3, dtype=np.int64), numbers.reshape(-1, 4)[:, 1:].reshape(-1)
+
+
+def _parse_any_faces(
+    block: list[bytes], start: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    rows = [line.split()[1:] for line in block]
+    sizes = np.array([len(row) for row in rows], dtype=np.int64)
+    try:
+        named = [int(word.partition(b"/")[0]) for row in rows for word in row]
+        return sizes, np.array(named, dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise MeshFileError(_first_bad_face(block, start)) from error
 
 
 def _first_bad_face(block: list[bytes], start: int) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from itertools import chain
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -11,20 +10,19 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_plausible_count
-from lcollision_core.meshes.formats.text import decimals, numbers
+from lcollision_core.meshes.formats.text import decimals, numbers, plain_integers
 
 _HEADER = re.compile(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?C?N?OFF\b([^\n]*)", re.IGNORECASE)
 _COUNTS = re.compile(rb"(?:\s*(?:#[^\n]*\n)?)*(-?\d+)\s+(-?\d+)")
 _HEAD_BYTES = 1 << 16
 
 
-def read(file: BinaryIO, size: int) -> Polygons:  # noqa: ARG001
+def read(file: BinaryIO) -> Polygons:
     """Read the vertices and faces; colours, normals and texture coordinates are passed over.
 
     Parameters
     ----------
     file : open binary file at its start
-    size : its size in bytes
 
     Returns
     -------
@@ -50,28 +48,38 @@ def read(file: BinaryIO, size: int) -> Polygons:  # noqa: ARG001
     data = data.partition(b"\n")[2]
     if b"#" in data:
         data = re.sub(rb"#[^\n]*", b"", data)
-    rows = [row for line in data.split(b"\n") if (row := line.split())]
-    if len(rows) < n_vertices + n_faces:
+    lines = [line for line in data.split(b"\n") if line.strip()]
+    if len(lines) < n_vertices + n_faces:
         raise MeshFileError(
-            f"it announces {n_vertices} vertices and {n_faces} faces but has only {len(rows)} "
+            f"it announces {n_vertices} vertices and {n_faces} faces but has only {len(lines)} "
             f"lines for them; it is truncated"
         )
-    vertex_rows = rows[:n_vertices]
-    short = next((i for i, row in enumerate(vertex_rows) if len(row) < 3), None)
-    if short is not None:
-        raise MeshFileError(
-            f"vertex {short} (from 0) has {len(vertex_rows[short])} coordinates, three are needed"
-        )
-    flat = list(chain.from_iterable(row[:3] for row in vertex_rows))
-    vertices = numbers(flat, "the vertices").reshape(-1, 3)
-    sizes, corners = _faces(rows[n_vertices : n_vertices + n_faces])
+    vertices = _vertices(lines[:n_vertices])
+    sizes, corners = _faces(lines[n_vertices : n_vertices + n_faces])
     return Polygons(vertices, sizes, corners)
 
 
-def _faces(rows: list[list[bytes]]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    sizes = np.empty(len(rows), dtype=np.int64)
+def _vertices(lines: list[bytes]) -> npt.NDArray[np.float64]:
+    words = b" ".join(lines).split()
+    if len(words) != 3 * len(lines):
+        rows = [line.split() for line in lines]
+        short = next((i for i, row in enumerate(rows) if len(row) < 3), None)
+        if short is not None:
+            raise MeshFileError(
+                f"vertex {short} (from 0) has {len(rows[short])} coordinates, three are needed"
+            )
+        words = [word for row in rows for word in row[:3]]
+    return numbers(words, "the vertices").reshape(-1, 3)
+
+
+def _faces(lines: list[bytes]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    table = plain_integers(b"\n".join(lines))
+    if table is not None and len(table) == 4 * len(lines) and (table[::4] == 3).all():
+        return table[::4], table.reshape(-1, 4)[:, 1:].reshape(-1)
+    sizes = np.empty(len(lines), dtype=np.int64)
     corners: list[int] = []
-    for face, row in enumerate(rows):
+    for face, line in enumerate(lines):
+        row = line.split()
         try:
             size = int(row[0])
             named = list(map(int, row[1 : 1 + max(size, 0)]))

@@ -51,13 +51,12 @@ class _Column:
     """The length of each row's list; None for single values."""
 
 
-def read(file: BinaryIO, size: int) -> Polygons:  # noqa: ARG001
+def read(file: BinaryIO) -> Polygons:
     """Read the vertices' x, y, z and the faces; every other property is passed over.
 
     Parameters
     ----------
     file : open binary file at its start
-    size : its size in bytes
 
     Returns
     -------

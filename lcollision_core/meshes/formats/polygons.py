@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -110,16 +111,18 @@ def require_plausible_count(count: int, what: str) -> None:
 
 def read_rest(file: BinaryIO) -> bytes:
     """Read what is left of an open file, or raise `MeshFileError` above `MAX_FILE_BYTES`."""
-    data = file.read(MAX_FILE_BYTES + 1)
-    if len(data) > MAX_FILE_BYTES:
+    start = file.tell()
+    size = file.seek(0, os.SEEK_END) - start
+    if size > MAX_FILE_BYTES:
         raise MeshFileError(
             f"it is larger than {MAX_FILE_BYTES >> 20} MiB; decimate the mesh or split the file"
         )
-    return data
+    file.seek(start)
+    return file.read(size)
 
 
-def require_few(file: BinaryIO, keyword: bytes, shortest_face: int, size: int) -> None:
-    """Refuse a text file in which `keyword` opens more than `MAX_FACES` faces.
+def require_few(file: BinaryIO, keyword: bytes, what: str, shortest: int, size: int) -> None:
+    """Refuse a text file in which `keyword` occurs more than `MAX_FACES` times.
 
     Counts in chunks, so that a file of gigabytes is refused in little memory; the file's position
     is left at its start.
@@ -127,11 +130,12 @@ def require_few(file: BinaryIO, keyword: bytes, shortest_face: int, size: int) -
     Parameters
     ----------
     file : open binary file at its start
-    keyword : bytes that occur once a face
-    shortest_face : the fewest bytes that one face can take, which spares small files the count
+    keyword : bytes that occur once a face, or once a vertex
+    what : plural noun for the message
+    shortest : the fewest bytes that one of them can take, which spares small files the count
     size : the file's size in bytes
     """
-    if size <= shortest_face * MAX_FACES:
+    if size <= shortest * MAX_FACES:
         return
     count = 0
     tail = b""
@@ -140,7 +144,7 @@ def require_few(file: BinaryIO, keyword: bytes, shortest_face: int, size: int) -
         count += joined.count(keyword)
         if count > MAX_FACES:
             raise MeshFileError(
-                f"it holds more than {MAX_FACES} faces, the most that can be read; "
+                f"it holds more than {MAX_FACES} {what}, the most that can be read; "
                 f"decimate the mesh"
             )
         tail = joined[len(joined) - len(keyword) + 1 :]

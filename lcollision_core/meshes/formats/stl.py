@@ -55,7 +55,7 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
         corners = np.frombuffer(body, dtype=_TRIANGLE)["corners"].astype(np.float64)
     elif is_text:
         file.seek(0)
-        require_few(file, b"endfacet", _SHORTEST_FACET, size)
+        require_few(file, b"endfacet", "triangles", _SHORTEST_FACET, size)
         corners = _text_corners(read_rest(file))
     elif n_triangles >= 0:
         require_plausible_count(n_triangles, "triangles")

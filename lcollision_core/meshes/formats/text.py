@@ -49,3 +49,14 @@ def numbers(words: Sequence[bytes], what: str) -> npt.NDArray[np.float64]:
                     f"{what} hold {word[:30]!r}, which is no number; export the mesh again"
                 ) from error
         raise
+
+
+def plain_integers(text: bytes) -> npt.NDArray[np.int64] | None:
+    """Parse blank-separated digits quickly; None where the text holds anything else.
+
+    Numbers beyond int64 become its largest, which no index check lets through.
+    """
+    # With nothing but digits and blanks there is nothing that numpy's parser could trip over.
+    if not text or text.isspace() or text.translate(None, b" \n0123456789"):
+        return None
+    return np.fromstring(text, dtype=np.int64, sep=" ")
