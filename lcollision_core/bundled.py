@@ -17,3 +17,8 @@ def bundled_file(*parts: str) -> Path:
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing from the installation; reinstall lcollision")
     return path
+
+
+def bundled_folder(name: str) -> Path:
+    """Return the path of a folder in ``resources/``, such as "models"; it may not exist."""
+    return Path(str(resources.files("resources").joinpath(name)))

@@ -47,7 +47,7 @@ class Section:
     Attributes
     ----------
     arrays : read-only arrays by name, of float32, float64, int32, int64, uint8 or bool; floats
-        are finite
+        are finite, and a name has no slash
     metadata : JSON values by name
     """
 
@@ -78,7 +78,7 @@ def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Sectio
     for section_name, section in sections.items():
         for name, array in section.arrays.items():
             full_name = f"{section_name}/{name}"
-            _require_storable(full_name, array)
+            _require_storable(full_name, name, array)
             # ascontiguousarray alone would turn a single number into an array of one.
             tensors[full_name] = np.ascontiguousarray(array).reshape(array.shape)
     try:
@@ -166,7 +166,7 @@ def _read_open_file(file: BinaryIO, path: str | os.PathLike[str]) -> dict[str, S
         _refuse_damaged(path)
     arrays: dict[str, dict[str, npt.NDArray[Any]]] = {name: {} for name in document["sections"]}
     for full_name, array in tensors.items():
-        section_name, _, name = full_name.partition("/")
+        section_name, _, name = full_name.rpartition("/")
         if section_name not in arrays:
             _refuse_damaged(path)
         if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -241,7 +241,9 @@ def _canonical_json(value: Any) -> str:
     return json.dumps(value, sort_keys=True, allow_nan=False, separators=(",", ":"))
 
 
-def _require_storable(full_name: str, array: npt.NDArray[Any]) -> None:
+def _require_storable(full_name: str, name: str, array: npt.NDArray[Any]) -> None:
+    if "/" in name:
+        raise ModelFileError(f"a model cannot hold an array called {name!r}: it has a slash")
     if array.dtype not in _DTYPES.values():
         raise ModelFileError(f"a model cannot hold {full_name} of dtype {array.dtype}; convert it")
     if array.dtype.kind == "f" and not np.isfinite(array).all():

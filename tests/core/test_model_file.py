@@ -38,6 +38,7 @@ def _sections() -> dict[str, Section]:
             {"names": ["left hand", "größer ☃"], "epochs": 20, "licence": None},
         ),
         "model": Section({}, {"source": "a test"}),
+        "run/level 1": Section({"step": np.array(3, np.int64)}, {}),
     }
 
 
@@ -225,6 +226,7 @@ def test_numbers_that_are_not_finite_are_neither_written_nor_read(
     "section",
     [
         Section({"x": np.array(["text"])}),
+        Section({"x/y": np.zeros(2)}),
         Section({"x": np.zeros(2, np.complex128)}),
         Section({"x": np.array([object()])}),
         Section({}, {"x": float("nan")}),
