@@ -61,10 +61,11 @@ def penetration_depth(
     if not np.isfinite(corners).all():
         pair = int(np.flatnonzero(~np.isfinite(corners).all(axis=(1, 2, 3)))[0])
         raise ShapeError(f"triangle pair {pair} has a corner that is not finite")
-    # Work near 1, so that neither products of tiny edges underflow nor huge ones overflow.
+    # Work near 1, so that neither products of tiny edges underflow nor huge ones overflow; by a
+    # power of two, so that what exactly touches still does.
     origin = corners[:, :1, :1]
-    scale: FloatArray = np.abs(corners - origin).max(axis=(1, 2, 3), initial=0.0)
-    scale[scale == 0.0] = 1.0
+    _, exponent = np.frexp(np.abs(corners - origin).max(axis=(1, 2, 3), initial=0.0))
+    scale: FloatArray = np.ldexp(1.0, exponent - 1)
     unit = (corners - origin) / scale[:, None, None, None]
     depths = np.empty(len(corners))
     fill_depths(unit.reshape(-1, 3, 3), tolerance / scale, depths)
