@@ -1,0 +1,164 @@
+"""Slow references that share nothing with the code under test.
+
+They know neither trees nor boxes nor the eleven axes of the closed form. All rest on the
+Minkowski difference of two triangles, the hull of nine points, and on one fact: its depth at the
+origin is the smallest value of its support function over the unit normals of all planes through
+three of the points, as the facets' normals are among these and no direction gives less.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linprog
+
+FloatArray = npt.NDArray[np.float64]
+
+TRIPLES = list(itertools.combinations(range(9), 3))
+
+
+def exact_depth(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
+    """Return the depth of two triangles (3, 3), computed without rounding but the last root."""
+    return exact_depth_and_direction(a, b)[0]
+
+
+def exact_depth_and_direction(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[float, FloatArray]:
+    """Return the depth and a unit direction to move a along so that it leaves b."""
+    first, second, unit_length = _integers(a, b)
+    points = [[p[c] - q[c] for c in range(3)] for p in first for q in second]
+    depth_squared: Fraction | None = None
+    direction = [0, 0, 0]
+    for i, j, k in TRIPLES:
+        u = [points[j][c] - points[i][c] for c in range(3)]
+        v = [points[k][c] - points[i][c] for c in range(3)]
+        n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+        length_squared = n[0] ** 2 + n[1] ** 2 + n[2] ** 2
+        if length_squared == 0:
+            continue
+        along = [n[0] * p[0] + n[1] * p[1] + n[2] * p[2] for p in points]
+        # To part the triangles, move a against n past the highest point, or along n.
+        for support, sign in ((max(along), -1), (-min(along), 1)):
+            if support <= 0:
+                return 0.0, np.zeros(3)
+            squared = Fraction(support * support, length_squared)
+            if depth_squared is None or squared < depth_squared:
+                depth_squared, direction = squared, [sign * x for x in n]
+    if depth_squared is None:
+        return 0.0, np.zeros(3)
+    largest = max(map(abs, direction))
+    unit = np.array([float(Fraction(x, largest)) for x in direction])
+    return _root(depth_squared * unit_length**2), unit / np.linalg.norm(unit)
+
+
+def _integers(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[list, list, Fraction]:
+    """Write the corners as whole numbers of one length, which they are without rounding."""
+    exact = [[[Fraction(float(x)) for x in corner] for corner in np.asarray(t)] for t in (a, b)]
+    parts = max(x.denominator for triangle in exact for corner in triangle for x in corner)
+    first, second = [[[int(x * parts) for x in corner] for corner in t] for t in exact]
+    return first, second, Fraction(1, parts)
+
+
+def _root(value: Fraction) -> float:
+    """Root of a rational whose square may be outside the range of floats."""
+    bits = value.numerator.bit_length() - value.denominator.bit_length()
+    shift = 128 - bits
+    shift += shift % 2
+    scaled = value * Fraction(2) ** shift
+    return math.ldexp(math.sqrt(float(scaled)), -shift // 2)
+
+
+def are_disjoint(a: FloatArray, b: FloatArray) -> bool:
+    """Decide by a linear program whether two triangles have no point in common."""
+    # Barycentric coordinates of one point in both triangles.
+    points = np.concatenate([a.T, -b.T], axis=1)
+    sums = np.array([[1, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 1]])
+    answer = linprog(
+        np.zeros(6),
+        A_eq=np.concatenate([points, sums]),
+        b_eq=[0, 0, 0, 1, 1],
+        options={"primal_feasibility_tolerance": 1e-10},
+    )
+    assert answer.status in (0, 2), answer.message
+    return bool(answer.status == 2)
+
+
+class ReferencePairs(NamedTuple):
+    """All pairs deeper than a tolerance: (P, 2), rows ascending, and their depths (P,)."""
+
+    pairs: npt.NDArray[np.int64]
+    depth: FloatArray
+
+
+def all_pairs(vertices: npt.ArrayLike, faces: npt.ArrayLike, tolerance: float) -> ReferencePairs:
+    """Measure every pair of faces that share no vertex.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array
+    faces : (F, 3) integer array
+    tolerance : depth up to which a pair is left out, in the unit of `vertices`
+    """
+    corners_of = np.asarray(faces)
+    points = np.asarray(vertices, dtype=np.float64)
+    triangles = points[corners_of]
+    blocks = [np.empty((0, 2), dtype=np.int64)]
+    for start in range(0, len(triangles), 256):
+        rows = np.arange(start, min(start + 256, len(triangles)))
+        straddles = _straddles(triangles[rows], points, corners_of)
+        a, b = np.nonzero(straddles)
+        a = rows[a]
+        blocks.append(np.stack([a, b], axis=1))
+    # A pair stays where each face has corners on both sides of the other's plane.
+    candidates = np.concatenate(blocks)
+    keys = candidates[:, 0] * len(triangles) + candidates[:, 1]
+    reverse = candidates[:, 1] * len(triangles) + candidates[:, 0]
+    candidates = candidates[
+        (candidates[:, 0] < candidates[:, 1]) & np.isin(keys, reverse, assume_unique=True)
+    ]
+    shared = (
+        (corners_of[candidates[:, 0]][:, :, None] == corners_of[candidates[:, 1]][:, None, :])
+        .any(axis=2)
+        .any(axis=1)
+    )
+    candidates = candidates[~shared]
+    depth = depths(triangles[candidates[:, 0]], triangles[candidates[:, 1]])
+    deep = depth > tolerance
+    return ReferencePairs(candidates[deep], depth[deep])
+
+
+def _straddles(planes: FloatArray, points: FloatArray, faces: npt.NDArray) -> npt.NDArray[np.bool_]:
+    """(R, F) whether face f is not wholly on one side of the plane of triangle r, with slack."""
+    normals = np.cross(planes[:, 1] - planes[:, 0], planes[:, 2] - planes[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    # The slack keeps pairs that rounding could take away; `depths` decides on them.
+    slack = 1e-12 * max(float(np.ptp(points, axis=0).max()), float(np.abs(points).max()))
+    heights = normals @ points.T - np.einsum("rc,rc->r", normals, planes[:, 0])[:, None]
+    above = (heights > -slack)[:, faces].any(axis=2)
+    below = (heights < slack)[:, faces].any(axis=2)
+    return above & below
+
+
+def depths(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the depths (P,) of triangles a and b (P, 3, 3), in floating point."""
+    depth = np.full(len(a), np.inf)
+    active = np.arange(len(a))
+    points = (a[:, :, None] - b[:, None, :]).reshape(-1, 9, 3)
+    for i, j, k in TRIPLES:
+        here = points[active]
+        u, v = here[:, j] - here[:, i], here[:, k] - here[:, i]
+        n = np.cross(u, v)
+        length = np.linalg.norm(n, axis=1)
+        spans = length > 1e-12 * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
+        n = n[spans] / length[spans, None]
+        along = np.einsum("pkc,pc->pk", here[spans], n)
+        support = np.minimum(along.max(axis=1), -along.min(axis=1))
+        of = active[spans]
+        depth[of] = np.minimum(depth[of], np.maximum(support, 0.0))
+        active = active[depth[active] > 0.0]
+    return np.where(np.isinf(depth), 0.0, depth)
