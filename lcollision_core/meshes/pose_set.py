@@ -82,13 +82,11 @@ class PoseSet:
         return self.topology.faces
 
 
-def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Return a sorting key under which mesh2 comes before mesh10."""
-    parts = re.split(r"([0-9]+)", name.casefold())
-    # Digits stand at the odd places; numbers sort before letters.
-    return [
-        (0, int(part), "") if place % 2 else (1, 0, part) for place, part in enumerate(parts)
-    ], name
+def natural_key(path: Path) -> tuple[list[str | int], str]:
+    """Return a sorting key under which mesh2.obj comes before mesh10.obj, in any case."""
+    parts = re.split(r"([0-9]+)", path.stem.casefold())
+    # Digits stand at the odd places of every name, so numbers meet numbers and text meets text.
+    return [int(part) if place % 2 else part for place, part in enumerate(parts)], path.name
 
 
 def read_pose_set(
@@ -211,7 +209,7 @@ def _collect_folder(
         report(MeshFileError(f"{path} cannot be listed: {error.strerror or error}"))
         return Collected(None, 0, same_topology=False)
     files = [entry for entry in entries if entry.suffix.lower() in READABLE_SUFFIXES]
-    files.sort(key=lambda file: natural_key(file.name))
+    files.sort(key=natural_key)
     formats = Counter(file.suffix.lower() for file in files)
     if len(formats) != 1:
         held = ", ".join(f"{count} {suffix}" for suffix, count in sorted(formats.items()))
