@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from app.cli import benchmark, check, dataset
+from app.cli import benchmark, check, dataset, models, poses, train
 from app.cli.console import ExitStatus
 from lcollision_core.errors import CancelledError, LCollisionError
 
@@ -45,8 +45,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+app.command("models")(models.models)
+app.command("info")(models.info)
+app.command("domains")(models.domains)
 app.command("check")(check.check)
+app.command("encode")(poses.encode)
+app.command("decode")(poses.decode)
+app.command("sample")(poses.sample)
 app.add_typer(dataset.app, name="dataset")
+app.add_typer(train.app, name="train")
 app.add_typer(benchmark.app, name="benchmark")
 
 

@@ -1,0 +1,193 @@
+"""``lcollision models``, ``info`` and ``domains``: what models there are, and what they hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli.console import ExitStatus, note, print_json
+from app.cli.results import require_output
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PoseModel
+
+ModelArgument = Annotated[
+    str, typer.Argument(metavar="M", help="A model file, or the name of a model.")
+]
+
+
+def models(
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+) -> None:
+    """List the bundled models and your own, with their metrics."""
+    from lcollision_core.model import PoseModel, list_models, user_models_folder
+
+    reports, failed = [], False
+    for listed in list_models():
+        try:
+            model = PoseModel.load(listed.path)
+        except LCollisionError as error:
+            note(str(error))
+            failed = True
+            continue
+        report = describe(model)
+        reports.append(report | {"bundled": listed.bundled, "file": str(listed.path)})
+    if as_json:
+        print_json(reports)
+    else:
+        for report in reports:
+            origin = "bundled" if report["bundled"] else "your own"
+            typer.echo(f"{report['name']}: {_size_sentence(report)} ({origin})")
+            typer.echo(f"  {error_sentence(report)}")
+        if not reports and not failed:
+            typer.echo(
+                f"there are no models yet; `lcollision train embedding` makes one, and those in "
+                f"{user_models_folder()} are listed here"
+            )
+    if failed:
+        raise typer.Exit(ExitStatus.BAD_INPUT)
+
+
+def info(
+    model_name: ModelArgument,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+    figure: Annotated[
+        Path | None,
+        typer.Option(metavar="MASKS.png", help="Draw the domains, darker where they own more."),
+    ] = None,
+) -> None:
+    """Say what a model holds and how exact it is; lengths are in heights."""
+    from lcollision_core.model import PoseModel
+
+    if figure is not None:
+        require_output(figure, ".png")
+    model = PoseModel.load(model_name)
+    report = describe(model)
+    if figure is not None:
+        from app.figures import draw_masks
+
+        draw_masks(model, figure)
+        note(f"drew the domains of {model.name} to {figure}")
+    if as_json:
+        print_json(report)
+        return
+    typer.echo(f"{report['name']}: {_size_sentence(report)}")
+    typer.echo(f"  trained on {report['source']}, licence {report['licence']}")
+    typer.echo(f"  {error_sentence(report)}")
+    if report["near_exclusion"]:
+        typer.echo(f"  pairs of faces within {report['near_exclusion']} heights count apart")
+    _print_domains(report)
+
+
+def domains(
+    model_name: ModelArgument,
+    names: Annotated[
+        list[str] | None,
+        typer.Option("--name", metavar="K=NAME", help="Call domain K (from 1) NAME."),
+    ] = None,
+) -> None:
+    """List the domains of a model, or rename them."""
+    from lcollision_core.model import PoseModel, find_model, list_models
+
+    path = find_model(model_name)
+    model = PoseModel.load(path)
+    for request in names or []:
+        number, _, name = request.partition("=")
+        if not number.strip().isdecimal() or not name:
+            raise typer.BadParameter(f"{request!r} is not of the form K=NAME, such as 3=tail")
+        model = model.rename_domain(int(number) - 1, name)
+    if names:
+        if any(listed.bundled and listed.path == path for listed in list_models()):
+            raise LCollisionError(
+                f"{model.name} is a bundled model and stays as it is; copy {path} and name the copy"
+            )
+        model.save(path)
+    _print_domains(describe(model))
+
+
+def describe(model: PoseModel) -> dict[str, Any]:
+    """Return the fields of ``lcollision info --json``; lengths in heights."""
+    from lcollision_core.model_file import FORMAT_VERSION
+
+    metrics = model.metrics
+    groups = model.latent_space.groups[1:]
+    mass = model.attention_mask.sum(axis=1)
+    return {
+        "name": model.name,
+        "version": FORMAT_VERSION,
+        "fingerprint": model.fingerprint,
+        "vertices": model.n_vertices,
+        "faces": len(model.faces),
+        "poses": len(model.pose_names),
+        "domains": [
+            {
+                "name": group.name,
+                "vertices": round(float(owned), 1),
+                "codes": len(group.code_names),
+                "colour": group.colour,
+            }
+            for group, owned in zip(groups, mass, strict=True)
+        ],
+        "latent_size": model.latent_size,
+        "reconstruction": metrics
+        and {
+            "level1_mean": metrics.level1_mean,
+            "mean": metrics.mean,
+            "max": metrics.max,
+            "held_out_mean": metrics.held_out_mean,
+            "held_out_max": metrics.held_out_max,
+            "pca_held_out_mean": metrics.pca_held_out_mean,
+        },
+        "acap": metrics and {"mean": metrics.acap_mean, "max": metrics.acap_max},
+        "masks": metrics
+        and {
+            "connected_share": metrics.connected_share,
+            "domains_per_vertex": metrics.domains_per_vertex,
+        },
+        "predictor": None,
+        "near_exclusion": model.near_exclusion,
+        "up_axis": "xyz"[model.up_axis],
+        "height": model.height,
+        "licence": model.card.licence,
+        "source": model.card.source,
+        "provenance": dict(model.card.provenance),
+    }
+
+
+def _size_sentence(report: dict[str, Any]) -> str:
+    return (
+        f"{report['vertices']} vertices, {report['faces']} faces, {report['poses']} poses, "
+        f"{len(report['domains'])} domains, {report['latent_size']} numbers a pose"
+    )
+
+
+def error_sentence(report: dict[str, Any]) -> str:
+    """Put the errors of what `describe` returns into words."""
+    errors = report["reconstruction"]
+    if errors is None:
+        return "not measured"
+    sentence = (
+        f"vertex error {_percent(errors['mean'])} of the height, at most "
+        f"{_percent(errors['max'])}; level 1 alone {_percent(errors['level1_mean'])}"
+    )
+    if errors["held_out_mean"] is not None:
+        sentence += (
+            f"; poses left out {_percent(errors['held_out_mean'])}, by principal components "
+            f"{_percent(errors['pca_held_out_mean'])}"
+        )
+    return sentence
+
+
+def _percent(heights: float) -> str:
+    return f"{100.0 * heights:.2f} %"
+
+
+def _print_domains(report: dict[str, Any]) -> None:
+    for number, domain in enumerate(report["domains"], start=1):
+        typer.echo(
+            f"  {number:2d}  {domain['name']}  ({domain['vertices']:.0f} vertices, "
+            f"{domain['codes']} numbers)"
+        )

@@ -1,0 +1,94 @@
+"""``lcollision encode``, ``decode`` and ``sample``: latent poses from and to meshes, by chance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from app.cli.console import note, progress_bar
+from app.cli.models import ModelArgument
+from app.cli.results import MeshFormat, require_output, write_result
+
+PosesOutput = Annotated[
+    Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
+]
+
+
+def encode(
+    model_name: ModelArgument,
+    meshes: Annotated[
+        list[Path], typer.Argument(metavar="MESH...", help="Meshes of the model's topology.")
+    ],
+    output: PosesOutput,
+) -> None:
+    """Turn meshes into latent poses, and say how well each fits."""
+    from lcollision_core.meshes import read_mesh
+    from lcollision_core.model import NamedPose, PoseModel, unique_names, write_poses
+
+    require_output(output, ".json")
+    model = PoseModel.load(model_name)
+    files = [read_mesh(path, topology=model.topology) for path in meshes]
+    for mesh in files:
+        model.require_topology(mesh.topology, str(mesh.source))
+    names = unique_names(mesh.source.stem for mesh in files)
+    poses = []
+    with progress_bar("Encoding meshes") as progress:
+        for name, mesh in zip(names, files, strict=True):
+            poses.append(NamedPose.of_mesh(name, model.encode(mesh.vertices)))
+            progress(len(poses), len(files))
+    write_poses(output, model, poses)
+    for pose in poses:
+        typer.echo(
+            f"{pose.name}: fit error {100.0 * (pose.fit_error_mean or 0.0):.3f} % of the height, "
+            f"at most {100.0 * (pose.fit_error_max or 0.0):.2f} %"
+        )
+
+
+def decode(
+    model_name: ModelArgument,
+    poses: Annotated[Path, typer.Argument(metavar="POSES", help="A .json file of poses.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="OUT",
+            help="A mesh file for one pose, a folder for several, or a .json file.",
+        ),
+    ],
+    mesh_format: Annotated[
+        MeshFormat, typer.Option("--format", help="Of the meshes in a folder.")
+    ] = MeshFormat.OBJ,
+) -> None:
+    """Turn latent poses into meshes; one that came in as a mesh returns to its place."""
+    from lcollision_core.model import PoseModel, read_poses
+
+    model = PoseModel.load(model_name)
+    named = read_poses(poses, model)
+    write_result(output, model, named, mesh_format)
+    note(f"wrote {len(named)} poses to {output}")
+
+
+def sample(
+    model_name: ModelArgument,
+    count: Annotated[int, typer.Option("-n", min=1, max=1_000_000, help="How many poses.")],
+    output: PosesOutput,
+    colliding: Annotated[
+        bool | None,
+        typer.Option("--colliding/--free", help="Keep only those poses, by the exact check."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal poses.")] = 0,
+) -> None:
+    """Draw latent poses from the box of 1.2 times the training range."""
+    from lcollision_core.model import NamedPose, PoseModel, sample_poses, write_poses
+
+    require_output(output, ".json")
+    model = PoseModel.load(model_name)
+    with progress_bar("Drawing poses") as progress:
+        latent = sample_poses(model, count, seed, colliding, progress)
+    width = len(str(count))
+    poses = [NamedPose(f"sample {place + 1:0{width}d}", row) for place, row in enumerate(latent)]
+    write_poses(output, model, poses)
+    note(f"wrote {count} poses to {output}")

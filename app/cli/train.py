@@ -1,0 +1,168 @@
+"""``lcollision train``: learn a model from data."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli.console import note
+from app.cli.models import describe, error_sentence
+from lcollision_core.errors import CancelledError
+from lcollision_core.jobs import CancelToken
+
+if TYPE_CHECKING:
+    from lcollision_core.embedding.training import StatusCallback, TrainingStatus
+
+app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
+
+
+@app.command("embedding")
+def embedding(
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="A folder of meshes or an .npz file.")
+    ],
+    output: Annotated[
+        str,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="M",
+            help="The .safetensors file to write; a name alone stores it with your models.",
+        ),
+    ],
+    n_domains: Annotated[
+        int, typer.Option("--domains", min=1, max=64, metavar="K", help="Parts of the body.")
+    ] = 10,
+    n_codes: Annotated[
+        int,
+        typer.Option("--domain-codes", min=1, max=64, metavar="k", help="Numbers of each part."),
+    ] = 10,
+    near_exclusion: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=0.99,
+            metavar="X",
+            help="Count pairs this near along the surface apart, in heights. "
+            "Default: what the set says.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal models.")] = 0,
+    source: Annotated[
+        str | None, typer.Option(help="What the poses are. Default: the dataset's name.")
+    ] = None,
+    licence: Annotated[str, typer.Option(help="Under which the model may be used.")] = "unknown",
+) -> None:
+    """Learn the latent space of a pose set.
+
+    A checkpoint beside the output lets a run that was stopped or killed go on where it was when it
+    is started again; it is removed at the end.
+    """
+    from dataclasses import replace
+
+    from lcollision_core.embedding.config import EmbeddingConfig
+    from lcollision_core.embedding.training import train_embedding
+    from lcollision_core.meshes import read_pose_set, require_writable
+    from lcollision_core.model import PoseModel, model_destination
+
+    destination = model_destination(output)
+    require_writable(destination)
+    poses = read_pose_set(dataset)
+    for remark in poses.notes:
+        note(f"{dataset}: {remark}")
+    if near_exclusion is not None:
+        poses = replace(poses, near_exclusion=near_exclusion)
+    config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)
+    checkpoint = destination.with_name(destination.name + ".checkpoint")
+    if checkpoint.exists():
+        note(f"going on from {checkpoint}")
+    try:
+        with _cancel_on_interrupt() as cancel, _training_bar() as progress:
+            trained = train_embedding(
+                poses, config, checkpoint=checkpoint, progress=progress, cancel=cancel, seed=seed
+            )
+    except CancelledError:
+        if checkpoint.exists():
+            note(f"stopped; run the same command again to go on from {checkpoint}")
+        raise
+    model = PoseModel.from_training(
+        destination.stem, trained, poses, source, licence, _provenance(poses.vertices, seed)
+    )
+    model.save(destination)
+    checkpoint.unlink(missing_ok=True)
+    note(f"wrote {destination}: {error_sentence(describe(model))}")
+
+
+def _provenance(vertices: Any, seed: int) -> dict[str, Any]:
+    import hashlib
+    from importlib.metadata import version
+
+    import numpy as np
+
+    digest = hashlib.sha256(np.ascontiguousarray(vertices).tobytes()).hexdigest()
+    return {
+        "program": f"lcollision {version('lcollision')}",
+        "command": "train embedding",
+        "seed": seed,
+        "poses_sha256": digest,
+    }
+
+
+@contextmanager
+def _cancel_on_interrupt() -> Iterator[CancelToken]:
+    """Give a token that the first Ctrl-C or SIGTERM sets; a second Ctrl-C interrupts at once."""
+    token = CancelToken()
+    previous: dict[signal.Signals, Any] = {}
+
+    def cancel(number: int, frame: object) -> None:  # noqa: ARG001
+        token.cancel()
+        signal.signal(number, previous[signal.Signals(number)])
+
+    for caught in (signal.SIGINT, signal.SIGTERM):
+        previous[caught] = signal.signal(caught, cancel)
+    try:
+        yield token
+    finally:
+        for caught, handler in previous.items():
+            signal.signal(caught, handler)
+
+
+@contextmanager
+def _training_bar() -> Iterator[StatusCallback]:
+    """Give a callback that draws the stage and both levels' errors on a terminal."""
+    from lcollision_core.embedding.training import no_status
+
+    if not sys.stderr.isatty():
+        yield no_status
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = (
+        rich_progress.TextColumn("{task.description}"),
+        rich_progress.BarColumn(),
+        rich_progress.TaskProgressColumn(),
+        rich_progress.TimeRemainingColumn(),
+    )
+    with rich_progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        bar = bars.add_task("Reading features", total=None)
+
+        def show(status: TrainingStatus) -> None:
+            errors = [
+                f"{level} {100.0 * error:.2f} %"
+                for level, error in (
+                    ("level 1", status.level1_error),
+                    ("both levels", status.both_error),
+                )
+                if error is not None
+            ]
+            described = f"{status.model}, {status.stage}: {', '.join(errors) or 'starting'}"
+            bars.update(bar, description=described, completed=status.done, total=status.total)
+
+        yield show

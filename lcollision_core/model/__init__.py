@@ -1,0 +1,35 @@
+"""A trained body: one file in, everything that a front end needs out."""
+
+from lcollision_core.model.card import ModelCard
+from lcollision_core.model.latent_space import BOX_SCALE, LatentGroup, LatentSpace
+from lcollision_core.model.library import (
+    MODEL_SUFFIX,
+    ListedModel,
+    find_model,
+    list_models,
+    model_destination,
+    user_models_folder,
+)
+from lcollision_core.model.pose_file import NamedPose, read_poses, unique_names, write_poses
+from lcollision_core.model.pose_model import EncodedPose, PoseModel
+from lcollision_core.model.sampling import sample_poses
+
+__all__ = [
+    "BOX_SCALE",
+    "MODEL_SUFFIX",
+    "EncodedPose",
+    "LatentGroup",
+    "LatentSpace",
+    "ListedModel",
+    "ModelCard",
+    "NamedPose",
+    "PoseModel",
+    "find_model",
+    "list_models",
+    "model_destination",
+    "read_poses",
+    "sample_poses",
+    "unique_names",
+    "user_models_folder",
+    "write_poses",
+]

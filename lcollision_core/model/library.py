@@ -1,0 +1,110 @@
+"""Where models live: bundled with the program, or in the user's own folder."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from lcollision_core.bundled import bundled_folder
+from lcollision_core.errors import ModelFileError
+
+MODEL_SUFFIX = ".safetensors"
+
+
+@dataclass(frozen=True)
+class ListedModel:
+    """A model that can be called by name.
+
+    Attributes
+    ----------
+    name : what it is called, its file's name without the extension
+    path : its file
+    bundled : whether it came with the program
+    """
+
+    name: str
+    path: Path
+    bundled: bool
+
+
+def user_models_folder() -> Path:
+    """Return the folder of the user's own models, which may not exist yet."""
+    from platformdirs import user_data_path
+
+    return user_data_path("lcollision", appauthor=False) / "models"
+
+
+def list_models() -> tuple[ListedModel, ...]:
+    """List the user's models and the bundled ones that no user's model hides, by name."""
+    found: dict[str, ListedModel] = {}
+    for folder, bundled in ((bundled_folder("models"), True), (user_models_folder(), False)):
+        for path in folder.glob(f"*{MODEL_SUFFIX}"):
+            if not path.name.startswith("."):
+                found[path.stem] = ListedModel(path.stem, path, bundled)
+    return tuple(found[name] for name in sorted(found))
+
+
+def find_model(name_or_path: str | os.PathLike[str]) -> Path:
+    """Return the file of a model.
+
+    Parameters
+    ----------
+    name_or_path : a file, or the name of a bundled or user model
+
+    Raises
+    ------
+    ModelFileError : it is neither; the sentence lists the names that there are.
+    """
+    path = Path(name_or_path)
+    if _is_name(path):
+        listed = list_models()
+        for model in listed:
+            if model.name == str(name_or_path):
+                return model.path
+        if not path.exists():
+            names = ", ".join(model.name for model in listed) or "none yet"
+            raise ModelFileError(
+                f"there is no model or file {str(name_or_path)!r}; the models are: {names}"
+            )
+    return path
+
+
+def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
+    """Return the file that a new model goes to.
+
+    Parameters
+    ----------
+    name_or_path : a file ending in .safetensors; or a name without extension or folder, which
+        goes to the user's own models, whose folder is made
+
+    Raises
+    ------
+    ModelFileError : another extension, no such folder, or the user's folder cannot be made.
+    """
+    path = Path(name_or_path)
+    if _is_name(path):
+        folder = user_models_folder()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ModelFileError(
+                f"{folder} cannot be made: {error.strerror or error}; name a file elsewhere"
+            ) from error
+        return folder / f"{path}{MODEL_SUFFIX}"
+    if path.suffix != MODEL_SUFFIX:
+        raise ModelFileError(
+            f"{path} cannot be written: a model is a {MODEL_SUFFIX} file; rename it, or give a "
+            f"name alone to store it with your models"
+        )
+    if not path.parent.is_dir():
+        raise ModelFileError(
+            f"{path} cannot be written: there is no folder {path.parent}; create it first"
+        )
+    if path.is_dir():
+        raise ModelFileError(f"{path} cannot be written: it is a folder; add a file name")
+    return path
+
+
+def _is_name(path: Path) -> bool:
+    return len(path.parts) == 1 and not path.suffix and path.name not in ("", ".", "..")

@@ -1,0 +1,396 @@
+"""One model file in, everything that a front end needs out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.embedding.bilevel import Embedding
+from lcollision_core.embedding.metrics import EmbeddingMetrics
+from lcollision_core.errors import ModelFileError, PoseSetError, ShapeError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes import PoseSet, RigidTransform, Topology, height, up_axis
+from lcollision_core.model.card import ModelCard
+from lcollision_core.model.colours import domain_colours
+from lcollision_core.model.latent_space import WHOLE_BODY, LatentGroup, LatentSpace
+from lcollision_core.model.library import find_model
+from lcollision_core.model.naming import checked_name, names_from_labels, numbered_names
+from lcollision_core.model_file import Section, read_model_file, write_model_file
+
+FloatArray = npt.NDArray[np.float64]
+
+_EMBEDDING = "embedding"
+_CARD = "model"
+
+
+@dataclass(frozen=True)
+class EncodedPose:
+    """A mesh as a latent pose.
+
+    Attributes
+    ----------
+    latent : (D,) float64 array
+    placement : takes the decoded pose to where the mesh was, in the data's unit
+    fit_error_mean, fit_error_max : distance of the decoded vertices from the mesh's, in heights
+    """
+
+    latent: FloatArray
+    placement: RigidTransform
+    fit_error_mean: float
+    fit_error_max: float
+
+
+class PoseModel:
+    """A body that can take poses: immutable, and safe to share between threads.
+
+    Poses are NumPy arrays in the unit of the data that the model was trained on, in the frame and
+    position of its reference. Build one with `load` or `from_training`.
+
+    Parameters
+    ----------
+    name : what the model is called
+    embedding : its latent space
+    card : its units, names and origin
+    other_sections : of its file, that this version of the program leaves as they are
+
+    Raises
+    ------
+    ModelFileError : the card names another number of domains or poses than the embedding has.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        embedding: Embedding,
+        card: ModelCard,
+        other_sections: Mapping[str, Section] | None = None,
+    ) -> None:
+        counts = (len(card.domain_names), len(card.pose_names))
+        if counts != (embedding.n_domains, len(embedding.training_latent)):
+            raise ModelFileError(
+                f"the model names {counts[0]} domains and {counts[1]} poses, but has "
+                f"{embedding.n_domains} and {len(embedding.training_latent)}; train or copy the "
+                f"model again"
+            )
+        self.name = name
+        self.card = card
+        self._embedding = embedding
+        self._other_sections = dict(other_sections or {})
+        self.reference: FloatArray = _read_only(embedding.rest_vertices * card.height)
+        self.attention_mask = _read_only(embedding.attention_mask)
+        self.training_latent: FloatArray = _read_only(embedding.training_latent.astype(np.float64))
+
+    @classmethod
+    def load(cls, name_or_path: str | os.PathLike[str]) -> PoseModel:
+        """Read a model; nothing in its file is ever run.
+
+        Parameters
+        ----------
+        name_or_path : a file, or the name of a bundled or user model
+
+        Raises
+        ------
+        ModelFileError : there is no such model, or its file is damaged, of another program or of
+            a later version.
+        """
+        path = find_model(name_or_path)
+        sections = read_model_file(path)
+        missing = [name for name in (_EMBEDDING, _CARD) if name not in sections]
+        if missing:
+            raise ModelFileError(
+                f"{path} is unusable: it lacks its section {missing[0]!r}; train or copy the "
+                f"model again"
+            )
+        try:
+            embedding_section, card_section = sections.pop(_EMBEDDING), sections.pop(_CARD)
+            embedding = Embedding.from_arrays(embedding_section.arrays, embedding_section.metadata)
+            card = ModelCard.from_metadata(card_section.metadata)
+            return cls(path.stem, embedding, card, sections)
+        except ModelFileError as error:
+            raise ModelFileError(f"{path} is unusable: {error}") from error
+
+    @classmethod
+    def from_training(
+        cls,
+        name: str,
+        embedding: Embedding,
+        pose_set: PoseSet,
+        source: str | None = None,
+        licence: str = "unknown",
+        provenance: Mapping[str, Any] | None = None,
+    ) -> PoseModel:
+        """Make a model of a trained embedding.
+
+        Parameters
+        ----------
+        name : what to call it
+        embedding : trained on `pose_set`
+        pose_set : gives the units, the poses' names and, where its vertices are labelled, the
+            domains' names
+        source : what the poses are, by default the name of their file
+        licence : under which the model may be used
+        provenance : how it was made, JSON values by name
+        """
+        reference = pose_set.vertices[0]
+        up = up_axis(reference) if pose_set.up_axis is None else pose_set.up_axis
+        if pose_set.vertex_labels is None:
+            names = numbered_names(embedding.n_domains)
+        else:
+            names = names_from_labels(
+                embedding.attention_mask, pose_set.vertex_labels, reference[:, up]
+            )
+        card = ModelCard(
+            height=height(reference),
+            up_axis=up,
+            near_exclusion=pose_set.near_exclusion,
+            domain_names=names,
+            domain_colours=domain_colours(embedding.n_domains),
+            pose_names=pose_set.names,
+            source=source or (pose_set.source.name if pose_set.source else "unknown"),
+            licence=licence,
+            provenance=dict(provenance or {}),
+        )
+        return cls(name, embedding, card)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model, whole or not at all; equal models give equal bytes.
+
+        Raises
+        ------
+        ModelFileError : the file cannot be written.
+        """
+        arrays, metadata = self._embedding.to_arrays()
+        sections = {
+            **self._other_sections,
+            _EMBEDDING: Section(arrays, metadata),
+            _CARD: Section({}, self.card.to_metadata()),
+        }
+        write_model_file(path, sections)
+
+    def decode(self, latent: npt.ArrayLike) -> FloatArray:
+        """Turn latent poses into meshes.
+
+        Parameters
+        ----------
+        latent : (D,) or (B, D) finite array
+
+        Returns
+        -------
+        vertices : (V, 3) or (B, V, 3) float64 array, in the data's unit, in the reference's frame
+            and position; a pose gets the same bits alone and in any batch
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        codes = np.asarray(latent, dtype=np.float64)
+        if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
+            raise ShapeError(
+                f"a latent pose of {self.name} has {self.latent_size} numbers, got an array of "
+                f"shape {codes.shape}"
+            )
+        if not np.isfinite(codes).all():
+            raise ShapeError("a latent pose has a number that is not finite")
+        vertices = self._embedding.decode(codes.reshape(-1, self.latent_size))
+        vertices *= self.card.height
+        return vertices[0] if codes.ndim == 1 else vertices
+
+    def encode(self, vertices: npt.ArrayLike, cancel: CancelToken | None = None) -> EncodedPose:
+        """Find the latent pose whose mesh lies nearest to a given one, wherever that lies.
+
+        The encoder's guess, then Gauss-Newton steps on the vertex distance that settle code and
+        rigid motion together.
+
+        Parameters
+        ----------
+        vertices : (V, 3) finite array, in the data's unit
+        cancel : polled before the fit
+
+        Raises
+        ------
+        ShapeError : another shape, or a coordinate that is not finite.
+        CancelledError : `cancel` was set.
+        """
+        mesh = np.asarray(vertices, dtype=np.float64)
+        if mesh.shape != self.reference.shape:
+            raise ShapeError(
+                f"a mesh of {self.name} has shape {self.reference.shape}, got {mesh.shape}"
+            )
+        if not np.isfinite(mesh).all():
+            vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
+            raise ShapeError(f"vertex {vertex} (from 0) is not finite")
+        fit = self._embedding.encode(mesh[None] / self.card.height, cancel=cancel)
+        aligning = RigidTransform(fit.rotations[0], fit.translations[0] * self.card.height)
+        return EncodedPose(
+            latent=fit.latent[0].astype(np.float64),
+            placement=aligning.inverse(),
+            fit_error_mean=float(fit.mean_error[0]),
+            fit_error_max=float(fit.max_error[0]),
+        )
+
+    def require_topology(self, topology: Topology, source: str) -> None:
+        """Refuse a mesh whose faces are not the model's, in whatever order they come.
+
+        Parameters
+        ----------
+        topology : the mesh's
+        source : what the sentence calls the mesh
+
+        Raises
+        ------
+        PoseSetError : another number of vertices or faces, or other faces.
+        """
+        for noun, found, needed in (
+            ("vertices", topology.n_vertices, self.n_vertices),
+            ("faces", topology.n_faces, self.topology.n_faces),
+        ):
+            if found != needed:
+                raise PoseSetError(
+                    f"{source} has {found} {noun}, the model {self.name!r} has {needed}; export "
+                    f"it with the model's topology"
+                )
+        if topology != self.topology and not np.array_equal(
+            _sorted_faces(topology.faces), _sorted_faces(self.faces)
+        ):
+            raise PoseSetError(
+                f"{source} has other faces than the model {self.name!r}; export it with the "
+                f"model's topology and vertex order"
+            )
+
+    def rename_domain(self, domain: int, name: str) -> PoseModel:
+        """Return the same model with one domain called otherwise.
+
+        Parameters
+        ----------
+        domain : index from 0
+        name : unlike the other domains' names
+
+        Raises
+        ------
+        ModelFileError : there is no such domain, or the name cannot be.
+        """
+        names = list(self.card.domain_names)
+        if not 0 <= domain < len(names):
+            raise ModelFileError(
+                f"{self.name} has no domain {domain + 1}; its domains are 1 to {len(names)}"
+            )
+        names[domain] = checked_name(name, names[:domain] + names[domain + 1 :])
+        card = replace(self.card, domain_names=tuple(names))
+        return PoseModel(self.name, self._embedding, card, self._other_sections)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that tell which latent space this is.
+
+        Models with one fingerprint understand each other's latent poses: it depends on neither
+        names nor anything that is trained upon the latent space.
+        """
+        arrays, metadata = self._embedding.to_arrays()
+        digest = hashlib.sha256(json.dumps(metadata["scaling"], sort_keys=True).encode())
+        for name in sorted(arrays):
+            array = np.ascontiguousarray(arrays[name])
+            digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+            digest.update(array.tobytes())
+        return digest.hexdigest()[:16]
+
+    @cached_property
+    def latent_space(self) -> LatentSpace:
+        """The groups, names, colours and ranges of the latent's codes."""
+        embedding = self._embedding
+        groups, start = [], 0
+        labels = ((WHOLE_BODY, None), *zip(self.domain_names, self.domain_colours, strict=True))
+        for (name, colour), size in zip(labels, embedding.group_sizes, strict=True):
+            code_names = (
+                self.domain_names
+                if colour is None
+                else tuple(f"{name} {code + 1}" for code in range(size))
+            )
+            groups.append(LatentGroup(name, colour, slice(start, start + size), code_names))
+            start += size
+        return LatentSpace(
+            groups=tuple(groups),
+            minimum=_read_only(embedding.latent_min.astype(np.float64)),
+            maximum=_read_only(embedding.latent_max.astype(np.float64)),
+        )
+
+    @cached_property
+    def detector(self) -> CollisionDetector:
+        """Finds exact self-collisions of this model's meshes, in the data's unit."""
+        return CollisionDetector(self.topology, self.reference, near_exclusion=self.near_exclusion)
+
+    @property
+    def topology(self) -> Topology:
+        """The faces that all poses share, and what follows from them."""
+        return self._embedding.topology
+
+    @property
+    def faces(self) -> npt.NDArray[np.int32]:
+        """(F, 3) int32 array, vertex indices from 0, read-only."""
+        return self.topology.faces
+
+    @property
+    def n_vertices(self) -> int:
+        """V."""
+        return self.topology.n_vertices
+
+    @property
+    def latent_size(self) -> int:
+        """D, the number of a latent pose's codes."""
+        return self._embedding.latent_size
+
+    @property
+    def height(self) -> float:
+        """One height, the unit of reports, in the data's unit."""
+        return self.card.height
+
+    @property
+    def up_axis(self) -> int:
+        """0, 1 or 2 for x, y or z."""
+        return self.card.up_axis
+
+    @property
+    def near_exclusion(self) -> float:
+        """Pairs of faces this near along the surface, in heights, are folds, not collisions."""
+        return self.card.near_exclusion
+
+    @property
+    def domain_names(self) -> tuple[str, ...]:
+        """K different names."""
+        return self.card.domain_names
+
+    @property
+    def domain_colours(self) -> tuple[str, ...]:
+        """K colours "#rrggbb"."""
+        return self.card.domain_colours
+
+    @property
+    def pose_names(self) -> tuple[str, ...]:
+        """N names of the training poses, whose codes are `training_latent`, (N, D)."""
+        return self.card.pose_names
+
+    @property
+    def metrics(self) -> EmbeddingMetrics | None:
+        """What training measured, lengths in heights."""
+        return self._embedding.metrics
+
+
+def _sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Turn each face until its least vertex comes first, then sort the faces."""
+    turned = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
+    rows = np.take_along_axis(faces, turned, axis=1)
+    return rows[np.lexsort(rows.T)]
+
+
+def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    view = array.view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,65 @@
+"""Latent poses by chance, all of them or only those that collide or do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.model.pose_model import PoseModel
+
+_DRAWN_AT_ONCE = 64
+_MOST_MISSES = 10_000
+
+
+def sample_poses(
+    model: PoseModel,
+    n_poses: int,
+    seed: int,
+    colliding: bool | None = None,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> npt.NDArray[np.float64]:
+    """Draw latent poses uniformly from the box of 1.2 times the training range.
+
+    Parameters
+    ----------
+    model : whose latent space
+    n_poses : how many to return
+    seed : equal seeds give equal poses, on any number of cores
+    colliding : True and False keep only poses that do and do not intersect themselves, by the
+        exact check of the vertices rounded to float32, as they are exported; None keeps all
+    progress : called with (poses found, n_poses)
+    cancel : polled between blocks of poses
+
+    Returns
+    -------
+    latent : (n_poses, D) float64 array
+
+    Raises
+    ------
+    LCollisionError : 10 000 poses in a row were not of the kind asked for.
+    CancelledError : `cancel` was set.
+    """
+    generator = np.random.default_rng(seed)
+    if colliding is None:
+        return model.latent_space.sample(n_poses, generator)
+    kept = np.empty((n_poses, model.latent_size))
+    n_kept = n_misses = 0
+    while n_kept < n_poses:
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        drawn = model.latent_space.sample(_DRAWN_AT_ONCE, generator)
+        vertices = model.decode(drawn).astype(np.float32)
+        found = drawn[model.detector.are_colliding(vertices) == colliding][: n_poses - n_kept]
+        kept[n_kept : n_kept + len(found)] = found
+        n_kept += len(found)
+        n_misses = 0 if len(found) else n_misses + _DRAWN_AT_ONCE
+        if n_misses >= _MOST_MISSES:
+            kind = "collides" if colliding else "is free"
+            raise LCollisionError(
+                f"none of {n_misses} poses in a row {kind}; ask for another kind of pose"
+            )
+        progress(n_kept, n_poses)
+    return kept
