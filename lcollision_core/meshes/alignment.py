@@ -24,7 +24,7 @@ _WEIGHT_TOLERANCE = 1e-4
 _CALM = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RigidTransform:
     """One rotation and translation, `aligned = rotation @ p + translation`.
 
@@ -47,7 +47,7 @@ class RigidTransform:
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Alignment:
     """Poses in the reference's frame, and how to bring them back.
 

@@ -16,7 +16,7 @@ from lcollision_core.meshes.pose_set import PoseSet, collect_poses, degenerate_f
 from lcollision_core.meshes.topology import Topology
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeshAudit:
     """The state of one mesh.
 
@@ -119,7 +119,7 @@ def _duplicates(points: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
     return np.sort(order[1:][repeats]).astype(np.int32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseSetInspection:
     """What there is at a path that should hold a pose set.
 

@@ -33,11 +33,13 @@ _ENCODERS: dict[str, Callable[[npt.NDArray[Any], npt.NDArray[np.int32]], bytes]]
     ".stl": stl.encode,
     ".glb": gltf.encode,
 }
+_SINGLE_PRECISION = (".stl", ".glb")
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
 WRITABLE_SUFFIXES = tuple(_ENCODERS)
 """Extensions that `write_mesh` writes, in lower case."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mesh:
     """One triangle mesh as it is in its file.
 
@@ -187,14 +189,19 @@ def write_mesh(
             f"known here; use one of {', '.join(WRITABLE_SUFFIXES)}"
         )
     points = np.asarray(vertices)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ShapeError(f"vertices must be a (V, 3) array, got {points.shape}")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ShapeError(f"vertices must be a (V, 3) array with V > 0, got {points.shape}")
     if points.dtype != np.float32:
         points = points.astype(np.float64)
     points = points.astype(points.dtype.newbyteorder("="), copy=False)
     vertex = first_not_finite(points)
     if vertex is not None:
         raise ShapeError(f"vertex {vertex} is at {points[vertex].tolist()}, which is not finite")
+    if suffix in _SINGLE_PRECISION and float(np.abs(points).max()) > _FLOAT32_MAX:
+        raise MeshFileError(
+            f"{path} cannot be written: a coordinate exceeds float32, which {suffix} stores; "
+            f"write .ply or .obj"
+        )
     data = _ENCODERS[suffix](points, Topology(faces, len(points)).faces)
     with atomic_write(path) as file:
         file.write(data)

@@ -24,7 +24,7 @@ FORMAT_VERSION = 1
 """The version that `write_pose_set` stores; later ones are refused."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseSet:
     """N poses of one mesh.
 
@@ -70,7 +70,10 @@ class PoseSet:
             raise ShapeError(f"near_exclusion must be in [0, 1), got {self.near_exclusion}")
         if self.vertex_labels is not None and self.vertex_labels.shape != shape[1:2]:
             raise ShapeError(f"vertex_labels must be ({shape[1]},), got {self.vertex_labels.shape}")
-        self.vertices.flags.writeable = False
+        # A view, so that the caller's own array stays as writable as it was.
+        view = self.vertices.view()
+        view.flags.writeable = False
+        object.__setattr__(self, "vertices", view)
 
     def __len__(self) -> int:
         """N, the number of poses."""
@@ -132,7 +135,7 @@ def read_pose_set(
     return pose_set
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Collected:
     """What `collect_poses` found.
 
@@ -191,7 +194,10 @@ def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDAr
     (D,) indices of the faces whose height over their longest side is below 1e-12 of that side:
     float64's rounding, in any unit
     """
-    a, b, c = (np.asarray(vertices, dtype=np.float64)[corner] for corner in topology.faces.T)
+    points = np.asarray(vertices, dtype=np.float64)
+    # At one, squares neither overflow nor vanish, whatever the unit.
+    points = points / max(float(np.abs(points).max()), np.finfo(np.float64).tiny)
+    a, b, c = (points[corner] for corner in topology.faces.T)
     longest_squared = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], 0)
     twice_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.flatnonzero(twice_area <= 1e-12 * longest_squared).astype(np.int32)
@@ -237,14 +243,14 @@ def _collect_folder(
             defect = _disagreement(pose, file.name, mesh.topology, topology)
         except MeshFileError as error:
             report(error)
-            continue
-        if defect is None:
-            vertices[len(names)] = mesh.vertices
-            names.append(file.name)
-            notes.update(mesh.notes)
         else:
-            same_topology = False
-            report(PoseSetError(defect))
+            if defect is None:
+                vertices[len(names)] = mesh.vertices
+                names.append(file.name)
+                notes.update(mesh.notes)
+            else:
+                same_topology = False
+                report(PoseSetError(defect))
         progress(pose + 1, len(files))
     if topology is None:
         return Collected(None, len(files), same_topology=False)

@@ -156,6 +156,11 @@ def test_obj_negative_numbers_count_back_from_where_they_stand(tmp_path: Path) -
     assert read_mesh(tmp_path / "m.obj").faces.tolist() == [[0, 1, 2], [0, 3, 1], [1, 2, 3]]
 
 
+def test_byte_order_mark_hides_no_vertex(tmp_path: Path) -> None:
+    (tmp_path / "m.obj").write_bytes(b"\xef\xbb\xbf" + (TRIANGLE + "f 1 2 3\n").encode())
+    assert len(read_mesh(tmp_path / "m.obj").vertices) == 3
+
+
 def test_seams_of_textures_and_normals_split_no_vertex(tmp_path: Path) -> None:
     (tmp_path / "m.obj").write_text(
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvn 0 0 1\nvn 0 0 -1\n"
@@ -269,6 +274,21 @@ def test_glb_node_places_the_mesh(tmp_path: Path) -> None:
     (tmp_path / "m.glb").write_bytes(scene.export(file_type="glb"))
     mesh = read_mesh(tmp_path / "m.glb")
     assert np.abs(mesh.vertices - VERTICES[[0, 1, 3, 5]] - [1, 2, 3]).max() < 1e-6
+
+
+def test_gltf_finds_the_buffers_beside_it(tmp_path: Path) -> None:
+    import trimesh
+
+    files = trimesh.Scene(trimesh.Trimesh(VERTICES, FACES, process=False)).export(file_type="gltf")
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    mesh = read_mesh(tmp_path / "model.gltf")
+    assert np.array_equal(mesh.vertices, VERTICES.astype(np.float32))
+    assert np.array_equal(mesh.faces, FACES)
+    for buffer in tmp_path.glob("*.bin"):
+        buffer.unlink()
+    with pytest.raises(MeshFileError, match=r"model\.gltf .* damaged or unsupported"):
+        read_mesh(tmp_path / "model.gltf")
 
 
 def test_glb_with_two_meshes_is_refused(tmp_path: Path) -> None:
@@ -480,4 +500,7 @@ def test_bad_arrays_are_not_written(tmp_path: Path) -> None:
         write_mesh(path, np.full((6, 3), np.nan), FACES)
     with pytest.raises(PoseSetError, match="face 0 names"):
         write_mesh(path, VERTICES, FACES + 3)
-    assert not path.exists()
+    for suffix in (".stl", ".glb"):
+        with pytest.raises(MeshFileError, match="exceeds float32"):
+            write_mesh(tmp_path / f"m{suffix}", VERTICES * 1e300, FACES)
+    assert list(tmp_path.iterdir()) == []

@@ -353,7 +353,7 @@ def test_audit_finds_every_defect_at_index_zero_too() -> None:
     assert len(audit.problems) == 4
 
 
-@pytest.mark.parametrize("unit", [1e-20, 1.0, 1e20])
+@pytest.mark.parametrize("unit", [1e-200, 1.0, 1e200])
 def test_area_is_judged_in_the_meshs_own_unit(unit: float) -> None:
     sliver = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1e-9, 0]]) * unit
     assert len(audit_mesh(Topology([[0, 1, 2]], 3), sliver).degenerate_faces) == 0
@@ -370,6 +370,13 @@ def test_audit_names_what_is_wrong_with_the_surface() -> None:
     assert "opposite senses" in audit_mesh(flipped, VERTICES).problems[0]
     with pytest.raises(ShapeError, match=r"\(4, 3\)"):
         audit_mesh(flipped, VERTICES[:3])
+
+
+def test_a_pose_set_is_read_only_but_its_makers_array_is_not() -> None:
+    poses = _poses(2)
+    pose_set = PoseSet(poses, Topology(FACES, 4), ("a", "b"))
+    assert not pose_set.vertices.flags.writeable
+    poses[0, 0] = 1.0
 
 
 def test_published_sets_are_sound(scape: PoseSet, jumping: PoseSet) -> None:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_few
-from lcollision_core.meshes.formats.text import decimals, plain_integers
+from lcollision_core.meshes.formats.text import decimals, normalised_text, plain_integers
 
 _SHORTEST_LINE = len(b"f 1 2 3\n")
 _BLOCK_LINES = 1 << 18
@@ -41,8 +41,7 @@ def read(file: BinaryIO, size: int) -> Polygons:
     data = read_rest(file)
     if b"\0" in data:
         raise MeshFileError("it is not a text file, so no OBJ; export the mesh again")
-    if b"\r" in data:
-        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    data = normalised_text(data)
     if b"\\" in data:
         data = data.replace(b"\\\n", b" ")
     vertex_lines: list[bytes] = []

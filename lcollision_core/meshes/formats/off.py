@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_plausible_count
-from lcollision_core.meshes.formats.text import decimals, numbers, plain_integers
+from lcollision_core.meshes.formats.text import decimals, normalised_text, numbers, plain_integers
 
 _HEADER = re.compile(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?C?N?OFF\b([^\n]*)", re.IGNORECASE)
 _COUNTS = re.compile(rb"(?:\s*(?:#[^\n]*\n)?)*(-?\d+)\s+(-?\d+)")
@@ -32,7 +32,7 @@ def read(file: BinaryIO) -> Polygons:
     ------
     MeshFileError : the header is no OFF header, or a vertex or face is missing or not readable.
     """
-    head = file.read(_HEAD_BYTES).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    head = normalised_text(file.read(_HEAD_BYTES))
     header = _HEADER.match(head)
     if header is None or b"BINARY" in header[1].upper():
         raise MeshFileError("it does not start with OFF as a text OFF file does")
@@ -43,7 +43,7 @@ def read(file: BinaryIO) -> Polygons:
     require_plausible_count(n_vertices, "vertices")
     require_plausible_count(n_faces, "faces")
     file.seek(0)
-    data = read_rest(file).replace(b"\r\n", b"\n").replace(b"\r", b"\n")[counts.end() :]
+    data = normalised_text(read_rest(file))[counts.end() :]
     # The rest of the line of counts is the number of edges, which readers ignore.
     data = data.partition(b"\n")[2]
     if b"#" in data:

@@ -24,7 +24,7 @@ MAX_FILE_BYTES = 1 << 30
 _CHUNK_BYTES = 1 << 24
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Polygons:
     """The content of a mesh file before triangulation.
 

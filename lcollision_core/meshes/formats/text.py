@@ -60,3 +60,10 @@ def plain_integers(text: bytes) -> npt.NDArray[np.int64] | None:
     if not text or text.isspace() or text.translate(None, b" \n0123456789"):
         return None
     return np.fromstring(text, dtype=np.int64, sep=" ")
+
+
+def normalised_text(data: bytes) -> bytes:
+    """Return text with line ends as a lone newline and without a byte order mark."""
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    return data.removeprefix(b"\xef\xbb\xbf")
