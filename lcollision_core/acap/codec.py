@@ -116,9 +116,15 @@ class AcapCodec:
 
         Raises
         ------
-        ShapeError : another shape.
+        ShapeError : another shape, or a vertex is not finite.
         """
         poses = self._checked(vertices, 3, "vertices")
+        broken = np.argwhere(~np.isfinite(poses).all(axis=2))
+        if len(broken):
+            pose, vertex = broken[0]
+            raise ShapeError(
+                f"vertex {vertex} of pose {pose} is not finite: {poses[pose, vertex].tolist()}"
+            )
         features = np.empty((len(poses), self.topology.n_vertices, N_FEATURES))
         n_jumps = np.zeros(len(poses), dtype=np.int64)
 

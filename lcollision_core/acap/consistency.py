@@ -138,6 +138,9 @@ def spanning_order(
                 o = quaternions[other]
                 # Falls with the cosine of half the relative angle, whichever sign q has.
                 key = 1.0 - abs(q[0] * o[0] + q[1] * o[1] + q[2] * o[2] + q[3] * o[3])
+                # A pose out of all measure gives NaN, and is still to be walked to its end.
+                if not key <= 1.0:
+                    key = 1.0
                 if key < best[other]:
                     best[other] = key
                     source[k] = vertex
@@ -274,7 +277,7 @@ def consistent_logarithms(
                     _hand_down(quaternions[vertex], trial[vertex], near, carried[vertex])
                 for a in range(3):
                     total += trial[vertex, a] * trial[vertex, a]
-            if total < least:
+            if not total >= least:
                 least = total
                 for k in range(begin, end):
                     logs[order[k]] = trial[order[k]]

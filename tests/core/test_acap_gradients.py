@@ -1,0 +1,150 @@
+"""Derivatives of decoding, against central differences, and decoding as a torch function."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from lcollision_core.acap.codec import AcapCodec
+from lcollision_core.acap.scaling import FeatureScaling
+from lcollision_core.acap.torch_decode import decode_torch
+from lcollision_core.errors import ShapeError
+from tests.core.shapes import join, sphere
+
+FloatArray = npt.NDArray[np.float64]
+STEP = 1e-5
+
+
+@pytest.fixture(scope="module")
+def codec() -> AcapCodec:
+    """Return the codec of two spheres and a loose vertex, anchored unevenly."""
+    mesh = join(sphere(n=10), sphere(0.3, 6).moved([1.6, 0.2, 0.1]))
+    vertices = np.concatenate([mesh.vertices, [[3.0, 0.0, 0.0]]])
+    weights = np.linspace(0.0, 1.0, len(vertices))
+    return AcapCodec(type(mesh.topology)(mesh.faces, len(vertices)), vertices, weights)
+
+
+@pytest.fixture(scope="module")
+def features(codec: AcapCodec) -> FloatArray:
+    """Return three fields: some rotations zero, some tiny, some beyond half and full turns."""
+    rng = np.random.default_rng(0)
+    n_vertices = codec.topology.n_vertices
+    fields = np.zeros((3, n_vertices, 9))
+    fields[..., [3, 6, 8]] = 1.0
+    fields += 0.3 * rng.normal(size=fields.shape)
+    fields[0, ::3, :3] = 0.0
+    fields[1, ::3, :3] *= 1e-6
+    fields[2, ::3, :3] *= 20.0
+    return fields
+
+
+def test_forward_derivative_is_the_central_difference(
+    codec: AcapCodec, features: FloatArray
+) -> None:
+    tangents = np.random.default_rng(1).normal(size=(11, *features.shape[1:]))
+    for at in features:
+        moved = codec.decode_jvp(at, tangents)
+        difference = codec.decode(at + STEP * tangents) - codec.decode(at - STEP * tangents)
+        assert moved == pytest.approx(difference / (2 * STEP), abs=1e-7)
+        assert np.abs(moved).max() > 0.1
+
+
+def test_torch_gradient_is_the_central_difference(codec: AcapCodec, features: FloatArray) -> None:
+    rng = np.random.default_rng(2)
+    target = rng.normal(size=(3, codec.topology.n_vertices, 3))
+    tangent = rng.normal(size=features.shape)
+
+    def loss(fields: torch.Tensor) -> torch.Tensor:
+        return ((decode_torch(codec, fields) - torch.from_numpy(target)) ** 2).sum()
+
+    variable = torch.from_numpy(features.copy()).requires_grad_()
+    loss(variable).backward()
+    assert variable.grad is not None
+    along = float((variable.grad * torch.from_numpy(tangent)).sum())
+    ahead, behind = (
+        float(loss(torch.from_numpy(features + sign * STEP * tangent))) for sign in (1, -1)
+    )
+    assert along == pytest.approx((ahead - behind) / (2 * STEP), rel=1e-6)
+    assert abs(along) > 1.0
+
+
+def test_every_entry_of_the_gradient_is_right(codec: AcapCodec, features: FloatArray) -> None:
+    variable = torch.from_numpy(features[:1].copy()).requires_grad_()
+    pull = torch.from_numpy(np.random.default_rng(3).normal(size=(codec.topology.n_vertices, 3)))
+    (decode_torch(codec, variable)[0] * pull).sum().backward()
+    assert variable.grad is not None
+    # Vertices 0 (rotation zero) and 1, and one of the smaller sphere.
+    for vertex in (0, 1, 50):
+        tangents = np.zeros((9, *features.shape[1:]))
+        tangents[np.arange(9), vertex, np.arange(9)] = 1.0
+        steps = [codec.decode(features[0] + sign * STEP * tangents) for sign in (1, -1)]
+        expected = ((steps[0] - steps[1]) / (2 * STEP) * pull.numpy()).sum(axis=(1, 2))
+        assert variable.grad[0, vertex].numpy() == pytest.approx(expected, abs=1e-8)
+        assert np.abs(expected).min() > 1e-6
+
+
+def test_backward_is_the_transpose_of_forward(codec: AcapCodec, features: FloatArray) -> None:
+    rng = np.random.default_rng(4)
+    n_poses = 20
+    fields = features[rng.integers(0, 3, n_poses)]
+    tangents = rng.normal(size=fields.shape)
+    pulls = rng.normal(size=(n_poses, codec.topology.n_vertices, 3))
+    pulled = codec.decode_vjp(fields, pulls)
+    for pose in range(n_poses):
+        moved = codec.decode_jvp(fields[pose], tangents[pose : pose + 1])[0]
+        assert (pulled[pose] * tangents[pose]).sum() == pytest.approx(
+            (pulls[pose] * moved).sum(), rel=1e-9
+        )
+        one = slice(pose, pose + 1)
+        assert np.array_equal(codec.decode_vjp(fields[one], pulls[one])[0], pulled[pose])
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 0.0)])
+def test_tensors_decode_as_arrays(
+    codec: AcapCodec, features: FloatArray, dtype: torch.dtype, tolerance: float
+) -> None:
+    expected = codec.decode(features)
+    tensor = torch.from_numpy(features).to(dtype)
+    decoded = codec.decode_torch(tensor)
+    assert decoded.dtype == dtype
+    assert decoded.numpy() == pytest.approx(expected, abs=tolerance)
+    assert torch.equal(codec.decode_torch(tensor[1]), decoded[1])
+    assert torch.equal(codec.decode_torch(tensor[:, None]), decoded[:, None])
+    single = tensor.clone().requires_grad_()
+    codec.decode_torch(single).sum().backward()
+    assert single.grad is not None
+    assert single.grad.dtype == dtype
+    assert bool(single.grad.isfinite().all())
+
+
+def test_other_shapes_are_refused(codec: AcapCodec, features: FloatArray) -> None:
+    n_vertices = codec.topology.n_vertices
+    with pytest.raises(ShapeError, match="features must have shape"):
+        codec.decode_torch(torch.zeros(n_vertices - 1, 9))
+    with pytest.raises(ShapeError, match="tangents must have shape"):
+        codec.decode_jvp(features[0], np.zeros((2, n_vertices, 3)))
+    with pytest.raises(ShapeError, match="3 poses but by_vertices 2"):
+        codec.decode_vjp(features, np.zeros((2, n_vertices, 3)))
+
+
+def test_scaling_takes_a_set_to_its_bounds_and_back(features: FloatArray) -> None:
+    scaling = FeatureScaling.fit(features)
+    scaled = scaling.apply(features)
+    for numbers in (scaled[..., :3], scaled[..., 3:]):
+        assert numbers.min() == pytest.approx(-0.95, abs=1e-12)
+        assert numbers.max() == pytest.approx(0.95, abs=1e-12)
+    assert scaling.invert(scaled) == pytest.approx(features, abs=1e-12)
+    tensor = torch.from_numpy(features).float()
+    assert scaling.apply(tensor).dtype == torch.float32
+    assert scaling.apply(tensor).numpy() == pytest.approx(scaled, abs=1e-5)
+    assert scaling.invert(scaling.apply(tensor)).numpy() == pytest.approx(features, abs=1e-5)
+
+
+def test_scaling_of_a_still_set_only_shifts() -> None:
+    still = np.zeros((2, 4, 9))
+    still[..., 3:] = 2.5
+    scaling = FeatureScaling.fit(still)
+    assert scaling == FeatureScaling(0.0, 1.0, 2.5, 1.0)
+    assert np.array_equal(scaling.apply(still), np.zeros_like(still))

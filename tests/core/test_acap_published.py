@@ -1,0 +1,35 @@
+"""Round trips of the published pose sets, where they are at hand: half of the limits asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lcollision_core.acap.codec import AcapCodec
+from lcollision_core.meshes import PoseSet
+from lcollision_core.meshes.alignment import align_rigid
+from lcollision_core.meshes.units import height
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "mean_limit", "max_limit", "most_jumps"),
+    [("scape", 1, 0.00075, 0.009, 20), ("jumping", 10, 0.00015, 0.003, 10)],
+)
+def test_round_trip_of_aligned_poses(
+    request: pytest.FixtureRequest,
+    name: str,
+    step: int,
+    mean_limit: float,
+    max_limit: float,
+    most_jumps: int,
+) -> None:
+    poses: PoseSet = request.getfixturevalue(name)
+    reference = poses.vertices[0] / height(poses.vertices[0])
+    aligned = align_rigid(poses.vertices[::step] / height(poses.vertices[0]), reference)
+    codec = AcapCodec(poses.topology, reference, aligned.weights)
+    encoded = codec.encode(aligned.vertices)
+    # Anchored like the alignment, so that no translation is left to take out.
+    error = np.linalg.norm(codec.decode(encoded.features) - aligned.vertices, axis=2)
+    assert 0.0 < error.mean() < mean_limit
+    assert error.max() < max_limit
+    assert encoded.n_jumps.sum() < most_jumps
