@@ -59,6 +59,8 @@ def read_npz(path: Path) -> dict[str, npt.NDArray[Any]]:
         raise MeshFileError(f"{error.strerror or error}; check the file") from error
     except _DAMAGE as error:
         raise MeshFileError("it is damaged or no .npz archive; export it again") from error
+    except MemoryError as error:
+        raise MeshFileError("it needs more memory than there is; keep fewer poses") from error
 
 
 def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> npt.NDArray[Any]:

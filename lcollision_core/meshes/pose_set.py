@@ -237,13 +237,17 @@ def _collect_folder(
             cancel.raise_if_cancelled()
         try:
             mesh = read_mesh(file, topology=topology)
-            if topology is None:
-                topology = mesh.topology
-                vertices = _empty_poses(path, len(files), topology.n_vertices, np.float64)
-            defect = _disagreement(pose, file.name, mesh.topology, topology)
         except MeshFileError as error:
             report(error)
         else:
+            if topology is None:
+                topology = mesh.topology
+                too_large = _too_large(path, len(files), topology.n_vertices)
+                if too_large is not None:
+                    report(too_large)
+                    return Collected(None, len(files), same_topology=False)
+                vertices = np.empty((len(files), topology.n_vertices, 3), dtype=np.float64)
+            defect = _disagreement(pose, file.name, mesh.topology, topology)
             if defect is None:
                 vertices[len(names)] = mesh.vertices
                 names.append(file.name)
@@ -288,13 +292,13 @@ def _disagreement(pose: int, name: str, found: Topology, expected: Topology) -> 
     return None
 
 
-def _empty_poses(path: Path, n: int, n_vertices: int, dtype: type) -> npt.NDArray[Any]:
-    if n * n_vertices * 3 > MAX_ITEMS:
-        raise MeshFileError(
-            f"{path} holds {n} poses of {n_vertices} vertices, more than {MAX_ITEMS} "
-            f"coordinates; keep fewer poses or decimate them"
-        )
-    return np.empty((n, n_vertices, 3), dtype=dtype)
+def _too_large(path: Path, n_poses: int, n_vertices: int) -> MeshFileError | None:
+    if n_poses * n_vertices * 3 <= MAX_ITEMS:
+        return None
+    return MeshFileError(
+        f"{path} holds {n_poses} poses of {n_vertices} vertices, more than {MAX_ITEMS} "
+        f"coordinates; keep fewer poses or decimate them"
+    )
 
 
 def _collect_npz(

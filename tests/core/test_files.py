@@ -405,7 +405,7 @@ def test_fifty_million_faces_are_refused_without_taking_memory(tmp_path: Path, s
     path = tmp_path / f"big{suffix}"
     n = 50_000_000
     if suffix == ".obj":
-        path.write_bytes(b"v 0 0 0\n" * 3 + b"f 1 2 3\n" * (n // 4))
+        path.write_bytes(b"v 0 0 0\n" * 3 + b"f 1 2 3\n" * (n // 8))
     elif suffix == ".ply":
         _sparse(path, HEADER.replace("ascii", "binary_little_endian").format(n, n).encode(), n * 25)
     elif suffix == ".off":

@@ -179,6 +179,16 @@ def test_folders_that_are_no_pose_set(tmp_path: Path) -> None:
     assert inspect_pose_set(tmp_path / "none").problems != ()
 
 
+def test_set_beyond_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lcollision_core.meshes.pose_set.MAX_ITEMS", 12 * 4 * 3 - 1)
+    folder = _write_folder(tmp_path)
+    with pytest.raises(MeshFileError, match="12 poses of 4 vertices, more than 143"):
+        read_pose_set(folder)
+    assert len(inspect_pose_set(folder).problems) == 1
+    (folder / "mesh11.obj").unlink()
+    assert len(read_pose_set(folder)) == 11
+
+
 def test_cancel_ends_reading(tmp_path: Path) -> None:
     token = CancelToken()
     read: list[int] = []

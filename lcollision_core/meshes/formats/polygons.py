@@ -11,15 +11,15 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 
-MAX_FACES = 10_000_000
+MAX_FACES = 5_000_000
 """The most faces, and the most vertices, that a mesh file may hold.
 
 Far above any posed body, and low enough that a file at the limit fits into memory. Counts are
 compared with it before anything of that size is allocated.
 """
 
-MAX_FILE_BYTES = 1 << 30
-"""The largest mesh file that is opened, in bytes."""
+MAX_FILE_BYTES = 1 << 29
+"""The largest mesh file that is read, in bytes: as text it takes some ten times that in memory."""
 
 _CHUNK_BYTES = 1 << 24
 
