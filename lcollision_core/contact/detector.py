@@ -190,7 +190,7 @@ class CollisionDetector:
         vertex_energy = np.zeros(poses.shape[:2])
 
         def search(searcher: _Searcher, pose: int) -> None:
-            n_found = searcher.search(poses[pose], first_only=False)
+            n_found = searcher.search(poses[pose], first_only=False, number=pose)
             add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
             n_near_pairs[pose] = np.count_nonzero(searcher.found.is_near[:n_found])
             n_pairs[pose] = n_found - n_near_pairs[pose]
@@ -214,7 +214,7 @@ class CollisionDetector:
         colliding = np.zeros(len(poses), dtype=np.bool_)
 
         def search(searcher: _Searcher, pose: int) -> None:
-            n_found = searcher.search(poses[pose], first_only=True)
+            n_found = searcher.search(poses[pose], first_only=True, number=pose)
             # The search ends at a pair that counts, so the last one found tells.
             colliding[pose] = n_found > 0 and not searcher.found.is_near[n_found - 1]
 
@@ -284,11 +284,17 @@ class _Searcher:
         self._pose = np.empty((topology.n_vertices, 3))
         self.found = _room_for(_FIRST_ROOM)
 
-    def search(self, pose: npt.NDArray[np.floating], *, first_only: bool) -> int:
-        """Fill `found` with the pairs of one pose (V, 3) and return how many there are."""
+    def search(
+        self, pose: npt.NDArray[np.floating], *, first_only: bool, number: int | None = None
+    ) -> int:
+        """Fill `found` with the pairs of one pose (V, 3) and return how many there are.
+
+        `number` is the pose's place in its batch, for the error message.
+        """
         np.copyto(self._pose, pose)
         if not np.isfinite(self._pose).all():
-            raise ShapeError(f"{_first_not_finite(self._pose)} is not finite")
+            where = "" if number is None else f" of pose {number}"
+            raise ShapeError(f"{_first_not_finite(self._pose)}{where} is not finite")
         while True:
             n_found: int = search_pose(
                 self._pose,
