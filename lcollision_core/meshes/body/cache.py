@@ -34,9 +34,9 @@ def cached_template(n_vertices: int) -> Template:
     """
     path = _cache_folder() / f"body-{n_vertices}-{_fingerprint()}.npz"
     try:
-        return _read(path)
+        return _read_only(_read(path))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        template = build_template(n_vertices)
+        template = _read_only(build_template(n_vertices))
     with suppress(OSError, LCollisionError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as file:
@@ -50,6 +50,13 @@ def cached_template(n_vertices: int) -> Template:
                 zero_names=np.array(list(template.skeleton.zeros)),
                 zero_rotations=np.array(list(template.skeleton.zeros.values())),
             )
+    return template
+
+
+def _read_only(template: Template) -> Template:
+    """Guard the arrays: every caller gets the same ones."""
+    for array in (template.vertices, template.faces, template.weights, template.mirror):
+        array.flags.writeable = False
     return template
 
 

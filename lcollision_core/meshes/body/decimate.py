@@ -17,7 +17,7 @@ Project = Callable[[FloatArray], FloatArray]
 MIN_NORMAL_COSINE = 0.3
 """A collapse may turn a face that it keeps by no more than this cosine allows."""
 
-SHAPE_WEIGHT = 40.0
+SHAPE_WEIGHT = 60.0
 """What a squared distance from the surface costs beside a squared relative edge length."""
 
 

@@ -220,7 +220,8 @@ def _reach(
         "knee": float(np.degrees(bend)),
         "ankle": -float(lift),
         "foot tilt": float(tilt),
-        "toes": max(0.0, foot.heel) if foot.height < 0.03 else 0.0,
+        # Toes stay flat on the floor and straighten as they leave it.
+        "toes": max(0.0, foot.heel) * max(0.0, 1.0 - foot.height / 0.12),
     }
 
 

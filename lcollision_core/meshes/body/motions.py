@@ -28,19 +28,20 @@ def jump_motion(skeleton: Skeleton) -> list[Figure]:
     the stretched legs.
     """
     crouch, take_off, landing, absorbed, standing = 46.0, 63.0, 99.0, 115.0, 146.0
+    upright = straight_rise(Figure(left_leg=Foot(0.13), right_leg=Foot(0.13)), skeleton) - 0.002
     flight = (landing - take_off) / JUMP_FRAME_RATE
     speed = 9.81 * flight / 2 / JUMP_FRAME_RATE
     pelvis = CubicHermiteSpline(
         [0, 10, crouch, take_off, landing, absorbed, standing, 149],
-        [0.0, 0.0, -0.30, 0.09, 0.09, -0.22, 0.0, 0.0],
+        [upright, upright, -0.27, 0.10, 0.10, -0.22, upright, upright],
         [0, 0, 0, speed, -speed, 0, 0, 0],
     )(_FRAMES)
     heel = _eased([0, 44, take_off, 80, landing, 108, 149], [0, 4, 50, 40, 30, 0, 0])
     tuck = 0.09 * np.sin(np.pi * np.clip((_FRAMES - take_off) / 36, 0, 1)) ** 2
-    lift = _eased([0, 10, 40, 64, 82, 104, 120, 146], [14, 14, -44, 138, 152, 74, 40, 14], 2.5)
+    swing = _eased([0, 10, 40, 64, 82, 104, 120, 146], [6, 6, -48, 134, 150, 74, 40, 6], 2.5)
     elbow = _eased([0, 10, 38, 52, 66, 100, 146], [15, 15, 22, 40, 12, 25, 15], 2.5)
-    lean = _eased([0, 12, crouch, 64, 84, landing, 115, 146], [0, 0, 34, 0, -3, 8, 26, 0], 2.5)
-    bend = _eased([0, 12, crouch, 64, 82, landing, 115, 146], [0, 0, 20, -8, -4, 8, 18, 0], 2.5)
+    lean = _eased([0, 12, crouch, 64, 84, landing, 115, 146], [0, 0, 27, 0, -3, 8, 24, 0], 2.5)
+    bend = _eased([0, 12, crouch, 64, 82, landing, 115, 146], [0, 0, 17, -8, -4, 8, 15, 0], 2.5)
     nod = _eased([0, 14, crouch, 64, 115, 146], [0, 0, -26, -14, -20, 0], 2.5)
     back = _eased([0, 12, crouch, 63, 100, 115, 146], [0, 0, -0.12, 0, -0.02, -0.09, 0], 2.5)
     figures = []
@@ -48,10 +49,10 @@ def jump_motion(skeleton: Skeleton) -> list[Figure]:
         foot = Foot(0.13, heading=9, heel=heel[frame])
         stance = Figure(left_leg=foot, right_leg=foot, lean=lean[frame], ahead=back[frame])
         # A soft maximum: the feet leave the floor as the legs end, without a jolt.
-        slack = pelvis[frame] - straight_rise(stance, skeleton) + 0.02
-        height = 0.025 * np.logaddexp(0.0, slack / 0.025) + tuck[frame]
+        slack = pelvis[frame] - straight_rise(stance, skeleton) + 0.03
+        height = 0.035 * np.logaddexp(0.0, slack / 0.035) + tuck[frame]
         foot = Foot(0.13, heading=9, heel=heel[frame], height=float(height))
-        arm = Arm(lift[frame], 76, 0, elbow[frame], 15)
+        arm = _swung_arm(swing[frame], elbow[frame])
         figures.append(
             Figure(
                 arm,
@@ -68,6 +69,18 @@ def jump_motion(skeleton: Skeleton) -> list[Figure]:
     return figures
 
 
+def _swung_arm(swing: float, elbow: float) -> Arm:
+    """Swing an arm forward by `swing` degrees, held clear of the hip."""
+    clear, swing = np.radians(16.0), np.radians(swing)
+    down, forward = np.cos(clear) * np.cos(swing), np.cos(clear) * np.sin(swing)
+    return Arm(
+        lift=float(np.degrees(np.arccos(down))),
+        plane=float(np.degrees(np.arctan2(forward, np.sin(clear)))),
+        elbow=elbow,
+        pronation=15,
+    )
+
+
 class _Step(NamedTuple):
     """A foot's step: lifted at `start`, down at `end`, at (x, ahead) metres, heading degrees."""
 
@@ -78,27 +91,40 @@ class _Step(NamedTuple):
     heading: float
 
 
+def _around(side: float, start: float, end: float, heading: float) -> _Step:
+    """Step to where a foot stands under a body that has turned by `heading` degrees."""
+    turned = np.radians(heading)
+    x = 0.10 + side * 0.12 * np.cos(turned)
+    return _Step(start, end, float(x), float(0.03 - side * 0.12 * np.sin(turned)), heading)
+
+
+_TURN = (
+    (1.0, 75, 84, 40.0),
+    (-1.0, 83, 92, 85.0),
+    (1.0, 91, 100, 130.0),
+    (-1.0, 99, 108, 175.0),
+    (1.0, 107, 116, 220.0),
+    (-1.0, 115, 124, 265.0),
+    (1.0, 123, 132, 310.0),
+    (-1.0, 131, 140, 350.0),
+    (1.0, 138, 147, 360.0),
+)
+"""Side, first and last frame and heading of the turn's steps."""
+
 # Two six-count basics (rock step, triple step, triple step) and a travelling turn to the left.
 _LEFT_STEPS = (
     _Step(4, 13, 0.13, -0.24, 0),
     _Step(26, 34, 0.30, 0.00, 0),
     _Step(40, 47, 0.38, 0.00, 0),
-    _Step(60, 67, 0.23, 0.02, 0),
-    _Step(78, 85, 0.16, 0.06, 45),
-    _Step(93, 100, 0.02, 0.22, 135),
-    _Step(108, 115, 0.00, 0.00, 225),
-    _Step(123, 130, 0.16, -0.06, 315),
-    _Step(137, 144, 0.20, 0.02, 360),
+    _Step(60, 68, 0.23, 0.02, 0),
+    *(_around(*step) for step in _TURN[0::2]),
 )
 _RIGHT_STEPS = (
     _Step(15, 24, -0.09, 0.05, 0),
     _Step(33, 40, 0.10, 0.00, 0),
     _Step(53, 60, 0.02, 0.00, 0),
-    _Step(67, 74, -0.04, 0.00, 10),
-    _Step(85, 93, 0.04, 0.02, 90),
-    _Step(100, 108, 0.20, 0.12, 180),
-    _Step(115, 123, 0.02, -0.14, 270),
-    _Step(130, 137, -0.04, 0.00, 350),
+    _Step(67, 75, -0.03, 0.00, 0),
+    *(_around(*step) for step in _TURN[1::2]),
 )
 
 
@@ -112,8 +138,9 @@ def swing_motion() -> list[Figure]:
     middle = gaussian_filter1d(0.5 * middle + 0.25 * (left.place + right.place), 3.5, axis=0)
     turn = gaussian_filter1d((left.heading + right.heading) / 2, 3.0, mode="nearest")
     beat = 2 * np.pi * _FRAMES / 13.4
-    rise = -0.035 + 0.012 * np.cos(beat)
-    sway = 4.0 * np.sin(beat / 2)
+    rise = -0.032 + 0.014 * np.cos(beat)
+    sway = 5.0 * np.sin(beat / 2)
+    turn += 1.4 * sway
     holding = _eased([0, 74, 92, 124, 144], [44, 46, 128, 130, 48], 3.0)
     guiding = _eased([0, 20, 44, 70, 92, 124, 144], [52, 60, 46, 56, 40, 42, 52], 3.0)
     offer = _eased([0, 12, 24, 40, 56, 74, 92, 124, 144], [62, 34, 66, 78, 60, 70, 44, 44, 62], 3.0)
@@ -123,7 +150,7 @@ def swing_motion() -> list[Figure]:
             Arm(guiding[frame], 62 + sway[frame], 30, 62 + 2 * sway[frame], 30),
             _foot(left, frame, 1.0),
             _foot(right, frame, -1.0),
-            spine=(5.0, 0.8 * sway[frame], -1.5 * sway[frame]),
+            spine=(5.0, 0.9 * sway[frame], -2.2 * sway[frame]),
             neck=(2.0, -0.5 * sway[frame], sway[frame]),
             shift=float(middle[frame, 0]),
             ahead=float(middle[frame, 1]) - 0.03,
@@ -163,8 +190,8 @@ def _foot(walk: _Walk, frame: int, side: float) -> Foot:
         out=side * x,
         ahead=ahead,
         heading=8.0 + side * float(walk.heading[frame]),
-        heel=18.0 * lift,
-        height=0.05 * lift,
+        heel=16.0 * lift,
+        height=0.04 * lift,
     )
 
 

@@ -69,7 +69,9 @@ class Skin:
         blend_real, blend_dual = blend_real / length, blend_dual / length
         conjugate = blend_real * [-1.0, -1.0, -1.0, 1.0]
         shift = 2.0 * _multiply(blend_dual, conjugate)[:, :3]
-        return np.asarray(Rotation.from_quat(blend_real).apply(template.vertices) + shift)
+        axis, scalar = blend_real[:, :3], blend_real[:, 3:]
+        twice = 2.0 * np.cross(axis, template.vertices)
+        return np.asarray(template.vertices + scalar * twice + np.cross(axis, twice) + shift)
 
     def _smooth(self, vertices: FloatArray) -> FloatArray:
         for _ in range(self._n_sweeps):
