@@ -165,20 +165,24 @@ def collect_poses(
     report : told of each defect; when it raises, reading ends there
     progress, cancel : as for `read_pose_set`
     """
-    if path.is_dir():
-        collected = _collect_folder(path, report, progress, cancel)
-    elif path.suffix.lower() == ".npz":
-        collected = _collect_npz(path, report, progress)
-    else:
-        if path.suffix.lower() in READABLE_SUFFIXES and path.exists():
-            defect = f"{path} is one mesh, not a pose set; name its folder"
-        elif path.exists():
-            defect = f"{path} is no pose set; name a folder of meshes or an .npz file"
-        else:
-            defect = f"{path} does not exist; name a folder of meshes or an .npz file"
-        report(MeshFileError(defect))
+    try:
+        is_folder, exists = path.is_dir(), path.exists()
+    except OSError as error:
+        report(MeshFileError(f"{path} cannot be read: {error.strerror or error}; check the name"))
         return Collected(None, 0, same_topology=False)
-    return collected
+    if is_folder:
+        return _collect_folder(path, report, progress, cancel)
+    suffix = path.suffix.lower()
+    if exists and suffix == ".npz":
+        return _collect_npz(path, report, progress)
+    if not exists:
+        defect = f"{path} does not exist; name a folder of meshes or an .npz file"
+    elif suffix in READABLE_SUFFIXES:
+        defect = f"{path} is one mesh, not a pose set; name its folder"
+    else:
+        defect = f"{path} is no pose set; name a folder of meshes or an .npz file"
+    report(MeshFileError(defect))
+    return Collected(None, 0, same_topology=False)
 
 
 def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDArray[np.int32]:

@@ -173,6 +173,8 @@ def test_folders_that_are_no_pose_set(tmp_path: Path) -> None:
         read_pose_set(tmp_path / "mesh0.obj")
     with pytest.raises(MeshFileError, match="does not exist"):
         read_pose_set(tmp_path / "none")
+    with pytest.raises(MeshFileError, match="name too long"):
+        read_pose_set(tmp_path / ("x" * 300))
     (tmp_path / "x.txt").write_text("x")
     with pytest.raises(MeshFileError, match="is no pose set"):
         read_pose_set(tmp_path / "x.txt")
