@@ -1,0 +1,339 @@
+"""A trained latent space of poses: what the model file keeps, and what decodes and encodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.acap.codec import AcapCodec
+from lcollision_core.acap.features import N_FEATURES
+from lcollision_core.acap.reconstruct import BLOCK_POSES
+from lcollision_core.acap.scaling import FeatureScaling
+from lcollision_core.embedding.autoencoders import (
+    AutoencoderWeights,
+    build_decoder,
+    centre_features,
+    deviation_of,
+    run_encoders,
+)
+from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.embedding.decoder import FeatureDecoder, Float32Array
+from lcollision_core.embedding.fitting import MAX_STEPS, LatentFit, fit_latent
+from lcollision_core.embedding.metrics import EmbeddingMetrics
+from lcollision_core.errors import ModelFileError, ShapeError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.alignment import fit_rigid
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+if TYPE_CHECKING:
+    import torch
+
+_LEAST_RANGE = 1e-6
+"""So that the range of a code that no training pose uses still straddles 0."""
+
+
+@dataclass(frozen=True)
+class Embedding:
+    """The bilevel autoencoder of one body; immutable and safe to share between threads.
+
+    A latent Z_all is (Z_0, Z_1, ..., Z_K): level 1's K codes, then each domain's. Latent 0 is the
+    mean of the training poses' features.
+
+    Attributes
+    ----------
+    topology : the connectivity
+    rest_vertices : (V, 3) float64 array, the reference, in heights
+    alignment_weights : (V,) float64 array, how much each vertex leads when a mesh is aligned
+    scaling : of the features
+    mean_features : (V, 9) float32 array, mean of the scaled training features
+    level1 : its support is all vertices
+    level2 : K autoencoders, on the vertices of their domains
+    attention_mask : (K, V) float32 array, each column sums to 1
+    training_latent : (N, D) float32 array, codes of the training poses
+    metrics : what training measured, None before it has
+    config : how it was trained
+    seed : of the order of level 2's batches
+    """
+
+    topology: Topology
+    rest_vertices: FloatArray
+    alignment_weights: FloatArray
+    scaling: FeatureScaling
+    mean_features: Float32Array
+    level1: AutoencoderWeights
+    level2: tuple[AutoencoderWeights, ...]
+    attention_mask: Float32Array
+    training_latent: Float32Array
+    metrics: EmbeddingMetrics | None
+    config: EmbeddingConfig
+    seed: int
+
+    @cached_property
+    def codec(self) -> AcapCodec:
+        """The features' codec, its matrix factored once."""
+        return AcapCodec(self.topology, self.rest_vertices, self.alignment_weights)
+
+    @cached_property
+    def decoder(self) -> FeatureDecoder:
+        """The decoders of both levels as tables."""
+        return build_decoder(
+            (self.level1, *self.level2), self.scaling, self.mean_features, self.topology
+        )
+
+    @property
+    def n_domains(self) -> int:
+        """K = |Z_0|."""
+        return len(self.level2)
+
+    @property
+    def group_sizes(self) -> tuple[int, ...]:
+        """(|Z_0|, |Z_1|, ..., |Z_K|)."""
+        return tuple(len(part.components) for part in (self.level1, *self.level2))
+
+    @property
+    def latent_size(self) -> int:
+        """D = |Z_all|."""
+        return sum(self.group_sizes)
+
+    @cached_property
+    def latent_min(self) -> Float32Array:
+        """(D,) least code of the training poses, below 0."""
+        least: Float32Array = np.minimum(self.training_latent.min(axis=0), -_LEAST_RANGE)
+        return least
+
+    @cached_property
+    def latent_max(self) -> Float32Array:
+        """(D,) largest code of the training poses, above 0."""
+        largest: Float32Array = np.maximum(self.training_latent.max(axis=0), _LEAST_RANGE)
+        return largest
+
+    @cached_property
+    def latent_deviation(self) -> FloatArray:
+        """(D,) root mean square of the training poses' codes, > 0."""
+        return deviation_of(self.training_latent)
+
+    def decode(self, latent: npt.NDArray[Any], n_threads: int | None = None) -> FloatArray:
+        """Decode latent codes to meshes.
+
+        Parameters
+        ----------
+        latent : (B, D) array
+        n_threads : to spread the poses over, numba's own number by default
+
+        Returns
+        -------
+        vertices : (B, V, 3) float64 array, in heights, in the reference's frame; a pose gets the
+            same bits in whichever batch it comes, on however many threads
+
+        Raises
+        ------
+        ShapeError : another shape.
+        """
+        rows = np.atleast_1d(np.asarray(latent))
+        if rows.ndim != 2 or rows.shape[1] != self.latent_size:
+            raise ShapeError(f"latent must have shape (B, {self.latent_size}), got {rows.shape}")
+        vertices = np.empty((len(rows), self.topology.n_vertices, 3))
+
+        def decode_block(start: int) -> None:
+            block = self.decoder.features(rows[start : start + BLOCK_POSES])
+            vertices[start : start + BLOCK_POSES] = self.codec.decode(block, n_threads=1)
+
+        starts = range(0, len(rows), BLOCK_POSES)
+        wanted = numba.config.NUMBA_NUM_THREADS if n_threads is None else n_threads
+        if min(wanted, len(starts)) <= 1:
+            for start in starts:
+                decode_block(start)
+        else:
+            _ = self.decoder, self.codec
+            with ThreadPoolExecutor(min(wanted, len(starts))) as pool:
+                list(pool.map(decode_block, starts))
+        return vertices
+
+    def decode_torch(self, latent: torch.Tensor) -> torch.Tensor:
+        """Decode (B, D) latent codes differentiably to (B, V, 3) vertices in heights."""
+        return self.codec.decode_torch(self.decoder.features_torch(latent))
+
+    def guess(self, features: npt.NDArray[Any]) -> Float32Array:
+        """Run the encoders: (B, V, 9) unscaled features to a (B, D) float32 latent."""
+        centred = centre_features(features, self.scaling, self.mean_features)
+        return run_encoders(centred, self.level1, self.level2, self.attention_mask, self.topology)
+
+    def encode(
+        self,
+        vertices: npt.NDArray[Any],
+        max_steps: int = MAX_STEPS,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> LatentFit:
+        """Find the latent codes of meshes in any rigid position.
+
+        The encoders guess from the features of the aligned mesh; a few Gauss-Newton steps on the
+        vertex error then settle code and rigid motion together.
+
+        Parameters
+        ----------
+        vertices : (B, V, 3) finite array, in heights
+        max_steps : at most so many steps a mesh; 0 returns the guess
+        progress : called with (meshes done, meshes in all)
+        cancel : polled between meshes
+
+        Returns
+        -------
+        fit : LatentFit
+
+        Raises
+        ------
+        ShapeError : another shape.
+        CancelledError : `cancel` was set.
+        """
+        rotations, translations = fit_rigid(vertices, self.rest_vertices, self.alignment_weights)
+        moved = np.asarray(vertices, np.float64) @ np.swapaxes(rotations, 1, 2)
+        guess = self.guess(self.codec.encode(moved + translations[:, None]).features)
+        return fit_latent(
+            self.decoder,
+            self.codec,
+            vertices,
+            guess,
+            self.latent_deviation,
+            max_steps,
+            progress,
+            cancel,
+        )
+
+    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+        """Return arrays and JSON metadata from which `from_arrays` builds the same embedding."""
+        arrays: dict[str, npt.NDArray[Any]] = {
+            "faces": self.topology.faces,
+            "rest_vertices": self.rest_vertices,
+            "alignment_weights": self.alignment_weights,
+            "mean_features": self.mean_features,
+            "training_latent": self.training_latent,
+        }
+        for name, part in self._named_parts():
+            arrays[f"{name}_components"] = part.components
+            arrays[f"{name}_self_weight"] = part.self_weight
+            arrays[f"{name}_ring_weight"] = part.ring_weight
+            if name != "level1":
+                arrays[f"{name}_support"] = part.support
+                domain = int(name.removeprefix("level2_"))
+                arrays[f"{name}_mask"] = self.attention_mask[domain, part.support]
+        metadata = {
+            "n_vertices": self.topology.n_vertices,
+            "n_domains": self.n_domains,
+            "scaling": asdict(self.scaling),
+            "metrics": None if self.metrics is None else asdict(self.metrics),
+            "config": {**asdict(self.config), "locality_reach": list(self.config.locality_reach)},
+            "seed": self.seed,
+        }
+        return arrays, metadata
+
+    @classmethod
+    def from_arrays(
+        cls, arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]
+    ) -> Embedding:
+        """Rebuild an embedding from what `to_arrays` returned.
+
+        Raises
+        ------
+        ModelFileError : something is missing, or the arrays do not fit together.
+        """
+        try:
+            n_vertices, n_domains = int(metadata["n_vertices"]), int(metadata["n_domains"])
+            mask = np.zeros((n_domains, n_vertices), dtype=np.float32)
+            parts = []
+            for name in ("level1", *(f"level2_{k}" for k in range(n_domains))):
+                support = (
+                    np.arange(n_vertices, dtype=np.int32)
+                    if name == "level1"
+                    else _int32(arrays[f"{name}_support"])
+                )
+                parts.append(
+                    AutoencoderWeights(
+                        components=_float32(arrays[f"{name}_components"]),
+                        self_weight=_float32(arrays[f"{name}_self_weight"]),
+                        ring_weight=_float32(arrays[f"{name}_ring_weight"]),
+                        support=support,
+                    )
+                )
+                if name != "level1":
+                    mask[len(parts) - 2, support] = arrays[f"{name}_mask"]
+            metrics = metadata["metrics"]
+            embedding = cls(
+                topology=Topology(arrays["faces"], n_vertices),
+                rest_vertices=np.asarray(arrays["rest_vertices"], dtype=np.float64),
+                alignment_weights=np.asarray(arrays["alignment_weights"], dtype=np.float64),
+                scaling=FeatureScaling(**metadata["scaling"]),
+                mean_features=_float32(arrays["mean_features"]),
+                level1=parts[0],
+                level2=tuple(parts[1:]),
+                attention_mask=mask,
+                training_latent=_float32(arrays["training_latent"]),
+                metrics=None if metrics is None else EmbeddingMetrics(**metrics),
+                config=EmbeddingConfig(**metadata["config"]),
+                seed=int(metadata["seed"]),
+            )
+        except KeyError as error:
+            raise ModelFileError(
+                f"the model's embedding lacks {error.args[0]!r}; train or copy the model again"
+            ) from error
+        except (TypeError, ValueError, IndexError) as error:
+            raise ModelFileError(
+                f"the model's embedding does not fit together ({error}); train or copy the "
+                "model again"
+            ) from error
+        embedding._refuse_misfits()
+        return embedding
+
+    def _named_parts(self) -> Iterator[tuple[str, AutoencoderWeights]]:
+        yield "level1", self.level1
+        for domain, part in enumerate(self.level2):
+            yield f"level2_{domain}", part
+
+    def _refuse_misfits(self) -> None:
+        n_vertices, n_poses = self.topology.n_vertices, len(self.training_latent)
+        expected: dict[str, tuple[npt.NDArray[Any], tuple[int, ...]]] = {
+            "rest_vertices": (self.rest_vertices, (n_vertices, 3)),
+            "alignment_weights": (self.alignment_weights, (n_vertices,)),
+            "mean_features": (self.mean_features, (n_vertices, N_FEATURES)),
+            "training_latent": (self.training_latent, (n_poses, self.latent_size)),
+        }
+        for name, part in self._named_parts():
+            shape = (len(part.components), len(part.support), N_FEATURES)
+            expected[f"{name}_components"] = (part.components, shape)
+            for kind in ("self_weight", "ring_weight"):
+                expected[f"{name}_{kind}"] = (getattr(part, kind), (N_FEATURES, N_FEATURES))
+            inside = (part.support >= 0) & (part.support < n_vertices)
+            if len(part.support) == 0 or not inside.all() or (np.diff(part.support) <= 0).any():
+                raise ModelFileError(
+                    f"the model's {name}_support is no ascending list of its {n_vertices} "
+                    "vertices; train or copy the model again"
+                )
+        expected["level1_components"] = (
+            self.level1.components,
+            (self.n_domains, n_vertices, N_FEATURES),
+        )
+        for name, (array, wanted) in expected.items():
+            if array.shape != wanted or 0 in wanted:
+                raise ModelFileError(
+                    f"the model's {name} has shape {array.shape} instead of {wanted}; train or "
+                    "copy the model again"
+                )
+        if np.abs(self.attention_mask.sum(axis=0) - 1.0).max() > 1e-5:
+            raise ModelFileError(
+                "the model's attention masks do not sum to 1; train or copy the model again"
+            )
+
+
+def _float32(array: npt.NDArray[Any]) -> Float32Array:
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def _int32(array: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    return np.ascontiguousarray(array, dtype=np.int32)

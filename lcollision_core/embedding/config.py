@@ -1,0 +1,74 @@
+"""The choices of stage 1, with their defaults."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lcollision_core.errors import LCollisionError
+
+
+@dataclass(frozen=True)
+class EmbeddingConfig:
+    """How a latent space is trained; what was tried stands in `training`.
+
+    Attributes
+    ----------
+    n_domains : K = |Z_0|, codes of level 1 and domains
+    n_domain_codes : |Z_k|, codes of each domain; fewer where the training poses span less
+    level1_epochs, level2_epochs : passes over the poses
+    level1_rate, level2_rate : Adam's step sizes for the fully connected layers, whose weights
+        have a root mean square of 1 here; the second falls to 0 along a cosine
+    convolution_rate : Adam's step size for the graph convolutions of both levels
+    batch_poses : poses per step of level 2
+    locality_weight : of the locality loss, divided by the root of V, beside the squared feature
+        error per vertex
+    locality_reach : shares of the mesh's largest geodesic distance between which the locality
+        loss rises from nothing to its full weight round a part
+    mask_softening : times that the parts' edges are averaged with their one-rings at the start
+    vertex_weight : of the mean squared vertex distance, in squared heights, beside the squared
+        feature error per vertex, in level 2
+    held_out_stride : every so many poses one is left out of a second model that measures how
+        unseen poses fare; 0 trains no second model
+
+    Raises
+    ------
+    LCollisionError : a value is out of its range.
+    """
+
+    n_domains: int = 10
+    n_domain_codes: int = 10
+    level1_epochs: int = 300
+    level2_epochs: int = 60
+    level1_rate: float = 0.1
+    level2_rate: float = 0.01
+    convolution_rate: float = 1e-3
+    batch_poses: int = 16
+    locality_weight: float = 0.1
+    locality_reach: tuple[float, float] = (0.0, 0.1)
+    mask_softening: int = 3
+    vertex_weight: float = 15.0
+    held_out_stride: int = 10
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "locality_reach", tuple(self.locality_reach))
+        least = {
+            "n_domains": 1,
+            "n_domain_codes": 1,
+            "level1_epochs": 0,
+            "level2_epochs": 0,
+            "batch_poses": 1,
+            "mask_softening": 0,
+            "held_out_stride": 0,
+        }
+        for name, low in least.items():
+            if getattr(self, name) < low:
+                raise LCollisionError(f"{name} must be at least {low}, got {getattr(self, name)}")
+        rates = ("level1_rate", "level2_rate", "convolution_rate")
+        for name in (*rates, "locality_weight", "vertex_weight"):
+            if not getattr(self, name) >= 0.0:
+                raise LCollisionError(f"{name} must be at least 0, got {getattr(self, name)}")
+        start, end = self.locality_reach
+        if not 0.0 <= start < end:
+            raise LCollisionError(f"locality_reach must rise from 0 or more, got {start} to {end}")
+        if self.held_out_stride == 1:
+            raise LCollisionError("held_out_stride 1 leaves no pose to train on; use 0 or 2 and up")

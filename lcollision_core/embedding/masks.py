@@ -1,0 +1,138 @@
+"""Attention masks: how much of each vertex belongs to each domain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
+
+from lcollision_core.embedding.seeding import bridged_edges, edge_graph
+from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+LEAST_SHARE = 1e-3
+"""Smaller shares of a vertex are given to its other domains, so that masks have an edge."""
+
+_UNTOUCHED = 1e-12
+"""Of the mean squared weight: below this share no component touches a vertex."""
+
+
+def attention_mask(
+    components: npt.NDArray[np.floating], topology: Topology, rest_vertices: FloatArray
+) -> npt.NDArray[np.float32]:
+    """Share the vertices out by the weights of level 1's fully connected layer.
+
+    M^{ki} = Σ_j (C^{kji})² / Σ_k Σ_j (C^{kji})², with shares under `LEAST_SHARE` set to 0 and the
+    rest scaled up again. A vertex that no component touches takes the mask of the nearest one
+    that some component does, along the mesh.
+
+    Parameters
+    ----------
+    components : (K, V, 9) array C
+    topology : the connectivity
+    rest_vertices : (V, 3) float64 array, the reference
+
+    Returns
+    -------
+    attention_mask : (K, V) float32 array, each column sums to 1 to rounding
+
+    Raises
+    ------
+    ShapeError : the arrays do not fit together, or all weights are 0.
+
+    Notes
+    -----
+    "Domain Decomposition via Attention" of Tan et al. 2021; the paper has no least share.
+    """
+    weights = np.asarray(components, dtype=np.float64)
+    n_vertices = topology.n_vertices
+    if weights.ndim != 3 or weights.shape[1] != n_vertices or len(weights) == 0:
+        raise ShapeError(f"components must be (K, {n_vertices}, 9), got {weights.shape}")
+    squared = np.einsum("kvj,kvj->kv", weights, weights)
+    total = squared.sum(axis=0)
+    if not total.max() > 0.0:
+        raise ShapeError("all weights of the components are 0, so no domain owns a vertex")
+    owned = total > _UNTOUCHED * total.mean()
+    shares = squared / np.where(owned, total, 1.0)
+    shares[shares < min(LEAST_SHARE, 1.0 / len(shares))] = 0.0
+    shares[:, owned] /= shares[:, owned].sum(axis=0)
+    if not owned.all():
+        shares[:, ~owned] = shares[:, _nearest_owned(owned, topology, rest_vertices)]
+    mask: npt.NDArray[np.float32] = shares.astype(np.float32)
+    return mask
+
+
+def _nearest_owned(
+    owned: npt.NDArray[np.bool_], topology: Topology, rest_vertices: FloatArray
+) -> npt.NDArray[np.intp]:
+    """Return for each vertex that is not owned the nearest one that is."""
+    lengths = topology.edge_lengths(rest_vertices)
+    # A stored 0 would be no edge at all.
+    graph = edge_graph(topology.edges, topology.n_vertices, np.maximum(lengths, 1e-12))
+    distance, _, source = csgraph.dijkstra(
+        graph, indices=np.flatnonzero(owned), min_only=True, return_predecessors=True
+    )
+    lost = np.flatnonzero(~owned)
+    nearest = np.asarray(source)[lost].astype(np.intp)
+    cut_off = ~np.isfinite(distance[lost])
+    if cut_off.any():
+        holders = np.flatnonzero(owned)
+        _, index = cKDTree(rest_vertices[holders]).query(rest_vertices[lost[cut_off]])
+        nearest[cut_off] = holders[index]
+    return nearest
+
+
+@dataclass(frozen=True)
+class MaskQuality:
+    """What a person would look for in a set of masks.
+
+    Attributes
+    ----------
+    connected_share : (K,) float64 array, of the vertices that a domain owns more than any other
+        does, the share in its largest connected patch; 0 for a domain that owns none
+    n_owned : (K,) int64 array, those vertices
+    domains_per_vertex : mean over vertices of 1 / Σ_k (M^{ki})², the effective number of domains
+    undivided_share : share of the vertices of which one domain owns at least half
+    """
+
+    connected_share: FloatArray
+    n_owned: npt.NDArray[np.int64]
+    domains_per_vertex: float
+    undivided_share: float
+
+
+def judge_masks(
+    attention_mask: npt.NDArray[np.floating], topology: Topology, rest_vertices: FloatArray
+) -> MaskQuality:
+    """Measure whether each domain is one patch of the body.
+
+    Parameters
+    ----------
+    attention_mask : (K, V) array, columns sum to 1
+    topology : the connectivity; separate components count as tied to their nearest neighbour
+    rest_vertices : (V, 3) float64 array, the reference
+
+    Returns
+    -------
+    quality : MaskQuality
+    """
+    mask = np.asarray(attention_mask, dtype=np.float64)
+    edges = bridged_edges(topology, rest_vertices)
+    owner = mask.argmax(axis=0)
+    inside = edges[owner[edges[:, 0]] == owner[edges[:, 1]]]
+    graph = edge_graph(inside, topology.n_vertices, np.ones(len(inside)))
+    _, patch = csgraph.connected_components(graph, directed=False)
+    n_owned = np.bincount(owner, minlength=len(mask))
+    connected = np.zeros(len(mask))
+    for domain in np.flatnonzero(n_owned):
+        sizes = np.bincount(patch[owner == domain])
+        connected[domain] = sizes.max() / n_owned[domain]
+    return MaskQuality(
+        connected_share=connected,
+        n_owned=n_owned.astype(np.int64),
+        domains_per_vertex=float((1.0 / (mask**2).sum(axis=0)).mean()),
+        undivided_share=float((mask.max(axis=0) >= 0.5).mean()),
+    )

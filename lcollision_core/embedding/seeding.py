@@ -1,0 +1,271 @@
+"""Where the domains start: connected parts of the body that move as one."""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
+
+from lcollision_core.acap.bridges import component_bridges
+from lcollision_core.acap.features import N_FEATURES, N_ROTATION
+from lcollision_core.errors import PoseSetError, ShapeError
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+
+POSITION_WEIGHT = 1.0
+"""Radians of relative rotation that weigh as much as one height of distance."""
+
+_MOTION_DIRECTIONS = 30
+_LEAST_AREA_SHARE = 1e-12
+
+
+def bridged_edges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
+    """Return the mesh's edges and the fewest further ones that make it one piece.
+
+    Loose parts, such as eyeballs, and vertices in no face are tied to the body by their shortest
+    segment, so that distances and neighbourhoods exist across the gap.
+
+    Parameters
+    ----------
+    topology : the connectivity
+    rest_vertices : (V, 3) float64 array, the reference
+
+    Returns
+    -------
+    edges : (E', 2) int32 array, E' >= E
+    """
+    _, component = topology.vertex_components
+    alone = np.flatnonzero(np.bincount(component)[component] == 1)
+    used = np.setdiff1d(np.arange(topology.n_vertices), alone)
+    _, nearest = cKDTree(rest_vertices[used]).query(rest_vertices[alone])
+    ties = np.stack([alone, used[nearest]], axis=1).astype(np.int32)
+    return np.concatenate([topology.edges, component_bridges(topology, rest_vertices), ties])
+
+
+def vertex_areas(topology: Topology, rest_vertices: FloatArray) -> FloatArray:
+    """Return a third of the area of the triangles round each vertex, (V,), in squared heights.
+
+    Never 0, so that a vertex in no face can be averaged too.
+    """
+    corners = rest_vertices[topology.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    thirds = np.linalg.norm(normals, axis=1) / 6.0
+    areas = np.bincount(topology.faces.ravel(), np.repeat(thirds, 3), minlength=topology.n_vertices)
+    floored: FloatArray = np.maximum(areas, _LEAST_AREA_SHARE * areas.sum() + np.finfo(float).tiny)
+    return floored
+
+
+def edge_graph(
+    edges: IntArray, n_vertices: int, weights: npt.NDArray[np.float64]
+) -> sparse.csr_matrix:
+    """Return the symmetric (V, V) matrix with a weight per undirected edge."""
+    i, j = edges.T
+    matrix = sparse.coo_matrix(
+        (np.tile(weights, 2), (np.concatenate([i, j]), np.concatenate([j, i]))),
+        shape=(n_vertices, n_vertices),
+    ).tocsr()
+    matrix.sort_indices()
+    return matrix
+
+
+def moving_parts(
+    features: npt.NDArray[np.floating],
+    topology: Topology,
+    rest_vertices: FloatArray,
+    n_parts: int,
+) -> IntArray:
+    """Split the body into connected parts, each of which turns as one over the poses.
+
+    Ward's clustering of the vertices by their rotations in all poses and their place on the
+    reference, weighed by area and restricted to neighbours on the mesh: two patches merge when
+    that adds least to the variance within the parts.
+
+    Parameters
+    ----------
+    features : (N, V, 9) array, unscaled deformation features
+    topology : the connectivity
+    rest_vertices : (V, 3) float64 array, the reference, in heights
+    n_parts : how many, at most V
+
+    Returns
+    -------
+    part : (V,) int32 array from 0, numbered along the longest side of the reference, from its
+        upper end down
+
+    Raises
+    ------
+    ShapeError : the arrays do not fit together.
+    PoseSetError : more parts than vertices.
+
+    Notes
+    -----
+    Ward 1963. Farthest-point seeds, which the paper's predecessors use, gave patches that a
+    person would not name: see the table in `training`.
+    """
+    n_vertices = topology.n_vertices
+    if np.ndim(features) != 3 or features.shape[1:] != (n_vertices, N_FEATURES):
+        raise ShapeError(
+            f"features must be (N, {n_vertices}, {N_FEATURES}), got {np.shape(features)}"
+        )
+    if not 1 <= n_parts <= n_vertices:
+        raise PoseSetError(
+            f"a mesh of {n_vertices} vertices cannot have {n_parts} domains; ask for 1 to "
+            f"{n_vertices}"
+        )
+    areas = vertex_areas(topology, rest_vertices)
+    rotations = np.asarray(features[..., :N_ROTATION], dtype=np.float64)
+    motion = rotations.transpose(1, 0, 2).reshape(n_vertices, -1) / np.sqrt(len(features))
+    motion = motion - np.average(motion, axis=0, weights=areas)
+    # The leading directions hold all that tells parts apart; the rest is noise that costs time.
+    spread = motion.T @ (motion * areas[:, None])
+    directions = np.linalg.eigh(spread)[1][:, ::-1][:, :_MOTION_DIRECTIONS]
+    places = np.hstack([motion @ directions, POSITION_WEIGHT * rest_vertices])
+    part = _ward(places, areas, bridged_edges(topology, rest_vertices), n_parts)
+
+    up = rest_vertices[:, int(np.ptp(rest_vertices, axis=0).argmax())]
+    levels = np.bincount(part, areas * up, n_parts) / np.bincount(part, areas, n_parts)
+    rank = np.empty(n_parts, dtype=np.int32)
+    rank[np.argsort(-levels, kind="stable")] = np.arange(n_parts, dtype=np.int32)
+    return rank[part]
+
+
+def _ward(places: FloatArray, masses: FloatArray, edges: IntArray, n_parts: int) -> IntArray:
+    """Merge neighbouring patches until `n_parts` are left; (V,) part of each vertex."""
+    n_vertices = len(places)
+    centre = dict(enumerate(places))
+    mass = dict(enumerate(masses.tolist()))
+    neighbours: dict[int, set[int]] = {vertex: set() for vertex in range(n_vertices)}
+    for a, b in edges.tolist():
+        neighbours[a].add(b)
+        neighbours[b].add(a)
+
+    def added_variance(a: int, b: int) -> float:
+        apart = centre[a] - centre[b]
+        return float(mass[a] * mass[b] / (mass[a] + mass[b]) * (apart @ apart))
+
+    queue = [(added_variance(a, b), a, b) for a, b in edges.tolist()]
+    heapq.heapify(queue)
+    parent = np.arange(2 * n_vertices - n_parts)
+    for merged in range(n_vertices, 2 * n_vertices - n_parts):
+        _, a, b = heapq.heappop(queue)
+        while a not in mass or b not in mass:
+            _, a, b = heapq.heappop(queue)
+        parent[a] = parent[b] = merged
+        total = mass[a] + mass[b]
+        centre[merged] = (mass[a] * centre[a] + mass[b] * centre[b]) / total
+        around = (neighbours.pop(a) | neighbours.pop(b)) - {a, b}
+        for patch in (a, b):
+            del mass[patch], centre[patch]
+        mass[merged] = total
+        neighbours[merged] = around
+        for patch in sorted(around):
+            neighbours[patch] -= {a, b}
+            neighbours[patch].add(merged)
+            heapq.heappush(queue, (added_variance(patch, merged), patch, merged))
+    for patch in range(len(parent) - 1, -1, -1):
+        parent[patch] = parent[parent[patch]]
+    part: IntArray = np.unique(parent[:n_vertices], return_inverse=True)[1].astype(np.int32)
+    return part
+
+
+def locality_weights(
+    part: IntArray,
+    topology: Topology,
+    rest_vertices: FloatArray,
+    reach: tuple[float, float],
+) -> FloatArray:
+    """Weigh each vertex by its distance from each part: Lambda of the locality loss.
+
+    Parameters
+    ----------
+    part : (V,) int32 array from 0, the part of each vertex
+    topology : the connectivity
+    rest_vertices : (V, 3) float64 array, the reference
+    reach : where the weight begins to rise and where it is 1, as shares of the mesh's largest
+        geodesic distance, the first less than the second
+
+    Returns
+    -------
+    weights : (K, V) float64 array in [0, 1], 0 inside the part
+
+    Notes
+    -----
+    Distances run along edges. The literature measures from the component's strongest vertex, so
+    that every domain is a disc of one size; measured from the part, a torso may be large and a
+    hand small, and a domain cannot drift over a joint.
+    """
+    edges = bridged_edges(topology, rest_vertices)
+    lengths = np.linalg.norm(rest_vertices[edges[:, 0]] - rest_vertices[edges[:, 1]], axis=1)
+    graph = edge_graph(edges, topology.n_vertices, np.maximum(lengths, 1e-12))
+    start = int(np.argmax(csgraph.dijkstra(graph, indices=0)))
+    largest = float(csgraph.dijkstra(graph, indices=start).max())
+    weights = np.empty((int(part.max()) + 1, topology.n_vertices))
+    for domain, row in enumerate(weights):
+        inside = np.flatnonzero(part == domain)
+        distance = csgraph.dijkstra(graph, indices=inside, min_only=True)
+        row[:] = np.clip((distance / largest - reach[0]) / (reach[1] - reach[0]), 0.0, 1.0)
+    return weights
+
+
+def initial_components(
+    features: npt.NDArray[np.float32],
+    part: IntArray,
+    topology: Topology,
+    areas: FloatArray,
+    n_softenings: int,
+) -> npt.NDArray[np.float32]:
+    """Start each domain from the leading principal component of its own part.
+
+    Parameters
+    ----------
+    features : (N, V, 9) float32 array, scaled and centred
+    part : (V,) int32 array from 0
+    topology : the connectivity
+    areas : (V,) float64 array, what each vertex counts
+    n_softenings : times that the parts' edges are averaged with their one-rings
+
+    Returns
+    -------
+    components : (K, V, 9) float32 array, each of unit norm
+    """
+    n_parts = int(part.max()) + 1
+    softness = np.eye(n_parts)[:, part]
+    ring = ring_average(topology)
+    for _ in range(n_softenings):
+        softness = 0.5 * (softness + (ring @ softness.T).T)
+    components = np.zeros((n_parts, topology.n_vertices, N_FEATURES), dtype=np.float32)
+    for domain in range(n_parts):
+        inside = np.flatnonzero(softness[domain] > 0.0)
+        share = softness[domain, inside] * np.sqrt(areas[inside] / areas.mean())
+        weighed = (features[:, inside] * share[:, None]).reshape(len(features), -1)
+        leading = principal_components(weighed, 1)[0].reshape(-1, N_FEATURES)
+        leading = leading * softness[domain, inside][:, None]
+        norm = np.linalg.norm(leading)
+        # A part that never moves still owns its vertices.
+        components[domain, inside] = (
+            leading / norm if norm > 0.0 else softness[domain, inside][:, None]
+        )
+        components[domain] /= np.linalg.norm(components[domain])
+    return components
+
+
+def ring_average(topology: Topology) -> sparse.csr_matrix:
+    """Return the (V, V) matrix that takes the mean over each one-ring; no ring gives 0."""
+    counts = np.maximum(np.diff(topology.adjacency.indptr), 1)
+    matrix = sparse.diags(1.0 / counts) @ topology.adjacency
+    return sparse.csr_matrix(matrix)
+
+
+def principal_components(rows: npt.NDArray[np.floating], n_wanted: int) -> FloatArray:
+    """Return the (n, D) leading right singular vectors of (N, D) rows, n = min(wanted, N, D).
+
+    The sign of each is fixed: its largest entry is positive.
+    """
+    _, _, right = np.linalg.svd(np.asarray(rows, dtype=np.float64), full_matrices=False)
+    leading = right[:n_wanted]
+    strongest = leading[np.arange(len(leading)), np.abs(leading).argmax(axis=1)]
+    oriented: FloatArray = leading * np.where(strongest < 0.0, -1.0, 1.0)[:, None]
+    return oriented

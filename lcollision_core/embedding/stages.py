@@ -1,0 +1,287 @@
+"""The two stages of learning one bilevel autoencoder, each resumable at any epoch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from lcollision_core.acap.codec import AcapCodec
+from lcollision_core.acap.features import N_FEATURES
+from lcollision_core.acap.scaling import FeatureScaling
+from lcollision_core.embedding.autoencoders import (
+    AutoencoderWeights,
+    build_decoder,
+    centre_features,
+)
+from lcollision_core.embedding.checkpoint import Checkpoint
+from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.embedding.decoder import Float32Array
+from lcollision_core.embedding.masks import attention_mask
+from lcollision_core.embedding.network import TiedAutoencoder, ring_mean
+from lcollision_core.embedding.seeding import (
+    initial_components,
+    locality_weights,
+    moving_parts,
+    principal_components,
+    ring_average,
+    vertex_areas,
+)
+from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes.topology import FloatArray
+
+_SAMPLED_POSES = 16
+_EPOCHS_BETWEEN_SAMPLES = 10
+
+Report = Callable[[str, int, int, float | None, float | None], None]
+"""Called with the stage, epochs done and in all, and the mean vertex errors of level 1 and of
+both levels, in heights, as far as known."""
+
+
+@dataclass(frozen=True)
+class BilevelWeights:
+    """What the stages learn; the attributes are those of `Embedding`."""
+
+    scaling: FeatureScaling
+    mean_features: Float32Array
+    level1: AutoencoderWeights
+    level2: tuple[AutoencoderWeights, ...]
+    attention_mask: Float32Array
+
+
+class BilevelTrainer:
+    """Learns level 1, then the masks, then level 2 from the poses given.
+
+    Parameters
+    ----------
+    codec : of the reference
+    vertices : (N, V, 3) float64 array, aligned poses, in heights
+    features : (N, V, 9) float64 array, their unscaled features
+    config : the choices
+    seed : of the order of level 2's batches
+    name : of this trainer in the checkpoint
+    checkpoint : where to go on from and to save
+    report : called after each epoch
+    cancel : polled after each epoch; the checkpoint is written before the work stops
+    """
+
+    def __init__(
+        self,
+        codec: AcapCodec,
+        vertices: FloatArray,
+        features: FloatArray,
+        config: EmbeddingConfig,
+        seed: int,
+        name: str,
+        checkpoint: Checkpoint,
+        report: Report,
+        cancel: CancelToken,
+    ) -> None:
+        self._codec, self._config, self._seed, self._name = codec, config, seed, name
+        self._checkpoint, self._report, self._cancel = checkpoint, report, cancel
+        self._topology, self._rest = codec.topology, codec.rest_vertices
+        self._vertices, self._features = vertices, features
+        self._scaling = FeatureScaling.fit(features)
+        self._mean = self._scaling.apply(features).mean(axis=0).astype(np.float32)
+        self._centred = centre_features(features, self._scaling, self._mean)
+        self._ring = ring_average(self._topology)
+        self._sample = np.unique(
+            np.linspace(0, len(features) - 1, _SAMPLED_POSES).round().astype(np.int64)
+        )
+
+    def train(self) -> BilevelWeights:
+        """Run both stages, or what is left of them.
+
+        Raises
+        ------
+        CancelledError : the cancel token was set; the checkpoint holds the last epoch.
+        """
+        level1, level1_output, level1_error = self._train_level1()
+        mask = attention_mask(level1.components, self._topology, self._rest)
+        level2 = self._train_level2(mask, level1_output, level1_error)
+        return BilevelWeights(self._scaling, self._mean, level1, level2, mask)
+
+    def _train_level1(self) -> tuple[AutoencoderWeights, Float32Array, float]:
+        config, topology = self._config, self._topology
+        part = moving_parts(self._features, topology, self._rest, config.n_domains)
+        areas = vertex_areas(topology, self._rest)
+        start = initial_components(self._centred, part, topology, areas, config.mask_softening)
+        locality = torch.from_numpy(
+            locality_weights(part, topology, self._rest, config.locality_reach).astype(np.float32)
+        )
+        network = TiedAutoencoder(_of_mean_square_1(start), self._ring)
+        features = torch.from_numpy(self._centred)
+        around = ring_mean(features, network.ring)
+        n_poses, n_vertices = self._centred.shape[:2]
+        error: float | None = None
+
+        def epoch(number: int, optimiser: torch.optim.Optimizer) -> None:
+            nonlocal error
+            optimiser.zero_grad()
+            rebuilt = network(features, around)
+            feature_loss = ((rebuilt - features) ** 2).sum() / (n_poses * n_vertices)
+            # The smallest number keeps the norm's slope finite where a component is 0.
+            strength = (network.unit_components().square().sum(dim=2) + 1e-12).sqrt()
+            locality_loss = (locality * strength).sum() / n_vertices**0.5
+            (feature_loss + config.locality_weight * locality_loss).backward()
+            optimiser.step()
+            if error is None or number % _EPOCHS_BETWEEN_SAMPLES == 0:
+                error = self._sampled_error(rebuilt.detach().numpy())
+            self._report("level 1", number + 1, config.level1_epochs, error, None)
+
+        self._optimise("level1", [network], config.level1_rate, 0.0, config.level1_epochs, epoch)
+        weights = _weights_of(network, np.arange(n_vertices, dtype=np.int32))
+        with torch.no_grad():
+            output: Float32Array = network(features, around).numpy()
+        return weights, output, self._sampled_error(output)
+
+    def _train_level2(
+        self, mask: Float32Array, level1_output: Float32Array, level1_error: float
+    ) -> tuple[AutoencoderWeights, ...]:
+        config = self._config
+        n_poses, n_vertices = self._centred.shape[:2]
+        residual = self._centred - level1_output
+        networks, inputs, arounds, supports = [], [], [], []
+        for share in mask:
+            support = np.flatnonzero(share).astype(np.int32)
+            masked = residual[:, support] * share[support][:, None]
+            leading = principal_components(
+                np.tanh(masked.reshape(n_poses, -1)), config.n_domain_codes
+            )
+            components = leading.reshape(len(leading), -1, N_FEATURES)
+            network = TiedAutoencoder(
+                _of_mean_square_1(components), self._ring[support][:, support]
+            )
+            networks.append(network)
+            inputs.append(torch.from_numpy(masked))
+            arounds.append(ring_mean(inputs[-1], network.ring))
+            supports.append(support)
+        indices = [torch.from_numpy(support.astype(np.int64)) for support in supports]
+        base, wanted = torch.from_numpy(level1_output), torch.from_numpy(self._centred)
+        decoder = build_decoder((), self._scaling, self._mean, self._topology)
+        offset = torch.from_numpy(decoder.offset.astype(np.float32))
+        scale = torch.from_numpy(decoder.scale.astype(np.float32))
+        targets = torch.from_numpy(self._vertices.astype(np.float32))
+
+        def epoch(number: int, optimiser: torch.optim.Optimizer) -> None:
+            order = np.random.default_rng([self._seed, number]).permutation(n_poses)
+            distance = 0.0
+            for start in range(0, n_poses, config.batch_poses):
+                batch = torch.from_numpy(order[start : start + config.batch_poses])
+                optimiser.zero_grad()
+                rebuilt = base[batch]
+                for network, values, around, index in zip(
+                    networks, inputs, arounds, indices, strict=True
+                ):
+                    rebuilt = rebuilt.index_add(1, index, network(values[batch], around[batch]))
+                feature_loss = ((rebuilt - wanted[batch]) ** 2).sum() / (len(batch) * n_vertices)
+                decoded = self._codec.decode_torch(offset + scale * rebuilt)
+                squared = ((decoded - targets[batch]) ** 2).sum(dim=2)
+                (feature_loss + config.vertex_weight * squared.mean()).backward()
+                optimiser.step()
+                distance += float(squared.detach().sqrt().mean(dim=1).sum())
+            self._report(
+                "level 2", number + 1, config.level2_epochs, level1_error, distance / n_poses
+            )
+
+        self._optimise("level2", networks, config.level2_rate, 1.0, config.level2_epochs, epoch)
+        return tuple(
+            _weights_of(network, support)
+            for network, support in zip(networks, supports, strict=True)
+        )
+
+    def _optimise(
+        self,
+        stage: str,
+        networks: list[TiedAutoencoder],
+        rate: float,
+        decline: float,
+        n_epochs: int,
+        epoch: Callable[[int, torch.optim.Optimizer], None],
+    ) -> None:
+        """Run the epochs that the checkpoint has not, and leave the networks trained."""
+        layers = [network.components for network in networks]
+        convolutions = [
+            weight for network in networks for weight in (network.self_weight, network.ring_weight)
+        ]
+        optimiser = torch.optim.Adam(
+            [
+                {"params": layers, "lr": rate},
+                {"params": convolutions, "lr": self._config.convolution_rate},
+            ]
+        )
+        parameters = layers + convolutions
+        full_rates = [group["lr"] for group in optimiser.param_groups]
+        part = f"{self._name}/{stage}"
+        stored = self._checkpoint.get(part)
+        done = 0
+        if stored is not None:
+            done = int(stored.metadata["epochs"])
+            _load_state(stored.arrays, parameters, optimiser)
+        for number in range(done, n_epochs):
+            fade = 1.0 - decline * 0.5 * (1.0 - np.cos(np.pi * number / n_epochs))
+            for group, full_rate in zip(optimiser.param_groups, full_rates, strict=True):
+                group["lr"] = full_rate * fade
+            epoch(number, optimiser)
+            last = number + 1 == n_epochs
+            if last or self._cancel.cancelled or self._checkpoint.due:
+                self._checkpoint.put(
+                    part,
+                    _state_arrays(parameters, optimiser),
+                    {"epochs": number + 1},
+                    now=last or self._cancel.cancelled,
+                )
+            self._cancel.raise_if_cancelled()
+
+    def _sampled_error(self, output: npt.NDArray[np.floating]) -> float:
+        """Return the mean vertex error, in heights, of a few poses rebuilt as `output`."""
+        decoder = build_decoder((), self._scaling, self._mean, self._topology)
+        features = decoder.offset + decoder.scale * output[self._sample]
+        distance = self._codec.decode(features) - self._vertices[self._sample]
+        return float(np.linalg.norm(distance, axis=2).mean())
+
+
+def _of_mean_square_1(components: npt.NDArray[np.floating]) -> Float32Array:
+    """Scale each code's weights to a root mean square of 1, so that one step size fits any mesh."""
+    flat = components.reshape(len(components), -1)
+    roots = np.sqrt((flat.astype(np.float64) ** 2).mean(axis=1))
+    scaled: Float32Array = (components / roots[:, None, None]).astype(np.float32)
+    return scaled
+
+
+def _weights_of(network: TiedAutoencoder, support: npt.NDArray[np.int32]) -> AutoencoderWeights:
+    with torch.no_grad():
+        return AutoencoderWeights(
+            components=network.unit_components().numpy().copy(),
+            self_weight=network.self_weight.numpy().copy(),
+            ring_weight=network.ring_weight.numpy().copy(),
+            support=support,
+        )
+
+
+def _state_arrays(
+    parameters: Iterable[torch.nn.Parameter], optimiser: torch.optim.Optimizer
+) -> dict[str, npt.NDArray[Any]]:
+    arrays = {}
+    for number, parameter in enumerate(parameters):
+        state = optimiser.state[parameter]
+        arrays[f"{number}_value"] = parameter.detach().numpy().copy()
+        for key in ("exp_avg", "exp_avg_sq", "step"):
+            arrays[f"{number}_{key}"] = state[key].numpy().copy()
+    return arrays
+
+
+def _load_state(
+    arrays: Any, parameters: Iterable[torch.nn.Parameter], optimiser: torch.optim.Optimizer
+) -> None:
+    with torch.no_grad():
+        for number, parameter in enumerate(parameters):
+            parameter.copy_(torch.from_numpy(np.array(arrays[f"{number}_value"])))
+            optimiser.state[parameter] = {
+                key: torch.from_numpy(np.array(arrays[f"{number}_{key}"]))
+                for key in ("exp_avg", "exp_avg_sq", "step")
+            }
