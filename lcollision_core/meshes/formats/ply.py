@@ -277,7 +277,7 @@ class _TextBody:
                     if offset >= len(values):
                         raise _truncated(element, row)
                     announced = values[offset]
-                    if not 0 <= announced <= len(values):
+                    if not (0 <= announced <= len(values) and announced.is_integer()):
                         raise MeshFileError(
                             f"{element.name} {row} (from 0) announces a list of {announced:g} items"
                         )
@@ -294,10 +294,23 @@ class _TextBody:
             counts = np.array(sizes[index] or [1] * element.count, dtype=np.int64)
             shift = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
             chosen = values[np.repeat(np.array(starts[index], dtype=np.int64), counts) + shift]
-            if item.name in _CORNER_NAMES and not (np.abs(chosen) < 2**53).all():
-                raise MeshFileError(f"a {element.name} names a vertex number that is far too large")
+            if item.name in _CORNER_NAMES:
+                _require_vertex_numbers(element, chosen, counts)
             columns[item.name] = _Column(chosen, None if item.count_dtype is None else counts)
         return columns
+
+
+def _require_vertex_numbers(
+    element: _Element, chosen: npt.NDArray[np.float64], counts: npt.NDArray[np.int64]
+) -> None:
+    """Refuse corners that only a decimal parser would accept, such as 1.5 or inf."""
+    bad = np.flatnonzero(~(np.abs(chosen) < 2**53) | (chosen != np.floor(chosen)))
+    if len(bad):
+        row = int(np.searchsorted(np.cumsum(counts), bad[0], side="right"))
+        raise MeshFileError(
+            f"{element.name} {row} (from 0) has a corner that is no vertex number: "
+            f"{chosen[bad[0]]:g}"
+        )
 
 
 def _no_rows(element: _Element) -> dict[str, _Column]:
