@@ -163,67 +163,6 @@ def align_rigid(
     made that error another 15 to 41 % worse.
     """
     poses = np.asarray(vertices, dtype=np.float64)
-    target = np.asarray(reference, dtype=np.float64)
-    if target.ndim != 2 or target.shape[1] != 3 or len(target) == 0:
-        raise ShapeError(f"reference must be a (V, 3) array with V > 0, got {target.shape}")
-    if poses.shape[-2:] != target.shape:
-        raise ShapeError(f"vertices must be (..., {len(target)}, 3), got {poses.shape}")
-    share = np.ones(len(target)) if weights is None else np.asarray(weights, dtype=np.float64)
-    if share.shape != (len(target),) or not (share >= 0.0).all() or not share.sum() > 0.0:
-        raise ShapeError(
-            f"weights must be ({len(target)},), non-negative and not all zero, got {share.shape}"
-        )
-    share = share / share.sum()
-    pose_centres = share @ poses
-    target_centre = share @ target
-    weighted = share[:, None] * (target - target_centre)
-    # (3, V) @ (V, 3) for each pose: the covariance, reference by pose.
-    covariance = weighted.T @ (poses - pose_centres[..., None, :])
-    left, _, right = np.linalg.svd(covariance)
-    signs = np.ones(covariance.shape[:-1])
-    signs[..., 2] = np.sign(np.linalg.det(left @ right))
-    rotations: FloatArray = (left * signs[..., None, :]) @ right
-    translations: FloatArray = target_centre - np.einsum(
-        "...ij,...j->...i", rotations, pose_centres
-    )
-    return rotations, translations
-
-
-def align_rigid(
-    vertices: npt.NDArray[Any],
-    reference: npt.NDArray[Any],
-    cancel: CancelToken | None = None,
-) -> Alignment:
-    """Align all poses of a set to a reference, led by the parts that move least against it.
-
-    Starts from plain Kabsch and reweighs: a vertex counts 1 / (1 + (m / s)²), where m is its
-    root mean square distance to the reference over all poses and s half the median of m. All
-    poses share the weights, so that the same part of the body leads throughout: with weights of
-    their own, poses would follow now the legs and now the torso.
-
-    Parameters
-    ----------
-    vertices : (N, V, 3) finite array, the poses, in the files' unit
-    reference : (V, 3) finite array, usually pose 0
-    cancel : polled between rounds
-
-    Returns
-    -------
-    the aligned poses, the transforms and the weights
-
-    Raises
-    ------
-    ShapeError : the arrays do not fit together.
-    CancelledError : `cancel` was set.
-
-    Notes
-    -----
-    Iteratively reweighted least squares with Cauchy's weight function. On SCAPE and the jumping
-    sequence it keeps the calmest tenth of the body two and a half and 1.2 times calmer than plain
-    Kabsch, at the same error of ten principal components; weights for each pose alone made that
-    error a fifth to a third worse.
-    """
-    poses = np.asarray(vertices, dtype=np.float64)
     if poses.ndim != 3 or len(poses) == 0:
         raise ShapeError(f"vertices must be (N, V, 3) with N > 0, got {poses.shape}")
     target = np.asarray(reference, dtype=np.float64)
