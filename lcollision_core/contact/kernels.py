@@ -1,8 +1,9 @@
 """The compiled inner loops: refit the tree to a pose, find candidates, keep those that penetrate.
 
 They release the GIL and write into arrays that the caller keeps, so threads work on poses side
-by side and nothing is allocated per pose. Boxes are float32 and rounded outwards: twice as many
-fit into a vector instruction, and no pair is lost. Depths are float64.
+by side and nothing is allocated per pose. Boxes are float32: twice as many fit into a vector
+instruction, and no pair is lost, as rounding keeps the order of numbers: what overlaps still
+does. Depths are float64.
 
 All compiled code is in this file because Numba notices that a cached function is stale by the
 date of the file it stands in, and by nothing else.
@@ -31,9 +32,6 @@ tolerance only has to keep out cross products that are rounding noise.
 
 SMALL_SINE_SQUARED = 1e-6
 """Below this squared sine of their angle, two edges' cross product is freed of rounding."""
-
-BOX_PADDING = np.float32(2.5e-7)
-"""Padding of a box, relative to the pose's reach: two float32 roundings, 2 x 2^-24, and some."""
 
 _LEAF = np.uint64(LEAF_SIZE)
 _LEAF_CORNERS = np.uint64(3 * LEAF_SIZE)
@@ -223,7 +221,6 @@ def _refit(pose, inverse_height, tree, work):
     the origin loses no precision to its distance.
     """
     middle = np.empty(3)
-    reach = 0.0
     for c in range(3):
         low = np.inf
         high = -np.inf
@@ -231,8 +228,6 @@ def _refit(pose, inverse_height, tree, work):
             low = min(low, pose[v, c])
             high = max(high, pose[v, c])
         middle[c] = 0.5 * (low + high)
-        reach = max(reach, 0.5 * (high - low) * inverse_height)
-    padding = np.float32(reach) * BOX_PADDING
 
     boxes = work.boxes
     for slot in range(len(tree.slot_face)):
@@ -253,8 +248,8 @@ def _refit(pose, inverse_height, tree, work):
             work.triangles[slot, 0, c] = p
             work.triangles[slot, 1, c] = q
             work.triangles[slot, 2, c] = r
-            boxes[base + c * LEAF_SIZE] = np.float32(min(p, min(q, r))) - padding
-            boxes[base + (3 + c) * LEAF_SIZE] = np.float32(max(p, max(q, r))) + padding
+            boxes[base + c * LEAF_SIZE] = np.float32(min(p, min(q, r)))
+            boxes[base + (3 + c) * LEAF_SIZE] = np.float32(max(p, max(q, r)))
 
     node_boxes = work.node_boxes
     for node in range(len(tree.left) - 1, -1, -1):
