@@ -1,0 +1,38 @@
+"""The comparison of all modes of the detector with brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lcollision_core.contact import DEPTH_TOLERANCE, CollisionDetector, SelfCollisions
+from tests.core.brute_force import all_pairs
+from tests.core.shapes import Mesh
+
+
+def detector_for(mesh: Mesh) -> CollisionDetector:
+    return CollisionDetector(mesh.topology, mesh.vertices)
+
+
+def check_against_brute_force(
+    detector: CollisionDetector, vertices: np.ndarray, faces: np.ndarray
+) -> SelfCollisions:
+    """Compare every mode with the reference: the same pairs, depths to 1e-12 heights."""
+    found = detector.detect(vertices)
+    expected = all_pairs(vertices, faces, DEPTH_TOLERANCE * detector.height)
+    assert found.pairs.dtype == np.int32
+    assert found.pairs.tolist() == expected.pairs.tolist()
+    np.testing.assert_allclose(
+        found.penetration_depth, expected.depth / detector.height, rtol=0, atol=1e-12
+    )
+    assert len(found.near_pairs) == len(found.near_penetration_depth) == 0
+    batch = detector.detect_batch(vertices[None], workers=1)
+    assert batch.n_pairs.tolist() == [len(expected.pairs)]
+    assert batch.n_near_pairs.tolist() == [0]
+    assert batch.colliding.tolist() == [found.colliding] == [len(expected.pairs) > 0]
+    assert np.array_equal(batch.vertex_energy[0], found.vertex_energy)
+    assert detector.are_colliding(vertices[None], workers=1).tolist() == [found.colliding]
+    return found
+
+
+def check_mesh(mesh: Mesh) -> SelfCollisions:
+    return check_against_brute_force(detector_for(mesh), mesh.vertices, mesh.faces)
