@@ -138,32 +138,50 @@ def test_progress_rises_to_the_total(
         assert threads == {threading.get_ident()}
 
 
+class CancelledAtPoll(CancelToken):
+    """A token that is set just before it is asked for the n-th time."""
+
+    def __init__(self, n: int) -> None:
+        super().__init__()
+        self._polls_left = n
+        self._lock = threading.Lock()
+
+    @property
+    def cancelled(self) -> bool:
+        with self._lock:
+            self._polls_left -= 1
+            return self._polls_left <= 0
+
+
 @pytest.mark.parametrize("mode", ["detect_batch", "are_colliding"])
-def test_cancelling(crumpled: tuple[CollisionDetector, np.ndarray], mode: str) -> None:
+@pytest.mark.parametrize("workers", [1, 3])
+def test_cancelling(
+    crumpled: tuple[CollisionDetector, np.ndarray], mode: str, workers: int
+) -> None:
     detector, poses = crumpled
-    poses = np.tile(poses, (20, 1, 1))
     search = getattr(detector, mode)
     before = CancelToken()
     before.cancel()
     with pytest.raises(CancelledError):
-        search(poses, cancel=before)
+        search(poses, workers=workers, cancel=before)
 
-    midway = CancelToken()
-    done_at: list[int] = []
-
-    def cancel_soon(done: int, _total: int) -> None:
-        done_at.append(done)
-        midway.cancel()
-
+    many = np.tile(poses, (20, 1, 1))
     n_threads = threading.active_count()
+    done_at = [0]
     with pytest.raises(CancelledError):
-        search(poses, workers=2, progress=cancel_soon, cancel=midway)
-    assert done_at[-1] < len(poses) // 2
+        search(
+            many,
+            workers=workers,
+            progress=lambda done, _: done_at.append(done),
+            cancel=CancelledAtPoll(5),
+        )
+    # Four tasks of a few poses went ahead, and no thread is left.
+    assert done_at[-1] < len(many) // 4
     assert threading.active_count() == n_threads
     # A token that nobody sets changes nothing, and the detector is as good as before.
-    idle = search(poses[:30], cancel=CancelToken())
+    idle = search(poses, cancel=CancelToken())
     verdict = idle.colliding if mode == "detect_batch" else idle
-    assert verdict.tolist() == [detector.detect(pose).colliding for pose in poses[:30]]
+    assert verdict.tolist() == [detector.detect(pose).colliding for pose in poses]
 
 
 def test_no_poses(crumpled: tuple[CollisionDetector, np.ndarray]) -> None:
