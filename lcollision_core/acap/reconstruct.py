@@ -48,55 +48,63 @@ class Poisson:
     anchor: FloatArray
     rest_mean: FloatArray
 
-    def solve(self, gradients: FloatArray, vertices: FloatArray) -> None:
-        """Write the poses of up to `BLOCK_POSES` fields of deformation gradients.
+    def right_sides(self, n_poses: int) -> FloatArray:
+        """Make room, (V, 3 n), for the right-hand sides of up to `BLOCK_POSES` poses."""
+        return np.empty((len(self.position), 3 * n_poses))
+
+    def load(self, gradients: FloatArray, right_sides: FloatArray, slot: int) -> None:
+        """Write the right-hand side of (V, 3, 3) deformation gradients into a pose's slot."""
+        _load(
+            gradients,
+            self.map_start,
+            self.map_vertex,
+            self.map_spoke,
+            self.position,
+            3 * slot,
+            right_sides,
+        )
+
+    def solve(self, right_sides: FloatArray, vertices: FloatArray) -> None:
+        """Write the poses of loaded right-hand sides, which are used up.
 
         Parameters
         ----------
-        gradients : (n, V, 3, 3) float64 array
+        right_sides : (V, 3 n) float64 array
         vertices : (n, V, 3) float64 array, overwritten; each component's mean is 0, to
             which `rest_mean` is to be added for poses, and nothing for derivatives
         """
-        right_sides = np.empty((len(self.position), 3 * len(gradients)))
-        for pose, field in enumerate(gradients):
-            _load(
-                field,
-                self.map_start,
-                self.map_vertex,
-                self.map_spoke,
-                self.position,
-                3 * pose,
-                right_sides,
-            )
         self._substitute(right_sides)
-        for pose, out in enumerate(vertices):
-            _unload(right_sides, 3 * pose, self.position, self.component, self.anchor, out)
+        for slot, out in enumerate(vertices):
+            _unload(right_sides, 3 * slot, self.position, self.component, self.anchor, out)
 
-    def solve_transposed(self, by_vertices: FloatArray, by_gradients: FloatArray) -> None:
-        """Write a loss's derivative by T from the one by the vertices: `solve` transposed.
+    def solve_transposed(self, by_vertices: FloatArray) -> FloatArray:
+        """Solve for a loss's derivative by the right-hand sides; `load_transposed` unpacks it.
 
         Parameters
         ----------
-        by_vertices : (n, V, 3) float64 array
-        by_gradients : (n, V, 3, 3) float64 array, overwritten
+        by_vertices : (n, V, 3) float64 array, the derivative by the vertices
+
+        Returns
+        -------
+        solution : (V, 3 n) float64 array
         """
-        right_sides = np.empty((len(self.position), 3 * len(by_vertices)))
-        for pose, given in enumerate(by_vertices):
-            totals = np.zeros_like(self.rest_mean)
-            np.add.at(totals, self.component, given)
-            centred = given - self.anchor[:, None] * totals[self.component]
-            right_sides[self.position, 3 * pose : 3 * pose + 3] = centred
-        self._substitute(right_sides)
-        for pose, out in enumerate(by_gradients):
-            _load_transposed(
-                right_sides,
-                3 * pose,
-                self.map_start,
-                self.map_vertex,
-                self.map_spoke,
-                self.position,
-                out,
-            )
+        solution = self.right_sides(len(by_vertices))
+        for slot, given in enumerate(by_vertices):
+            _load_centred(given, self.position, self.component, self.anchor, 3 * slot, solution)
+        self._substitute(solution)
+        return solution
+
+    def load_transposed(self, solution: FloatArray, slot: int, by_gradients: FloatArray) -> None:
+        """Write a loss's derivative by a pose's (V, 3, 3) deformation gradients."""
+        _load_transposed(
+            solution,
+            3 * slot,
+            self.map_start,
+            self.map_vertex,
+            self.map_spoke,
+            self.position,
+            by_gradients,
+        )
 
     def _substitute(self, right_sides: FloatArray) -> None:
         kernel = _substitute_three if right_sides.shape[1] == 3 else _substitute_many
@@ -140,11 +148,35 @@ def _load_transposed(
     by_gradients[:] = 0.0
     for i in range(len(position)):
         p = position[i]
+        x, y, z = solution[p, column], solution[p, column + 1], solution[p, column + 2]
         for k in range(map_start[i], map_start[i + 1]):
-            j = map_vertex[k]
-            for a in range(3):
-                for b in range(3):
-                    by_gradients[j, a, b] += solution[p, column + a] * map_spoke[k, b]
+            out = by_gradients[map_vertex[k]]
+            for b in range(3):
+                spoke = map_spoke[k, b]
+                out[0, b] += x * spoke
+                out[1, b] += y * spoke
+                out[2, b] += z * spoke
+
+
+@compiled
+def _load_centred(
+    by_vertices: FloatArray,
+    position: IntArray,
+    component: IntArray,
+    anchor: FloatArray,
+    column: int,
+    right_sides: FloatArray,
+) -> None:
+    """`_unload` transposed: what is pinned to the mean passes no force on to the rest."""
+    total = np.zeros((component.max() + 1, 3))
+    for i in range(len(position)):
+        for a in range(3):
+            total[component[i], a] += by_vertices[i, a]
+    for i in range(len(position)):
+        for a in range(3):
+            right_sides[position[i], column + a] = (
+                by_vertices[i, a] - anchor[i] * total[component[i], a]
+            )
 
 
 @compiled
