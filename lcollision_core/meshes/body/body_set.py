@@ -183,7 +183,7 @@ def joint_angles(figures: Sequence[Figure], skeleton: Skeleton) -> FloatArray:
 def _varied(figure: Figure, generator: np.random.Generator) -> Figure:
     """Return the figure with its free angles moved by a few degrees, its feet by centimetres."""
 
-    def degrees(scale: float = 4.0) -> float:
+    def degrees(scale: float = 3.0) -> float:
         return float(np.clip(generator.normal(0.0, scale), -2 * scale, 2 * scale))
 
     def arm(old: Arm) -> Arm:

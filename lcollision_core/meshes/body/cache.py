@@ -61,7 +61,7 @@ def _read_only(template: Template) -> Template:
 
 
 def _read(path: Path) -> Template:
-    with np.load(path, allow_pickle=False) as arrays:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         names = [str(name) for name in arrays["zero_names"]]
         zeros = dict(zip(names, arrays["zero_rotations"], strict=True))
         return Template(

