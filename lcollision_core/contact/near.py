@@ -31,8 +31,8 @@ def near_vertices(
             vertex=np.empty(0, dtype=np.int32),
         )
     i, j = topology.edges.T
-    # SciPy takes a stored zero for a missing edge; a duplicate vertex is an edge of length 0.
-    lengths = np.maximum(topology.edge_lengths(vertices), np.finfo(np.float64).tiny)
+    lengths = topology.edge_lengths(vertices)
+    # Duplicate vertices give edges of length 0, which a sparse graph stores like any other.
     graph = sparse.coo_matrix((lengths, (i, j)), shape=2 * (topology.n_vertices,)).tocsr()
     counts = np.zeros(topology.n_vertices + 1, dtype=np.int64)
     reached: list[npt.NDArray[np.int32]] = []
