@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -155,9 +154,9 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> tup
     for place, entry in enumerate(entries):
         try:
             poses.append(_from_json(entry, model.latent_size))
-        except (TypeError, ValueError, KeyError, OverflowError) as error:
+        except ValueError as error:
             raise ModelFileError(
-                f"{path} is damaged: its pose {place} (from 0) is unusable, {error}"
+                f"{path} is damaged at pose {place} (from 0): {error}; mend or remove that pose"
             ) from error
     if len({pose.name for pose in poses}) < len(poses):
         raise ModelFileError(f"{path} is damaged: two of its poses share a name; rename one")
@@ -177,32 +176,41 @@ def _to_json(pose: NamedPose) -> dict[str, Any]:
 
 
 def _from_json(entry: Any, latent_size: int) -> NamedPose:
-    if not isinstance(entry, dict):
-        raise TypeError("it is no object")
-    name = entry.get("name")
+    pose = _object(entry, "entry")
+    name = pose.get("name")
     if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH:
-        raise ValueError("it has no usable name")
-    latent = _numbers(entry.get("latent"), (latent_size,), "latent")
+        raise ValueError(f"its name must be a text of 1 to {MAX_NAME_LENGTH} characters")
+    latent = _numbers(pose.get("latent"), (latent_size,), "latent")
     placement = None
-    if "placement" in entry:
-        rotation = _numbers(entry["placement"]["rotation"], (3, 3), "rotation")
-        translation = _numbers(entry["placement"]["translation"], (3,), "translation")
+    if "placement" in pose:
+        held = _object(pose["placement"], "placement")
+        rotation = _numbers(held.get("rotation"), (3, 3), "rotation")
+        translation = _numbers(held.get("translation"), (3,), "translation")
         turned = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
             raise ValueError("its rotation is no rotation matrix")
         placement = RigidTransform(rotation, translation)
-    if "fit_error" not in entry:
+    if "fit_error" not in pose:
         return NamedPose(name, latent, placement)
-    mean, largest = (float(entry["fit_error"][key]) for key in ("mean", "max"))
-    if not (math.isfinite(mean) and math.isfinite(largest)):
-        raise ValueError("its fit error is not finite")
-    return NamedPose(name, latent, placement, mean, largest)
+    errors = _object(pose["fit_error"], "fit error")
+    mean, largest = _numbers([errors.get("mean"), errors.get("max")], (2,), "fit error")
+    return NamedPose(name, latent, placement, float(mean), float(largest))
+
+
+def _object(value: Any, name: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"its {name} must be a JSON object")
+    return value
 
 
 def _numbers(value: Any, shape: tuple[int, ...], name: str) -> npt.NDArray[np.float64]:
-    array = np.array(value)
+    try:
+        array = np.array(value)
+    except ValueError:
+        array = np.array(None)
     if array.shape != shape or array.dtype.kind not in "iuf":
-        raise ValueError(f"its {name} must be {shape} numbers")
+        size = " by ".join(map(str, shape))
+        raise ValueError(f"its {name} must be {size} numbers")
     numbers = array.astype(np.float64)
     if not np.isfinite(numbers).all():
         raise ValueError(f"its {name} has a number that is not finite")

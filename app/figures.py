@@ -1,0 +1,159 @@
+"""Pictures of a model, drawn without a window."""
+
+from __future__ import annotations
+
+import io
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+    from lcollision_core.model import PoseModel
+
+_VIEW_WIDTH, _VIEW_HEIGHT = 900, 1300
+_LEGEND_COLUMN, _LEGEND_ROW = 425, 52
+_MARGIN = 50
+_INK = (40, 44, 52)
+
+
+def draw_masks(model: PoseModel, path: str | os.PathLike[str]) -> None:
+    """Draw the reference from two sides, each domain in its colour, darker where it owns more.
+
+    Parameters
+    ----------
+    model : whose attention masks
+    path : the .png file to write, whole or not at all
+
+    Raises
+    ------
+    MeshFileError : the file cannot be written.
+
+    Notes
+    -----
+    After figure 2 of Tan et al. 2021.
+    """
+    from PIL import Image
+
+    from lcollision_core.meshes import atomic_write
+
+    colours = mask_colours(model.attention_mask, model.domain_colours)
+    views = _two_sides(model, colours)
+    legend = _legend(model, 2 * _VIEW_WIDTH)
+    picture = Image.new("RGB", (2 * _VIEW_WIDTH, _VIEW_HEIGHT + legend.height), "white")
+    for place, view in enumerate(views):
+        picture.paste(Image.fromarray(view), (place * _VIEW_WIDTH, 0))
+    picture.paste(legend, (0, _VIEW_HEIGHT))
+    encoded = io.BytesIO()
+    picture.save(encoded, format="PNG", optimize=True)
+    with atomic_write(path) as file:
+        file.write(encoded.getbuffer())
+
+
+def mask_colours(
+    attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ...]
+) -> npt.NDArray[np.uint8]:
+    """Colour each vertex by its domains: the full colour at weight 1, paler where it is shared.
+
+    Parameters
+    ----------
+    attention_mask : (K, V) array, each column sums to 1
+    domain_colours : K strings "#rrggbb"
+
+    Returns
+    -------
+    colours : (V, 3) uint8 array, red, green, blue
+    """
+    # Squared weights sum to less than 1 where a vertex is shared: what is missing is white.
+    shares = np.asarray(attention_mask, dtype=np.float64) ** 2
+    absorbed = 255.0 - np.array([_rgb(colour) for colour in domain_colours], dtype=np.float64)
+    colours: npt.NDArray[np.uint8] = np.round(255.0 - shares.T @ absorbed).astype(np.uint8)
+    return colours
+
+
+def _two_sides(
+    model: PoseModel, colours: npt.NDArray[np.uint8]
+) -> tuple[npt.NDArray[np.uint8], ...]:
+    """Render the reference from the front and from behind, as far as its shape tells."""
+    import pyvista as pv
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    # Without a display VTK warns of that, then draws all the same.
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    surface = pv.PolyData.from_regular_faces(model.reference.astype(np.float32), model.faces)
+    surface.point_data["colours"] = colours
+    up = np.eye(3)[model.up_axis]
+    front = _front(model.reference, model.up_axis)
+    centre = 0.5 * (model.reference.min(axis=0) + model.reference.max(axis=0))
+    views = []
+    for direction in (front, -front):
+        plotter = pv.Plotter(off_screen=True, window_size=(_VIEW_WIDTH, _VIEW_HEIGHT))
+        plotter.set_background("white")
+        plotter.enable_anti_aliasing("ssaa")
+        plotter.add_mesh(
+            surface,
+            scalars="colours",
+            rgb=True,
+            smooth_shading=True,
+            ambient=0.45,
+            diffuse=0.65,
+            specular=0.08,
+            specular_power=15,
+        )
+        plotter.camera_position = [centre + 3.0 * model.height * direction, centre, up]
+        plotter.enable_parallel_projection()
+        width = float(np.ptp(model.reference @ np.cross(up, direction)))
+        plotter.camera.parallel_scale = 0.54 * max(model.height, width * _VIEW_HEIGHT / _VIEW_WIDTH)
+        views.append(np.asarray(plotter.screenshot(return_img=True))[:, :, :3])
+        plotter.close()
+    return tuple(views)
+
+
+def _front(vertices: npt.NDArray[np.float64], up: int) -> npt.NDArray[np.float64]:
+    """Guess the direction in which a body looks: across its flat side, where its toes point."""
+    levels = [axis for axis in range(3) if axis != up]
+    depth = min(levels, key=lambda axis: np.ptp(vertices[:, axis]))
+    height = vertices[:, up]
+    direction: npt.NDArray[np.float64] = np.eye(3)[depth]
+    lowest = vertices[height < height.min() + 0.04 * np.ptp(height), depth]
+    ankles = vertices[
+        (height > height.min() + 0.06 * np.ptp(height))
+        & (height < height.min() + 0.12 * np.ptp(height)),
+        depth,
+    ]
+    if len(lowest) and len(ankles) and lowest.mean() < ankles.mean():
+        direction = -direction
+    return direction
+
+
+def _legend(model: PoseModel, width: int) -> Image:
+    """Draw each domain's name beside its colour, from pale to full."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    n_columns = max(1, (width - 2 * _MARGIN) // _LEGEND_COLUMN)
+    n_domains = len(model.domain_names)
+    n_columns = min(n_columns, n_domains)
+    n_rows = -(-n_domains // n_columns)
+    legend = Image.new("RGB", (width, n_rows * _LEGEND_ROW + 2 * _MARGIN), "white")
+    draw = ImageDraw.Draw(legend)
+    font = ImageFont.load_default(size=26)
+    left = (width - n_columns * _LEGEND_COLUMN) // 2
+    for domain, (name, colour) in enumerate(
+        zip(model.domain_names, model.domain_colours, strict=True)
+    ):
+        column, row = divmod(domain, n_rows)
+        x, y = left + column * _LEGEND_COLUMN, _MARGIN + row * _LEGEND_ROW
+        for step, weight in enumerate(np.linspace(0.0, 1.0, 60)):
+            shade = mask_colours(np.array([[weight]]), (colour,))[0]
+            draw.line((x + step, y, x + step, y + 30), fill=tuple(shade.tolist()))
+        draw.rectangle((x, y, x + 60, y + 30), outline=(200, 200, 205))
+        draw.text((x + 76, y + 15), name, fill=_INK, font=font, anchor="lm")
+    return legend
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return red, green, blue

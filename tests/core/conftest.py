@@ -1,0 +1,29 @@
+"""A small model, trained once."""
+
+from __future__ import annotations
+
+import pytest
+
+from lcollision_core.meshes import PoseSet
+from lcollision_core.model import PoseModel
+from tests.bending_tube import bending_tube
+
+
+@pytest.fixture(scope="session")
+def tube_poses() -> PoseSet:
+    """Return 16 poses of a tube whose lower half is a left shin and whose upper half a thigh."""
+    return bending_tube(labelled=True)
+
+
+@pytest.fixture(scope="session")
+def tube_model(tube_poses: PoseSet) -> PoseModel:
+    """Return a model of them with two domains of three codes."""
+    from lcollision_core.embedding.config import EmbeddingConfig
+    from lcollision_core.embedding.training import train_embedding
+
+    config = EmbeddingConfig(
+        n_domains=2, n_domain_codes=3, level1_epochs=60, level2_epochs=20, held_out_stride=0
+    )
+    return PoseModel.from_training(
+        "tube", train_embedding(tube_poses, config), tube_poses, "a tube", "CC0-1.0"
+    )

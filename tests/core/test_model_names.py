@@ -1,0 +1,189 @@
+"""What domains are called and coloured, and where models are found by name."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.meshes.body.skeleton import BONES
+from lcollision_core.model import find_model, list_models, model_destination, user_models_folder
+from lcollision_core.model.colours import PALETTE, domain_colours
+from lcollision_core.model.naming import join_names, names_from_labels, plain_words
+
+
+def _names(shares: list[dict[str, float]], levels: list[float] | None = None) -> tuple[str, ...]:
+    """Name domains whose weights on the parts are given, each part being one vertex."""
+    parts = sorted({part for share in shares for part in share})
+    mask = np.array([[share.get(part, 0.0) for part in parts] for share in shares])
+    heights = np.arange(len(parts), dtype=float) if levels is None else np.array(levels)
+    return names_from_labels(mask, np.array(parts), heights)
+
+
+def test_the_part_with_most_weight_names_the_domain() -> None:
+    names = _names([{"left hand": 0.1, "left forearm": 0.9}, {"right forearm": 1.0}])
+    assert names == ("left forearm", "right forearm")
+
+
+def test_two_parts_of_like_weight_are_joined() -> None:
+    names = _names([{"left forearm": 0.55, "left hand": 0.45}, {"head": 0.5, "neck": 0.4}])
+    assert names == ("left forearm & hand", "head & neck")
+
+
+def test_a_part_of_little_weight_is_not_named() -> None:
+    shares = {"chest": 0.5, "waist": 0.18, "left shoulder": 0.17, "right shoulder": 0.15}
+    assert _names([shares]) == ("chest",)
+
+
+def test_domains_of_one_part_take_their_second_part_too() -> None:
+    names = _names(
+        [
+            {"left thigh": 0.7, "hips": 0.3},
+            {"left thigh": 0.7, "left shin": 0.3},
+            {"left thigh": 0.95, "left shin": 0.05},
+        ]
+    )
+    assert names == ("left thigh & hips", "left thigh & shin", "left thigh")
+
+
+def test_domains_that_share_all_are_told_apart_by_their_height() -> None:
+    mask = np.eye(4)
+    labels = np.array(["tail", "tail", "tail", "leg"])
+    assert names_from_labels(mask, labels, np.array([0.0, 2.0, 1.0, 5.0])) == (
+        "lower tail",
+        "upper tail",
+        "middle tail",
+        "leg",
+    )
+    assert names_from_labels(np.eye(4), np.array(["tail"] * 4), np.arange(4.0)) == (
+        "tail 4",
+        "tail 3",
+        "tail 2",
+        "tail 1",
+    )
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "joined"),
+    [
+        ("left forearm", "left hand", "left forearm & hand"),
+        ("left upper arm", "left shoulder", "left upper arm & shoulder"),
+        ("left thigh", "right thigh", "left & right thigh"),
+        ("right thigh", "left thigh", "left & right thigh"),
+        ("chest", "left shoulder", "chest & left shoulder"),
+        ("left", "left hand", "left & hand"),
+    ],
+)
+def test_joined_names_do_not_repeat_themselves(first: str, second: str, joined: str) -> None:
+    assert join_names(first, second) == joined
+
+
+def test_bones_of_the_built_in_body_have_plain_names_that_keep_their_side() -> None:
+    for bone in BONES:
+        name = plain_words(bone)
+        assert name.startswith("left ") == bone.startswith("left ")
+        assert name.startswith("right ") == bone.startswith("right ")
+        assert not name.endswith(" end")
+        assert not any(letter.isdigit() for letter in name)
+    assert plain_words("left upper arm end") == "left upper arm"
+    assert plain_words("thorax 2") == "chest"
+    # Other sets number their parts on purpose.
+    assert plain_words("segment 2") == "segment 2"
+
+
+def test_no_weight_at_all_still_gives_names() -> None:
+    assert len(set(names_from_labels(np.zeros((2, 3)), np.array(["a", "b", "c"]), np.ones(3)))) == 2
+
+
+# Machado et al. 2009, severity 1, on linear RGB: full, red-blind and green-blind sight.
+_SIGHTS = [
+    np.eye(3),
+    np.array(
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
+    ),
+    np.array(
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.011820, 0.042940, 0.968881],
+        ]
+    ),
+]
+
+
+def _cielab(colour: str, sight: np.ndarray) -> np.ndarray:
+    rgb = np.frombuffer(bytes.fromhex(colour[1:]), np.uint8) / 255.0
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(sight @ linear, 0.0, 1.0)
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    xyz = np.array(to_xyz) @ seen / [0.9505, 1.0, 1.089]
+    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def test_colours_are_told_apart_by_colour_blind_eyes() -> None:
+    for sight in _SIGHTS:
+        seen = [_cielab(colour, sight) for colour in domain_colours(12)]
+        assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 10.0
+    assert len(set(PALETTE)) == len(PALETTE) == 16
+    assert domain_colours(18)[16:] == PALETTE[:2]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    return tmp_path / "lcollision" / "models"
+
+
+def test_users_models_are_found_by_name(folder: Path) -> None:
+    assert user_models_folder() == folder
+    assert model_destination("tail") == folder / "tail.safetensors"
+    (folder / "tail.safetensors").write_bytes(b"anything")
+    (folder / ".tail.safetensors.1.part").write_bytes(b"")
+    (folder / "notes.txt").write_bytes(b"")
+    assert find_model("tail") == folder / "tail.safetensors"
+    mine = [model for model in list_models() if not model.bundled]
+    assert [(model.name, model.path) for model in mine] == [("tail", folder / "tail.safetensors")]
+
+
+def test_an_unknown_name_lists_those_that_there_are(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    (folder / "tail.safetensors").write_bytes(b"")
+    with pytest.raises(ModelFileError, match=r"no model or file 'trunk'; .*\btail\b"):
+        find_model("trunk")
+
+
+def test_a_file_needs_no_folder_of_models(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "some.safetensors"
+    assert find_model(path) == path
+    assert not folder.exists()
+
+
+def test_a_file_without_extension_is_found_where_no_model_has_its_name(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("plain").write_bytes(b"")
+    assert find_model("plain") == Path("plain")
+    assert not folder.exists()
+
+
+def test_destinations_that_cannot_be_are_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "taken.safetensors").mkdir()
+    for destination, reason in (
+        (tmp_path / "model.obj", "a model is a .safetensors file"),
+        (tmp_path / "none" / "m.safetensors", "no folder"),
+        (tmp_path / "taken.safetensors", "it is a folder"),
+    ):
+        with pytest.raises(ModelFileError, match=reason):
+            model_destination(destination)
+    folder.parent.write_bytes(b"a file where the folder should be")
+    with pytest.raises(LCollisionError, match="cannot be made"):
+        model_destination("tail")
