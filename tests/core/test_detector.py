@@ -287,3 +287,15 @@ def test_no_shallow_pair_slips_between_the_boxes(spread: float) -> None:
     found = detector.detect(mesh.vertices)
     assert {(2 * k, 2 * k + 1) for k in range(n)} <= set(map(tuple, found.pairs.tolist()))
     check_against_brute_force(detector, mesh.vertices, mesh.faces)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_boxes_that_only_touch_in_single_precision(axis: int, up: float) -> None:
+    # A leaf of 8 floors in one plane, a leaf of 8 blades whose tips are 1e-8 behind it.
+    places = np.arange(8)[:, None, None] * np.array([0.03, 0.0, 0.0])
+    floors = 0.02 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) + places
+    blades = np.array([[0.005, 0.005, -1e-8], [0.005, 0.005, 1], [0.006, 0.005, 1]]) + places
+    triangles = np.roll(np.concatenate([floors, blades]) * [1, 1, up], axis + 1, axis=2)
+    found = check_mesh(soup(triangles))
+    assert found.pairs.tolist() == [[k, k + 8] for k in range(8)]
