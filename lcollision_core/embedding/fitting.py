@@ -13,9 +13,11 @@ from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray
 
-MAX_STEPS = 6
-PRIOR_WEIGHT = 1e-8
-"""Squared heights that a code at one training deviation costs: it settles what vertices do not."""
+MAX_STEPS = 20
+PRIOR_SHARE = 2.5e-3
+"""Of the mean squared vertex distance reached so far: what a code at one training deviation costs.
+It settles what the vertices do not, and vanishes for a mesh that the decoder can reach, whose
+code thus comes back."""
 
 _SETTLED = 0.02
 _HALVINGS = 5
@@ -63,7 +65,7 @@ class _Candidate:
     translation: FloatArray
     decoded: FloatArray
     aligned: FloatArray
-    cost: float
+    misfit: float
 
 
 def fit_latent(
@@ -78,8 +80,9 @@ def fit_latent(
 ) -> LatentFit:
     """Fit code and rigid motion together to each mesh.
 
-    Minimises the mean squared vertex distance over all rigid motions of the mesh plus
-    `PRIOR_WEIGHT` Σ (z / deviation)², by damped Gauss-Newton from a guess.
+    Minimises the mean squared vertex distance over all rigid motions of the mesh, by damped
+    Gauss-Newton from a guess, where each step weighs the distance d² that it starts from against
+    `PRIOR_SHARE` d² Σ (z / deviation)².
 
     Parameters
     ----------
@@ -125,7 +128,7 @@ def _fit_one(
     deviation: FloatArray,
     max_steps: int,
 ) -> _Candidate:
-    stiffness = PRIOR_WEIGHT / deviation.astype(np.float64) ** 2
+    inverse_variance = deviation.astype(np.float64) ** -2.0
     n_vertices = len(target)
 
     def at(latent: npt.NDArray[Any]) -> _Candidate:
@@ -134,11 +137,16 @@ def _fit_one(
         rotation, translation = fit_rigid(target, decoded)
         aligned = target @ rotation.T + translation
         misfit = float(((decoded - aligned) ** 2).sum() / n_vertices)
-        prior = float((stiffness * code.astype(np.float64) ** 2).sum())
-        return _Candidate(code, rotation, translation, decoded, aligned, misfit + prior)
+        return _Candidate(code, rotation, translation, decoded, aligned, misfit)
+
+    def cost(candidate: _Candidate, stiffness: FloatArray) -> float:
+        prior = float((stiffness * candidate.latent.astype(np.float64) ** 2).sum())
+        return candidate.misfit + prior
 
     best = at(np.asarray(guess))
     for _ in range(max_steps):
+        stiffness = PRIOR_SHARE * best.misfit * inverse_variance
+        start_cost = cost(best, stiffness)
         features = decoder.features(best.latent[None])[0]
         moved = codec.decode_jvp(features, decoder.tangents(best.latent))
         # The mesh is free to turn and shift after the pose, so only what no small rigid motion
@@ -162,12 +170,12 @@ def _fit_one(
         length = 1.0
         for _ in range(_HALVINGS):
             candidate = at(best.latent - length * step)
-            if candidate.cost < best.cost:
+            if cost(candidate, stiffness) < start_cost:
                 break
             length *= 0.5
         else:
             break
-        gain = 1.0 - candidate.cost / best.cost
+        gain = 1.0 - cost(candidate, stiffness) / start_cost
         best = candidate
         if gain < _SETTLED:
             break
