@@ -1,0 +1,373 @@
+"""``train embedding``, ``models``, ``info``, ``domains``, ``encode``, ``decode``, ``sample``."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from app.cli.main import app
+from lcollision_core.meshes import read_mesh, write_mesh, write_pose_set
+from lcollision_core.model import PoseModel, read_poses
+from tests.app.support import Lcollision
+from tests.bending_tube import LENGTH_IN_FILES, bending_tube
+from tests.core.shapes import random_rotation
+
+TRAINING = ("--domains", "2", "--domain-codes", "3", "--seed", "1", "--licence", "CC0-1.0")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("dataset") / "bends.npz"
+    write_pose_set(path, bending_tube())
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("trained") / "tube.safetensors"
+    result = CliRunner().invoke(
+        app, ["train", "embedding", str(dataset), "-o", str(path), *TRAINING]
+    )
+    assert result.exit_code == 0, result.output
+    assert result.stdout == ""
+    assert f"wrote {path}: vertex error" in result.stderr
+    assert list(path.parent.iterdir()) == [path]
+    return path
+
+
+@pytest.fixture
+def tube(trained: Path, tmp_path: Path) -> Path:
+    """Return a copy of the trained model that a test may change."""
+    return Path(shutil.copy(trained, tmp_path / "tube.safetensors"))
+
+
+@pytest.fixture(autouse=True)
+def user_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keep the tests from the models of whoever runs them."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    return tmp_path / "data" / "lcollision" / "models"
+
+
+def _refusal(lcollision: Lcollision, *arguments: object) -> str:
+    """Run a command that must fail for bad input, and return its one sentence."""
+    result = lcollision(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("lcollision: ")
+    return line
+
+
+def test_info_prints_what_scripts_read(lcollision: Lcollision, tube: Path) -> None:
+    result = lcollision("info", tube, "--json")
+    assert result.exit_code == 0
+    report = json.loads(result.stdout)
+    assert (
+        report.items()
+        >= {
+            "name": "tube",
+            "version": 1,
+            "vertices": 210,
+            "faces": 416,
+            "latent_size": 8,
+            "near_exclusion": 0.0,
+            "licence": "CC0-1.0",
+            "source": "bends.npz",
+            "predictor": None,
+        }.items()
+    )
+    assert [domain["name"] for domain in report["domains"]] == ["part 1", "part 2"]
+    assert sum(domain["vertices"] for domain in report["domains"]) == pytest.approx(210, abs=0.2)
+    assert [domain["codes"] for domain in report["domains"]] == [3, 3]
+    errors = report["reconstruction"]
+    assert 0 < errors["mean"] < errors["level1_mean"] < 0.05
+    assert errors["mean"] < errors["max"] < 0.05
+    assert 0 < errors["held_out_mean"] < errors["held_out_max"]
+    assert errors["pca_held_out_mean"] > 0
+    assert 0 < report["acap"]["mean"] < report["acap"]["max"] < 0.02
+    assert report["masks"]["connected_share"] > 0.95
+    assert 1 <= report["masks"]["domains_per_vertex"] <= 2
+    assert report["provenance"]["seed"] == 1
+
+
+def test_info_in_words_names_domains_and_errors(lcollision: Lcollision, tube: Path) -> None:
+    result = lcollision("info", tube)
+    assert result.exit_code == 0
+    assert "210 vertices, 416 faces, 16 poses, 2 domains, 8 numbers a pose" in result.stdout
+    assert "vertex error 0." in result.stdout
+    assert "poses left out" in result.stdout
+    assert " 2  part 2  (" in result.stdout
+
+
+def test_figure_shows_each_domain_in_its_colour(
+    lcollision: Lcollision, tube: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "masks.png"
+    result = lcollision("info", tube, "--json", "--figure", path)
+    assert result.exit_code == 0
+    colours = [domain["colour"] for domain in json.loads(result.stdout)["domains"]]
+    pixels = np.asarray(Image.open(path).convert("RGB"), dtype=float)
+    assert pixels.shape[0] > 800
+    # The model's upper domain is listed first and drawn above the other, on both sides.
+    surface = pixels[:1300].reshape(1300, 2, 900, 3)
+    for side in range(2):
+        levels = []
+        for colour in colours:
+            wanted = np.array(list(bytes.fromhex(colour[1:])), dtype=float)
+            drawn = surface[:, side]
+            length = np.linalg.norm(drawn, axis=2) * np.linalg.norm(wanted)
+            alike = (drawn @ wanted / np.maximum(length, 1.0) > 0.99) & (np.ptp(drawn, axis=2) > 60)
+            assert alike.sum() > 5000
+            levels.append(np.nonzero(alike)[0].mean())
+        assert levels[0] < levels[1]
+    assert (pixels[:20] == 255).all()
+
+
+def test_domains_are_listed_and_renamed_for_good(lcollision: Lcollision, tube: Path) -> None:
+    result = lcollision("domains", tube)
+    assert result.exit_code == 0
+    assert [line.split("  ")[2] for line in result.stdout.splitlines()] == ["part 1", "part 2"]
+    before = PoseModel.load(tube)
+    result = lcollision("domains", tube, "--name", "2=foot = end", "--name", "1=neck")
+    assert result.exit_code == 0
+    assert "neck" in result.stdout
+    after = PoseModel.load(tube)
+    assert after.domain_names == ("neck", "foot = end")
+    assert after.fingerprint == before.fingerprint
+    assert np.array_equal(after.training_latent, before.training_latent)
+    assert "foot = end" in lcollision("domains", tube).stdout
+
+
+@pytest.mark.parametrize("request_", ["3=tail", "0=tail", "x=tail", "tail", "1=", "1=fine", "=a"])
+def test_bad_renamings_change_nothing(lcollision: Lcollision, tube: Path, request_: str) -> None:
+    before = tube.read_bytes()
+    result = lcollision("domains", tube, "--name", "2=fine", "--name", request_)
+    assert result.exit_code == 2
+    assert "Traceback" not in result.stderr
+    assert tube.read_bytes() == before
+
+
+def test_bundled_models_are_not_renamed(
+    lcollision: Lcollision, tube: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = tube.read_bytes()
+    monkeypatch.setattr("lcollision_core.model.library.bundled_folder", lambda _: tube.parent)
+    assert "part 1" in lcollision("domains", "tube").stdout
+    assert "bundled model" in _refusal(lcollision, "domains", "tube", "--name", "1=neck")
+    assert tube.read_bytes() == before
+
+
+def test_models_are_listed_and_used_by_name(
+    lcollision: Lcollision, tube: Path, user_models: Path, tmp_path: Path
+) -> None:
+    user_models.mkdir(parents=True)
+    shutil.copy(tube, user_models / "my tube.safetensors")
+    result = lcollision("models", "--json")
+    assert result.exit_code == 0
+    (mine,) = (report for report in json.loads(result.stdout) if not report["bundled"])
+    assert mine["name"] == "my tube"
+    assert mine["vertices"] == 210
+    assert mine["reconstruction"]["mean"] > 0
+    assert "my tube: 210 vertices" in lcollision("models").stdout
+    poses = tmp_path / "poses.json"
+    assert lcollision("sample", "my tube", "-n", 2, "-o", poses).exit_code == 0
+    assert poses.exists()
+    sentence = _refusal(lcollision, "info", "our tube")
+    assert "'our tube'" in sentence
+    assert "my tube" in sentence
+
+
+def test_a_damaged_model_is_named_and_the_others_are_listed(
+    lcollision: Lcollision, tube: Path, user_models: Path
+) -> None:
+    user_models.mkdir(parents=True)
+    shutil.copy(tube, user_models / "good.safetensors")
+    (user_models / "bad.safetensors").write_bytes(tube.read_bytes()[:-1])
+    result = lcollision("models")
+    assert result.exit_code == 2
+    assert "good: 210 vertices" in result.stdout
+    assert "bad.safetensors" in result.stderr
+
+
+def test_no_models_are_no_error(
+    lcollision: Lcollision, user_models: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lcollision_core.model.library.bundled_folder", lambda _: user_models)
+    result = lcollision("models")
+    assert result.exit_code == 0
+    assert str(user_models) in result.stdout
+    assert json.loads(lcollision("models", "--json").stdout) == []
+
+
+def test_samples_are_the_seeds_own(lcollision: Lcollision, tube: Path, tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("a.json", "b.json", "c.json")]
+    for path, seed in zip(files, (5, 5, 6), strict=True):
+        assert lcollision("sample", tube, "-n", 12, "-o", path, "--seed", seed).exit_code == 0
+    assert files[0].read_bytes() == files[1].read_bytes()
+    model = PoseModel.load(tube)
+    poses = read_poses(files[0], model)
+    assert [pose.name for pose in poses] == [f"sample {n:02d}" for n in range(1, 13)]
+    other = read_poses(files[2], model)
+    assert not np.array_equal(poses[0].latent, other[0].latent)
+
+
+@pytest.mark.parametrize(("option", "status"), [("--free", 0), ("--colliding", 1)])
+def test_exported_samples_are_of_the_kind_asked_for(
+    lcollision: Lcollision, tube: Path, tmp_path: Path, option: str, status: int
+) -> None:
+    poses, folder = tmp_path / "poses.json", tmp_path / "meshes"
+    assert lcollision("sample", tube, "-n", 6, "-o", poses, option).exit_code == 0
+    assert lcollision("decode", tube, poses, "-o", folder, "--format", "ply").exit_code == 0
+    meshes = sorted(folder.iterdir())
+    assert [mesh.name for mesh in meshes] == [f"sample {n}.ply" for n in range(1, 7)]
+    result = lcollision("check", "--json", *meshes)
+    assert result.exit_code == status
+    assert [report["colliding"] for report in json.loads(result.stdout)] == [bool(status)] * 6
+
+
+def test_a_mesh_comes_back_to_its_place(lcollision: Lcollision, tube: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    model = PoseModel.load(tube)
+    latent = model.latent_space.sample(2, rng)
+    meshes = []
+    for place, vertices in enumerate(model.decode(latent)):
+        meshes.append(tmp_path / f"mesh {place}.obj")
+        write_mesh(meshes[-1], vertices @ random_rotation(rng).T + 1000.0, model.faces)
+    poses, folder = tmp_path / "poses.json", tmp_path / "back"
+    result = lcollision("encode", tube, *meshes, "-o", poses)
+    assert result.exit_code == 0
+    assert "mesh 1: fit error 0.000 % of the height" in result.stdout
+    encoded = read_poses(poses, model)
+    assert [pose.name for pose in encoded] == ["mesh 0", "mesh 1"]
+    for pose, wanted in zip(encoded, latent, strict=True):
+        assert pose.latent == pytest.approx(wanted, abs=1e-4 * np.abs(wanted).max())
+        assert pose.fit_error_max == pytest.approx(0.0, abs=1e-6)
+    assert lcollision("decode", tube, poses, "-o", folder).exit_code == 0
+    for mesh in meshes:
+        back = read_mesh(folder / mesh.name).vertices
+        assert np.abs(back - read_mesh(mesh).vertices).max() < 1e-5 * LENGTH_IN_FILES
+
+
+def test_form_of_the_output_decides_what_decode_writes(
+    lcollision: Lcollision, tube: Path, tmp_path: Path
+) -> None:
+    one, two = tmp_path / "one.json", tmp_path / "two.json"
+    lcollision("sample", tube, "-n", 1, "-o", one)
+    lcollision("sample", tube, "-n", 2, "-o", two)
+    model = PoseModel.load(tube)
+    mesh = tmp_path / "mesh.GLB"
+    assert lcollision("decode", tube, one, "-o", mesh).exit_code == 0
+    decoded = model.decode(read_poses(one, model)[0].latent)
+    assert np.array_equal(read_mesh(mesh).vertices, decoded.astype(np.float32))
+    copy = tmp_path / "copy.json"
+    assert lcollision("decode", tube, two, "-o", copy).exit_code == 0
+    assert copy.read_bytes() == two.read_bytes()
+    existing = tmp_path / "folder.with.dots"
+    existing.mkdir()
+    assert lcollision("decode", tube, two, "-o", existing).exit_code == 0
+    assert sorted(path.name for path in existing.iterdir()) == ["sample 1.obj", "sample 2.obj"]
+    for output, sentence in (
+        (tmp_path / "both.obj", "2 poses; name a folder"),
+        (tmp_path / "both.xyz", ".xyz is no format"),
+        (tmp_path / "none" / "folder", "cannot be made"),
+        (one / "folder", "cannot be made"),
+    ):
+        assert sentence in _refusal(lcollision, "decode", tube, two, "-o", output)
+        assert not output.exists()
+
+
+def test_pose_names_that_are_no_file_names_are_made_safe(
+    lcollision: Lcollision, tube: Path, tmp_path: Path
+) -> None:
+    poses, folder = tmp_path / "poses.json", tmp_path / "meshes"
+    lcollision("sample", tube, "-n", 4, "-o", poses)
+    document = json.loads(poses.read_text())
+    for pose, name in zip(document["poses"], ("../up", "A", "a", ". ."), strict=True):
+        pose["name"] = name
+    poses.write_text(json.dumps(document))
+    assert lcollision("decode", tube, poses, "-o", folder, "--format", "off").exit_code == 0
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["A.off", "_up.off", "a 2.off", "pose.off"]
+    assert not (tmp_path / "up.off").exists()
+
+
+def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(
+    lcollision: Lcollision, tube: Path, dataset: Path, tmp_path: Path
+) -> None:
+    work = tmp_path / "work"
+    work.mkdir()
+    mesh, foreign = work / "mesh.obj", work / "foreign.obj"
+    model = PoseModel.load(tube)
+    write_mesh(mesh, model.reference, model.faces)
+    write_mesh(foreign, model.reference, model.faces[:-1])
+    other_model = work / "other.safetensors"
+    other_model.write_bytes(b"not a model")
+    poses = work / "poses.json"
+    before = sorted(work.iterdir())
+    output = work / "out"
+    refusals = [
+        (("info", other_model), "no model of this program"),
+        (("info", tube, "--figure", work / "m.jpg"), "must be a .png file"),
+        (("info", tube, "--figure", work / "none" / "m.png"), "no folder"),
+        (("encode", tube, mesh, foreign, "-o", poses), "foreign.obj has 415 faces"),
+        (("encode", tube, work / "none.obj", "-o", poses), "none.obj"),
+        (("encode", tube, mesh, "-o", work / "poses.obj"), "must be a .json file"),
+        (("encode", other_model, mesh, "-o", poses), "no model of this program"),
+        (("decode", tube, poses, "-o", output), "no such file"),
+        (("decode", tube, mesh, "-o", output), "no JSON"),
+        (("sample", tube, "-n", 1, "-o", work / "poses"), "must be a .json file"),
+        (("train", "embedding", work / "none.npz", "-o", work / "m.safetensors"), "none.npz"),
+        (("train", "embedding", dataset, "-o", work / "m.obj"), "a model is a .safetensors file"),
+        (("train", "embedding", dataset, "-o", work / "x" / "m.safetensors"), "no folder"),
+        (("train", "embedding", mesh, "-o", work / "m.safetensors"), "one mesh, not a pose set"),
+    ]
+    for arguments, sentence in refusals:
+        assert sentence in _refusal(lcollision, *arguments)
+        assert sorted(work.iterdir()) == before
+
+
+def test_poses_of_another_model_are_refused(
+    lcollision: Lcollision, tube: Path, tmp_path: Path
+) -> None:
+    poses = tmp_path / "poses.json"
+    lcollision("sample", tube, "-n", 1, "-o", poses)
+    document = json.loads(poses.read_text())
+    document["model"] = {"name": "dancer", "fingerprint": "0" * 16}
+    poses.write_text(json.dumps(document))
+    sentence = _refusal(lcollision, "decode", tube, poses, "-o", tmp_path / "out")
+    assert "model 'dancer'" in sentence
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+def test_an_interrupted_training_goes_on_and_ends_with_the_same_model(
+    dataset: Path, trained: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "tube.safetensors"
+    checkpoint = tmp_path / "tube.safetensors.checkpoint"
+    command = [sys.executable, "-m", "app", "train", "embedding", dataset, "-o", output, *TRAINING]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert "run the same command again" in said
+    assert "Traceback" not in said
+    assert sorted(tmp_path.iterdir()) == [output, checkpoint][1:]
+    result = CliRunner().invoke(app, [str(argument) for argument in command[3:]])
+    assert result.exit_code == 0, result.output
+    assert f"going on from {checkpoint}" in result.stderr
+    assert list(tmp_path.iterdir()) == [output]
+    assert output.read_bytes() == trained.read_bytes()
