@@ -97,7 +97,9 @@ def domains(
     for request in names or []:
         number, _, name = request.partition("=")
         if not number.strip().isdecimal() or not name:
-            raise typer.BadParameter(f"{request!r} is not of the form K=NAME, such as 3=tail")
+            raise LCollisionError(
+                f"{request!r} does not name a domain; write K=NAME, such as 3=tail"
+            )
         model = model.rename_domain(int(number) - 1, name)
     if names:
         if any(listed.bundled and listed.path == path for listed in list_models()):
@@ -109,12 +111,17 @@ def domains(
 
 
 def describe(model: PoseModel) -> dict[str, Any]:
-    """Return the fields of ``lcollision info --json``; lengths in heights."""
+    """Return the fields of ``lcollision info --json``; lengths in heights.
+
+    A domain's vertices are those of which it owns more than any other domain does.
+    """
+    import numpy as np
+
     from lcollision_core.model_file import FORMAT_VERSION
 
     metrics = model.metrics
     groups = model.latent_space.groups[1:]
-    mass = model.attention_mask.sum(axis=1)
+    owned = np.bincount(model.attention_mask.argmax(axis=0), minlength=len(groups))
     return {
         "name": model.name,
         "version": FORMAT_VERSION,
@@ -125,11 +132,11 @@ def describe(model: PoseModel) -> dict[str, Any]:
         "domains": [
             {
                 "name": group.name,
-                "vertices": round(float(owned), 1),
+                "vertices": int(n_vertices),
                 "codes": len(group.code_names),
                 "colour": group.colour,
             }
-            for group, owned in zip(groups, mass, strict=True)
+            for group, n_vertices in zip(groups, owned, strict=True)
         ],
         "latent_size": model.latent_size,
         "reconstruction": metrics
@@ -188,6 +195,6 @@ def _percent(heights: float) -> str:
 def _print_domains(report: dict[str, Any]) -> None:
     for number, domain in enumerate(report["domains"], start=1):
         typer.echo(
-            f"  {number:2d}  {domain['name']}  ({domain['vertices']:.0f} vertices, "
+            f"  {number:2d}  {domain['name']}  ({domain['vertices']} vertices, "
             f"{domain['codes']} numbers)"
         )

@@ -88,7 +88,7 @@ def test_info_prints_what_scripts_read(lcollision: Lcollision, tube: Path) -> No
         }.items()
     )
     assert [domain["name"] for domain in report["domains"]] == ["part 1", "part 2"]
-    assert sum(domain["vertices"] for domain in report["domains"]) == pytest.approx(210, abs=0.2)
+    assert sum(domain["vertices"] for domain in report["domains"]) == 210
     assert [domain["codes"] for domain in report["domains"]] == [3, 3]
     errors = report["reconstruction"]
     assert 0 < errors["mean"] < errors["level1_mean"] < 0.05
@@ -152,9 +152,7 @@ def test_domains_are_listed_and_renamed_for_good(lcollision: Lcollision, tube: P
 @pytest.mark.parametrize("request_", ["3=tail", "0=tail", "x=tail", "tail", "1=", "1=fine", "=a"])
 def test_bad_renamings_change_nothing(lcollision: Lcollision, tube: Path, request_: str) -> None:
     before = tube.read_bytes()
-    result = lcollision("domains", tube, "--name", "2=fine", "--name", request_)
-    assert result.exit_code == 2
-    assert "Traceback" not in result.stderr
+    _refusal(lcollision, "domains", tube, "--name", "2=fine", "--name", request_)
     assert tube.read_bytes() == before
 
 
