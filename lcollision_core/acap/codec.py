@@ -74,7 +74,8 @@ class EncodedPoses:
     Attributes
     ----------
     features : (B, V, 9) float64 array, unscaled
-    n_jumps : (B,) int64 array, edges whose two rotation vectors are more than pi apart
+    n_jumps : (B,) int64 array, edges whose two angles differ by more than pi, their
+        axes pointing the same way
     """
 
     features: FloatArray
@@ -288,7 +289,7 @@ class AcapCodec:
         return by_features
 
     def decode_torch(self, features: torch.Tensor) -> torch.Tensor:
-        """Decode a tensor, differentiably: see `torch_decode.decode_torch`."""
+        """Decode a (..., V, 9) tensor differentiably: see `torch_decode.decode_torch`."""
         from lcollision_core.acap.torch_decode import decode_torch
 
         return decode_torch(self, features)

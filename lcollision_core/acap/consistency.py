@@ -13,6 +13,8 @@ from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
 _TURN = 2.0 * math.pi
 _AXIS_DEFINED_ABOVE = 1e-7
+# Sine of half the angle: 90 degrees to either side of a full turn. On a tube that is wound as
+# steeply as its surface can bear, 60 degrees were too few to pass the full turn.
 _AXIS_TRUSTED_ABOVE = 0.7
 _N_LANDMARKS = 8
 

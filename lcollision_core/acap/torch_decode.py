@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch.autograd.function import once_differentiable
 
-from lcollision_core.acap.codec import AcapCodec
+if TYPE_CHECKING:
+    from lcollision_core.acap.codec import AcapCodec
 
 
 class _Decode(torch.autograd.Function):

@@ -167,6 +167,19 @@ def test_jumps_are_counted_edge_by_edge() -> None:
     assert n_jumps > 0
 
 
+def test_walk_goes_round_a_cut_and_not_across() -> None:
+    mesh = grid(12)
+    x, y = mesh.vertices[:, 0] - 0.52, mesh.vertices[:, 1] - 0.52
+    # Winds up by 4 radians round the middle: across the cut that looks like -2.3, the shorter way.
+    vectors = np.zeros((169, 3))
+    vectors[:, 2] = 4.0 * (np.arctan2(y, x) % (2 * np.pi)) / (2 * np.pi)
+    root = int(np.argmin(np.abs(vectors[:, 2] - 2.0)))
+    logs, n_jumps = logarithms(mesh.topology, vectors, [root])
+    assert logs == pytest.approx(vectors, abs=1e-9)
+    start, end = mesh.topology.edges.T
+    assert n_jumps == (np.abs(vectors[start, 2] - vectors[end, 2]) > np.pi).sum() > 0
+
+
 def test_components_are_walked_apart() -> None:
     mesh = join(grid(3), grid(3), grid(3))
     vectors = np.zeros((48, 3))
