@@ -50,23 +50,20 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
 
     Parameters
     ----------
-    name_or_path : a file, or the name of a bundled or user model
+    name_or_path : a file, or, where there is no such file, the name of a bundled or user model
 
     Raises
     ------
     ModelFileError : it is neither; the sentence lists the names that there are.
     """
     path = Path(name_or_path)
-    if _is_name(path):
+    if len(path.parts) == 1 and not path.is_file():
         listed = list_models()
         for model in listed:
-            if model.name == str(name_or_path):
+            if model.name == path.name:
                 return model.path
-        if not path.exists():
-            names = ", ".join(model.name for model in listed) or "none yet"
-            raise ModelFileError(
-                f"there is no model or file {str(name_or_path)!r}; the models are: {names}"
-            )
+        names = ", ".join(model.name for model in listed) or "none yet"
+        raise ModelFileError(f"there is no model or file {path.name!r}; the models are: {names}")
     return path
 
 
@@ -83,7 +80,7 @@ def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
     ModelFileError : another extension, no such folder, or the user's folder cannot be made.
     """
     path = Path(name_or_path)
-    if _is_name(path):
+    if len(path.parts) == 1 and not path.suffix:
         folder = user_models_folder()
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +101,3 @@ def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
     if path.is_dir():
         raise ModelFileError(f"{path} cannot be written: it is a folder; add a file name")
     return path
-
-
-def _is_name(path: Path) -> bool:
-    return len(path.parts) == 1 and not path.suffix and path.name not in ("", ".", "..")

@@ -148,9 +148,12 @@ def test_users_models_are_found_by_name(folder: Path) -> None:
     (folder / "tail.safetensors").write_bytes(b"anything")
     (folder / ".tail.safetensors.1.part").write_bytes(b"")
     (folder / "notes.txt").write_bytes(b"")
+    (folder / "tail.v2.safetensors").write_bytes(b"")
     assert find_model("tail") == folder / "tail.safetensors"
+    assert find_model("tail.v2") == folder / "tail.v2.safetensors"
     mine = [model for model in list_models() if not model.bundled]
-    assert [(model.name, model.path) for model in mine] == [("tail", folder / "tail.safetensors")]
+    assert [model.name for model in mine] == ["tail", "tail.v2"]
+    assert mine[0].path == folder / "tail.safetensors"
 
 
 def test_an_unknown_name_lists_those_that_there_are(folder: Path) -> None:
