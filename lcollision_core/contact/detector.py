@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact.kernels import (
     LEAF_SIZE,
+    MAX_REACH,
     FaceTree,
     Found,
     NearVertices,
@@ -119,7 +121,8 @@ class CollisionDetector:
                 f"the reference must have shape ({topology.n_vertices}, 3), got {vertices.shape}"
             )
         if not np.isfinite(vertices).all():
-            raise ShapeError(f"{_first_not_finite(vertices)} of the reference is not finite")
+            vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+            raise ShapeError(f"vertex {vertex} of the reference is not finite")
         if not near_exclusion >= 0.0:
             raise ShapeError(f"the near exclusion must be 0 or more heights, got {near_exclusion}")
         self.topology = topology
@@ -142,9 +145,9 @@ class CollisionDetector:
 
         Raises
         ------
-        ShapeError : another shape, or a vertex that is not finite.
+        ShapeError : another shape, or a vertex that is not finite or absurdly far away.
         """
-        pose = self._checked(np.asarray(vertices)[None])[0]
+        pose = self._checked(vertices, (self.topology.n_vertices, 3))
         with self._searcher() as searcher:
             n_found = searcher.search(pose, first_only=False)
             found = searcher.found
@@ -181,10 +184,10 @@ class CollisionDetector:
 
         Raises
         ------
-        ShapeError : another shape, or a vertex that is not finite.
+        ShapeError : another shape, or a vertex that is not finite or absurdly far away.
         CancelledError : `cancel` was set.
         """
-        poses = self._checked(vertices)
+        poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
         n_pairs = np.zeros(len(poses), dtype=np.int64)
         n_near_pairs = np.zeros(len(poses), dtype=np.int64)
         vertex_energy = np.zeros(poses.shape[:2])
@@ -210,7 +213,7 @@ class CollisionDetector:
 
         Parameters and errors are those of `detect_batch`; returns a (B,) bool array.
         """
-        poses = self._checked(vertices)
+        poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
         colliding = np.zeros(len(poses), dtype=np.bool_)
 
         def search(searcher: _Searcher, pose: int) -> None:
@@ -221,16 +224,13 @@ class CollisionDetector:
         self._for_each(len(poses), search, workers, progress, cancel)
         return colliding
 
-    def _checked(self, vertices: npt.ArrayLike) -> npt.NDArray[np.floating]:
-        poses = np.asarray(vertices)
-        if poses.dtype.kind != "f":
-            poses = poses.astype(np.float64)
-        if poses.ndim != 3 or poses.shape[1:] != (self.topology.n_vertices, 3):
-            raise ShapeError(
-                f"poses must have {self.topology.n_vertices} vertices of 3 coordinates, "
-                f"got an array of shape {poses.shape}"
-            )
-        return poses
+    def _checked(self, vertices: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[np.floating]:
+        """Refuse another shape, in which -1 stands for any number of poses."""
+        array = np.asarray(vertices)
+        if array.ndim != len(shape) or array.shape[-2:] != shape[-2:]:
+            wanted = ", ".join("B" if size < 0 else str(size) for size in shape)
+            raise ShapeError(f"vertices must have shape ({wanted}), got {array.shape}")
+        return array if array.dtype.kind == "f" else array.astype(np.float64)
 
     def _for_each(
         self,
@@ -251,7 +251,8 @@ class CollisionDetector:
                     search(searcher, pose)
             return stop
 
-        pool = ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="contact")
+        n_threads = available_cores() if workers is None else workers
+        pool = ThreadPoolExecutor(n_threads, thread_name_prefix="contact")
         try:
             for stop in pool.map(work, starts):
                 progress(stop, n_poses)
@@ -292,9 +293,6 @@ class _Searcher:
         `number` is the pose's place in its batch, for the error message.
         """
         np.copyto(self._pose, pose)
-        if not np.isfinite(self._pose).all():
-            where = "" if number is None else f" of pose {number}"
-            raise ShapeError(f"{_first_not_finite(self._pose)}{where} is not finite")
         while True:
             n_found: int = search_pose(
                 self._pose,
@@ -307,9 +305,23 @@ class _Searcher:
                 self.found,
                 LEAF_SIZE,
             )
+            if n_found < 0:
+                self._refuse(number)
             if n_found <= len(self.found.slots):
                 return n_found
             self.found = _room_for(2 * n_found)
+
+    def _refuse(self, number: int | None) -> NoReturn:
+        within = np.abs(self._pose) * self._inverse_height <= MAX_REACH  # False for NaN
+        vertex = int(np.flatnonzero(~within.all(axis=1))[0])
+        where = "" if number is None else f" of pose {number}"
+        position = self._pose[vertex].tolist()
+        what = (
+            f"is more than {MAX_REACH:.0e} heights away"
+            if np.isfinite(position).all()
+            else "is not finite"
+        )
+        raise ShapeError(f"vertex {vertex}{where} {what}: {position}")
 
 
 def _room_for(n_pairs: int) -> Found:
@@ -318,8 +330,3 @@ def _room_for(n_pairs: int) -> Found:
         squared_depth=np.empty(n_pairs),
         is_near=np.empty(n_pairs, dtype=np.bool_),
     )
-
-
-def _first_not_finite(vertices: FloatArray) -> str:
-    vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-    return f"vertex {vertex}"

@@ -30,6 +30,10 @@ Relative, so the same at every scale. Any direction gives an upper bound of the 
 tolerance only has to keep out cross products that are rounding noise.
 """
 
+MAX_REACH = 1e9
+"""Heights from the origin beyond which a pose is refused as a mistake. Within it, products of
+coordinates stay far from overflow."""
+
 SMALL_SINE_SQUARED = 1e-6
 """Below this squared sine of their angle, two edges' cross product is freed of rounding."""
 
@@ -69,7 +73,7 @@ class NearVertices(NamedTuple):
     is excluded.
     """
 
-    start: IntArray
+    start: npt.NDArray[np.int64]
     vertex: IntArray
 
 
@@ -78,12 +82,14 @@ class PoseWork(NamedTuple):
 
     Attributes
     ----------
-    triangles : (S, 3, 3) float64, corners in heights about the middle of the pose
+    middle : (3,) float64, the middle of the pose's bounding box, in its unit
+    triangles : (S, 3, 3) float64, corners in heights about that middle
     boxes : (6 S,) float32, leaf by leaf the lower x of its slots, lower y, lower z, upper x, ...
     node_boxes : (n, 6) float32, lower x, y, z, upper x, y, z
     stack : (depth bound, 2) int32, pairs of nodes still to be visited
     """
 
+    middle: npt.NDArray[np.float64]
     triangles: npt.NDArray[np.float64]
     boxes: npt.NDArray[np.float32]
     node_boxes: npt.NDArray[np.float32]
@@ -215,16 +221,19 @@ def fill_depths(triangles, tolerances, depths):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _refit(pose, inverse_height, tree, work):
-    """Fill `work` for one pose.
+    """Fill `work` for one pose and return True, or False where it is not within `MAX_REACH`.
 
     Coordinates are taken from the middle of the pose's bounding box, so that a pose far from
     the origin loses no precision to its distance.
     """
-    middle = np.empty(3)
+    middle = work.middle
     for c in range(3):
         low = np.inf
         high = -np.inf
         for v in range(len(pose)):
+            # Written so that NaN fails it.
+            if not abs(pose[v, c]) * inverse_height <= MAX_REACH:
+                return False
             low = min(low, pose[v, c])
             high = max(high, pose[v, c])
         middle[c] = 0.5 * (low + high)
@@ -269,6 +278,7 @@ def _refit(pose, inverse_height, tree, work):
             for c in range(3):
                 node_boxes[node, c] = min(node_boxes[a, c], node_boxes[b, c])
                 node_boxes[node, 3 + c] = max(node_boxes[a, 3 + c], node_boxes[b, 3 + c])
+    return True
 
 
 @njit(inline="always", error_model="numpy")
@@ -403,7 +413,7 @@ def search_pose(pose, inverse_height, tolerance, tree, near, work, first_only, f
 
     Parameters
     ----------
-    pose : (V, 3) float64 array, finite
+    pose : (V, 3) float64 array
     inverse_height : factor from the pose's unit to heights
     tolerance : depth in heights up to which two faces touch rather than penetrate
     tree, near, work : of one topology; `work` is overwritten
@@ -414,9 +424,10 @@ def search_pose(pose, inverse_height, tolerance, tree, near, work, first_only, f
     Returns
     -------
     n_found : how many pairs there are. Those beyond the room in `found` were counted and not
-        stored: call again with more room.
+        stored: call again with more room. -1 where a vertex is not finite or beyond `MAX_REACH`.
     """
-    _refit(pose, inverse_height, tree, work)
+    if not _refit(pose, inverse_height, tree, work):
+        return -1
     boxes = work.node_boxes
     stack = work.stack
     n_found = 0

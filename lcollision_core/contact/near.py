@@ -27,7 +27,7 @@ def near_vertices(
     """
     if distance <= 0.0:
         return NearVertices(
-            start=np.zeros(topology.n_vertices + 1, dtype=np.int32),
+            start=np.zeros(topology.n_vertices + 1, dtype=np.int64),
             vertex=np.empty(0, dtype=np.int32),
         )
     i, j = topology.edges.T
@@ -42,4 +42,4 @@ def near_vertices(
         rows, columns = np.nonzero(distances <= distance)
         counts[sources + 1] = np.bincount(rows, minlength=len(sources))
         reached.append(columns.astype(np.int32))
-    return NearVertices(start=np.cumsum(counts).astype(np.int32), vertex=np.concatenate(reached))
+    return NearVertices(start=np.cumsum(counts), vertex=np.concatenate(reached))

@@ -72,6 +72,7 @@ def allocate_work(tree: FaceTree) -> PoseWork:
     # A pair of nodes is replaced by at most three, one level further down on one side or both.
     levels = int(np.ceil(np.log2(n_slots // LEAF_SIZE))) + 1
     return PoseWork(
+        middle=np.empty(3),
         triangles=np.zeros((n_slots, 3, 3)),
         boxes=np.empty(6 * n_slots, dtype=np.float32),
         node_boxes=np.empty((n_nodes, 6), dtype=np.float32),
