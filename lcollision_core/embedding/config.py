@@ -22,9 +22,8 @@ class EmbeddingConfig:
     batch_poses : poses per step of level 2
     locality_weight : of the locality loss, divided by the root of V, beside the squared feature
         error per vertex
-    locality_reach : shares of the mesh's largest geodesic distance between which the locality
-        loss rises from nothing to its full weight round a part
-    mask_softening : times that the parts' edges are averaged with their one-rings at the start
+    locality_reach : distances from a part, as shares of the mesh's largest geodesic distance,
+        between which the locality loss rises from nothing to its full weight
     vertex_weight : of the mean squared vertex distance, in squared heights, beside the squared
         feature error per vertex, in level 2
     held_out_stride : every so many poses one is left out of a second model that measures how
@@ -37,15 +36,14 @@ class EmbeddingConfig:
 
     n_domains: int = 10
     n_domain_codes: int = 10
-    level1_epochs: int = 300
+    level1_epochs: int = 100
     level2_epochs: int = 60
     level1_rate: float = 0.1
     level2_rate: float = 0.01
     convolution_rate: float = 1e-3
     batch_poses: int = 16
-    locality_weight: float = 0.1
-    locality_reach: tuple[float, float] = (0.0, 0.1)
-    mask_softening: int = 3
+    locality_weight: float = 0.03
+    locality_reach: tuple[float, float] = (0.1, 0.4)
     vertex_weight: float = 15.0
     held_out_stride: int = 10
 
@@ -57,7 +55,6 @@ class EmbeddingConfig:
             "level1_epochs": 0,
             "level2_epochs": 0,
             "batch_poses": 1,
-            "mask_softening": 0,
             "held_out_stride": 0,
         }
         for name, low in least.items():

@@ -171,84 +171,80 @@ def _ward(places: FloatArray, masses: FloatArray, edges: IntArray, n_parts: int)
     return part
 
 
-def locality_weights(
-    part: IntArray,
-    topology: Topology,
-    rest_vertices: FloatArray,
-    reach: tuple[float, float],
-) -> FloatArray:
-    """Weigh each vertex by its distance from each part: Lambda of the locality loss.
+def part_distances(part: IntArray, topology: Topology, rest_vertices: FloatArray) -> FloatArray:
+    """Measure how far each vertex lies from each part along the mesh's edges.
 
     Parameters
     ----------
     part : (V,) int32 array from 0, the part of each vertex
     topology : the connectivity
     rest_vertices : (V, 3) float64 array, the reference
-    reach : where the weight begins to rise and where it is 1, as shares of the mesh's largest
-        geodesic distance, the first less than the second
 
     Returns
     -------
-    weights : (K, V) float64 array in [0, 1], 0 inside the part
-
-    Notes
-    -----
-    Distances run along edges. The literature measures from the component's strongest vertex, so
-    that every domain is a disc of one size; measured from the part, a torso may be large and a
-    hand small, and a domain cannot drift over a joint.
+    distances : (K, V) float64 array, 0 inside the part, as shares of the mesh's largest geodesic
+        distance
     """
     edges = bridged_edges(topology, rest_vertices)
     lengths = np.linalg.norm(rest_vertices[edges[:, 0]] - rest_vertices[edges[:, 1]], axis=1)
+    # A stored 0 would be no edge at all.
     graph = edge_graph(edges, topology.n_vertices, np.maximum(lengths, 1e-12))
     start = int(np.argmax(csgraph.dijkstra(graph, indices=0)))
     largest = float(csgraph.dijkstra(graph, indices=start).max())
-    weights = np.empty((int(part.max()) + 1, topology.n_vertices))
-    for domain, row in enumerate(weights):
+    distances = np.empty((int(part.max()) + 1, topology.n_vertices))
+    for domain, row in enumerate(distances):
         inside = np.flatnonzero(part == domain)
-        distance = csgraph.dijkstra(graph, indices=inside, min_only=True)
-        row[:] = np.clip((distance / largest - reach[0]) / (reach[1] - reach[0]), 0.0, 1.0)
+        row[:] = csgraph.dijkstra(graph, indices=inside, min_only=True)
+    return distances / max(largest, 1e-12)
+
+
+def locality_weights(distances: FloatArray, reach: tuple[float, float]) -> FloatArray:
+    """Weigh vertices by their distance from the parts: Lambda of the locality loss.
+
+    Parameters
+    ----------
+    distances : (K, V) float64 array, see `part_distances`
+    reach : at which distance the weight begins to rise from 0, and at which it is 1
+
+    Returns
+    -------
+    weights : (K, V) float64 array in [0, 1]
+
+    Notes
+    -----
+    The literature measures from the component's strongest vertex, so that every domain is a disc
+    of one size; measured from the part, a torso may be large and a hand small, and a domain
+    cannot drift over the body.
+    """
+    weights: FloatArray = np.clip((distances - reach[0]) / (reach[1] - reach[0]), 0.0, 1.0)
     return weights
 
 
 def initial_components(
-    features: npt.NDArray[np.float32],
-    part: IntArray,
-    topology: Topology,
-    areas: FloatArray,
-    n_softenings: int,
+    features: npt.NDArray[np.float32], distances: FloatArray, areas: FloatArray, reach: float
 ) -> npt.NDArray[np.float32]:
-    """Start each domain from the leading principal component of its own part.
+    """Start each domain from the leading principal component of its part and surroundings.
 
     Parameters
     ----------
     features : (N, V, 9) float32 array, scaled and centred
-    part : (V,) int32 array from 0
-    topology : the connectivity
+    distances : (K, V) float64 array, see `part_distances`
     areas : (V,) float64 array, what each vertex counts
-    n_softenings : times that the parts' edges are averaged with their one-rings
+    reach : distance from the part at which the component has faded to 0
 
     Returns
     -------
     components : (K, V, 9) float32 array, each of unit norm
     """
-    n_parts = int(part.max()) + 1
-    softness = np.eye(n_parts)[:, part]
-    ring = ring_average(topology)
-    for _ in range(n_softenings):
-        softness = 0.5 * (softness + (ring @ softness.T).T)
-    components = np.zeros((n_parts, topology.n_vertices, N_FEATURES), dtype=np.float32)
-    for domain in range(n_parts):
-        inside = np.flatnonzero(softness[domain] > 0.0)
-        share = softness[domain, inside] * np.sqrt(areas[inside] / areas.mean())
+    components = np.zeros((*distances.shape, N_FEATURES), dtype=np.float32)
+    for domain, distance in enumerate(distances):
+        window = np.clip(1.0 - distance / reach, 0.0, 1.0)
+        inside = np.flatnonzero(window)
+        share = window[inside] * np.sqrt(areas[inside] / areas.mean())
         weighed = (features[:, inside] * share[:, None]).reshape(len(features), -1)
         leading = principal_components(weighed, 1)[0].reshape(-1, N_FEATURES)
-        leading = leading * softness[domain, inside][:, None]
-        norm = np.linalg.norm(leading)
-        # A part that never moves still owns its vertices.
-        components[domain, inside] = (
-            leading / norm if norm > 0.0 else softness[domain, inside][:, None]
-        )
-        components[domain] /= np.linalg.norm(components[domain])
+        faded = leading * window[inside, None]
+        components[domain, inside] = faded / np.linalg.norm(faded)
     return components
 
 

@@ -27,6 +27,7 @@ from lcollision_core.embedding.seeding import (
     initial_components,
     locality_weights,
     moving_parts,
+    part_distances,
     principal_components,
     ring_average,
     vertex_areas,
@@ -109,10 +110,10 @@ class BilevelTrainer:
         config, topology = self._config, self._topology
         part = moving_parts(self._features, topology, self._rest, config.n_domains)
         areas = vertex_areas(topology, self._rest)
-        start = initial_components(self._centred, part, topology, areas, config.mask_softening)
-        locality = torch.from_numpy(
-            locality_weights(part, topology, self._rest, config.locality_reach).astype(np.float32)
-        )
+        distances = part_distances(part, topology, self._rest)
+        reach = config.locality_reach
+        start = initial_components(self._centred, distances, areas, reach[1])
+        locality = torch.from_numpy(locality_weights(distances, reach).astype(np.float32))
         network = TiedAutoencoder(_of_mean_square_1(start), self._ring)
         features = torch.from_numpy(self._centred)
         around = ring_mean(features, network.ring)

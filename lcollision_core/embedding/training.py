@@ -250,13 +250,13 @@ class _Run:
             done = int(stored.metadata["poses"])
             latent, errors = np.array(stored.arrays["latent"]), np.array(stored.arrays["errors"])
         for index in range(done, len(poses)):
-            self._cancel.raise_if_cancelled()
             one = slice(index, index + 1)
             fit = fit_latent(
                 decoder, self._codec, self._vertices[poses[one]], latent[one], deviation
             )
             latent[one] = fit.latent
             errors[index] = fit.mean_error[0], fit.max_error[0]
+            self._report(model, "codes", index + 1, len(poses), index + 1)
             last = index + 1 == len(poses)
             self._checkpoint.put(
                 name,
@@ -264,7 +264,7 @@ class _Run:
                 {"poses": index + 1},
                 now=last or self._cancel.cancelled,
             )
-            self._report(model, "codes", index + 1, len(poses), index + 1)
+            self._cancel.raise_if_cancelled()
         self._before += len(poses)
         return _FittedCodes(latent, errors[:, 0], errors[:, 1])
 
