@@ -7,6 +7,7 @@ vertices of its domain only, so a pose costs one pass over a few megabytes of fl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,22 @@ class DecoderGroup:
 
     weights: Float32Array
     support: IntArray
+
+    @cached_property
+    def blocks(self) -> Float32Array:
+        """The weights block by block, (n_blocks, m, `_BLOCK`), the last one filled up with 0.
+
+        Read from front to end where `weights` would be read in strides: half the time or less on
+        a mesh of 10 000 vertices, whose weights no cache holds.
+        """
+        n_codes, n_numbers = self.weights.shape
+        n_blocks = -(-n_numbers // _BLOCK)
+        padded = np.zeros((n_codes, n_blocks * _BLOCK), dtype=np.float32)
+        padded[:, :n_numbers] = self.weights
+        blocks: Float32Array = np.ascontiguousarray(
+            padded.reshape(n_codes, n_blocks, _BLOCK).transpose(1, 0, 2)
+        )
+        return blocks
 
 
 @dataclass(frozen=True)
@@ -71,13 +88,12 @@ class FeatureDecoder:
         """
         rows = self._checked(latent)
         features = np.empty((len(rows), *self.offset.shape))
-        for row, out in zip(rows, features, strict=True):
-            out[:] = self.offset
-            start = 0
-            for group in self.groups:
-                stop = start + len(group.weights)
-                _add_group(row[start:stop], group.weights, group.support, self.scale, out)
-                start = stop
+        features[:] = self.offset
+        start = 0
+        for group in self.groups:
+            stop = start + len(group.weights)
+            _add_group(rows[:, start:stop], group.blocks, group.support, self.scale, features)
+            start = stop
         return features
 
     def tangents(self, latent: npt.NDArray[Any]) -> FloatArray:
@@ -120,35 +136,38 @@ class FeatureDecoder:
 @compiled
 def _add_group(
     codes: Float32Array,
-    weights: Float32Array,
+    blocks: Float32Array,
     support: IntArray,
     scale: FloatArray,
     features: FloatArray,
 ) -> None:
-    """Add scale * tanh(codes @ weights) to the (V, 9) features on the support."""
+    """Add scale * tanh(codes @ weights) to the (B, V, 9) features on the support."""
     one = np.float32(1.0)
     total = np.empty(_BLOCK, dtype=np.float32)
-    n_numbers = weights.shape[1]
-    for first in range(0, n_numbers, _BLOCK):
-        width = min(_BLOCK, n_numbers - first)
-        for i in range(width):
-            total[i] = codes[0] * weights[0, first + i]
-        for k in range(1, len(codes)):
-            code = codes[k]
-            for i in range(width):
-                total[i] += code * weights[k, first + i]
-        # tanh by its continued fraction at x / 4 and two double-angle steps: within 2e-7 of the
-        # true value, and unlike libm's it runs on vector registers.
-        for i in range(width):
-            x = np.float32(0.25) * min(max(total[i], np.float32(-12.0)), np.float32(12.0))
-            s = x * x
-            top = x * (np.float32(10395.0) + s * (np.float32(1260.0) + s * np.float32(21.0)))
-            bottom = np.float32(10395.0) + s * (np.float32(4725.0) + s * (np.float32(210.0) + s))
-            t = top / bottom
-            t = (t + t) / (one + t * t)
-            total[i] = (t + t) / (one + t * t)
-        vertex = first // 9
-        for n in range(width // 9):
-            out = features[support[vertex + n]]
-            for j in range(9):
-                out[j] += scale[j] * total[9 * n + j]
+    for block in range(len(blocks)):
+        weights = blocks[block]
+        first = block * _BLOCK // 9
+        last = min(first + _BLOCK // 9, len(support))
+        for pose in range(len(codes)):
+            for i in range(_BLOCK):
+                total[i] = codes[pose, 0] * weights[0, i]
+            for k in range(1, codes.shape[1]):
+                code = codes[pose, k]
+                for i in range(_BLOCK):
+                    total[i] += code * weights[k, i]
+            # tanh by its continued fraction at x / 4 and two double-angle steps: within 2e-7 of
+            # the true value, and unlike libm's it runs on vector registers.
+            for i in range(_BLOCK):
+                x = np.float32(0.25) * min(max(total[i], np.float32(-12.0)), np.float32(12.0))
+                s = x * x
+                top = x * (np.float32(10395.0) + s * (np.float32(1260.0) + s * np.float32(21.0)))
+                bottom = np.float32(10395.0) + s * (
+                    np.float32(4725.0) + s * (np.float32(210.0) + s)
+                )
+                t = top / bottom
+                t = (t + t) / (one + t * t)
+                total[i] = (t + t) / (one + t * t)
+            for n in range(last - first):
+                out = features[pose, support[first + n]]
+                for j in range(9):
+                    out[j] += scale[j] * total[9 * n + j]
