@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -105,6 +107,8 @@ def _other_side(bone: str) -> str:
 
 def _read_anny() -> _Source:
     try:
+        # warp, which anny computes with, greets on standard output unless told otherwise.
+        import_module("warp").config.log_level = logging.WARNING
         import anny
         import pyvista  # noqa: F401
         import torch
