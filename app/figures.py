@@ -56,7 +56,7 @@ def draw_masks(model: PoseModel, path: str | os.PathLike[str]) -> None:
 def mask_colours(
     attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ...]
 ) -> npt.NDArray[np.uint8]:
-    """Colour each vertex by its domains: the full colour at weight 1, paler where it is shared.
+    """Colour each vertex by the domain that owns most of it, darker the more that is.
 
     Parameters
     ----------
@@ -67,10 +67,13 @@ def mask_colours(
     -------
     colours : (V, 3) uint8 array, red, green, blue
     """
-    # Squared weights sum to less than 1 where a vertex is shared: what is missing is white.
-    shares = np.asarray(attention_mask, dtype=np.float64) ** 2
-    absorbed = 255.0 - np.array([_rgb(colour) for colour in domain_colours], dtype=np.float64)
-    colours: npt.NDArray[np.uint8] = np.round(255.0 - shares.T @ absorbed).astype(np.uint8)
+    # Mixed hues would look like a domain that is not there; white cannot be mistaken for one.
+    leading = attention_mask.argmax(axis=0)
+    share = attention_mask.max(axis=0)[:, None]
+    full = np.array([_rgb(colour) for colour in domain_colours], dtype=np.float64)
+    colours: npt.NDArray[np.uint8] = np.round(255.0 - share * (255.0 - full[leading])).astype(
+        np.uint8
+    )
     return colours
 
 

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
 PALETTE = (
     "#0077bb",
     "#e69f00",
@@ -24,7 +30,67 @@ PALETTE = (
 furthest in CIELAB from those before it, at its worst of full, red-, green- and blue-blind sight
 (Machado et al. 2009)."""
 
+_XYZ_OF_RGB = np.array(
+    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+)
+_D65 = np.array([0.9505, 1.0, 1.089])
 
-def domain_colours(n_domains: int) -> tuple[str, ...]:
-    """Return `n_domains` colours as "#rrggbb"; past the palette's 16 they repeat."""
-    return tuple(PALETTE[domain % len(PALETTE)] for domain in range(n_domains))
+
+def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
+    """Choose a colour for each domain, unlike in hue where domains meet.
+
+    Parameters
+    ----------
+    attention_mask : (K, V) array
+
+    Returns
+    -------
+    colours : K strings "#rrggbb", all different up to the palette's 16
+
+    Notes
+    -----
+    A weight's darkness is drawn as a tint, so that a pale colour must not pass for a neighbour's
+    full one: only the hue and chroma of CIELAB count here. Colours swap domains as long as that
+    lessens the sum of overlaps over squared distances.
+    """
+    n_domains = len(attention_mask)
+    chosen = [PALETTE[domain % len(PALETTE)] for domain in range(n_domains)]
+    chroma = np.array([cielab(colour)[1:] for colour in chosen])
+    squared_distance = ((chroma[:, None] - chroma) ** 2).sum(axis=2)
+    likeness = 1.0 / (squared_distance + 25.0)
+    mask = np.asarray(attention_mask, dtype=np.float64)
+    overlap = mask @ mask.T
+    np.fill_diagonal(overlap, 0.0)
+    order = list(range(n_domains))
+
+    def clash(candidate: list[int]) -> float:
+        return float((overlap * likeness[np.ix_(candidate, candidate)]).sum())
+
+    best = clash(order)
+    improved = True
+    while improved:
+        improved = False
+        for a, b in combinations(range(n_domains), 2):
+            swapped = order.copy()
+            swapped[a], swapped[b] = order[b], order[a]
+            tried = clash(swapped)
+            if tried < best * (1.0 - 1e-9):
+                order, best, improved = swapped, tried, True
+    return tuple(chosen[colour] for colour in order)
+
+
+def cielab(colour: str, sight: npt.NDArray[np.float64] | None = None) -> npt.NDArray[np.float64]:
+    """Return the CIELAB lightness, a and b of "#rrggbb" under daylight (D65).
+
+    Parameters
+    ----------
+    colour : sRGB
+    sight : (3, 3) matrix on linear RGB, such as one that simulates colour blindness
+    """
+    rgb = np.frombuffer(bytes.fromhex(colour.removeprefix("#")), np.uint8) / 255.0
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    if sight is not None:
+        linear = np.clip(sight @ linear, 0.0, 1.0)
+    xyz = _XYZ_OF_RGB @ linear / _D65
+    f = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -18,16 +17,8 @@ _MAIN_SHARE = 0.6
 """Of a domain's weight: a body part with as much names the domain alone."""
 _SECOND_SHARE = 0.2
 """Of a domain's weight: a second part with less is not worth naming."""
-
-
-# What people call the bones of a trunk.
-_PLAIN_WORDS = {
-    "collar": "shoulder",
-    "lumbar": "waist",
-    "neck": "neck",
-    "pelvis": "hips",
-    "thorax": "chest",
-}
+_SAME_SHARE = 0.5
+"""Of the other side's weight: with more, a domain belongs to both sides."""
 
 
 def numbered_names(n_domains: int) -> tuple[str, ...]:
@@ -42,53 +33,44 @@ def names_from_labels(
 ) -> tuple[str, ...]:
     """Name each domain after the body parts that its mask covers.
 
-    The part with most of the mask's weight gives the name; where it has less than 60 %, a second
-    part with at least 20 % joins it, as in "left forearm & hand". Domains that would share a name
-    take their second part too, and where that does not help, their place: "upper left thigh".
+    Parts count by the squares of the mask's weights: what a domain owns, not what it touches.
+    The leading part names it; where that has less than 60 %, a second part with at least 20 %
+    joins it, as in "left forearm & hand". A left and a right part of like share count as one,
+    "thighs". Domains that would share a name take their second part too, and where that does not
+    help, their place: "upper left thigh".
 
     Parameters
     ----------
     attention_mask : (K, V) array
-    vertex_labels : (V,) strings, such as "left forearm"; of a built-in body its bones, whose
-        names are put in plain words: "thorax 2" is "chest"
+    vertex_labels : (V,) strings, such as "left forearm"
     heights : (V,) array, each vertex's coordinate along the up axis, in any unit
 
     Returns
     -------
     names : K different names
     """
-    parts, part_of_label = np.unique(vertex_labels, return_inverse=True)
-    labels, label_of_part = np.unique([plain_words(part) for part in parts], return_inverse=True)
-    index = label_of_part[part_of_label].astype(np.int64)
-    weights = np.stack([np.bincount(index, row, len(labels)) for row in attention_mask])
-    shares = weights / np.maximum(weights.sum(axis=1, keepdims=True), np.finfo(float).tiny)
-    order = np.argsort(-shares, axis=1, kind="stable")
+    parts, part_of_vertex = np.unique(vertex_labels, return_inverse=True)
+    ranked = []
+    for row in np.asarray(attention_mask, dtype=np.float64):
+        weights = np.bincount(part_of_vertex, row**2, len(parts))
+        shares = weights / max(float(weights.sum()), np.finfo(float).tiny)
+        ranked.append(_ranked_parts(dict(zip(parts.tolist(), shares.tolist(), strict=True))))
 
-    def name(domain: int, with_second: bool) -> str:
-        first = str(labels[order[domain, 0]])
-        if len(labels) == 1 or not with_second:
+    def name(parts_of_domain: list[tuple[str, float]], with_second: bool) -> str:
+        first = parts_of_domain[0][0]
+        if not with_second or len(parts_of_domain) == 1:
             return first
-        second = order[domain, 1]
-        if shares[domain, second] < _SECOND_SHARE:
-            return first
-        return join_names(first, str(labels[second]))
+        second, share = parts_of_domain[1]
+        return join_names(first, second) if share >= _SECOND_SHARE else first
 
-    n_domains = len(attention_mask)
-    names = [
-        name(domain, bool(shares[domain, order[domain, 0]] < _MAIN_SHARE))
-        for domain in range(n_domains)
-    ]
+    names = [name(found, found[0][1] < _MAIN_SHARE) for found in ranked]
     shared = _shared(names)
-    names = [name(k, True) if names[k] in shared else names[k] for k in range(n_domains)]
+    names = [
+        name(found, True) if first in shared else first
+        for first, found in zip(names, ranked, strict=True)
+    ]
     mass = np.maximum(attention_mask.sum(axis=1), np.finfo(float).tiny)
     return _told_apart(names, attention_mask @ heights / mass)
-
-
-def plain_words(bone: str) -> str:
-    """Return what a person calls the part round a bone: "left thigh end" is "left thigh"."""
-    side = next((side for side in ("left ", "right ") if bone.startswith(side)), "")
-    name = bone.removeprefix(side).removesuffix(" end")
-    return side + _PLAIN_WORDS.get(re.sub(r" [0-9]+$", "", name), name)
 
 
 def join_names(first: str, second: str) -> str:
@@ -96,9 +78,25 @@ def join_names(first: str, second: str) -> str:
     words, others = first.split(), second.split()
     if words[0] == others[0]:
         return f"{first} & {' '.join(others[1:])}" if len(others) > 1 else first
-    if words[1:] == others[1:] and {words[0], others[0]} == {"left", "right"}:
-        return " ".join(["left & right", *words[1:]])
     return f"{first} & {second}"
+
+
+def _ranked_parts(shares: dict[str, float]) -> list[tuple[str, float]]:
+    """Return parts and shares from the largest down, both sides of a part that are alike as one."""
+    merged = dict(shares)
+    for part, left in shares.items():
+        stem = part.removeprefix("left ")
+        right = shares.get(f"right {stem}", 0.0)
+        if stem != part and min(left, right) > _SAME_SHARE * max(left, right):
+            del merged[part], merged[f"right {stem}"]
+            merged[_plural(stem)] = left + right
+    return sorted(merged.items(), key=lambda item: -item[1])
+
+
+def _plural(part: str) -> str:
+    if part.endswith("foot"):
+        return f"{part.removesuffix('foot')}feet"
+    return part if part.endswith("s") else f"{part}s"
 
 
 def checked_name(name: str, taken: Sequence[str]) -> str:

@@ -153,7 +153,7 @@ class PoseModel:
             up_axis=up,
             near_exclusion=pose_set.near_exclusion,
             domain_names=names,
-            domain_colours=domain_colours(embedding.n_domains),
+            domain_colours=domain_colours(embedding.attention_mask),
             pose_names=pose_set.names,
             source=source or (pose_set.source.name if pose_set.source else "unknown"),
             licence=licence,

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.meshes.body.skeleton import BONES
 from lcollision_core.model import find_model, list_models, model_destination, user_models_folder
-from lcollision_core.model.colours import PALETTE, domain_colours
-from lcollision_core.model.naming import join_names, names_from_labels, plain_words
+from lcollision_core.model.colours import PALETTE, cielab, domain_colours
+from lcollision_core.model.naming import join_names, names_from_labels
 
 
 def _names(shares: list[dict[str, float]], levels: list[float] | None = None) -> tuple[str, ...]:
-    """Name domains whose weights on the parts are given, each part being one vertex."""
+    """Name domains whose squared weights on the parts are given, each part being one vertex."""
     parts = sorted({part for share in shares for part in share})
-    mask = np.array([[share.get(part, 0.0) for part in parts] for share in shares])
+    mask = np.sqrt([[share.get(part, 0.0) for part in parts] for share in shares])
     heights = np.arange(len(parts), dtype=float) if levels is None else np.array(levels)
     return names_from_labels(mask, np.array(parts), heights)
 
@@ -34,7 +33,7 @@ def test_two_parts_of_like_weight_are_joined() -> None:
 
 
 def test_a_part_of_little_weight_is_not_named() -> None:
-    shares = {"chest": 0.5, "waist": 0.18, "left shoulder": 0.17, "right shoulder": 0.15}
+    shares = {"chest": 0.55, "waist": 0.18, "left shoulder": 0.17, "right shoulder": 0.02}
     assert _names([shares]) == ("chest",)
 
 
@@ -71,8 +70,7 @@ def test_domains_that_share_all_are_told_apart_by_their_height() -> None:
     [
         ("left forearm", "left hand", "left forearm & hand"),
         ("left upper arm", "left shoulder", "left upper arm & shoulder"),
-        ("left thigh", "right thigh", "left & right thigh"),
-        ("right thigh", "left thigh", "left & right thigh"),
+        ("left thigh", "right shin", "left thigh & right shin"),
         ("chest", "left shoulder", "chest & left shoulder"),
         ("left", "left hand", "left & hand"),
     ],
@@ -81,17 +79,16 @@ def test_joined_names_do_not_repeat_themselves(first: str, second: str, joined: 
     assert join_names(first, second) == joined
 
 
-def test_bones_of_the_built_in_body_have_plain_names_that_keep_their_side() -> None:
-    for bone in BONES:
-        name = plain_words(bone)
-        assert name.startswith("left ") == bone.startswith("left ")
-        assert name.startswith("right ") == bone.startswith("right ")
-        assert not name.endswith(" end")
-        assert not any(letter.isdigit() for letter in name)
-    assert plain_words("left upper arm end") == "left upper arm"
-    assert plain_words("thorax 2") == "chest"
-    # Other sets number their parts on purpose.
-    assert plain_words("segment 2") == "segment 2"
+def test_both_sides_of_a_part_are_named_as_one() -> None:
+    names = _names(
+        [
+            {"belly": 0.45, "left thigh": 0.3, "right thigh": 0.25},
+            {"left foot": 0.7, "right foot": 0.7},
+            {"left toes": 0.7, "right toes": 0.6},
+            {"left upper arm": 0.9, "right upper arm": 0.1},
+        ]
+    )
+    assert names == ("thighs & belly", "feet", "toes", "left upper arm")
 
 
 def test_no_weight_at_all_still_gives_names() -> None:
@@ -118,22 +115,42 @@ _SIGHTS = [
 ]
 
 
-def _cielab(colour: str, sight: np.ndarray) -> np.ndarray:
-    rgb = np.frombuffer(bytes.fromhex(colour[1:]), np.uint8) / 255.0
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(sight @ linear, 0.0, 1.0)
-    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-    xyz = np.array(to_xyz) @ seen / [0.9505, 1.0, 1.089]
-    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
-    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+def test_cielab_of_known_colours() -> None:
+    assert cielab("#ffffff") == pytest.approx([100.0, 0.0, 0.0], abs=0.02)
+    assert cielab("#000000") == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
+    assert cielab("#ff0000") == pytest.approx([53.24, 80.09, 67.20], abs=0.05)
 
 
 def test_colours_are_told_apart_by_colour_blind_eyes() -> None:
     for sight in _SIGHTS:
-        seen = [_cielab(colour, sight) for colour in domain_colours(12)]
+        seen = [cielab(colour, sight) for colour in PALETTE[:12]]
         assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 10.0
     assert len(set(PALETTE)) == len(PALETTE) == 16
-    assert domain_colours(18)[16:] == PALETTE[:2]
+
+
+@pytest.mark.parametrize("n_domains", [1, 2, 12, 16])
+def test_each_domain_has_a_colour_of_its_own(n_domains: int) -> None:
+    mask = np.random.default_rng(n_domains).dirichlet(np.ones(n_domains), 50).T
+    assert sorted(domain_colours(mask)) == sorted(PALETTE[:n_domains])
+
+
+def test_domains_that_meet_differ_in_hue() -> None:
+    # A chain, whose neighbours share a vertex in the palette's own order.
+    n_domains = 12
+    mask = np.eye(n_domains) + np.eye(n_domains, k=1) + np.eye(n_domains, k=-1)
+    colours = domain_colours(mask)
+    chroma = np.array([cielab(colour)[1:] for colour in colours])
+    apart = np.linalg.norm(np.diff(chroma, axis=0), axis=1)
+    plain = np.array([cielab(colour)[1:] for colour in PALETTE[:n_domains]])
+    assert apart.min() > 45.0
+    assert apart.min() > np.linalg.norm(np.diff(plain, axis=0), axis=1).min()
+    assert domain_colours(mask) == colours
+
+
+def test_more_domains_than_colours_repeat_them() -> None:
+    colours = domain_colours(np.eye(40))
+    assert len(colours) == 40
+    assert set(colours) == set(PALETTE)
 
 
 @pytest.fixture
