@@ -23,7 +23,6 @@ from lcollision_core.embedding.autoencoders import (
     deviation_of,
     run_encoders,
 )
-from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.decoder import FeatureDecoder, Float32Array
 from lcollision_core.embedding.fitting import MAX_STEPS, LatentFit, fit_latent
 from lcollision_core.embedding.metrics import EmbeddingMetrics
@@ -58,7 +57,8 @@ class Embedding:
     attention_mask : (K, V) float32 array, each column sums to 1
     training_latent : (N, D) float32 array, codes of the training poses
     metrics : what training measured, None before it has
-    config : how it was trained
+    config : how it was trained, the values of an `EmbeddingConfig` by name; kept as they are, so
+        that a model outlives the choices of the program that trained it
     seed : of the order of level 2's batches
     """
 
@@ -72,7 +72,7 @@ class Embedding:
     attention_mask: Float32Array
     training_latent: Float32Array
     metrics: EmbeddingMetrics | None
-    config: EmbeddingConfig
+    config: Mapping[str, Any]
     seed: int
 
     @cached_property
@@ -229,7 +229,7 @@ class Embedding:
             "n_domains": self.n_domains,
             "scaling": asdict(self.scaling),
             "metrics": None if self.metrics is None else asdict(self.metrics),
-            "config": {**asdict(self.config), "locality_reach": list(self.config.locality_reach)},
+            "config": dict(self.config),
             "seed": self.seed,
         }
         return arrays, metadata
@@ -276,7 +276,7 @@ class Embedding:
                 attention_mask=mask,
                 training_latent=_float32(arrays["training_latent"]),
                 metrics=None if metrics is None else EmbeddingMetrics(**metrics),
-                config=EmbeddingConfig(**metadata["config"]),
+                config=dict(metadata["config"]),
                 seed=int(metadata["seed"]),
             )
         except KeyError as error:

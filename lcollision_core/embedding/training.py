@@ -227,7 +227,10 @@ class _Run:
             attention_mask=learnt.attention_mask,
             training_latent=latent,
             metrics=None,
-            config=self._config,
+            config={
+                **asdict(self._config),
+                "locality_reach": list(self._config.locality_reach),
+            },
             seed=self._seed,
         )
 

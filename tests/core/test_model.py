@@ -358,3 +358,17 @@ def test_sampling_gives_up_in_a_sentence(model: PoseModel, monkeypatch: pytest.M
     calm_model = PoseModel("calm", calm, model.card)
     with pytest.raises(LCollisionError, match="none of 128 poses"):
         sample_poses(calm_model, 1, seed=0, colliding=True)
+
+
+def test_models_of_programs_with_other_training_options_still_load(path: Path) -> None:
+    sections = read_model_file(path)
+    embedding = sections["embedding"]
+    config = {**embedding.metadata["config"], "an_option_of_later": [1, 2]}
+    del config["level2_rate"]
+    metadata = {**embedding.metadata, "config": config}
+    sections["embedding"] = Section(embedding.arrays, metadata)
+    write_model_file(path, sections)
+    before = PoseModel.load(path)
+    before.rename_domain(0, "tail").save(path)
+    assert read_model_file(path)["embedding"].metadata["config"] == config
+    assert PoseModel.load(path).fingerprint == before.fingerprint
