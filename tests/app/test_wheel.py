@@ -56,7 +56,7 @@ def test_it_finds_every_resource(site: Path, tmp_path: Path) -> None:
 
 
 def test_its_program_checks_a_bundled_pose(site: Path, tmp_path: Path) -> None:
-    pose = site / "resources" / "poses" / "crossed_arms.obj"
+    pose = site / "resources" / "poses" / "windmill.obj"
     result = _run(site, tmp_path, "-m", "app", "check", "--json", str(pose))
     assert result.returncode == 1, result.stderr
     (report,) = json.loads(result.stdout)
