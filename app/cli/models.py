@@ -94,14 +94,16 @@ def domains(
 
     path = find_model(model_name)
     model = PoseModel.load(path)
+    renamings: dict[int, str] = {}
     for request in names or []:
         number, _, name = request.partition("=")
         if not number.strip().isdecimal() or not name:
             raise LCollisionError(
                 f"{request!r} does not name a domain; write K=NAME, such as 3=tail"
             )
-        model = model.rename_domain(int(number) - 1, name)
-    if names:
+        renamings[int(number) - 1] = name
+    if renamings:
+        model = model.rename_domains(renamings)
         if any(listed.bundled and listed.path == path for listed in list_models()):
             raise LCollisionError(
                 f"{model.name} is a bundled model and stays as it is; copy {path} and name the copy"

@@ -10,6 +10,7 @@ import typer
 from app.cli.console import note, progress_bar
 from app.cli.models import ModelArgument
 from app.cli.results import MeshFormat, require_output, write_result
+from lcollision_core.errors import PoseSetError
 
 PosesOutput = Annotated[
     Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
@@ -36,7 +37,11 @@ def encode(
     poses = []
     with progress_bar("Encoding meshes") as progress:
         for name, mesh in zip(names, files, strict=True):
-            poses.append(NamedPose.of_mesh(name, model.encode(mesh.vertices)))
+            try:
+                encoded = model.encode(mesh.vertices)
+            except PoseSetError as error:
+                raise PoseSetError(f"{mesh.source} cannot be encoded: {error}") from error
+            poses.append(NamedPose.of_mesh(name, encoded))
             progress(len(poses), len(files))
     write_poses(output, model, poses)
     for pose in poses:

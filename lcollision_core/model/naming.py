@@ -99,20 +99,18 @@ def _plural(part: str) -> str:
     return part if part.endswith("s") else f"{part}s"
 
 
-def checked_name(name: str, taken: Sequence[str]) -> str:
-    """Return a name without the spaces round it, if a domain may bear it.
+def checked_name(name: str) -> str:
+    """Return a name without the spaces round it.
 
     Raises
     ------
-    ModelFileError : it is empty, longer than `MAX_NAME_LENGTH`, not printable, or taken.
+    ModelFileError : it is empty, longer than `MAX_NAME_LENGTH`, or not printable.
     """
     stripped = name.strip()
     if not stripped or len(stripped) > MAX_NAME_LENGTH or not stripped.isprintable():
         raise ModelFileError(
             f"{name[:80]!r} cannot name a domain; use 1 to {MAX_NAME_LENGTH} printable characters"
         )
-    if stripped in taken:
-        raise ModelFileError(f"another domain is already called {stripped!r}; choose another name")
     return stripped
 
 

@@ -31,6 +31,8 @@ FloatArray = npt.NDArray[np.float64]
 _EMBEDDING = "embedding"
 _CARD = "model"
 
+_LARGEST_SIZE = 20.0
+
 
 @dataclass(frozen=True)
 class EncodedPose:
@@ -218,6 +220,7 @@ class PoseModel:
         Raises
         ------
         ShapeError : another shape, or a coordinate that is not finite.
+        PoseSetError : 20 times larger or smaller than the reference.
         CancelledError : `cancel` was set.
         """
         mesh = np.asarray(vertices, dtype=np.float64)
@@ -228,6 +231,12 @@ class PoseModel:
         if not np.isfinite(mesh).all():
             vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
             raise ShapeError(f"vertex {vertex} (from 0) is not finite")
+        size = height(mesh) / self.height
+        if not 1.0 / _LARGEST_SIZE < size < _LARGEST_SIZE:
+            raise PoseSetError(
+                f"the mesh is {size:.3g} times as large as the reference of {self.name!r}; export "
+                f"it in the unit of the model's data"
+            )
         fit = self._embedding.encode(mesh[None] / self.card.height, cancel=cancel)
         aligning = RigidTransform(fit.rotations[0], fit.translations[0] * self.card.height)
         return EncodedPose(
@@ -266,25 +275,28 @@ class PoseModel:
                 f"model's topology and vertex order"
             )
 
-    def rename_domain(self, domain: int, name: str) -> PoseModel:
-        """Return the same model with one domain called otherwise.
+    def rename_domains(self, names: Mapping[int, str]) -> PoseModel:
+        """Return the same model with some domains called otherwise.
 
         Parameters
         ----------
-        domain : index from 0
-        name : unlike the other domains' names
+        names : new names by domain, an index from 0; two domains may swap theirs
 
         Raises
         ------
-        ModelFileError : there is no such domain, or the name cannot be.
+        ModelFileError : there is no such domain, or a name cannot be or is another domain's.
         """
-        names = list(self.card.domain_names)
-        if not 0 <= domain < len(names):
-            raise ModelFileError(
-                f"{self.name} has no domain {domain + 1}; its domains are 1 to {len(names)}"
-            )
-        names[domain] = checked_name(name, names[:domain] + names[domain + 1 :])
-        card = replace(self.card, domain_names=tuple(names))
+        renamed = list(self.domain_names)
+        for domain, name in names.items():
+            if not 0 <= domain < len(renamed):
+                raise ModelFileError(
+                    f"{self.name} has no domain {domain + 1}; its domains are 1 to {len(renamed)}"
+                )
+            renamed[domain] = checked_name(name)
+        for name in renamed:
+            if renamed.count(name) > 1:
+                raise ModelFileError(f"two domains would be called {name!r}; choose another name")
+        card = replace(self.card, domain_names=tuple(renamed))
         return PoseModel(self.name, self._embedding, card, self._other_sections)
 
     @cached_property

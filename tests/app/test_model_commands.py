@@ -147,6 +147,8 @@ def test_domains_are_listed_and_renamed_for_good(lcollision: Lcollision, tube: P
     assert after.fingerprint == before.fingerprint
     assert np.array_equal(after.training_latent, before.training_latent)
     assert "foot = end" in lcollision("domains", tube).stdout
+    lcollision("domains", tube, "--name", "1=foot = end", "--name", "2=neck")
+    assert PoseModel.load(tube).domain_names == ("foot = end", "neck")
 
 
 @pytest.mark.parametrize("request_", ["3=tail", "0=tail", "x=tail", "tail", "1=", "1=fine", "=a"])
@@ -309,6 +311,8 @@ def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(
     model = PoseModel.load(tube)
     write_mesh(mesh, model.reference, model.faces)
     write_mesh(foreign, model.reference, model.faces[:-1])
+    larger = work / "larger.obj"
+    write_mesh(larger, 1000.0 * model.reference, model.faces)
     other_model = work / "other.safetensors"
     other_model.write_bytes(b"not a model")
     poses = work / "poses.json"
@@ -320,6 +324,7 @@ def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(
         (("info", tube, "--figure", work / "none" / "m.png"), "no folder"),
         (("encode", tube, mesh, foreign, "-o", poses), "foreign.obj has 415 faces"),
         (("encode", tube, work / "none.obj", "-o", poses), "none.obj"),
+        (("encode", tube, mesh, larger, "-o", poses), "larger.obj cannot be encoded"),
         (("encode", tube, mesh, "-o", work / "poses.obj"), "must be a .json file"),
         (("encode", other_model, mesh, "-o", poses), "no model of this program"),
         (("decode", tube, poses, "-o", output), "no such file"),

@@ -232,7 +232,7 @@ def test_loading_and_decoding_need_no_torch_and_no_front_end(path: Path) -> None
 
 
 def test_renaming_is_kept_and_leaves_the_latent_space_alone(model: PoseModel, path: Path) -> None:
-    renamed = PoseModel.load(path).rename_domain(1, "  Schwanz ☃ ")
+    renamed = PoseModel.load(path).rename_domains({1: "  Schwanz ☃ "})
     renamed.save(path)
     loaded = PoseModel.load(path)
     assert loaded.domain_names == (model.domain_names[0], "Schwanz ☃")
@@ -244,22 +244,46 @@ def test_renaming_is_kept_and_leaves_the_latent_space_alone(model: PoseModel, pa
 @pytest.mark.parametrize("name", ["", "  ", "a\nb", "x" * 61, "\x07"])
 def test_names_that_cannot_be_shown_are_refused(model: PoseModel, name: str) -> None:
     with pytest.raises(ModelFileError, match="cannot name a domain"):
-        model.rename_domain(0, name)
+        model.rename_domains({0: name})
 
 
 def test_taken_names_and_missing_domains_are_refused(model: PoseModel) -> None:
-    with pytest.raises(ModelFileError, match="already called"):
-        model.rename_domain(0, model.domain_names[1])
-    assert model.rename_domain(0, model.domain_names[0]).domain_names == model.domain_names
+    first, second = model.domain_names
+    with pytest.raises(ModelFileError, match="two domains would be called"):
+        model.rename_domains({0: second})
+    assert model.rename_domains({0: first}).domain_names == (first, second)
+    assert model.rename_domains({0: second, 1: first}).domain_names == (second, first)
     for domain in (-1, 2):
         with pytest.raises(ModelFileError, match="domains are 1 to 2"):
-            model.rename_domain(domain, "tail")
+            model.rename_domains({domain: "tail"})
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.01, 100.0, 1e150])
+def test_meshes_in_another_unit_are_refused(model: PoseModel, scale: float) -> None:
+    with pytest.raises(PoseSetError, match="times as large as the reference of 'tube'"):
+        model.encode(scale * model.reference)
+
+
+def test_meshes_that_are_no_pose_are_fitted_as_well_as_may_be(model: PoseModel) -> None:
+    """Flat, mirrored, shuffled and random meshes get finite codes and an error that says so."""
+    rng = np.random.default_rng(0)
+    mesh = model.decode(_box(model, 1)[0])
+    for foreign in (
+        mesh * [1.0, 0.0, 1.0],
+        mesh * [0.0, 1.0, 0.0],
+        mesh * [-1.0, 1.0, 1.0] + [0.0, 0.0, 1e6],
+        mesh[rng.permutation(len(mesh))],
+        rng.normal(0.0, LENGTH_IN_FILES, mesh.shape),
+    ):
+        encoded = model.encode(foreign)
+        assert np.isfinite(encoded.latent).all()
+        assert encoded.fit_error_max > encoded.fit_error_mean > 0.001
 
 
 def test_sections_of_later_programs_survive_a_renaming(path: Path) -> None:
     later = Section({"bones": np.arange(4, dtype=np.int32)}, {"kind": "later"})
     write_model_file(path, read_model_file(path) | {"skeleton": later})
-    PoseModel.load(path).rename_domain(0, "tail").save(path)
+    PoseModel.load(path).rename_domains({0: "tail"}).save(path)
     kept = read_model_file(path)["skeleton"]
     assert kept.metadata == later.metadata
     assert np.array_equal(kept.arrays["bones"], later.arrays["bones"])
@@ -369,6 +393,6 @@ def test_models_of_programs_with_other_training_options_still_load(path: Path) -
     sections["embedding"] = Section(embedding.arrays, metadata)
     write_model_file(path, sections)
     before = PoseModel.load(path)
-    before.rename_domain(0, "tail").save(path)
+    before.rename_domains({0: "tail"}).save(path)
     assert read_model_file(path)["embedding"].metadata["config"] == config
     assert PoseModel.load(path).fingerprint == before.fingerprint
