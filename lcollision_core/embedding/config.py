@@ -36,7 +36,7 @@ class EmbeddingConfig:
 
     n_domains: int = 10
     n_domain_codes: int = 10
-    level1_epochs: int = 100
+    level1_epochs: int = 60
     level2_epochs: int = 60
     level1_rate: float = 0.1
     level2_rate: float = 0.01
