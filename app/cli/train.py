@@ -149,20 +149,26 @@ def _training_bar() -> Iterator[StatusCallback]:
         rich_progress.BarColumn(),
         rich_progress.TaskProgressColumn(),
         rich_progress.TimeRemainingColumn(),
+        rich_progress.TextColumn("{task.fields[errors]}"),
     )
     with rich_progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        bar = bars.add_task("Reading features", total=None)
+        bar = bars.add_task("reading features", total=None, errors="")
 
         def show(status: TrainingStatus) -> None:
             errors = [
-                f"{level} {100.0 * error:.2f} %"
-                for level, error in (
+                f"{levels} {100.0 * error:.2f} %"
+                for levels, error in (
                     ("level 1", status.level1_error),
                     ("both levels", status.both_error),
                 )
                 if error is not None
             ]
-            described = f"{status.model}, {status.stage}: {', '.join(errors) or 'starting'}"
-            bars.update(bar, description=described, completed=status.done, total=status.total)
+            bars.update(
+                bar,
+                description=f"{status.model}: learning {status.stage}",
+                completed=status.done,
+                total=status.total,
+                errors=f"error {', '.join(errors)}" if errors else "",
+            )
 
         yield show

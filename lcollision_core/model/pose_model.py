@@ -64,6 +64,13 @@ class PoseModel:
     card : its units, names and origin
     other_sections : of its file, that this version of the program leaves as they are
 
+    Attributes
+    ----------
+    name, embedding, card : as given; front ends need only what follows
+    reference : (V, 3) float64 array, read-only, in the data's unit
+    attention_mask : (K, V) float32 array, read-only, each column sums to 1
+    training_latent : (N, D) float64 array, read-only, the training poses' codes
+
     Raises
     ------
     ModelFileError : the card names another number of domains or poses than the embedding has.
@@ -85,7 +92,7 @@ class PoseModel:
             )
         self.name = name
         self.card = card
-        self._embedding = embedding
+        self.embedding = embedding
         self._other_sections = dict(other_sections or {})
         self.reference: FloatArray = _read_only(embedding.rest_vertices * card.height)
         self.attention_mask = _read_only(embedding.attention_mask)
@@ -170,7 +177,7 @@ class PoseModel:
         ------
         ModelFileError : the file cannot be written.
         """
-        arrays, metadata = self._embedding.to_arrays()
+        arrays, metadata = self.embedding.to_arrays()
         sections = {
             **self._other_sections,
             _EMBEDDING: Section(arrays, metadata),
@@ -178,12 +185,13 @@ class PoseModel:
         }
         write_model_file(path, sections)
 
-    def decode(self, latent: npt.ArrayLike) -> FloatArray:
+    def decode(self, latent: npt.ArrayLike, n_threads: int | None = None) -> FloatArray:
         """Turn latent poses into meshes.
 
         Parameters
         ----------
         latent : (D,) or (B, D) finite array
+        n_threads : threads to spread the poses over, one for each core by default
 
         Returns
         -------
@@ -202,7 +210,7 @@ class PoseModel:
             )
         if not np.isfinite(codes).all():
             raise ShapeError("a latent pose has a number that is not finite")
-        vertices = self._embedding.decode(codes.reshape(-1, self.latent_size))
+        vertices = self.embedding.decode(codes.reshape(-1, self.latent_size), n_threads)
         vertices *= self.card.height
         return vertices[0] if codes.ndim == 1 else vertices
 
@@ -237,7 +245,7 @@ class PoseModel:
                 f"the mesh is {size:.3g} times as large as the reference of {self.name!r}; export "
                 f"it in the unit of the model's data"
             )
-        fit = self._embedding.encode(mesh[None] / self.card.height, cancel=cancel)
+        fit = self.embedding.encode(mesh[None] / self.card.height, cancel=cancel)
         aligning = RigidTransform(fit.rotations[0], fit.translations[0] * self.card.height)
         return EncodedPose(
             latent=fit.latent[0].astype(np.float64),
@@ -297,7 +305,7 @@ class PoseModel:
             if renamed.count(name) > 1:
                 raise ModelFileError(f"two domains would be called {name!r}; choose another name")
         card = replace(self.card, domain_names=tuple(renamed))
-        return PoseModel(self.name, self._embedding, card, self._other_sections)
+        return PoseModel(self.name, self.embedding, card, self._other_sections)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -306,7 +314,7 @@ class PoseModel:
         Models with one fingerprint understand each other's latent poses: it depends on neither
         names nor anything that is trained upon the latent space.
         """
-        arrays, metadata = self._embedding.to_arrays()
+        arrays, metadata = self.embedding.to_arrays()
         digest = hashlib.sha256(json.dumps(metadata["scaling"], sort_keys=True).encode())
         for name in sorted(arrays):
             array = np.ascontiguousarray(arrays[name])
@@ -317,7 +325,7 @@ class PoseModel:
     @cached_property
     def latent_space(self) -> LatentSpace:
         """The groups, names, colours and ranges of the latent's codes."""
-        embedding = self._embedding
+        embedding = self.embedding
         groups, start = [], 0
         labels = ((WHOLE_BODY, None), *zip(self.domain_names, self.domain_colours, strict=True))
         for (name, colour), size in zip(labels, embedding.group_sizes, strict=True):
@@ -342,7 +350,7 @@ class PoseModel:
     @property
     def topology(self) -> Topology:
         """The faces that all poses share, and what follows from them."""
-        return self._embedding.topology
+        return self.embedding.topology
 
     @property
     def faces(self) -> npt.NDArray[np.int32]:
@@ -357,7 +365,7 @@ class PoseModel:
     @property
     def latent_size(self) -> int:
         """D, the number of a latent pose's codes."""
-        return self._embedding.latent_size
+        return self.embedding.latent_size
 
     @property
     def height(self) -> float:
@@ -392,7 +400,7 @@ class PoseModel:
     @property
     def metrics(self) -> EmbeddingMetrics | None:
         """What training measured, lengths in heights."""
-        return self._embedding.metrics
+        return self.embedding.metrics
 
 
 def _sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

@@ -46,6 +46,7 @@ def test_a_pose_has_the_same_bits_alone_in_a_batch_and_in_a_thread(model: PoseMo
     alone = np.stack([model.decode(row) for row in latent])
     assert batch.shape == (21, model.n_vertices, 3)
     assert np.array_equal(batch, alone)
+    assert np.array_equal(model.decode(latent, n_threads=1), alone)
     with ThreadPoolExecutor(4) as pool:
         assert np.array_equal(np.stack(list(pool.map(model.decode, latent))), alone)
     assert np.ptp(batch, axis=0).max() > 0.1 * model.height
@@ -193,7 +194,7 @@ def test_labelled_parts_name_the_domains_from_top_to_bottom(model: PoseModel) ->
 
 def test_unlabelled_domains_are_numbered(model: PoseModel, poses: PoseSet) -> None:
     plain = replace(poses, vertex_labels=None, source=Path("/data/some tube.npz"))
-    other = PoseModel.from_training("plain", model._embedding, plain)
+    other = PoseModel.from_training("plain", model.embedding, plain)
     assert other.domain_names == ("part 1", "part 2")
     assert other.card.source == "some tube.npz"
 
@@ -338,10 +339,10 @@ def test_embeddings_that_do_not_fit_are_refused(path: Path) -> None:
 
 
 def test_another_latent_space_has_another_fingerprint(model: PoseModel, poses: PoseSet) -> None:
-    weights = model._embedding.level1
+    weights = model.embedding.level1
     changed = weights.components.copy()
     changed[0, 0, 0] = np.nextafter(changed[0, 0, 0], np.float32(2.0))
-    embedding = replace(model._embedding, level1=replace(weights, components=changed))
+    embedding = replace(model.embedding, level1=replace(weights, components=changed))
     other = PoseModel.from_training("tube", embedding, poses)
     assert other.fingerprint != model.fingerprint
     assert len(model.fingerprint) == 16
@@ -378,7 +379,7 @@ def test_sampled_poses_are_of_the_kind_asked_for(model: PoseModel, colliding: bo
 def test_sampling_gives_up_in_a_sentence(model: PoseModel, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lcollision_core.model.sampling._MOST_MISSES", 128)
     # Poses this near to the mean one are all free.
-    calm = replace(model._embedding, training_latent=0.01 * model._embedding.training_latent)
+    calm = replace(model.embedding, training_latent=0.01 * model.embedding.training_latent)
     calm_model = PoseModel("calm", calm, model.card)
     with pytest.raises(LCollisionError, match="none of 128 poses"):
         sample_poses(calm_model, 1, seed=0, colliding=True)
