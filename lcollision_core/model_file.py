@@ -130,6 +130,8 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
             return _read_open_file(file, path)
     except FileNotFoundError as error:
         raise ModelFileError(f"{path} does not exist; check the name") from error
+    except RecursionError as error:
+        _refuse_damaged(path, error)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ModelFileError(f"{path} cannot be read: {reason}; check the file") from error

@@ -206,6 +206,17 @@ def test_a_huge_or_hostile_header_is_refused(tmp_path: Path) -> None:
             read_model_file(path)
 
 
+def test_metadata_of_any_depth_is_refused(path: Path) -> None:
+    for depth in (10, 100, *range(900, 1000, 3), 5000):
+        deep = "[" * depth + "]" * depth
+        sections = f'{{"embedding": {{"deep": {deep}}}}}'
+        document = f'{{"format_version": 1, "sections": {sections}, "sha256": "0"}}'
+        tensors = load(path.read_bytes())
+        path.write_bytes(save(tensors, metadata={"lcollision": document}))
+        with pytest.raises(ModelFileError, match="damaged"):
+            read_model_file(path)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_numbers_that_are_not_finite_are_neither_written_nor_read(
     tmp_path: Path, bad: float, monkeypatch: pytest.MonkeyPatch
