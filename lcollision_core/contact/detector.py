@@ -12,13 +12,10 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.contact.arrays import FaceTree, Found, NearVertices, PoseWork
 from lcollision_core.contact.kernels import (
     LEAF_SIZE,
     MAX_REACH,
-    FaceTree,
-    Found,
-    NearVertices,
-    PoseWork,
     add_vertex_energy,
     search_pose,
 )

@@ -5,20 +5,21 @@ by side and nothing is allocated per pose. Boxes are float32: twice as many fit 
 instruction, and no pair is lost, as rounding keeps the order of numbers: what overlaps still
 does. Depths are float64.
 
-All compiled code is in this file because Numba notices that a cached function is stale by the
-date of the file it stands in, and by nothing else.
+All compiled code is in this file, with the constants that it bakes in, because Numba notices that
+a cached function is stale by the date of the file it stands in, and by nothing else.
 """
-# mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit, uint64
 
-IntArray = npt.NDArray[np.int32]
+from lcollision_core.compiled import compiled
+from lcollision_core.contact.arrays import FaceTree, Found, NearVertices, PoseWork
+
+FloatArray = npt.NDArray[np.float64]
 
 LEAF_SIZE = 8
 """Faces in a leaf of the tree: as many as one vector instruction compares."""
@@ -40,75 +41,6 @@ SMALL_SINE_SQUARED = 1e-6
 _LEAF = np.uint64(LEAF_SIZE)
 _LEAF_CORNERS = np.uint64(3 * LEAF_SIZE)
 _LEAF_BOXES = np.uint64(6 * LEAF_SIZE)
-
-
-class FaceTree(NamedTuple):
-    """A binary tree over the faces, whose leaves hold `LEAF_SIZE` slots of faces each.
-
-    Nodes are stored parents before children, so a refit walks them backwards. S is the number
-    of slots, a multiple of `LEAF_SIZE`; n the number of nodes.
-
-    Attributes
-    ----------
-    slot_face : (S,) int32, the face in each slot, -1 in the unused slots of the last leaf
-    corners : (3 S,) int32, leaf by leaf the first corners of its faces, then the second, then
-        the third, as vertex indices; -1 in unused slots
-    left, right : (n,) int32, the children of a node, -1 at a leaf
-    leaf : (n,) int32, the number of the leaf, -1 at an inner node
-    size : (n,) int32, faces below the node
-    """
-
-    slot_face: IntArray
-    corners: IntArray
-    left: IntArray
-    right: IntArray
-    leaf: IntArray
-    size: IntArray
-
-
-class NearVertices(NamedTuple):
-    """For each vertex the vertices within the near exclusion of it, itself among them.
-
-    ``vertex[start[v]:start[v + 1]]`` are those of v, ascending; `vertex` is empty where nothing
-    is excluded.
-    """
-
-    start: npt.NDArray[np.int64]
-    vertex: IntArray
-
-
-class PoseWork(NamedTuple):
-    """What is computed anew for each pose, kept between poses.
-
-    Attributes
-    ----------
-    middle : (3,) float64, the middle of the pose's bounding box, in its unit
-    triangles : (S, 3, 3) float64, corners in heights about that middle
-    boxes : (6 S,) float32, leaf by leaf the lower x of its slots, lower y, lower z, upper x, ...
-    node_boxes : (n, 6) float32, lower x, y, z, upper x, y, z
-    stack : (depth bound, 2) int32, pairs of nodes still to be visited
-    """
-
-    middle: npt.NDArray[np.float64]
-    triangles: npt.NDArray[np.float64]
-    boxes: npt.NDArray[np.float32]
-    node_boxes: npt.NDArray[np.float32]
-    stack: IntArray
-
-
-class Found(NamedTuple):
-    """Room for the penetrating pairs of one pose, filled from the front.
-
-    Attributes
-    ----------
-    slots : (P, 2) int32, the slots of the two faces
-    squared_depth : (P,) float64, in squared heights
-    is_near : (P,) bool
-    """
-
-    slots: IntArray
-    squared_depth: npt.NDArray[np.float64]
-    is_near: npt.NDArray[np.bool_]
 
 
 @njit(inline="always", error_model="numpy")
@@ -143,7 +75,7 @@ def _along(triangles, t, k, ox, oy, oz, dx, dy, dz):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _pair_depth_squared(triangles, a, b, tolerance):
     """Return the squared depth of triangles a and b, or 0 where it is at most `tolerance`.
 
@@ -210,8 +142,8 @@ def _pair_depth_squared(triangles, a, b, tolerance):
     return best if best < np.inf else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def fill_depths(triangles, tolerances, depths):
+@compiled
+def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArray) -> None:
     """Write the depth of triangles 2i and 2i + 1 to depths[i], 0 up to tolerances[i]."""
     for pair in range(len(depths)):
         depths[pair] = np.sqrt(
@@ -219,7 +151,7 @@ def fill_depths(triangles, tolerances, depths):
         )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _refit(pose, inverse_height, tree, work):
     """Fill `work` for one pose and return True, or False where it is not within `MAX_REACH`.
 
@@ -319,7 +251,7 @@ def _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_near(corners, slot_a, slot_b, near):
     """Whether some corner of one face is near some corner of the other."""
     if len(near.vertex) == 0:
@@ -343,7 +275,7 @@ def _is_near(corners, slot_a, slot_b, near):
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _search_leaves(
     tree, work, near, leaf_a, leaf_b, box_b, tolerance, first_only, found, n_found, leaf_size
 ):
@@ -407,8 +339,18 @@ def _search_leaves(
     return n_found, False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def search_pose(pose, inverse_height, tolerance, tree, near, work, first_only, found, leaf_size):
+@compiled
+def search_pose(
+    pose: FloatArray,
+    inverse_height: float,
+    tolerance: float,
+    tree: FaceTree,
+    near: NearVertices,
+    work: PoseWork,
+    first_only: bool,
+    found: Found,
+    leaf_size: int,
+) -> int:
     """Find the pairs of faces that share no vertex and penetrate each other in one pose.
 
     Parameters
@@ -430,7 +372,7 @@ def search_pose(pose, inverse_height, tolerance, tree, near, work, first_only, f
         return -1
     boxes = work.node_boxes
     stack = work.stack
-    n_found = 0
+    n_found: int = 0
     stack[0, 0] = 0
     stack[0, 1] = 0
     height = 1
@@ -488,8 +430,10 @@ def search_pose(pose, inverse_height, tolerance, tree, near, work, first_only, f
     return n_found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_vertex_energy(tree, found, n_found, vertex_energy):
+@compiled
+def add_vertex_energy(
+    tree: FaceTree, found: Found, n_found: int, vertex_energy: FloatArray
+) -> None:
     """Add a sixth of each pair's squared depth to its six vertices: Algorithm 1 of the paper.
 
     Near pairs add nothing. `vertex_energy` (V,) float64, in squared heights, is added to.

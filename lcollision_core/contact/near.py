@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from lcollision_core.contact.kernels import NearVertices
+from lcollision_core.contact.arrays import NearVertices
 from lcollision_core.meshes.topology import Topology
 
 _SOURCES_AT_ONCE = 256

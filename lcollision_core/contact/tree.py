@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact.kernels import LEAF_SIZE, FaceTree, PoseWork
+from lcollision_core.contact.arrays import FaceTree, PoseWork
+from lcollision_core.contact.kernels import LEAF_SIZE
 
 IntArray = npt.NDArray[np.int32]
 

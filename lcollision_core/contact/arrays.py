@@ -1,0 +1,79 @@
+"""The arrays that the compiled loops share: the tree, one pose's work, what was found."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+IntArray = npt.NDArray[np.int32]
+
+
+class FaceTree(NamedTuple):
+    """A binary tree over the faces, whose leaves hold `kernels.LEAF_SIZE` slots of faces each.
+
+    Nodes are stored parents before children, so a refit walks them backwards. S is the number
+    of slots, a multiple of `kernels.LEAF_SIZE`; n the number of nodes.
+
+    Attributes
+    ----------
+    slot_face : (S,) int32, the face in each slot, -1 in the unused slots of the last leaf
+    corners : (3 S,) int32, leaf by leaf the first corners of its faces, then the second, then
+        the third, as vertex indices; -1 in unused slots
+    left, right : (n,) int32, the children of a node, -1 at a leaf
+    leaf : (n,) int32, the number of the leaf, -1 at an inner node
+    size : (n,) int32, faces below the node
+    """
+
+    slot_face: IntArray
+    corners: IntArray
+    left: IntArray
+    right: IntArray
+    leaf: IntArray
+    size: IntArray
+
+
+class NearVertices(NamedTuple):
+    """For each vertex the vertices within the near exclusion of it, itself among them.
+
+    ``vertex[start[v]:start[v + 1]]`` are those of v, ascending; `vertex` is empty where nothing
+    is excluded.
+    """
+
+    start: npt.NDArray[np.int64]
+    vertex: IntArray
+
+
+class PoseWork(NamedTuple):
+    """What is computed anew for each pose, kept between poses.
+
+    Attributes
+    ----------
+    middle : (3,) float64, the middle of the pose's bounding box, in its unit
+    triangles : (S, 3, 3) float64, corners in heights about that middle
+    boxes : (6 S,) float32, leaf by leaf the lower x of its slots, lower y, lower z, upper x, ...
+    node_boxes : (n, 6) float32, lower x, y, z, upper x, y, z
+    stack : (depth bound, 2) int32, pairs of nodes still to be visited
+    """
+
+    middle: npt.NDArray[np.float64]
+    triangles: npt.NDArray[np.float64]
+    boxes: npt.NDArray[np.float32]
+    node_boxes: npt.NDArray[np.float32]
+    stack: IntArray
+
+
+class Found(NamedTuple):
+    """Room for the penetrating pairs of one pose, filled from the front.
+
+    Attributes
+    ----------
+    slots : (P, 2) int32, the slots of the two faces
+    squared_depth : (P,) float64, in squared heights
+    is_near : (P,) bool
+    """
+
+    slots: IntArray
+    squared_depth: npt.NDArray[np.float64]
+    is_near: npt.NDArray[np.bool_]

@@ -1,0 +1,46 @@
+"""Compiled loops run wherever the program is installed."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+SOURCE = """\
+from lcollision_core.compiled import compiled
+
+@compiled
+def triangular(n):
+    total = 0
+    for i in range(n + 1):
+        total += i
+    return total
+"""
+
+
+def _module(folder: Path) -> ModuleType:
+    path = folder / "loops.py"
+    path.write_text(SOURCE)
+    spec = importlib.util.spec_from_file_location("loops", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_loop_is_cached_beside_its_file(tmp_path: Path) -> None:
+    assert _module(tmp_path).triangular(4) == 10
+    assert list(tmp_path.glob("__pycache__/loops.triangular-*.nbc"))
+
+
+def test_a_loop_runs_where_nothing_can_be_cached(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A file in the folder's place keeps even root from writing there.
+    (tmp_path / "__pycache__").write_text("")
+    for variable in ("HOME", "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.setenv(variable, str(tmp_path / "__pycache__"))
+    assert _module(tmp_path).triangular(4) == 10
