@@ -356,6 +356,11 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.stl", TEXT_STL[:-60], "truncated or damaged"),
         ("a.stl", "x" * 50, "too few"),
         ("a.stl", "x" * 80 + "\1\0\0\0", "announces 1 triangles, which take 134 bytes, but has 84"),
+        (
+            "a.stl",
+            "\xff" * 200,
+            "announces 4294967295 triangles, .* truncated, or no STL",
+        ),
         ("a.glb", "glTF\2\0\0\0", "truncated GLB"),
         ("a.gltf", "{", "no readable glTF"),
         ("a.gltf", '{"meshes": []}', "holds 0 meshes"),

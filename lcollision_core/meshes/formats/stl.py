@@ -58,7 +58,6 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
         require_few(file, b"endfacet", "triangles", _SHORTEST_FACET, size)
         corners = _text_corners(read_rest(file))
     elif n_triangles >= 0:
-        require_plausible_count(n_triangles, "triangles")
         raise MeshFileError(
             f"it announces {n_triangles} triangles, which take {expected} bytes, but has {size}; "
             f"it is truncated, or no STL file"
