@@ -31,6 +31,10 @@ FloatArray = npt.NDArray[np.float64]
 DEPTH_TOLERANCE = 1e-9
 """Depth in heights up to which two faces touch; beyond it they collide."""
 
+MAX_HEIGHT = 1e150
+"""The reference's height in its unit is at most this and at least its inverse: squared lengths
+then neither overflow nor vanish, either of which would call a colliding pose free."""
+
 _FIRST_ROOM = 256
 """Pairs that a thread has room for at first; it grows to what a pose needs and stays there."""
 
@@ -105,8 +109,8 @@ class CollisionDetector:
 
     Raises
     ------
-    ShapeError : `reference` is not a finite (V, 3) array with an extent, or `near_exclusion`
-        is negative.
+    ShapeError : `reference` is not a finite (V, 3) array with an extent between 1 / `MAX_HEIGHT`
+        and `MAX_HEIGHT`, or `near_exclusion` is negative.
     """
 
     def __init__(
@@ -124,9 +128,15 @@ class CollisionDetector:
             raise ShapeError(f"the near exclusion must be 0 or more heights, got {near_exclusion}")
         self.topology = topology
         self.near_exclusion = float(near_exclusion)
-        self.height = float(np.ptp(vertices, axis=0).max())
+        # Halves, as the whole may be beyond the largest number.
+        self.height = 2.0 * float(np.ptp(0.5 * vertices, axis=0).max())
         if self.height == 0.0:
-            raise ShapeError("all vertices of the reference are in one point")
+            raise ShapeError("all vertices are in one point; give it a mesh with an extent")
+        if not 1.0 / MAX_HEIGHT <= self.height <= MAX_HEIGHT:
+            raise ShapeError(
+                f"the mesh is {self.height:.1e} high, {1.0 / MAX_HEIGHT:.0e} to {MAX_HEIGHT:.0e} "
+                f"is needed; scale it"
+            )
         self._tree: FaceTree = build_tree(vertices, topology.faces)
         self._near: NearVertices = near_vertices(
             topology, vertices, self.near_exclusion * self.height
@@ -314,11 +324,11 @@ class _Searcher:
         where = "" if number is None else f" of pose {number}"
         position = self._pose[vertex].tolist()
         what = (
-            f"is more than {MAX_REACH:.0e} heights away"
+            f"is more than {MAX_REACH:.0e} heights away from the origin"
             if np.isfinite(position).all()
             else "is not finite"
         )
-        raise ShapeError(f"vertex {vertex}{where} {what}: {position}")
+        raise ShapeError(f"vertex {vertex}{where} {what}, at {position}; move or mend the mesh")
 
 
 def _room_for(n_pairs: int) -> Found:

@@ -153,6 +153,28 @@ def test_an_absurdly_large_pose_is_refused_rather_than_called_free(factor: float
         detector.are_colliding(np.stack([mesh.vertices, factor * mesh.vertices]))
 
 
+@pytest.mark.parametrize("factor", [1e-320, 1e-200, 1e200, 1e307, 1.7e308])
+def test_a_unit_beyond_arithmetic_is_refused_rather_than_called_free(factor: float) -> None:
+    mesh = figure_eight(0.2, 0.15)
+    vertices = mesh.vertices / np.abs(mesh.vertices).max() * factor
+    with pytest.raises(ShapeError, match=r"(high|one point).*(scale it|extent)$"):
+        CollisionDetector(mesh.topology, vertices)
+
+
+@pytest.mark.parametrize("factor", [1e-149, 1e149])
+def test_results_hold_up_to_the_largest_unit(factor: float) -> None:
+    mesh = figure_eight(0.2, 0.15)
+    at_home = detector_for(mesh).detect(mesh.vertices)
+    scaled = Mesh(mesh.vertices * factor, mesh.faces)
+    found = CollisionDetector(scaled.topology, scaled.vertices, near_exclusion=0.1).detect(
+        scaled.vertices
+    )
+    near = CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=0.1).detect(mesh.vertices)
+    assert at_home.colliding
+    assert found.pairs.tolist() == near.pairs.tolist()
+    assert found.near_pairs.tolist() == near.near_pairs.tolist()
+
+
 @pytest.mark.parametrize("last", [1, 2, 7, 8, 9, 40])
 def test_face_0_is_a_face(last: int) -> None:
     floor = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
