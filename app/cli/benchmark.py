@@ -18,7 +18,10 @@ def detection(
     data: Annotated[
         list[Path] | None,
         typer.Option(
-            "--data", metavar="PATH", help="A pose set; may be repeated. Default: the bundled one."
+            "--data",
+            metavar="PATH",
+            readable=False,
+            help="A pose set; may be repeated. Default: the bundled one.",
         ),
     ] = None,
     n_poses: Annotated[

@@ -14,7 +14,9 @@ from lcollision_core.errors import LCollisionError
 
 def check(
     meshes: Annotated[
-        list[Path], typer.Argument(metavar="MESH...", help="OBJ, PLY, OFF, STL or GLB files.")
+        list[Path],
+        # readable=False: read_mesh says in its own words what is wrong with which file.
+        typer.Argument(metavar="MESH...", readable=False, help="OBJ, PLY, OFF, STL or GLB files."),
     ],
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
     near_exclusion: Annotated[
@@ -54,6 +56,7 @@ def check(
 def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
     """Check one file; the keys are those of ``lcollision check --json``."""
     from lcollision_core.contact import CollisionDetector
+    from lcollision_core.errors import MeshFileError, ShapeError
     from lcollision_core.meshes import audit_mesh, read_mesh
 
     start = time.perf_counter()
@@ -61,8 +64,11 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
     audit = audit_mesh(mesh.topology, mesh.vertices)
     for remark in (*mesh.notes, *audit.problems):
         note(f"{path}: {remark}")
-    detector = CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=near_exclusion)
-    found = detector.detect(mesh.vertices)
+    try:
+        detector = CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=near_exclusion)
+        found = detector.detect(mesh.vertices)
+    except ShapeError as error:
+        raise MeshFileError(f"{path} cannot be checked: {error}") from error
     return {
         "file": str(path),
         "vertices": mesh.topology.n_vertices,

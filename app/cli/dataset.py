@@ -23,7 +23,10 @@ class BodyKind(StrEnum):
 
 @app.command("check")
 def check(
-    path: Annotated[Path, typer.Argument(help="A folder of meshes or an .npz file.")],
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="PATH", readable=False, help="A folder of meshes or an .npz file."),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
     near_exclusion: Annotated[
         float | None,
@@ -42,7 +45,7 @@ def check(
     the first has no area.
     """
     from lcollision_core.contact import CollisionDetector
-    from lcollision_core.errors import MeshFileError
+    from lcollision_core.errors import MeshFileError, ShapeError
     from lcollision_core.meshes import inspect_pose_set
 
     with progress_bar("Reading poses") as progress:
@@ -50,10 +53,15 @@ def check(
     poses = inspection.pose_set
     if poses is None or inspection.audit is None:
         raise MeshFileError(inspection.problems[0])
+    for remark in poses.notes:
+        note(f"{path}: {remark}")
     exclusion = poses.near_exclusion if near_exclusion is None else near_exclusion
-    detector = CollisionDetector(poses.topology, poses.vertices[0], near_exclusion=exclusion)
-    with progress_bar("Finding self-collisions") as progress:
-        found = detector.detect_batch(poses.vertices, progress=progress)
+    try:
+        detector = CollisionDetector(poses.topology, poses.vertices[0], near_exclusion=exclusion)
+        with progress_bar("Finding self-collisions") as progress:
+            found = detector.detect_batch(poses.vertices, progress=progress)
+    except ShapeError as error:
+        raise MeshFileError(f"{path} cannot be checked: {error}") from error
     report: dict[str, Any] = {
         "poses": inspection.n_found,
         "vertices": poses.topology.n_vertices,
@@ -101,7 +109,7 @@ def _print(path: Path, report: dict[str, Any]) -> None:
 
 @app.command("make")
 def make(
-    kind: Annotated[BodyKind, typer.Argument(help="Which pose set to make.")],
+    kind: Annotated[BodyKind, typer.Argument(metavar="KIND", help="Which pose set to make.")],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT.npz", help="The file to write.")
     ],

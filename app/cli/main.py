@@ -5,6 +5,8 @@ Every command imports what it needs when it runs: ``lcollision --help`` loads no
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 import traceback
 from typing import Annotated, Any
@@ -33,6 +35,16 @@ class _Commands(TyperGroup):
             raise typer.Exit(ExitStatus.INTERRUPTED) from None
         except MemoryError:
             typer.echo("lcollision: out of memory; give it smaller meshes or fewer poses", err=True)
+            raise typer.Exit(ExitStatus.BAD_INPUT) from None
+        except BrokenPipeError:
+            # The reader left, as `head` does; typer's own status 1 would be an answer. What is
+            # still buffered must not fail once more at the exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(ExitStatus.INTERRUPTED) from None
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            typer.echo("lcollision: the answer cannot be written: the disk is full", err=True)
             raise typer.Exit(ExitStatus.BAD_INPUT) from None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -123,6 +124,74 @@ def test_good_files_are_reported_beside_a_bad_one(
     result = lcollision("check", "--json", tmp_path / "nowhere.obj", apart)
     assert result.exit_code == 2
     assert [report["file"] for report in json.loads(result.stdout)] == [str(apart)]
+
+
+UNCHECKABLE = {
+    "point.obj": ("v 3 2 1\n" * 3, "one point"),
+    "vast.obj": ("v -1.7e308 0 0\nv 1.7e308 0 0\nv 0 1 0\n", "scale it"),
+    "far.obj": ("v 1e12 0 0\nv 1e12 1 0\nv 1e12 0 1\n", "vertex 0 is more than"),
+}
+
+
+@pytest.mark.parametrize("name", UNCHECKABLE)
+def test_mesh_that_cannot_be_checked_is_named(
+    lcollision: Lcollision, tmp_path: Path, name: str
+) -> None:
+    vertices, expected = UNCHECKABLE[name]
+    path = tmp_path / name
+    path.write_text(vertices + "f 1 2 3\n")
+    result = lcollision("check", path)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    sentence = result.stderr.splitlines()[-1]
+    assert sentence.startswith(f"lcollision: {path} cannot be checked: ")
+    assert expected in sentence
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads all")
+def test_file_without_permission_does_not_keep_the_others_from_being_checked(
+    lcollision: Lcollision, apart: Path, tmp_path: Path
+) -> None:
+    locked = tmp_path / "locked.obj"
+    locked.write_text("")
+    locked.chmod(0)
+    result = lcollision("check", "--json", locked, apart)
+    assert result.exit_code == 2
+    assert f"{locked} cannot be read: permission is denied" in result.stderr
+    assert len(json.loads(result.stdout)) == 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_full_disk_is_no_bug(apart: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        result = subprocess.run(
+            [sys.executable, "-m", "app", "check", apart],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert result.returncode == 2
+    assert result.stderr.splitlines()[-1] == (
+        "lcollision: the answer cannot be written: the disk is full"
+    )
+
+
+def test_reader_that_leaves_is_no_answer(apart: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "app", "check", apart],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.stderr is not None
+    with process.stderr as stderr:
+        said = stderr.read()
+    assert process.wait() == 130
+    assert "Traceback" not in said
+    assert "BrokenPipe" not in said
 
 
 def test_a_bug_does_not_look_like_an_answer() -> None:

@@ -81,6 +81,27 @@ def test_every_misfit_is_listed(
     assert "pose4.obj" in report["problems"][1]
 
 
+def test_what_was_done_on_reading_is_said(lcollision: Lcollision, tmp_path: Path) -> None:
+    quad = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"
+    for pose in (0, 1):
+        (tmp_path / f"pose{pose}.obj").write_text(quad)
+    result = lcollision("dataset", "check", tmp_path, "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["faces"] == 2
+    assert f"{tmp_path}: 1 quad was triangulated" in result.stderr
+
+
+def test_set_that_cannot_be_checked_is_named(
+    lcollision: Lcollision, two_tetrahedra: PoseSet, tmp_path: Path
+) -> None:
+    path = tmp_path / "set.npz"
+    far = two_tetrahedra.vertices + np.array([0.0, 1e12])[:, None, None]
+    write_pose_set(path, PoseSet(far, two_tetrahedra.topology, two_tetrahedra.names))
+    result = lcollision("dataset", "check", path)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"lcollision: {path} cannot be checked: vertex 0 of pose 1 ")
+
+
 def test_path_without_poses_gets_one_sentence(lcollision: Lcollision, tmp_path: Path) -> None:
     for path in (tmp_path / "nowhere", tmp_path):
         result = lcollision("dataset", "check", path, "--json")
