@@ -22,8 +22,8 @@ class EmbeddingConfig:
     batch_poses : poses per step of level 2
     locality_weight : of the locality loss, divided by the root of V, beside the squared feature
         error per vertex
-    locality_reach : distances from a part, as shares of the mesh's largest geodesic distance,
-        between which the locality loss rises from nothing to its full weight
+    window_overlap : effective domains per vertex of the windows in which level 1's components
+        start, at most (K + 1) / 2; the distances of the locality loss follow the windows
     vertex_weight : of the mean squared vertex distance, in squared heights, beside the squared
         feature error per vertex, in level 2
     held_out_stride : every so many poses one is left out of a second model that measures how
@@ -43,12 +43,11 @@ class EmbeddingConfig:
     convolution_rate: float = 1e-3
     batch_poses: int = 16
     locality_weight: float = 0.03
-    locality_reach: tuple[float, float] = (0.1, 0.4)
+    window_overlap: float = 3.7
     vertex_weight: float = 15.0
     held_out_stride: int = 10
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "locality_reach", tuple(self.locality_reach))
         least = {
             "n_domains": 1,
             "n_domain_codes": 1,
@@ -64,8 +63,7 @@ class EmbeddingConfig:
         for name in (*rates, "locality_weight", "vertex_weight"):
             if not getattr(self, name) >= 0.0:
                 raise LCollisionError(f"{name} must be at least 0, got {getattr(self, name)}")
-        start, end = self.locality_reach
-        if not 0.0 <= start < end:
-            raise LCollisionError(f"locality_reach must rise from 0 or more, got {start} to {end}")
+        if not self.window_overlap > 1.0:
+            raise LCollisionError(f"window_overlap must be over 1, got {self.window_overlap}")
         if self.held_out_stride == 1:
             raise LCollisionError("held_out_stride 1 leaves no pose to train on; use 0 or 2 and up")

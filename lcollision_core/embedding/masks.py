@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from lcollision_core.embedding.seeding import bridged_edges, edge_graph
 from lcollision_core.errors import ShapeError
-from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
 LEAST_SHARE = 1e-3
 """Smaller shares of a vertex are given to its other domains, so that masks have an edge."""
@@ -63,6 +63,53 @@ def attention_mask(
         shares[:, ~owned] = shares[:, _nearest_owned(owned, topology, rest_vertices)]
     mask: npt.NDArray[np.float32] = shares.astype(np.float32)
     return mask
+
+
+def keep_one_patch(
+    components: npt.NDArray[np.float32], topology: Topology, rest_vertices: FloatArray
+) -> npt.NDArray[np.float32]:
+    """Take each component off the vertices where it is strongest but cut off from its domain.
+
+    Poses that fold or tear, such as clothes, leave islands of one domain inside another. There
+    the next strongest component takes over, until every domain is one connected patch.
+
+    Parameters
+    ----------
+    components : (K, V, 9) float32 array C
+    topology : the connectivity; separate components count as tied to their nearest neighbour
+    rest_vertices : (V, 3) float64 array, the reference
+
+    Returns
+    -------
+    components : (K, V, 9) float32 array, a copy with islands set to 0
+    """
+    kept = components.copy()
+    edges = bridged_edges(topology, rest_vertices)
+    while True:
+        squared = (kept.astype(np.float64) ** 2).sum(axis=2)
+        # Vertices that nobody touches belong to no patch: they follow their neighbours later.
+        owner = np.where(squared.max(axis=0) > 0.0, squared.argmax(axis=0), -1)
+        islands = owner[None] == np.arange(len(kept))[:, None]
+        for domain, patch in enumerate(_largest_patches(owner, len(kept), edges)):
+            islands[domain, patch] = False
+        if not islands.any():
+            return kept
+        kept[islands] = 0.0
+
+
+def _largest_patches(
+    owner: npt.NDArray[np.intp], n_domains: int, edges: IntArray
+) -> list[npt.NDArray[np.intp]]:
+    """Return the vertices of each domain's largest connected patch, none for an empty domain."""
+    inside = edges[owner[edges[:, 0]] == owner[edges[:, 1]]]
+    graph = edge_graph(inside, len(owner), np.ones(len(inside)))
+    _, patch = csgraph.connected_components(graph, directed=False)
+    found = []
+    for domain in range(n_domains):
+        owned = np.flatnonzero(owner == domain)
+        sizes = np.bincount(patch[owned], minlength=1)
+        found.append(owned[patch[owned] == sizes.argmax()])
+    return found
 
 
 def _nearest_owned(
@@ -122,14 +169,9 @@ def judge_masks(
     mask = np.asarray(attention_mask, dtype=np.float64)
     edges = bridged_edges(topology, rest_vertices)
     owner = mask.argmax(axis=0)
-    inside = edges[owner[edges[:, 0]] == owner[edges[:, 1]]]
-    graph = edge_graph(inside, topology.n_vertices, np.ones(len(inside)))
-    _, patch = csgraph.connected_components(graph, directed=False)
     n_owned = np.bincount(owner, minlength=len(mask))
-    connected = np.zeros(len(mask))
-    for domain in np.flatnonzero(n_owned):
-        sizes = np.bincount(patch[owner == domain])
-        connected[domain] = sizes.max() / n_owned[domain]
+    in_patch = [len(patch) for patch in _largest_patches(owner, len(mask), edges)]
+    connected = np.array(in_patch) / np.maximum(n_owned, 1)
     return MaskQuality(
         connected_share=connected,
         n_owned=n_owned.astype(np.int64),

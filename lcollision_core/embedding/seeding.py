@@ -20,6 +20,8 @@ POSITION_WEIGHT = 1.0
 
 _MOTION_DIRECTIONS = 30
 _LEAST_AREA_SHARE = 1e-12
+_LEAST_REACH = 1e-3
+_BISECTIONS = 30
 
 
 def bridged_edges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
@@ -198,6 +200,36 @@ def part_distances(part: IntArray, topology: Topology, rest_vertices: FloatArray
     return distances / max(largest, 1e-12)
 
 
+def windows(distances: FloatArray, reach: float) -> FloatArray:
+    """Return (K, V) weights that fall from 1 in each part to 0 at a distance of `reach`."""
+    fading: FloatArray = np.clip(1.0 - distances / reach, 0.0, 1.0)
+    return fading
+
+
+def reach_of_overlap(distances: FloatArray, overlap: float) -> float:
+    """Find how far windows reach that overlap as much as asked, whatever the size of the parts.
+
+    Parameters
+    ----------
+    distances : (K, V) float64 array, see `part_distances`
+    overlap : effective domains per vertex of the windows, mean of 1 / Σ_k (M^{ki})² with M^{ki}
+        the windows' squared weights shared out; it counts as at most (K + 1) / 2
+
+    Returns
+    -------
+    reach : distance at which the windows have faded to 0
+    """
+    wanted = min(overlap, 0.5 * (len(distances) + 1))
+    low, high = _LEAST_REACH, 2.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        squared = windows(distances, middle) ** 2
+        shares = squared / squared.sum(axis=0)
+        found = float((1.0 / (shares**2).sum(axis=0)).mean())
+        low, high = (middle, high) if found < wanted else (low, middle)
+    return high
+
+
 def locality_weights(distances: FloatArray, reach: tuple[float, float]) -> FloatArray:
     """Weigh vertices by their distance from the parts: Lambda of the locality loss.
 
@@ -238,7 +270,7 @@ def initial_components(
     """
     components = np.zeros((*distances.shape, N_FEATURES), dtype=np.float32)
     for domain, distance in enumerate(distances):
-        window = np.clip(1.0 - distance / reach, 0.0, 1.0)
+        window = windows(distance, reach)
         inside = np.flatnonzero(window)
         share = window[inside] * np.sqrt(areas[inside] / areas.mean())
         weighed = (features[:, inside] * share[:, None]).reshape(len(features), -1)

@@ -21,7 +21,7 @@ from lcollision_core.embedding.autoencoders import (
 from lcollision_core.embedding.checkpoint import Checkpoint
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.decoder import Float32Array
-from lcollision_core.embedding.masks import attention_mask
+from lcollision_core.embedding.masks import attention_mask, keep_one_patch
 from lcollision_core.embedding.network import TiedAutoencoder, ring_mean
 from lcollision_core.embedding.seeding import (
     initial_components,
@@ -29,11 +29,15 @@ from lcollision_core.embedding.seeding import (
     moving_parts,
     part_distances,
     principal_components,
+    reach_of_overlap,
     ring_average,
     vertex_areas,
 )
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
+
+_LOCALITY_START = 0.25
+"""Share of the windows' reach from which the locality loss rises."""
 
 _SAMPLED_POSES = 16
 _EPOCHS_BETWEEN_SAMPLES = 10
@@ -111,9 +115,10 @@ class BilevelTrainer:
         part = moving_parts(self._features, topology, self._rest, config.n_domains)
         areas = vertex_areas(topology, self._rest)
         distances = part_distances(part, topology, self._rest)
-        reach = config.locality_reach
-        start = initial_components(self._centred, distances, areas, reach[1])
-        locality = torch.from_numpy(locality_weights(distances, reach).astype(np.float32))
+        reach = reach_of_overlap(distances, config.window_overlap)
+        start = initial_components(self._centred, distances, areas, reach)
+        weights = locality_weights(distances, (_LOCALITY_START * reach, reach))
+        locality = torch.from_numpy(weights.astype(np.float32))
         network = TiedAutoencoder(_of_mean_square_1(start), self._ring)
         features = torch.from_numpy(self._centred)
         around = ring_mean(features, network.ring)
@@ -135,10 +140,13 @@ class BilevelTrainer:
             self._report("level 1", number + 1, config.level1_epochs, error, None)
 
         self._optimise("level1", [network], config.level1_rate, 0.0, config.level1_epochs, epoch)
-        weights = _weights_of(network, np.arange(n_vertices, dtype=np.int32))
+        with torch.no_grad():
+            components = network.components.numpy()
+            components[:] = keep_one_patch(components, topology, self._rest)
+        trained = _weights_of(network, np.arange(n_vertices, dtype=np.int32))
         with torch.no_grad():
             output: Float32Array = network(features, around).numpy()
-        return weights, output, self._sampled_error(output)
+        return trained, output, self._sampled_error(output)
 
     def _train_level2(
         self, mask: Float32Array, level1_output: Float32Array, level1_error: float

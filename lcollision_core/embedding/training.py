@@ -280,10 +280,7 @@ class _Run:
             attention_mask=learnt.attention_mask,
             training_latent=latent,
             metrics=None,
-            config={
-                **asdict(self._config),
-                "locality_reach": list(self._config.locality_reach),
-            },
+            config=asdict(self._config),
             seed=self._seed,
         )
 

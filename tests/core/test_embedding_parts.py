@@ -17,7 +17,7 @@ from lcollision_core.embedding.autoencoders import (
     run_encoders,
 )
 from lcollision_core.embedding.decoder import DecoderGroup, FeatureDecoder
-from lcollision_core.embedding.masks import LEAST_SHARE, attention_mask, judge_masks
+from lcollision_core.embedding.masks import LEAST_SHARE, attention_mask, judge_masks, keep_one_patch
 from lcollision_core.embedding.network import TiedAutoencoder, ring_mean
 from lcollision_core.embedding.seeding import (
     bridged_edges,
@@ -25,6 +25,7 @@ from lcollision_core.embedding.seeding import (
     moving_parts,
     part_distances,
     principal_components,
+    reach_of_overlap,
     ring_average,
     vertex_areas,
 )
@@ -118,6 +119,20 @@ def test_locality_rises_with_the_distance_from_the_part() -> None:
     assert columns[[1, 6, 10]].tolist() == [0.0, 1.0, 1.0]
 
 
+def test_reach_gives_the_overlap_asked_for() -> None:
+    mesh = strip(40)
+    part = np.repeat(np.arange(4, dtype=np.int32), 20)
+    distances = part_distances(part, mesh.topology, mesh.vertices)
+    for overlap in (1.3, 2.0):
+        reach = reach_of_overlap(distances, overlap)
+        squared = np.clip(1.0 - distances / reach, 0.0, 1.0) ** 2
+        shares = squared / squared.sum(axis=0)
+        assert (1.0 / (shares**2).sum(axis=0)).mean() == pytest.approx(overlap, abs=1e-3)
+    assert reach_of_overlap(distances, 9.0) == reach_of_overlap(distances, 2.5)
+    alone = part_distances(np.zeros(80, dtype=np.int32), mesh.topology, mesh.vertices)
+    assert reach_of_overlap(alone, 3.0) > 0.0
+
+
 def test_principal_components_are_orthonormal_and_ordered() -> None:
     rng = np.random.default_rng(1)
     axes = np.linalg.qr(rng.standard_normal((12, 3)))[0].T
@@ -165,6 +180,28 @@ def test_untouched_vertices_take_their_nearest_owners_mask() -> None:
     assert np.isfinite(mask).all()
     with pytest.raises(ShapeError, match="all weights"):
         attention_mask(np.zeros_like(components), mesh.topology, mesh.vertices)
+
+
+def test_islands_go_to_the_next_strongest_component() -> None:
+    mesh = strip(12)
+    components = np.zeros((3, 24, 9), dtype=np.float32)
+    components[0, :16, 0] = 2.0
+    components[1, 12:, 1] = 3.0
+    components[1, 4:6, 1] = 3.0
+    components[2, 10:12, 2] = 1.0
+    components[2, 20:22, 2] = 4.0
+    before = components.copy()
+    kept = keep_one_patch(components, mesh.topology, mesh.vertices)
+    assert np.array_equal(components, before)
+    mask = attention_mask(kept, mesh.topology, mesh.vertices)
+    quality = judge_masks(mask, mesh.topology, mesh.vertices)
+    assert quality.connected_share.tolist() == [1.0, 1.0, 1.0]
+    # Domain 2 cuts two vertices off the end of domain 1, which nobody else touches.
+    owner = mask.argmax(axis=0)
+    assert owner.tolist() == [0] * 12 + [1] * 8 + [2] * 4
+    assert (kept[1, 4:6] == 0.0).all()
+    assert (kept[1, 22:] == 0.0).all()
+    assert np.array_equal(kept[2], components[2])
 
 
 def test_mask_quality_counts_patches_and_overlap() -> None:

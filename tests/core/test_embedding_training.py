@@ -336,7 +336,7 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         {"held_out_stride": 1},
         {"level1_rate": -1.0},
         {"vertex_weight": float("nan")},
-        {"locality_reach": (0.2, 0.2)},
+        {"window_overlap": 1.0},
     ],
 )
 def test_senseless_choices_are_refused(change: dict[str, object]) -> None:
