@@ -135,7 +135,30 @@ def test_progress_rises_to_the_total(
         assert calls[-1] == (n_poses, n_poses)
         assert [done for done, _ in calls] == sorted({done for done, _ in calls})
         assert {total for _, total in calls} == {n_poses}
+        # Even a small batch has work for every thread.
+        assert len(calls) >= min(workers, n_poses)
         assert threads == {threading.get_ident()}
+
+
+class PolledBy(CancelToken):
+    """A token that notes which threads ask it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.threads: set[int] = set()
+
+    @property
+    def cancelled(self) -> bool:
+        self.threads.add(threading.get_ident())
+        return False
+
+
+def test_one_pose_starts_no_thread(crumpled: tuple[CollisionDetector, np.ndarray]) -> None:
+    detector, poses = crumpled
+    token = PolledBy()
+    detector.are_colliding(poses[:1], cancel=token)
+    detector.detect_batch(poses, workers=1, cancel=token)
+    assert token.threads == {threading.get_ident()}
 
 
 class CancelledAtPoll(CancelToken):
