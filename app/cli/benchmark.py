@@ -56,19 +56,18 @@ def _print(rows: list[dict[str, Any]]) -> None:
     table = Table(box=None)
     for heading in ("vertices", "tool", "threads", "mode", "ms per pose", "x ours", "agrees"):
         table.add_column(heading, justify="left" if heading in {"tool", "mode"} else "right")
-    ours = {
-        row["vertices"]: row["ms_per_pose"]
-        for row in reversed(rows)
-        if row["tool"] == "lcollision" and row["threads"] == 1 and row["mode"] == "all"
-    }
+    ours = 1.0
     for row in rows:
+        # The row that each set begins with.
+        if (row["tool"], row["threads"], row["mode"]) == ("lcollision", 1, "all"):
+            ours = row["ms_per_pose"]
         table.add_row(
             str(row["vertices"]),
             row["tool"],
             str(row["threads"]),
             row["mode"],
             f"{row['ms_per_pose']:.2f}",
-            f"{row['ms_per_pose'] / ours[row['vertices']]:.1f}",
+            f"{row['ms_per_pose'] / ours:.1f}",
             "yes" if row["agrees"] else "NO",
         )
     Console().print(table)

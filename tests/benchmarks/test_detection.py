@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from app.benchmarks import detection
+from app.cli import benchmark
 from lcollision_core.meshes import PoseSet, Topology, write_pose_set
 from tests.app.support import Lcollision
 
@@ -83,3 +84,20 @@ def test_command_prints_the_rows(
     table = lcollision("benchmark", "detection", "--data", path, "-n", 2).stdout
     assert "python-fcl" in table
     assert "NO" not in table
+
+
+def test_each_set_is_compared_with_our_time_on_it(capsys: pytest.CaptureFixture[str]) -> None:
+    def row(tool: str, milliseconds: float) -> dict[str, object]:
+        return {
+            "vertices": 162,
+            "poses": 3,
+            "tool": tool,
+            "threads": 1,
+            "mode": "all",
+            "ms_per_pose": milliseconds,
+            "agrees": True,
+        }
+
+    benchmark._print([row("lcollision", 2), row("coal", 50), row("lcollision", 4), row("coal", 50)])
+    ratios = [line.split()[-2] for line in capsys.readouterr().out.splitlines()[1:]]
+    assert ratios == ["1.0", "25.0", "1.0", "12.5"]
