@@ -25,6 +25,8 @@ class MeshAudit:
     watertight : every edge has two faces that run along it in opposite directions
     boundary_edges : number of edges with one face
     non_manifold_edges : number of edges with more than two faces
+    pinched_vertices : indices of the vertices in which fans of faces touch without sharing an
+        edge, int32
     components : number of connected parts, unused vertices not counted
     unused_vertices : indices of the vertices in no face, int32
     degenerate_faces : indices of the faces without area, int32
@@ -35,6 +37,7 @@ class MeshAudit:
     watertight: bool
     boundary_edges: int
     non_manifold_edges: int
+    pinched_vertices: npt.NDArray[np.int32]
     components: int
     unused_vertices: npt.NDArray[np.int32]
     degenerate_faces: npt.NDArray[np.int32]
@@ -64,6 +67,7 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
     watertight = topology.is_watertight
     n_boundary = len(topology.boundary_edges)
     n_non_manifold = len(topology.non_manifold_edges)
+    pinched = topology.pinched_vertices
     unused = topology.unused_vertices
     degenerate = degenerate_faces(topology, points)
     duplicates = _duplicates(points)
@@ -77,6 +81,11 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
             f"the mesh is not manifold: {_count(n_non_manifold, 'edge has', 'edges have')} more "
             f"than two faces, the first between vertices "
             f"{' and '.join(map(str, topology.non_manifold_edges[0]))}"
+        )
+    if len(pinched):
+        problems.append(
+            f"the mesh is not manifold: {_count(len(pinched), 'vertex joins', 'vertices join')} "
+            f"parts of the surface that share no edge there, the first is vertex {pinched[0]}"
         )
     if not watertight and not n_boundary and not n_non_manifold:
         problems.append("the mesh has neighbouring faces that are wound in opposite senses")
@@ -99,6 +108,7 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
         watertight=watertight,
         boundary_edges=n_boundary,
         non_manifold_edges=n_non_manifold,
+        pinched_vertices=pinched,
         components=topology.vertex_components[0] - len(unused),
         unused_vertices=unused,
         degenerate_faces=degenerate,

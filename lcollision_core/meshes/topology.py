@@ -99,6 +99,27 @@ class Topology:
         return self.edges[self._edges_and_counts[1] > 2]
 
     @property
+    def pinched_vertices(self) -> IntArray:
+        """Indices of the vertices whose faces form several fans that touch in the vertex alone."""
+        directed = self._directed_edges.astype(np.int64)
+        keys = directed.min(axis=1) * self.n_vertices + directed.max(axis=1)
+        order = np.argsort(keys, kind="stable")
+        followed = keys[order[:-1]] == keys[order[1:]]
+        # A node for each corner of each face; the faces at an edge join their corners at both ends.
+        corner = np.arange(3 * self.n_faces).reshape(self.n_faces, 3)
+        ends = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]])
+        ends = np.where((directed[:, 0] < directed[:, 1])[:, None], ends, ends[:, ::-1])
+        joined_a = ends[order[:-1][followed]].reshape(-1)
+        joined_b = ends[order[1:][followed]].reshape(-1)
+        graph = sparse.coo_matrix(
+            (np.ones(len(joined_a), dtype=np.int8), (joined_a, joined_b)), shape=2 * (corner.size,)
+        )
+        _, fan = csgraph.connected_components(graph, directed=False)
+        _, a_corner = np.unique(fan, return_index=True)
+        fans = np.bincount(self.faces.reshape(-1)[a_corner], minlength=self.n_vertices)
+        return np.flatnonzero(fans > 1).astype(np.int32)
+
+    @property
     def is_watertight(self) -> bool:
         """Whether every edge has two faces that run along it in opposite directions."""
         if not bool((self._edges_and_counts[1] == 2).all()):

@@ -353,7 +353,7 @@ def test_audit_of_a_sound_mesh() -> None:
 
 
 def test_audit_finds_every_defect_at_index_zero_too() -> None:
-    # Face 0 flat, vertex 4 on vertex 0, vertex 5 in no face, edges open.
+    # Face 0 flat, vertex 1 a bow tie, vertex 4 on vertex 0, vertex 5 in no face, edges open.
     vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0], [9, 9, 9.0]])
     audit = audit_mesh(Topology([[0, 1, 2], [4, 1, 3]], 6), vertices)
     assert audit.degenerate_faces.tolist() == [0]
@@ -362,7 +362,8 @@ def test_audit_finds_every_defect_at_index_zero_too() -> None:
     assert audit.boundary_edges == 6
     assert not audit.watertight
     assert audit.components == 1
-    assert len(audit.problems) == 4
+    assert audit.pinched_vertices.tolist() == [1]
+    assert len(audit.problems) == 5
 
 
 @pytest.mark.parametrize("unit", [1e-200, 1.0, 1e200])
@@ -380,6 +381,10 @@ def test_audit_names_what_is_wrong_with_the_surface() -> None:
     assert any("the mesh is open" in problem for problem in problems)
     flipped = Topology(np.vstack([FACES[:3], [FACES[3, ::-1]]]), 4)
     assert "opposite senses" in audit_mesh(flipped, VERTICES).problems[0]
+    bow_tie = Topology([[0, 1, 2], [0, 3, 4]], 5)
+    problems = audit_mesh(bow_tie, np.vstack([VERTICES, [[3, 3, 3]]])).problems
+    assert "not manifold: 1 vertex joins" in problems[1]
+    assert "vertex 0" in problems[1]
     with pytest.raises(ShapeError, match=r"\(4, 3\)"):
         audit_mesh(flipped, VERTICES[:3])
 

@@ -41,6 +41,38 @@ def test_fin_makes_a_non_manifold_edge() -> None:
     assert not topology.is_watertight
 
 
+def test_fans_that_touch_in_a_vertex_alone_pinch_it() -> None:
+    apexes_joined = Topology(np.vstack([TETRAHEDRON, TETRAHEDRON + 3]), 7)
+    assert apexes_joined.is_watertight
+    assert apexes_joined.pinched_vertices.tolist() == [3]
+    assert Topology([[0, 1, 2], [0, 3, 4]], 5).pinched_vertices.tolist() == [0]
+    for whole in (TETRAHEDRON, TETRAHEDRON[1:], np.vstack([TETRAHEDRON, [[0, 1, 4]]])):
+        assert Topology(whole, 5).pinched_vertices.tolist() == []
+
+
+def _fans(faces: np.ndarray, vertex: int) -> int:
+    """Count the fans round a vertex by growing each from any face."""
+    left = [set(face.tolist()) for face in faces if vertex in face]
+    fans = 0
+    while left:
+        fans += 1
+        grown = [left.pop()]
+        while grown:
+            face = grown.pop()
+            grown += [other for other in left if len(face & other) >= 2]
+            left = [other for other in left if len(face & other) < 2]
+    return fans
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pinched_vertices_agree_with_fans_grown_face_by_face(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    faces = np.array([rng.permutation(12)[:3] for _ in range(14)])
+    expected = [vertex for vertex in range(12) if _fans(faces, vertex) > 1]
+    assert Topology(faces, 12).pinched_vertices.tolist() == expected
+    assert 0 < len(expected) < 12
+
+
 def test_unused_vertices_are_components_but_not_of_the_surface() -> None:
     topology = Topology(np.vstack([TETRAHEDRON, TETRAHEDRON + 5]), 9)
     assert topology.unused_vertices.tolist() == [4]
