@@ -75,7 +75,7 @@ def keep_one_patch(
 
     Parameters
     ----------
-    components : (K, V, 9) float32 array C
+    components : (K, V, 9) float32 array C, of any norms; compared at unit norm
     topology : the connectivity; separate components count as tied to their nearest neighbour
     rest_vertices : (V, 3) float64 array, the reference
 
@@ -87,6 +87,8 @@ def keep_one_patch(
     edges = bridged_edges(topology, rest_vertices)
     while True:
         squared = (kept.astype(np.float64) ** 2).sum(axis=2)
+        # As the masks will see them: each component of unit norm.
+        squared /= squared.sum(axis=1, keepdims=True)
         # Vertices that nobody touches belong to no patch: they follow their neighbours later.
         owner = np.where(squared.max(axis=0) > 0.0, squared.argmax(axis=0), -1)
         islands = owner[None] == np.arange(len(kept))[:, None]
