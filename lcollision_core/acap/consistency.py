@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csgraph, csr_matrix
 
-from lcollision_core.acap.compiled import compiled
+from lcollision_core.compiled import compiled
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
 _TURN = 2.0 * math.pi

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from lcollision_core.acap.compiled import compiled
+from lcollision_core.compiled import compiled
 from lcollision_core.meshes.topology import FloatArray
 
 N_FEATURES = 9

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lcollision_core.acap.compiled import compiled
+from lcollision_core.compiled import compiled
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
 NORMAL_LENGTH = 0.3

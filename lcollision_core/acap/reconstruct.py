@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph, linalg
 
-from lcollision_core.acap.compiled import compiled
+from lcollision_core.compiled import compiled
 from lcollision_core.meshes.topology import FloatArray, IntArray
 
 BLOCK_POSES = 8

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.acap.compiled import compiled
 from lcollision_core.acap.features import N_FEATURES
+from lcollision_core.compiled import compiled
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, IntArray
 
