@@ -113,7 +113,7 @@ class CollisionDetector:
     Raises
     ------
     ShapeError : `reference` is not a finite (V, 3) array with an extent between 1 / `MAX_HEIGHT`
-        and `MAX_HEIGHT`, or `near_exclusion` is negative.
+        and `MAX_HEIGHT`, or `near_exclusion` is negative, or relates too many vertices.
     """
 
     def __init__(

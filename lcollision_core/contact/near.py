@@ -8,10 +8,14 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from lcollision_core.contact.arrays import NearVertices
+from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import Topology
 
 _SOURCES_AT_ONCE = 256
 """Rows of the dense distance block that SciPy returns; bounds the memory to 256 V numbers."""
+
+MAX_NEAR = 250_000_000
+"""The most entries that the table may have: 1 GB. All pairs of 10 000 vertices take 100 million."""
 
 
 def near_vertices(
@@ -24,6 +28,10 @@ def near_vertices(
     topology : of the mesh
     vertices : (V, 3) float64 array, the reference
     distance : >= 0, in the unit of `vertices`; 0 excludes nothing
+
+    Raises
+    ------
+    ShapeError : there would be more than `MAX_NEAR` entries.
     """
     if distance <= 0.0:
         return NearVertices(
@@ -42,4 +50,9 @@ def near_vertices(
         rows, columns = np.nonzero(distances <= distance)
         counts[sources + 1] = np.bincount(rows, minlength=len(sources))
         reached.append(columns.astype(np.int32))
+        if counts.sum() > MAX_NEAR:
+            raise ShapeError(
+                f"the near exclusion relates more than {MAX_NEAR} pairs of the "
+                f"{topology.n_vertices} vertices; make it smaller"
+            )
     return NearVertices(start=np.cumsum(counts), vertex=np.concatenate(reached))
