@@ -94,5 +94,6 @@ def _sentence(report: dict[str, Any]) -> str:
         verdict += f", {counted(report['near_pairs'], 'pair')} in skin folds"
     return (
         f"{report['file']}: {verdict} "
-        f"({report['vertices']} vertices, {report['faces']} faces, {report['seconds']:.2f} s)"
+        f"({counted(report['vertices'], 'vertex', 'vertices')}, "
+        f"{counted(report['faces'], 'face')}, {report['seconds']:.2f} s)"
     )

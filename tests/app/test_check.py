@@ -49,6 +49,12 @@ def test_free_mesh_exits_with_zero(lcollision: Lcollision, apart: Path) -> None:
     result = lcollision("check", apart)
     assert result.exit_code == 0
     assert "free of self-collisions" in result.stdout
+    assert "(6 vertices, 2 faces, " in result.stdout
+
+
+def test_one_face_is_no_faces(lcollision: Lcollision, tmp_path: Path) -> None:
+    (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert "(3 vertices, 1 face, " in lcollision("check", tmp_path / "one.obj").stdout
 
 
 def test_several_files_come_in_order(lcollision: Lcollision, apart: Path, stabbed: Path) -> None:
