@@ -29,3 +29,7 @@ class MissingExtraError(LCollisionError):
 
 class CancelledError(LCollisionError):
     """The caller's cancel token was set; nothing was left half-written."""
+
+
+class LabelStoreError(LCollisionError):
+    """A folder cannot be read as labelled samples of a model, or cannot be written."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import note
+from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import describe, error_sentence
 from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken
 
 if TYPE_CHECKING:
     from lcollision_core.embedding.training import StatusCallback, TrainingStatus
@@ -83,7 +82,7 @@ def embedding(
     if checkpoint.exists():
         note(f"going on from {checkpoint}")
     try:
-        with _cancel_on_interrupt() as cancel, _training_bar() as progress:
+        with cancel_on_interrupt() as cancel, _training_bar() as progress:
             trained = train_embedding(
                 poses, config, checkpoint=checkpoint, progress=progress, cancel=cancel, seed=seed
             )
@@ -112,25 +111,6 @@ def _provenance(vertices: Any, seed: int) -> dict[str, Any]:
         "seed": seed,
         "poses_sha256": digest,
     }
-
-
-@contextmanager
-def _cancel_on_interrupt() -> Iterator[CancelToken]:
-    """Give a token that the first Ctrl-C or SIGTERM sets; a second Ctrl-C interrupts at once."""
-    token = CancelToken()
-    previous: dict[signal.Signals, Any] = {}
-
-    def cancel(number: int, frame: object) -> None:  # noqa: ARG001
-        token.cancel()
-        signal.signal(number, previous[signal.Signals(number)])
-
-    for caught in (signal.SIGINT, signal.SIGTERM):
-        previous[caught] = signal.signal(caught, cancel)
-    try:
-        yield token
-    finally:
-        for caught, handler in previous.items():
-            signal.signal(caught, handler)
 
 
 @contextmanager

@@ -1,0 +1,150 @@
+"""``lcollision label``: exact labels of samples of a model's latent box."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli.console import counted, note, print_json
+from app.cli.interrupt import cancel_on_interrupt
+from app.cli.models import ModelArgument
+from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
+
+if TYPE_CHECKING:
+    from lcollision_core.labels import LabelStatus, StatusCallback
+
+
+def label(
+    model_name: ModelArgument,
+    count: Annotated[
+        int, typer.Option("-n", min=1, max=1_000_000_000, help="Samples the store is to hold.")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="STORE", help="The Zarr store to make or to go on with."
+        ),
+    ],
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one for each core."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Label on the workers of this Dask scheduler."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal rows.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+) -> None:
+    """Draw poses from the model's latent box and find their exact collisions.
+
+    However it is stopped, the store keeps the chunks that are finished, and the same command goes
+    on from there. The rows do not depend on who labels them.
+    """
+    from lcollision_core.labels import Labeller, LabelStore, label_poses
+    from lcollision_core.model import PoseModel
+
+    if workers is not None and scheduler is not None:
+        raise LCollisionError(
+            "--workers and --scheduler exclude each other; the cluster has its own workers"
+        )
+    model = PoseModel.load(model_name)
+    labeller = Labeller(model.embedding, model.height, model.near_exclusion, model.fingerprint)
+    started = time.monotonic()
+    try:
+        with cancel_on_interrupt() as cancel, _labelling_bar() as progress:
+            watched = _Watched(progress)
+            store = label_poses(
+                labeller,
+                output,
+                count,
+                seed=seed,
+                workers=workers,
+                scheduler=scheduler,
+                progress=watched,
+                cancel=cancel,
+            )
+    except CancelledError:
+        with suppress(LabelStoreError):
+            kept = counted(LabelStore.open(output).n_rows, "row")
+            note(f"stopped; {output} keeps {kept}, run the same command again to go on")
+        raise
+    seconds = time.monotonic() - started
+    report: dict[str, Any] = {
+        "store": str(output),
+        "model": model.name,
+        "seed": seed,
+        "rows": store.n_rows,
+        "labelled": watched.labelled,
+        "colliding_share": store.n_colliding / store.n_rows,
+        "near_exclusion": model.near_exclusion,
+        "seconds": seconds,
+    }
+    if as_json:
+        print_json(report)
+        return
+    near = (
+        f", pairs within {model.near_exclusion:g} heights along the surface left out"
+        if model.near_exclusion
+        else ""
+    )
+    typer.echo(
+        f"{output}: {counted(store.n_rows, 'row')} of {model.name}, "
+        f"{100.0 * report['colliding_share']:.1f} % collide{near} "
+        f"({watched.labelled} labelled now, {watched.labelled / seconds:.0f}/s)"
+    )
+
+
+class _Watched:
+    """Passes a status on and remembers how many rows this run labelled."""
+
+    def __init__(self, show: StatusCallback) -> None:
+        self._show = show
+        self._before: int | None = None
+        self.labelled = 0
+
+    def __call__(self, status: LabelStatus) -> None:
+        if self._before is None:
+            self._before = status.done
+        self.labelled = status.done - self._before
+        self._show(status)
+
+
+@contextmanager
+def _labelling_bar() -> Iterator[StatusCallback]:
+    """Give a callback that draws rows, rate, time left and share colliding on a terminal."""
+    from lcollision_core.labels import no_status
+
+    if not sys.stderr.isatty():
+        yield no_status
+        return
+    from datetime import timedelta
+
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = (
+        rich_progress.TextColumn("Labelling"),
+        rich_progress.BarColumn(),
+        rich_progress.MofNCompleteColumn(),
+        rich_progress.TextColumn("{task.fields[facts]}"),
+    )
+    with rich_progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        bar = bars.add_task("", total=None, facts="")
+
+        def show(status: LabelStatus) -> None:
+            facts = []
+            if status.rows_per_second is not None and status.seconds_left is not None:
+                left = timedelta(seconds=round(status.seconds_left))
+                facts += [f"{status.rows_per_second:.0f}/s", f"{left} left"]
+            if status.colliding_share is not None:
+                facts.append(f"{100.0 * status.colliding_share:.1f} % collide")
+            bars.update(bar, completed=status.done, total=status.total, facts=", ".join(facts))
+
+        yield show

@@ -1,0 +1,137 @@
+"""Labelling on a Dask cluster: workers label chunks, this process alone writes them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator, Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lcollision_core.errors import LCollisionError, MissingExtraError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.labels.labeller import Labeller, LabelRows
+from lcollision_core.labels.local import ChunkTask, CountRows, label_chunk
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_CONNECT_SECONDS = 20
+_POLL_SECONDS = 0.5
+_CHUNKS_AHEAD = 2
+"""Chunks in hand for each thread of the cluster: none idles while its result travels."""
+
+
+def label_on_cluster(
+    labeller: Labeller,
+    seed: int,
+    tasks: Sequence[ChunkTask],
+    scheduler: str,
+    count: CountRows,
+    cancel: CancelToken,
+) -> Generator[tuple[ChunkTask, LabelRows], None, None]:
+    """Label chunks on the workers of a Dask scheduler.
+
+    The workers need this program in the same version. Those that leave are replaced by others,
+    those that come later join in.
+
+    Parameters
+    ----------
+    labeller : of the model; it is sent to every worker once
+    seed : of the samples
+    tasks : what to label
+    scheduler : its address
+    count : called after each chunk
+    cancel : polled while waiting
+
+    Yields
+    ------
+    each task with its rows, as they come
+
+    Raises
+    ------
+    MissingExtraError : Dask is not installed.
+    LCollisionError : no scheduler or worker answers, a worker has another version of the program
+        or none, or workers die.
+    CancelledError : `cancel` was set.
+    """
+    try:
+        from distributed import Client, wait
+    except ImportError as error:
+        raise MissingExtraError(
+            "labelling on a cluster needs Dask; install it with pip install 'lcollision[cluster]'"
+        ) from error
+    try:
+        client = Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise LCollisionError(
+            f"no Dask scheduler answers at {scheduler}; start one with `dask scheduler`, or check "
+            f"the address"
+        ) from error
+    with client:
+        n_threads = _require_workers(client, scheduler)
+        shared = client.scatter(labeller, broadcast=True, hash=False)
+        remaining = deque(tasks)
+        in_hand: dict[Any, ChunkTask] = {}
+        while remaining or in_hand:
+            while remaining and len(in_hand) < _CHUNKS_AHEAD * n_threads:
+                task = remaining.popleft()
+                in_hand[client.submit(label_chunk, shared, seed, task, pure=False)] = task
+            cancel.raise_if_cancelled()
+            try:
+                with client.as_current():
+                    finished = wait(
+                        list(in_hand), timeout=_POLL_SECONDS, return_when="FIRST_COMPLETED"
+                    ).done
+            except TimeoutError:
+                continue
+            for future in finished:
+                task = in_hand.pop(future)
+                rows = _result(future, scheduler)
+                count(len(rows), int(np.count_nonzero(rows.colliding)))
+                yield task, rows
+
+
+def program_version() -> str:
+    """Return the version of this program: asked of every worker before it gets work."""
+    return version("lcollision")
+
+
+def _require_workers(client: Client, scheduler: str) -> int:
+    """Return the number of the workers' threads, after asking all for their version."""
+    try:
+        client.wait_for_workers(1, timeout=_CONNECT_SECONDS)
+        versions = client.run(program_version)
+    except TimeoutError as error:
+        raise LCollisionError(
+            f"the scheduler at {scheduler} has no workers; start some with `dask worker "
+            f"{scheduler}`"
+        ) from error
+    except ImportError as error:
+        raise LCollisionError(
+            f"a worker of {scheduler} lacks this program ({error}); install lcollision "
+            f"{program_version()} there"
+        ) from error
+    for worker, found in versions.items():
+        if found != program_version():
+            raise LCollisionError(
+                f"the worker {worker} has lcollision {found}, this is {program_version()}; "
+                f"install the same version there"
+            )
+    n_threads: int = sum(client.nthreads().values())
+    return n_threads
+
+
+def _result(future: Any, scheduler: str) -> LabelRows:
+    from distributed import CancelledError as LostError
+    from distributed import KilledWorker
+
+    try:
+        rows: LabelRows = future.result()
+    except (KilledWorker, LostError) as error:
+        raise LCollisionError(
+            f"the workers of {scheduler} died while labelling; give them more memory, then run "
+            f"the same command again to go on"
+        ) from error
+    return rows

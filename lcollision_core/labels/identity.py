@@ -1,0 +1,83 @@
+"""What a store labels, and which of its rows are held out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.labels.labeller import Labeller
+
+
+def is_held_out(index: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Tell which samples test a predictor and never train it: those whose index ends in 7, 8, 9.
+
+    A fixed 30 %, so that a row keeps its side when its store grows. Samples are independent, so
+    every tenth is as random as any other.
+
+    Parameters
+    ----------
+    index : (B,) integer array, the samples' indices in the store
+    """
+    held_out: npt.NDArray[np.bool_] = np.asarray(index) % 10 >= 7
+    return held_out
+
+
+@dataclass(frozen=True)
+class StoreIdentity:
+    """What a store labels; rows of two stores with one identity are interchangeable.
+
+    Attributes
+    ----------
+    model : fingerprint of the model
+    seed : of the samples
+    n_domains : K
+    height : one height in the data's unit, in which vertices are rounded
+    near_exclusion : in heights
+    box_low, box_high : D numbers each
+    """
+
+    model: str
+    seed: int
+    n_domains: int
+    height: float
+    near_exclusion: float
+    box_low: tuple[float, ...]
+    box_high: tuple[float, ...]
+
+    @classmethod
+    def of(cls, labeller: Labeller, seed: int) -> StoreIdentity:
+        """Return the identity of the samples of a model drawn with a seed."""
+        return cls(
+            model=labeller.fingerprint,
+            seed=seed,
+            n_domains=labeller.embedding.n_domains,
+            height=labeller.height,
+            near_exclusion=labeller.near_exclusion,
+            box_low=tuple(labeller.box.low.tolist()),
+            box_high=tuple(labeller.box.high.tolist()),
+        )
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, Any]) -> StoreIdentity:
+        """Rebuild an identity from JSON values; KeyError, TypeError or ValueError if it cannot."""
+        identity = cls(
+            model=str(metadata["model"]),
+            seed=int(metadata["seed"]),
+            n_domains=int(metadata["n_domains"]),
+            height=float(metadata["height"]),
+            near_exclusion=float(metadata["near_exclusion"]),
+            box_low=tuple(float(number) for number in metadata["box_low"]),
+            box_high=tuple(float(number) for number in metadata["box_high"]),
+        )
+        if not 0 < len(identity.box_low) == len(identity.box_high) or identity.n_domains < 1:
+            raise ValueError("no latent box")
+        return identity
+
+    @property
+    def latent_size(self) -> int:
+        """D."""
+        return len(self.box_low)

@@ -1,0 +1,143 @@
+"""Exact labels: what the collision predictor has to learn of a latent pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.embedding import Embedding
+from lcollision_core.labels.box import LatentBox
+
+
+@dataclass(frozen=True, eq=False)
+class LabelRows:
+    """B labelled samples.
+
+    Attributes
+    ----------
+    latent : (B, D) float32 array, Z_all
+    domain_energy : (B, K) float64 array, S_k, each row sums to `energy`, in squared heights
+    energy : (B,) float64 array, PDe-sum, in squared heights
+    n_pairs : (B,) int32 array, colliding pairs of faces
+    n_near_pairs : (B,) int32 array, pairs within the near exclusion, which count for nothing else
+    """
+
+    latent: npt.NDArray[np.float32]
+    domain_energy: npt.NDArray[np.float64]
+    energy: npt.NDArray[np.float64]
+    n_pairs: npt.NDArray[np.int32]
+    n_near_pairs: npt.NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.latent)
+
+    @property
+    def colliding(self) -> npt.NDArray[np.bool_]:
+        """(B,) whether each pose intersects itself, by the strict pair rule."""
+        return self.n_pairs > 0
+
+    def head(self, n_rows: int) -> LabelRows:
+        """Return the first `n_rows` rows, views of these."""
+        return LabelRows(*(getattr(self, field.name)[:n_rows] for field in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[LabelRows]) -> LabelRows:
+        """Put rows one after the other, in one copy."""
+        return cls(
+            *(
+                np.concatenate([getattr(part, field.name) for part in parts])
+                for field in fields(cls)
+            )
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Labeller:
+    """Decodes latent poses and finds their exact labels; may be shared between threads.
+
+    Vertices are tested as `PoseModel` exports them: in the data's unit, rounded to float32. So a
+    label agrees with the exact verdict on the same pose wherever else it is asked for.
+
+    Attributes
+    ----------
+    embedding : decodes
+    height : one height in the data's unit
+    near_exclusion : pairs of faces this near along the surface, in heights, are counted apart
+    fingerprint : tells the model from others
+    """
+
+    embedding: Embedding
+    height: float
+    near_exclusion: float
+    fingerprint: str
+
+    @cached_property
+    def box(self) -> LatentBox:
+        """The box that is sampled."""
+        return LatentBox.of(self.embedding)
+
+    @cached_property
+    def detector(self) -> CollisionDetector:
+        """The exact check, in the data's unit."""
+        return CollisionDetector(
+            self.embedding.topology,
+            self.embedding.rest_vertices * self.height,
+            near_exclusion=self.near_exclusion,
+        )
+
+    def prepare(self) -> None:
+        """Build what labelling needs, once, before several threads would each begin to."""
+        _ = self.box, self.detector, self.embedding.codec, self.embedding.decoder
+
+    def label_block(self, seed: int, block: int) -> LabelRows:
+        """Draw and label block `block` of the box's samples: see `LatentBox.draw`."""
+        return self.label(self.box.draw(seed, block))
+
+    def label(self, latent: npt.NDArray[Any]) -> LabelRows:
+        """Label latent poses exactly, on the calling thread alone.
+
+        Parameters
+        ----------
+        latent : (B, D) array, used as float32
+
+        Returns
+        -------
+        rows : LabelRows; a pose gets the same bits in whichever batch it comes
+
+        Raises
+        ------
+        ShapeError : another shape, or a pose that does not decode to finite vertices.
+        """
+        codes = np.ascontiguousarray(latent, dtype=np.float32)
+        vertices = self.embedding.decode(codes, n_threads=1)
+        vertices *= self.height
+        found = self.detector.detect_batch(vertices.astype(np.float32), workers=1)
+        mask = self.embedding.attention_mask
+        domain_energy = np.zeros((len(codes), len(mask)))
+        energy = np.zeros(len(codes))
+        for row, vertex_energy in enumerate(found.vertex_energy):
+            # Not a matrix product: BLAS sums in an order that depends on the processor, its
+            # threads and the batch, and rows must be the same on every machine.
+            touched = np.flatnonzero(vertex_energy)
+            shares = np.take(mask, touched, axis=1) * vertex_energy[touched]
+            domain_energy[row] = shares.sum(axis=1)
+            energy[row] = vertex_energy[touched].sum()
+        return LabelRows(
+            latent=codes,
+            domain_energy=domain_energy,
+            energy=energy,
+            n_pairs=found.n_pairs.astype(np.int32),
+            n_near_pairs=found.n_near_pairs.astype(np.int32),
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The detector lends out per-thread work arrays and does not travel; the embedding travels
+        # with its factored matrix, which another machine might factor to other bits.
+        self.prepare()
+        return {field.name: getattr(self, field.name) for field in fields(self)}

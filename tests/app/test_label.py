@@ -1,0 +1,173 @@
+"""``lcollision label``."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.embedding.training import train_embedding
+from lcollision_core.labels import ROWS_A_CHUNK, LabelStore
+from lcollision_core.model import PoseModel
+from tests.app.support import Lcollision
+from tests.bending_tube import bending_tube
+from tests.core.labelled import as_bytes
+
+SECONDS_TO_WAIT = 120.0
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a model that was hardly trained; what it learnt matters little here."""
+    poses = bending_tube()
+    config = EmbeddingConfig(
+        n_domains=2, n_domain_codes=3, level1_epochs=10, level2_epochs=2, held_out_stride=0
+    )
+    path = tmp_path_factory.mktemp("model") / "tube.safetensors"
+    PoseModel.from_training("tube", train_embedding(poses, config), poses).save(path)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def user_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the tests from the models of whoever runs them."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+
+
+def _start(*arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "app", "label", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def _wait_for_chunks(store: Path, n_chunks: int, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + SECONDS_TO_WAIT
+    while len(list((store / "chunks").glob("c/*/0"))) < n_chunks:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def _refusal(lcollision: Lcollision, *arguments: object) -> str:
+    """Run a command that must fail for bad input, and return its one sentence."""
+    result = lcollision(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("lcollision: ")
+    return line
+
+
+def test_label_says_how_many_and_what_share_collides(
+    lcollision: Lcollision, model: Path, tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
+    result = lcollision("label", model, "-n", 600, "-o", store)
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""
+    share = 100.0 * LabelStore.open(store).load().colliding.mean()
+    assert share > 0.5
+    expected = f"{store}: 600 rows of tube, {share:.1f} % collide (600 labelled now, "
+    assert result.stdout.startswith(expected)
+
+
+def test_json_is_one_document_and_a_second_run_has_nothing_to_do(
+    lcollision: Lcollision, model: Path, tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
+    for labelled in (300, 0):
+        result = lcollision("label", model, "-n", 300, "-o", store, "--seed", 4, "--json")
+        assert result.exit_code == 0
+        report = json.loads(result.stdout)
+        assert report.pop("seconds") > 0.0
+        assert report == {
+            "store": str(store),
+            "model": "tube",
+            "seed": 4,
+            "rows": 300,
+            "labelled": labelled,
+            "colliding_share": LabelStore.open(store).load().colliding.mean(),
+            "near_exclusion": 0.0,
+        }
+
+
+def test_a_killed_run_goes_on_and_ends_with_the_same_rows(
+    lcollision: Lcollision, model: Path, tmp_path: Path
+) -> None:
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    process = _start(model, "-n", 200_000, "-o", killed)
+    _wait_for_chunks(killed, 2, process)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    kept = LabelStore.open(killed)
+    assert 2 * ROWS_A_CHUNK <= kept.n_rows < 200_000
+    before = kept.load()
+
+    n_rows = kept.n_rows + 300
+    result = lcollision("label", model, "-n", n_rows, "-o", killed, "--workers", 1, "--json")
+    assert json.loads(result.stdout)["labelled"] == 300
+    assert lcollision("label", model, "-n", n_rows, "-o", whole, "--workers", 2).exit_code == 0
+    rows = LabelStore.open(killed).load()
+    assert as_bytes(rows) == as_bytes(LabelStore.open(whole).load())
+    assert as_bytes(rows.head(len(before))) == as_bytes(before)
+    assert len(np.unique(rows.latent, axis=0)) == n_rows
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
+def test_ctrl_c_keeps_what_is_there_and_says_so(model: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    process = _start(model, "-n", 200_000, "-o", store)
+    _wait_for_chunks(store, 1, process)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=SECONDS_TO_WAIT)
+    assert process.returncode == 130
+    assert stdout == ""
+    n_rows = LabelStore.open(store).n_rows
+    assert n_rows >= ROWS_A_CHUNK
+    assert stderr == (
+        f"lcollision: stopped; {store} keeps {n_rows} rows, run the same command again to go on\n"
+    )
+
+
+def test_what_cannot_be_labelled_is_refused(
+    lcollision: Lcollision, model: Path, tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
+    assert lcollision("label", model, "-n", 40, "-o", store).exit_code == 0
+    assert "samples of seed 0, not samples of seed 9" in _refusal(
+        lcollision, "label", model, "-n", 40, "-o", store, "--seed", 9
+    )
+    other = tmp_path / "other.safetensors"
+    trained = PoseModel.load(model)
+    few = bending_tube(9)
+    config = EmbeddingConfig(
+        n_domains=2, n_domain_codes=2, level1_epochs=1, level2_epochs=1, held_out_stride=0
+    )
+    PoseModel.from_training("other", train_embedding(few, config), few).save(other)
+    assert f"labels the model {trained.fingerprint}, not the model" in _refusal(
+        lcollision, "label", other, "-n", 40, "-o", store
+    )
+    both = ("--workers", 2, "--scheduler", "tcp://127.0.0.1:9")
+    assert "exclude each other" in _refusal(
+        lcollision, "label", model, "-n", 40, "-o", store, *both
+    )
+    assert "there is no model or file 'nobody'" in _refusal(
+        lcollision, "label", "nobody", "-n", 40, "-o", store
+    )
+    shutil.rmtree(store)
+    store.write_text("a letter")
+    assert "is no label store" in _refusal(lcollision, "label", model, "-n", 40, "-o", store)
+    assert store.read_text() == "a letter"

@@ -1,0 +1,144 @@
+"""Labelling on a Dask cluster says the same as labelling here, and fails in sentences."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from distributed import Client, LocalCluster
+
+from lcollision_core.errors import CancelledError, LCollisionError, MissingExtraError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.labels import (
+    ROWS_A_CHUNK,
+    Labeller,
+    LabelStatus,
+    LabelStore,
+    cluster,
+    label_poses,
+)
+from lcollision_core.model import PoseModel
+from tests.core.labelled import as_bytes, labeller_of
+
+N_ROWS = 4 * ROWS_A_CHUNK + 200
+
+
+@pytest.fixture(scope="module")
+def labeller(tube_model: PoseModel) -> Labeller:
+    return labeller_of(tube_model)
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """Return the address of a scheduler with two worker processes."""
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=":0"
+    ) as local:
+        yield local.scheduler_address
+
+
+def test_a_cluster_gives_the_rows_of_this_process(
+    scheduler: str, labeller: Labeller, tmp_path: Path
+) -> None:
+    label_poses(labeller, tmp_path / "here", N_ROWS, seed=5, workers=1)
+    statuses: list[LabelStatus] = []
+    label_poses(
+        labeller,
+        tmp_path / "there",
+        N_ROWS,
+        seed=5,
+        scheduler=scheduler,
+        progress=statuses.append,
+    )
+    here = {
+        file.relative_to(tmp_path / "here"): file.read_bytes()
+        for file in (tmp_path / "here").rglob("*")
+        if file.is_file()
+    }
+    there = {
+        file.relative_to(tmp_path / "there"): file.read_bytes()
+        for file in (tmp_path / "there").rglob("*")
+        if file.is_file()
+    }
+    assert len(here) > 30
+    assert here == there
+    assert statuses[-1].done == N_ROWS
+    assert len(statuses) == 6
+
+
+def test_a_cancelled_run_goes_on_here(scheduler: str, labeller: Labeller, tmp_path: Path) -> None:
+    token = CancelToken()
+    with pytest.raises(CancelledError):
+        label_poses(
+            labeller,
+            tmp_path / "store",
+            N_ROWS,
+            seed=5,
+            scheduler=scheduler,
+            progress=lambda status: token.cancel() if status.done else None,
+            cancel=token,
+        )
+    statuses: list[LabelStatus] = []
+    finished = label_poses(
+        labeller, tmp_path / "store", N_ROWS, seed=5, progress=statuses.append
+    ).load()
+    assert statuses[0].done > 0
+    label_poses(labeller, tmp_path / "whole", N_ROWS, seed=5)
+    assert as_bytes(finished) == as_bytes(LabelStore.open(tmp_path / "whole").load())
+
+
+def test_the_others_do_the_work_of_a_worker_that_dies(
+    scheduler: str, labeller: Labeller, tmp_path: Path
+) -> None:
+    with Client(scheduler, set_as_default=False) as client:
+        killed = threading.Event()
+
+        def kill_one(status: LabelStatus) -> None:
+            if status.done and not killed.is_set():
+                killed.set()
+                os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
+
+        label_poses(
+            labeller, tmp_path / "there", N_ROWS, seed=5, scheduler=scheduler, progress=kill_one
+        )
+        assert killed.is_set()
+    label_poses(labeller, tmp_path / "here", N_ROWS, seed=5)
+    here, there = (LabelStore.open(tmp_path / name).load() for name in ("here", "there"))
+    assert as_bytes(here) == as_bytes(there)
+
+
+def test_a_worker_of_another_version_is_refused(
+    scheduler: str, labeller: Labeller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "version", lambda _: "9.9")
+    with pytest.raises(
+        LCollisionError, match=r"has lcollision \S+, this is 9\.9; install the same"
+    ):
+        label_poses(labeller, tmp_path / "store", 10, scheduler=scheduler)
+
+
+def test_no_scheduler_and_no_worker_are_told(
+    labeller: Labeller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 1)
+    for address in ("tcp://127.0.0.1:9", "nonsense://nowhere"):
+        with pytest.raises(LCollisionError, match=f"no Dask scheduler answers at {address}"):
+            label_poses(labeller, tmp_path / "store", 10, scheduler=address)
+    with (
+        LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=":0") as empty,
+        pytest.raises(LCollisionError, match="has no workers; start some with `dask worker"),
+    ):
+        label_poses(labeller, tmp_path / "store", 10, scheduler=empty.scheduler_address)
+
+
+def test_without_dask_the_extra_is_named(
+    labeller: Labeller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtraError, match=r"lcollision\[cluster\]"):
+        label_poses(labeller, tmp_path / "store", 10, scheduler="tcp://127.0.0.1:8786")
