@@ -41,6 +41,11 @@ overlap 2.26; 100 epochs 0.92 and 2.23. So the reach follows from how much the w
 overlap 1.83. What is not connected after that is given to the neighbours (`keep_one_patch`): 1.00
 on both.
 
+Jumping, 12 domains of 10 codes, with the defaults: level 1 4.19; encoded 0.37 / 3.06; fitted 0.25 /
+2.40; held out 0.28 / 3.13, where 132 plain components fitted alike have 0.16: each held-out frame
+lies between two frames of the same jump, which is what global components do best. Box 0.94 (36 %
+of the decoded training frames collide, 79 % of the box with pairs nearer than 0.05 left out).
+
 Plain principal components of the features, fitted in the same way, have 0.30 held out with all the
 63 numbers that 64 poses span; their box collides at 0.38, 0.65 and 0.69 with 10, 20 and 60 numbers.
 
