@@ -3,15 +3,15 @@
 The peers know no "share a vertex" rule, so they are asked for every contact of the mesh with
 itself and their neighbours are dropped afterwards; they cannot stop at the first pair that
 counts. Each of their poses includes building their tree, as python-fcl cannot refit one; ours
-is built once for the set. Drawing the same poses in turn with every tool keeps the ratios honest
-on a machine whose speed drifts.
+is built once for the set. All tools are given the same poses within one run, so their ratios hold
+where the machine's speed drifts from run to run.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -20,7 +20,7 @@ from typing import Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector, SelfCollisions
+from lcollision_core.contact import CollisionDetector
 from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.meshes import PoseSet
 
@@ -32,10 +32,10 @@ FindPairs = Callable[[FloatArray, IntArray], npt.NDArray[np.int64]]
 MAX_CONTACTS = 10_000_000
 """Far above the number of contacts of a mesh with itself, so that no peer's list is cut."""
 
-REPEATS = 5
-"""Calls per pose of ours, which is quick enough to be disturbed by a single interruption."""
+ROUNDS = 5
+"""Batches of ours that are timed, for their median."""
 
-THROUGHPUT_ROUNDS = 5
+BATCH_POSES_A_THREAD = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,8 @@ class DetectionTiming:
     tool : "lcollision", "python-fcl" or "coal"
     threads : that the tool used
     mode : "all" finds every pair with its depth, "first" stops at the first
-    ms_per_pose : median over the poses; with several threads, batch time over batch size
+    ms_per_pose : a peer's median over the poses; ours is the median over `ROUNDS` batches of
+        the batch's time over its size
     agrees : whether its set of pairs equals ours on every pose (verdicts, in mode "first")
     """
 
@@ -70,7 +71,7 @@ def time_detection(
     ----------
     poses : the set
     n_poses : how many of them to time
-    threads : for the batch rows
+    threads : of ours in a second row, beside one thread; 1 for no such row
     progress : in poses
     """
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(n_poses, len(poses))).astype(int))
@@ -78,19 +79,12 @@ def time_detection(
     detector = CollisionDetector(poses.topology, vertices[0])
     peers = {name: find for name, find in _PEERS.items() if find_spec(_MODULES[name])}
 
-    detector.are_colliding(vertices[:1])  # load the compiled code
-    truth: list[SelfCollisions] = []
-    ours: dict[str, list[float]] = {"all": [], "first": []}
+    truth = []
     theirs: dict[str, list[float]] = {name: [] for name in peers}
     agrees = dict.fromkeys(peers, True)
-    verdicts = []
     for done, pose in enumerate(vertices):
-        seconds, found = _timed(partial(detector.detect, pose), REPEATS)
-        ours["all"].append(seconds)
-        truth.append(found)
-        seconds, verdict = _timed(partial(detector.are_colliding, pose[None], workers=1), REPEATS)
-        ours["first"].append(seconds)
-        verdicts.append(bool(verdict[0]) == found.colliding)
+        found = detector.detect(pose)
+        truth.append(len(found.pairs))
         expected = set(map(tuple, found.pairs.tolist()))
         for name, find in peers.items():
             seconds, contacts = _timed(partial(find, pose, poses.faces))
@@ -99,11 +93,7 @@ def time_detection(
         progress(done + 1, len(vertices))
 
     def row(
-        tool: str,
-        n_threads: int,
-        mode: Literal["all", "first"],
-        seconds: Iterable[float],
-        agreed: bool,
+        tool: str, n_threads: int, mode: Literal["all", "first"], seconds: list[float], agreed: bool
     ) -> DetectionTiming:
         return DetectionTiming(
             vertices=poses.topology.n_vertices,
@@ -115,23 +105,28 @@ def time_detection(
             agrees=agreed,
         )
 
-    rows = [
-        row("lcollision", 1, "all", ours["all"], True),
-        row("lcollision", 1, "first", ours["first"], all(verdicts)),
+    # Many poses a thread, so that its start and the last one's wait do not count.
+    repeats = -(-BATCH_POSES_A_THREAD * threads // len(vertices))
+    batch = np.tile(vertices, (repeats, 1, 1))
+    n_pairs = np.tile(truth, repeats)
+    thread_counts = [1] if threads == 1 else [1, threads]
+    ours: dict[int, list[float]] = {count: [] for count in thread_counts}
+    first: list[float] = []
+    same = dict.fromkeys(thread_counts, True)
+    same_verdicts = True
+    for _ in range(ROUNDS):
+        for count in thread_counts:
+            seconds, collisions = _timed(partial(detector.detect_batch, batch, workers=count))
+            ours[count].append(seconds / len(batch))
+            same[count] &= bool((collisions.n_pairs == n_pairs).all())
+        seconds, verdicts = _timed(partial(detector.are_colliding, batch, workers=1))
+        first.append(seconds / len(batch))
+        same_verdicts &= bool((verdicts == (n_pairs > 0)).all())
+    return [
+        *(row("lcollision", count, "all", ours[count], same[count]) for count in thread_counts),
+        row("lcollision", 1, "first", first, same_verdicts),
+        *(row(name, 1, "all", theirs[name], agrees[name]) for name in peers),
     ]
-    if threads > 1:
-        whole = [
-            _timed(lambda: detector.detect_batch(vertices, workers=threads))
-            for _ in range(THROUGHPUT_ROUNDS)
-        ]
-        same = [
-            bool((batch.n_pairs == [len(found.pairs) for found in truth]).all())
-            for _, batch in whole
-        ]
-        per_pose = [seconds / len(vertices) for seconds, _ in whole]
-        rows.append(row("lcollision", threads, "all", per_pose, all(same)))
-    rows += [row(name, 1, "all", theirs[name], agrees[name]) for name in peers]
-    return rows
 
 
 def missing_peers() -> list[str]:
@@ -139,14 +134,10 @@ def missing_peers() -> list[str]:
     return [name for name, module in _MODULES.items() if find_spec(module) is None]
 
 
-def _timed(call: Callable[[], T], repeats: int = 1) -> tuple[float, T]:
-    """Return the median seconds of some calls, and the last result."""
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        result = call()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds), result
+def _timed(call: Callable[[], T]) -> tuple[float, T]:
+    start = time.perf_counter()
+    result = call()
+    return time.perf_counter() - start, result
 
 
 def _disjoint_pairs(contacts: npt.NDArray[np.int64], faces: IntArray) -> set[tuple[int, ...]]:

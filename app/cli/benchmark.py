@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -70,4 +71,5 @@ def _print(rows: list[dict[str, Any]]) -> None:
             f"{row['ms_per_pose'] / ours:.1f}",
             "yes" if row["agrees"] else "NO",
         )
-    Console().print(table)
+    # In a pipe rich would fold the table to 80 columns.
+    Console(width=None if sys.stdout.isatty() else 120).print(table)

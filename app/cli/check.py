@@ -73,7 +73,7 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
         "file": str(path),
         "vertices": mesh.topology.n_vertices,
         "faces": mesh.topology.n_faces,
-        "watertight": mesh.topology.is_watertight,
+        "watertight": audit.watertight,
         "pairs": len(found.pairs),
         "near_pairs": len(found.near_pairs),
         "energy": found.energy,

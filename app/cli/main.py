@@ -9,7 +9,7 @@ import errno
 import os
 import sys
 import traceback
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -18,13 +18,24 @@ from app.cli import benchmark, check, dataset, label, models, poses, train
 from app.cli.console import ExitStatus
 from lcollision_core.errors import CancelledError, LCollisionError
 
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+"""What typer raises for wrong words; typer itself gives only this child a public name."""
+
 
 class _Commands(TyperGroup):
     """Turns the errors that a user can mend into one sentence."""
 
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return super().make_context(*args, **kwargs)
+        except _UsageError as error:
+            _refuse_usage(error)
+
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
+        except _UsageError as error:
+            _refuse_usage(error)
         except CancelledError:
             raise typer.Exit(ExitStatus.INTERRUPTED) from None
         except LCollisionError as error:
@@ -46,6 +57,15 @@ class _Commands(TyperGroup):
                 raise
             typer.echo("lcollision: the answer cannot be written: the disk is full", err=True)
             raise typer.Exit(ExitStatus.BAD_INPUT) from None
+
+
+def _refuse_usage(error: Any) -> NoReturn:
+    sentence = error.format_message().rstrip(".")
+    if "\n" in sentence:  # a group without a command: its help, not an error
+        raise error
+    program = error.ctx.command_path if error.ctx else "lcollision"
+    typer.echo(f"lcollision: {sentence}; see {program} --help", err=True)
+    raise typer.Exit(ExitStatus.BAD_INPUT)
 
 
 app = typer.Typer(

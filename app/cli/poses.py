@@ -20,7 +20,8 @@ PosesOutput = Annotated[
 def encode(
     model_name: ModelArgument,
     meshes: Annotated[
-        list[Path], typer.Argument(metavar="MESH...", help="Meshes of the model's topology.")
+        list[Path],
+        typer.Argument(metavar="MESH...", readable=False, help="Meshes of the model's topology."),
     ],
     output: PosesOutput,
 ) -> None:
@@ -53,7 +54,9 @@ def encode(
 
 def decode(
     model_name: ModelArgument,
-    poses: Annotated[Path, typer.Argument(metavar="POSES", help="A .json file of poses.")],
+    poses: Annotated[
+        Path, typer.Argument(metavar="POSES", readable=False, help="A .json file of poses.")
+    ],
     output: Annotated[
         Path,
         typer.Option(

@@ -24,7 +24,10 @@ app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
 @app.command("embedding")
 def embedding(
     dataset: Annotated[
-        Path, typer.Argument(metavar="DATASET", help="A folder of meshes or an .npz file.")
+        Path,
+        typer.Argument(
+            metavar="DATASET", readable=False, help="A folder of meshes or an .npz file."
+        ),
     ],
     output: Annotated[
         str,

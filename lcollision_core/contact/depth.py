@@ -36,7 +36,8 @@ def penetration_depth(
 
     Raises
     ------
-    ShapeError : the arrays are not both (P, 3, 3), or hold NaN or infinity.
+    ShapeError : the arrays are not both (P, 3, 3), or hold NaN or infinity, or `tolerance` is
+        negative or NaN.
 
     Notes
     -----
@@ -57,6 +58,8 @@ def penetration_depth(
             f"triangles must be two (P, 3, 3) arrays of one length, "
             f"got {first.shape} and {second.shape}"
         )
+    if not tolerance >= 0.0:
+        raise ShapeError(f"the tolerance must be 0 or more, got {tolerance}")
     corners = np.stack([first, second], axis=1)
     if not np.isfinite(corners).all():
         pair = int(np.flatnonzero(~np.isfinite(corners).all(axis=(1, 2, 3)))[0])

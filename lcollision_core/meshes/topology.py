@@ -119,14 +119,14 @@ class Topology:
         fans = np.bincount(self.faces.reshape(-1)[a_corner], minlength=self.n_vertices)
         return np.flatnonzero(fans > 1).astype(np.int32)
 
-    @property
+    @cached_property
     def is_watertight(self) -> bool:
         """Whether every edge has two faces that run along it in opposite directions."""
         if not bool((self._edges_and_counts[1] == 2).all()):
             return False
         directed = self._directed_edges.astype(np.int64)
-        keys = directed[:, 0] * self.n_vertices + directed[:, 1]
-        return len(np.unique(keys)) == len(keys)
+        keys = np.sort(directed[:, 0] * self.n_vertices + directed[:, 1])
+        return bool((keys[1:] != keys[:-1]).all())
 
     @cached_property
     def adjacency(self) -> sparse.csr_matrix:

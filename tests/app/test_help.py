@@ -5,6 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
+from tests.app.support import Lcollision
+
 
 def _loaded_modules(code: str) -> set[str]:
     """Run code in a fresh interpreter and return the top-level modules that it loaded."""
@@ -51,3 +55,28 @@ def test_version_is_that_of_the_package() -> None:
         [sys.executable, "-m", "app", "--version"], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == f"lcollision {version('lcollision')}"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["nonsense"], "No such command 'nonsense'; see lcollision --help"),
+        (["--bogus"], "No such option: --bogus; see lcollision --help"),
+        (["check"], "Missing argument 'MESH...'; see lcollision check --help"),
+        (["dataset", "check", "--bogus"], "--bogus; see lcollision dataset check --help"),
+    ],
+)
+def test_wrong_words_get_one_sentence(
+    lcollision: Lcollision, words: list[str], sentence: str
+) -> None:
+    result = lcollision(*words)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith("lcollision: ")
+    assert sentence in result.stderr
+
+
+def test_a_group_alone_shows_its_commands(lcollision: Lcollision) -> None:
+    result = lcollision("dataset")
+    assert "\n  check" in result.stdout + result.stderr

@@ -41,8 +41,8 @@ def test_peers_find_the_same_pairs(crossing_sheets: PoseSet) -> None:
     rows = detection.time_detection(crossing_sheets, n_poses=3, threads=2)
     assert [(row.tool, row.threads, row.mode) for row in rows] == [
         ("lcollision", 1, "all"),
-        ("lcollision", 1, "first"),
         ("lcollision", 2, "all"),
+        ("lcollision", 1, "first"),
         ("python-fcl", 1, "all"),
         ("coal", 1, "all"),
     ]

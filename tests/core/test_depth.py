@@ -261,3 +261,9 @@ def test_the_depth_is_the_shortest_way_out() -> None:
         for direction in rng.normal(size=(20, 3)):
             direction /= np.linalg.norm(direction)
             assert not are_disjoint(a + (found - 1e-6) * direction, b)
+
+
+@pytest.mark.parametrize("tolerance", [-1e-9, float("nan")])
+def test_a_tolerance_that_is_no_length_is_refused(tolerance: float) -> None:
+    with pytest.raises(ShapeError, match="tolerance must be 0 or more"):
+        penetration_depth([FLOOR], [FLOOR], tolerance)

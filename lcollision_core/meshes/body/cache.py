@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import zipfile
 from contextlib import suppress
 from functools import lru_cache
@@ -11,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
+from platformdirs import user_cache_path
 
 from lcollision_core.errors import LCollisionError, MissingExtraError
 from lcollision_core.meshes.atomic import atomic_write
@@ -32,7 +32,7 @@ def cached_template(n_vertices: int) -> Template:
     ------
     MissingExtraError : anny, torch or pyvista is not installed.
     """
-    path = _cache_folder() / f"body-{n_vertices}-{_fingerprint()}.npz"
+    path = user_cache_path("lcollision") / f"body-{n_vertices}-{_fingerprint()}.npz"
     try:
         return _read_only(_read(path))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
@@ -71,11 +71,6 @@ def _read(path: Path) -> Template:
             arrays["mirror"],
             Skeleton(arrays["positions"], zeros),
         )
-
-
-def _cache_folder() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(base) if base else Path.home() / ".cache") / "lcollision"
 
 
 def _fingerprint() -> str:
