@@ -36,8 +36,8 @@ def names_from_labels(
     Parts count by the squares of the mask's weights: what a domain owns, not what it touches.
     The leading part names it; where that has less than 60 %, a second part with at least 20 %
     joins it, as in "left forearm & hand". A left and a right part of like share count as one,
-    "thighs". Domains that would share a name take their second part too, and where that does not
-    help, their place: "upper left thigh".
+    "thighs", and the two sides of the body are named alike. Domains that would share a name take
+    their second part too, and where that does not help, their place: "upper left thigh".
 
     Parameters
     ----------
@@ -63,7 +63,11 @@ def names_from_labels(
         second, share = parts_of_domain[1]
         return join_names(first, second) if share >= _SECOND_SHARE else first
 
-    names = [name(found, found[0][1] < _MAIN_SHARE) for found in ranked]
+    needs_second = {found[0][0] for found in ranked if found[0][1] < _MAIN_SHARE}
+    names = [
+        name(found, bool({found[0][0], _other_side(found[0][0])} & needs_second))
+        for found in ranked
+    ]
     shared = _shared(names)
     names = [
         name(found, True) if first in shared else first
@@ -91,6 +95,12 @@ def _ranked_parts(shares: dict[str, float]) -> list[tuple[str, float]]:
             del merged[part], merged[f"right {stem}"]
             merged[_plural(stem)] = left + right
     return sorted(merged.items(), key=lambda item: -item[1])
+
+
+def _other_side(part: str) -> str:
+    side, _, stem = part.partition(" ")
+    other = {"left": "right", "right": "left"}.get(side, side)
+    return f"{other} {stem}".strip()
 
 
 def _plural(part: str) -> str:

@@ -32,6 +32,17 @@ def test_two_parts_of_like_weight_are_joined() -> None:
     assert names == ("left forearm & hand", "head & neck")
 
 
+def test_both_sides_of_the_body_are_named_alike() -> None:
+    names = _names(
+        [
+            {"left hand": 0.58, "left forearm": 0.42},
+            {"right hand": 0.62, "right forearm": 0.38},
+            {"left shin": 0.9, "left foot": 0.1},
+        ]
+    )
+    assert names == ("left hand & forearm", "right hand & forearm", "left shin")
+
+
 def test_a_part_of_little_weight_is_not_named() -> None:
     shares = {"chest": 0.55, "waist": 0.18, "left shoulder": 0.17, "right shoulder": 0.02}
     assert _names([shares]) == ("chest",)
