@@ -1,7 +1,7 @@
 """A trained body: one file in, everything that a front end needs out."""
 
 from lcollision_core.model.card import ModelCard
-from lcollision_core.model.latent_space import BOX_SCALE, LatentGroup, LatentSpace
+from lcollision_core.model.latent_space import LatentGroup, LatentSpace
 from lcollision_core.model.library import (
     MODEL_SUFFIX,
     ListedModel,
@@ -15,7 +15,6 @@ from lcollision_core.model.pose_model import EncodedPose, PoseModel
 from lcollision_core.model.sampling import sample_poses
 
 __all__ = [
-    "BOX_SCALE",
     "MODEL_SUFFIX",
     "EncodedPose",
     "LatentGroup",

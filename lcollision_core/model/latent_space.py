@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-BOX_SCALE = 1.2
-"""Poses are sampled in this multiple of the training codes' range (paper, section 4.3)."""
+from lcollision_core.labels.box import BOX_SCALE
 
 WHOLE_BODY = "Whole body"
 

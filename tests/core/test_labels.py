@@ -26,7 +26,6 @@ from lcollision_core.labels import (
     is_held_out,
     label_poses,
 )
-from lcollision_core.model import BOX_SCALE as BOX_SCALE_OF_SAMPLES
 from lcollision_core.model import PoseModel
 from tests.core.labelled import as_bytes, labeller_of
 
@@ -82,7 +81,7 @@ def test_blocks_and_seeds_differ() -> None:
 def test_the_box_is_the_one_that_poses_are_sampled_from(
     labeller: Labeller, tube_model: PoseModel
 ) -> None:
-    assert BOX_SCALE == BOX_SCALE_OF_SAMPLES == 1.2
+    assert BOX_SCALE == 1.2
     assert np.array_equal(labeller.box.low, 1.2 * tube_model.latent_space.minimum)
     assert np.array_equal(labeller.box.high, 1.2 * tube_model.latent_space.maximum)
 

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import LCollisionError, ModelFileError, PoseSetError, ShapeError
+from lcollision_core.labels import BOX_SCALE
 from lcollision_core.meshes import PoseSet, Topology
-from lcollision_core.model import BOX_SCALE, PoseModel, sample_poses
+from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.model_file import Section, read_model_file, write_model_file
 from tests.bending_tube import LENGTH_IN_FILES
 from tests.core.shapes import random_rotation
