@@ -61,8 +61,8 @@ def encode_torch(codec: AcapCodec, vertices: torch.Tensor) -> torch.Tensor:
 
     Notes
     -----
-    First derivatives only. There is none where a one-ring is crushed to a line, nor at a rotation
-    by exactly a whole turn other than none; torch then gets numbers that are not finite or large.
+    First derivatives only. Where there is none, as at a one-ring crushed to a line or a rotation by
+    exactly a whole turn other than none, the one of least norm stands in.
     """
     batch = vertices.reshape(-1, *vertices.shape[-2:])
     features: torch.Tensor = _Encode.apply(batch, codec)  # type: ignore[no-untyped-call]
@@ -87,7 +87,10 @@ def pull_features(features: FloatArray, by_features: FloatArray) -> FloatArray:
     push_forward(features, unit_changes, moved)
     # Row by row the derivatives of T along each feature: the transpose of J.
     jacobian_transposed = moved.reshape(N_FEATURES, n_vertices, 9).transpose(1, 0, 2)
-    solved = np.linalg.solve(jacobian_transposed, by_features[:, :, None])
+    try:
+        solved = np.linalg.solve(jacobian_transposed, by_features[:, :, None])
+    except np.linalg.LinAlgError:
+        solved = np.linalg.pinv(jacobian_transposed) @ by_features[:, :, None]
     by_gradients: FloatArray = np.asarray(solved, dtype=np.float64).reshape(n_vertices, 3, 3)
     return by_gradients
 

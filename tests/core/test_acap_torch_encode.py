@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from lcollision_core.acap.codec import AcapCodec
+from lcollision_core.acap.features import IDENTITY_FEATURE
+from lcollision_core.acap.torch_encode import pull_features
 from lcollision_core.meshes import Topology
 from tests.core.shapes import random_rotation, torus
 
@@ -68,6 +70,16 @@ def test_gradient_is_finite_at_rest(codec: AcapCodec) -> None:
     assert np.abs(vertices.grad.numpy()).max() > 1e-2
 
 
+def test_gradient_is_finite_where_a_ring_is_crushed_to_a_point(codec: AcapCodec) -> None:
+    crushed = codec.rest_vertices.copy()
+    ring = codec.topology.adjacency[0].indices
+    crushed[ring] = crushed[0]
+    vertices = torch.tensor(crushed, requires_grad=True)
+    codec.encode_torch(vertices).sum().backward()
+    assert vertices.grad is not None
+    assert np.isfinite(vertices.grad.numpy()).all()
+
+
 def test_a_pose_can_be_found_by_descent_on_its_features(
     codec: AcapCodec, poses: np.ndarray
 ) -> None:
@@ -84,3 +96,12 @@ def test_a_pose_can_be_found_by_descent_on_its_features(
     before = loss().item()
     optimiser.step(loss)
     assert loss().item() < 1e-4 * before
+
+
+def test_a_stretch_of_nothing_takes_the_derivative_of_least_norm() -> None:
+    features = np.zeros((3, 9))
+    features[1:] = IDENTITY_FEATURE
+    pulled = pull_features(features, np.ones((3, 9)))
+    # T = exp(log R) S: without S the rotation moves nothing, and the triangle of S is T's.
+    np.testing.assert_allclose(pulled[0], [[1, 0.5, 0.5], [0.5, 1, 0.5], [0.5, 0.5, 1]], atol=1e-12)
+    np.testing.assert_allclose(pulled[1], pulled[2])
