@@ -1,0 +1,1 @@
+"""Latent codes to energy per domain and collision probability: learned, smooth, fast (stage 2)."""

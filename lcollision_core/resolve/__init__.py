@@ -1,0 +1,1 @@
+"""The nearest collision-free pose, proved exactly."""
