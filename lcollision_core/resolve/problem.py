@@ -1,0 +1,122 @@
+"""The paper's problem, as the solvers see it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.resolve.metric import LatentMetric
+
+
+class CollisionModel(Protocol):
+    """What Resolve asks of a predictor; it is to be smooth in the latent pose."""
+
+    def logit_and_gradient(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        """(B, D) poses to (B,) collision logits and their (B, D) gradients."""
+
+
+@dataclass
+class Watch:
+    """Clock and cancel token of one solve, asked at every evaluation.
+
+    Attributes
+    ----------
+    budget : seconds, None for no limit
+    cancel : None where nobody may cancel
+    """
+
+    budget: float | None = None
+    cancel: CancelToken | None = None
+    started: float = field(default_factory=time.perf_counter)
+
+    @property
+    def seconds(self) -> float:
+        """Spent so far."""
+        return time.perf_counter() - self.started
+
+    @property
+    def expired(self) -> bool:
+        """Whether the budget is spent."""
+        return self.budget is not None and self.seconds >= self.budget
+
+    def poll(self) -> None:
+        """Raise `CancelledError` once the token is set."""
+        if self.cancel is not None:
+            self.cancel.raise_if_cancelled()
+
+
+@dataclass(eq=False)
+class ResolveProblem:
+    """min d(Z, Z*) subject to logit(Z) <= limit - margin and low <= Z <= high.
+
+    Equation 1 of Tan et al. 2021 with the classifier's logit in place of its probability: the same
+    set at margin 0, without the vanishing gradient of the sigmoid.
+
+    Attributes
+    ----------
+    target : (D,) float64 array Z*
+    metric : d
+    low, high : (D,) float64 arrays; equal where a code is locked
+    limit : the threshold's logit
+    model : of the constraint
+    watch : asked before each evaluation
+    evaluations : poses that the model was asked about so far
+    """
+
+    target: FloatArray
+    metric: LatentMetric
+    low: FloatArray
+    high: FloatArray
+    limit: float
+    model: CollisionModel
+    watch: Watch = field(default_factory=Watch)
+    evaluations: int = 0
+
+    @property
+    def movable(self) -> npt.NDArray[np.bool_]:
+        """(D,) which codes are not locked."""
+        free: npt.NDArray[np.bool_] = self.high > self.low
+        return free
+
+    def distance(self, latent: FloatArray) -> FloatArray:
+        """Measure d of (..., D) poses from Z*: (...)."""
+        return self.metric.squared(latent - self.target)
+
+    def excess(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Evaluate (B, D) poses: how far the logits are above the limit, (B,), and (B, D) slopes.
+
+        Raises
+        ------
+        CancelledError : the watch's token was set.
+        """
+        self.watch.poll()
+        self.evaluations += len(latent)
+        logit, gradient = self.model.logit_and_gradient(latent)
+        return logit - self.limit, np.where(self.movable, gradient, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SolverOutcome:
+    """The best that a solver has seen.
+
+    Attributes
+    ----------
+    latent : (D,) float64 array: of the poses that satisfy the constraint the nearest, else the
+        one that violates it least
+    status : what the solver said, in a word or two
+    converged : it ended by its tolerances
+    feasible : the constraint holds, margin included
+    iterations : of the solver
+    """
+
+    latent: FloatArray
+    status: str
+    converged: bool
+    feasible: bool
+    iterations: int

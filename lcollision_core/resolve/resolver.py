@@ -1,0 +1,173 @@
+"""Resolve: the nearest pose that is free of collisions, proved exactly."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.embedding import Embedding
+from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.resolve.exact import ExactCheck
+from lcollision_core.resolve.ladder import climb
+from lcollision_core.resolve.metric import LatentMetric
+from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult
+from lcollision_core.resolve.problem import CollisionModel, ResolveProblem, Watch
+
+
+class PoseResolver:
+    """Moves poses of one model free of self-collisions; immutable, safe between threads.
+
+    Parameters
+    ----------
+    embedding : decodes latent poses
+    predictor : says how a latent pose collides, smoothly: a `CollisionPredictor`
+    detector : the exact check, in the data's unit
+    height : one height in the data's unit
+    free_latents : (F, D) array of poses known to be exactly free: see `find_free_poses`. With
+        none, a pose that the other steps do not free stays colliding.
+    bounds : (low, high), two (D,) arrays: the latent box in which to look
+    """
+
+    def __init__(
+        self,
+        embedding: Embedding,
+        predictor: CollisionModel,
+        detector: CollisionDetector,
+        height: float,
+        free_latents: npt.ArrayLike,
+        bounds: tuple[npt.ArrayLike, npt.ArrayLike],
+    ) -> None:
+        self._embedding = embedding
+        self._predictor = predictor
+        self._detector = detector
+        self._height = height
+        size = embedding.latent_size
+        self._free_latents: FloatArray = np.array(free_latents, np.float64).reshape(-1, size)
+        self._low, self._high = (np.array(bound, np.float64) for bound in bounds)
+
+    def resolve(
+        self,
+        latent: npt.ArrayLike,
+        options: ResolveOptions | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+        placement: RigidTransform | None = None,
+        near: npt.ArrayLike | None = None,
+    ) -> ResolveResult:
+        """Find the nearest pose that is exactly free.
+
+        Parameters
+        ----------
+        latent : (D,) finite array Z*
+        options : the defaults if None
+        progress : called with (steps of the ladder done, all steps)
+        cancel : polled at every evaluation
+        placement : where the pose is exported to; the exact check is of the vertices there
+        near : (D,) array, a correction Z - Z* to try first, as of the neighbouring frame
+
+        Returns
+        -------
+        result : ResolveResult; a pose that is exactly free comes back unchanged, and what cannot
+            be done (all domains locked, no free pose known) is said in its note
+
+        Raises
+        ------
+        ShapeError : another shape, a number that is not finite, a locked domain that there is not
+            or another number of weights.
+        CancelledError : `cancel` was set.
+        """
+        chosen = options or ResolveOptions()
+        target = self._checked(latent)
+        problem = self._problem(target, chosen, cancel)
+        check = ExactCheck(self._embedding, self._detector, self._height, placement)
+        correction = None if near is None else self._checked(near)
+        return climb(problem, check, self._free_latents, chosen, correction, progress)
+
+    def resolve_many(
+        self,
+        latents: npt.ArrayLike,
+        options: ResolveOptions | None = None,
+        workers: int | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> list[ResolveResult]:
+        """Resolve (B, D) poses, each on its own, on several threads.
+
+        Parameters
+        ----------
+        latents : (B, D) finite array
+        options : the defaults if None
+        workers : threads, one for each available core by default; results do not depend on it
+        progress : called with (poses done, B)
+        cancel : polled at every evaluation
+
+        Returns
+        -------
+        results : B of them, in the order of `latents`
+
+        Raises
+        ------
+        ShapeError, CancelledError : as of `resolve`.
+        """
+        rows = np.atleast_2d(np.asarray(latents, dtype=np.float64))
+        results = []
+        pool = ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="resolve")
+        try:
+            solving = [pool.submit(self.resolve, row, options, no_progress, cancel) for row in rows]
+            for solved in solving:
+                results.append(solved.result())
+                progress(len(results), len(rows))
+        finally:
+            pool.shutdown(cancel_futures=True)
+        return results
+
+    @cached_property
+    def _eye(self) -> LatentMetric:
+        return LatentMetric.eye(self._embedding)
+
+    @cached_property
+    def _group_of_code(self) -> npt.NDArray[np.int64]:
+        sizes = self._embedding.group_sizes
+        return np.repeat(np.arange(len(sizes)), sizes)
+
+    def _checked(self, latent: npt.ArrayLike) -> FloatArray:
+        target: FloatArray = np.array(latent, dtype=np.float64)
+        size = self._embedding.latent_size
+        if target.shape != (size,):
+            raise ShapeError(f"a latent pose has {size} numbers, got shape {target.shape}")
+        if not np.isfinite(target).all():
+            raise ShapeError("a latent pose has a number that is not finite; mend the pose")
+        return target
+
+    def _problem(
+        self, target: FloatArray, options: ResolveOptions, cancel: CancelToken | None
+    ) -> ResolveProblem:
+        metric = self._eye if options.metric == Metric.EYE else LatentMetric.latent(len(target))
+        if options.group_weights is not None:
+            n_groups = len(self._embedding.group_sizes)
+            if len(options.group_weights) != n_groups:
+                raise ShapeError(
+                    f"{n_groups} group weights are needed, got {len(options.group_weights)}"
+                )
+            metric = metric.weighted(np.array(options.group_weights)[self._group_of_code])
+        low, high = np.minimum(self._low, target), np.maximum(self._high, target)
+        for domain in sorted(options.locked_domains):
+            if not 0 <= domain < self._embedding.n_domains:
+                raise LCollisionError(
+                    f"there is no domain {domain + 1} to lock; the model has "
+                    f"{self._embedding.n_domains}"
+                )
+            locked = self._group_of_code == domain + 1
+            locked[domain] = True
+            low[locked] = high[locked] = target[locked]
+        watch = Watch(options.time_budget, cancel)
+        return ResolveProblem(
+            target, metric, low, high, options.threshold_logit, self._predictor, watch
+        )
