@@ -1,1 +1,33 @@
 """Latent codes to energy per domain and collision probability: learned, smooth, fast (stage 2)."""
+
+from lcollision_core.predictor.config import LOSSES, PRESETS, Loss, PredictorConfig
+from lcollision_core.predictor.metrics import CalibrationBin, PredictorMetrics
+from lcollision_core.predictor.predictor import (
+    CollisionPredictor,
+    Prediction,
+    TrainingFacts,
+    evaluate_predictor,
+)
+from lcollision_core.predictor.training import (
+    PredictorStatus,
+    StatusCallback,
+    no_status,
+    train_predictor,
+)
+
+__all__ = [
+    "LOSSES",
+    "PRESETS",
+    "CalibrationBin",
+    "CollisionPredictor",
+    "Loss",
+    "Prediction",
+    "PredictorConfig",
+    "PredictorMetrics",
+    "PredictorStatus",
+    "StatusCallback",
+    "TrainingFacts",
+    "evaluate_predictor",
+    "no_status",
+    "train_predictor",
+]

@@ -1,0 +1,73 @@
+"""The choices of stage 2, by preset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from lcollision_core.errors import LCollisionError
+
+Loss = Literal["full", "no-rank", "no-depth", "entropy"]
+Schedule = Literal["constant", "one-cycle"]
+
+LOSSES: tuple[Loss, ...] = ("full", "no-rank", "no-depth", "entropy")
+"""Table 1 of Tan et al. 2021: Ours, entropy+PD, entropy+rank, entropy."""
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """How a collision predictor is trained.
+
+    Attributes
+    ----------
+    preset : names the network, see `networks.NETWORKS`
+    by_domain : whether there is a predictor for each domain; False is the paper's baseline ND
+    depth_weight, rank_weight, entropy_weight : of L_PD, L_rank, L_entropy; the entropy's is over 0
+    rate : Adam's step size; the largest one with the schedule "one-cycle"
+    schedule : "constant", or "one-cycle": up to `rate` in the first fifth of the steps, then down
+        to 0, along cosines
+    batch_rows : rows per step, of all processes together; even, for the ranking loss's pairs
+    epochs : passes over the training rows
+
+    Raises
+    ------
+    LCollisionError : a value is out of its range.
+    """
+
+    preset: str = "default"
+    by_domain: bool = True
+    depth_weight: float = 5.0
+    rank_weight: float = 2.0
+    entropy_weight: float = 2.0
+    rate: float = 1e-3
+    schedule: Schedule = "constant"
+    batch_rows: int = 32
+    epochs: int = 30
+
+    def __post_init__(self) -> None:
+        for name, low in (("batch_rows", 2), ("epochs", 1)):
+            if getattr(self, name) < low:
+                raise LCollisionError(f"{name} must be at least {low}, got {getattr(self, name)}")
+        if self.batch_rows % 2:
+            raise LCollisionError(f"batch_rows must be even, got {self.batch_rows}")
+        for name in ("depth_weight", "rank_weight"):
+            if not getattr(self, name) >= 0.0:
+                raise LCollisionError(f"{name} must be at least 0, got {getattr(self, name)}")
+        for name in ("entropy_weight", "rate"):
+            if not getattr(self, name) > 0.0:
+                raise LCollisionError(f"{name} must be over 0, got {getattr(self, name)}")
+
+    def with_loss(self, loss: Loss) -> PredictorConfig:
+        """Return the same choices with some of the loss's terms left out."""
+        return replace(
+            self,
+            depth_weight=0.0 if loss in ("no-depth", "entropy") else self.depth_weight,
+            rank_weight=0.0 if loss in ("no-rank", "entropy") else self.rank_weight,
+        )
+
+
+PRESETS = {
+    "default": PredictorConfig("default", schedule="one-cycle", batch_rows=256, epochs=10),
+    "paper": PredictorConfig("paper"),
+}
+"""The presets by name: what measures best, and Tan et al. 2021, section Evaluation."""

@@ -1,0 +1,272 @@
+"""The training loop of stage 2: resumable at any step, shared by any number of processes."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch.nn.parallel import DistributedDataParallel
+
+from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.checkpoint import Checkpoint, run_key
+from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.labels import LabelRows, is_held_out
+from lcollision_core.predictor.config import PredictorConfig
+from lcollision_core.predictor.networks import NETWORKS, PredictorNetwork, Targets
+from lcollision_core.predictor.predictor import TrainingFacts, taken
+from lcollision_core.predictor.processes import Processes, joined_processes
+from lcollision_core.predictor.training import PredictorStatus, StatusCallback
+
+_RUN_VERSION = 1
+"""Goes up when training changes, so that no checkpoint is continued by other rules."""
+
+_WATCHED_ROWS = 4000
+"""Held-out rows whose accuracy is shown while training."""
+
+_SECONDS_BETWEEN_REPORTS = 0.25
+_STEPS_BETWEEN_TALKS = 20
+"""Processes agree this often on whether to stop or to save: each time costs a round trip."""
+
+_WARM_UP = 0.2
+_LEAST_RATE = 1e-2
+"""Where the one-cycle schedule begins, in its largest rate."""
+
+_STATE, _MOMENTS = "network", "optimiser"
+
+
+class TrainingLoop:
+    """Trains a preset's network on the rows that are not held out.
+
+    Parameters
+    ----------
+    rows : samples 0, 1, 2, ...; the latent codes are read where they are and never copied whole
+    embedding, config, facts : see `training.train_predictor`
+    device : "auto", "cpu" or "cuda"
+    checkpoint : a file, or None
+    progress, cancel : see `training.train_predictor`
+    """
+
+    def __init__(
+        self,
+        rows: LabelRows,
+        embedding: Embedding,
+        config: PredictorConfig,
+        facts: TrainingFacts,
+        device: str,
+        checkpoint: Path | None,
+        progress: StatusCallback,
+        cancel: CancelToken,
+    ) -> None:
+        self._rows, self._embedding = rows, embedding
+        self._config, self._facts = config, facts
+        self._device_name, self._path = device, checkpoint
+        self._progress, self._cancel = progress, cancel
+        held_out = is_held_out(np.arange(len(rows)))
+        self._training_index = np.flatnonzero(~held_out)
+        self._watched = taken(rows, np.flatnonzero(held_out)[:_WATCHED_ROWS])
+        self._steps_an_epoch = -(-len(self._training_index) // config.batch_rows)
+        self._total = config.epochs * self._steps_an_epoch
+        self._losses: list[float] = []
+        self._accuracy: float | None = None
+        self._reported = -math.inf
+
+    def run(self) -> PredictorNetwork:
+        """Train, or go on from the checkpoint; returns the network on the training device.
+
+        Raises
+        ------
+        LCollisionError : the checkpoint is another run's, there is no such device, or the
+            training diverges.
+        CancelledError : the cancel token was set; the checkpoint holds the last step.
+        """
+        with joined_processes(self._device_name) as processes:
+            return self._run(processes)
+
+    def _run(self, processes: Processes) -> PredictorNetwork:
+        config = self._config
+        checkpoint = Checkpoint(self._path, self._key())
+        # The constructor wants the rows that train, and only briefly.
+        network = NETWORKS[config.preset].build(
+            self._embedding, config, taken(self._rows, self._training_index), self._facts.seed
+        )
+        network = network.to(processes.device)
+        learnt = [values for values in network.parameters() if values.requires_grad]
+        optimiser = torch.optim.Adam(learnt, lr=config.rate, fused=True)
+        step = self._restore(checkpoint, network, optimiser)
+        processes.wait()
+        shared: torch.nn.Module = network
+        if processes.count > 1:
+            shared = DistributedDataParallel(network, find_unused_parameters=True)
+        batches = _Batches(self._rows, self._training_index, config, self._facts, processes.device)
+        network.train()
+        self._report(step, network)
+        while step < self._total:
+            latent, targets = batches.at(*divmod(step, self._steps_an_epoch))
+            part = processes.share(len(latent))
+            for group in optimiser.param_groups:
+                group["lr"] = rate_at(step, self._total, config)
+            optimiser.zero_grad(set_to_none=True)
+            output = shared(latent[part[0] : part[1]])
+            loss = network.loss(output, targets, part, config, self._facts.margin)
+            # Processes average their gradients, but each holds a share of the sum.
+            (loss * processes.count).backward()
+            optimiser.step()
+            step += 1
+            self._losses.append(processes.sum_of(loss))
+            if not math.isfinite(self._losses[-1]):
+                raise LCollisionError(
+                    f"the training diverged in step {step} of {self._total}; lower the rate"
+                )
+            self._after_step(step, network, optimiser, checkpoint, processes)
+        return network
+
+    def _after_step(
+        self,
+        step: int,
+        network: PredictorNetwork,
+        optimiser: torch.optim.Optimizer,
+        checkpoint: Checkpoint,
+        processes: Processes,
+    ) -> None:
+        stop, due = self._cancel.cancelled, checkpoint.due
+        if processes.count > 1:
+            talk = step % _STEPS_BETWEEN_TALKS == 0
+            stop = talk and processes.any_of(stop)
+        if processes.rank == 0 and (stop or due):
+            self._save(step, network, optimiser, checkpoint)
+        if stop:
+            processes.wait()
+            self._cancel.cancel()
+            self._cancel.raise_if_cancelled()
+        if step % self._steps_an_epoch == 0:
+            self._accuracy = self._watched_accuracy(network)
+            self._report(step, network)
+            self._losses.clear()
+        elif time.monotonic() - self._reported > _SECONDS_BETWEEN_REPORTS:
+            self._report(step, network)
+
+    def _report(self, step: int, network: PredictorNetwork) -> None:  # noqa: ARG002
+        self._reported = time.monotonic()
+        self._progress(
+            PredictorStatus(
+                epoch=step // self._steps_an_epoch,
+                epochs=self._config.epochs,
+                done=step,
+                total=self._total,
+                loss=math.fsum(self._losses) / len(self._losses) if self._losses else None,
+                held_out_accuracy=self._accuracy,
+            )
+        )
+
+    def _watched_accuracy(self, network: PredictorNetwork) -> float:
+        device = next(network.parameters()).device
+        network.eval()
+        with torch.inference_mode():
+            logit = network(torch.tensor(self._watched.latent, device=device)).logit
+        network.train()
+        return float(((logit > 0.0).cpu().numpy() == self._watched.colliding).mean())
+
+    def _key(self) -> str:
+        """Return a digest of all that decides how this run ends."""
+        rows = self._rows
+        digest = hashlib.sha256()
+        for array in (rows.latent, rows.domain_energy, rows.energy, rows.n_pairs):
+            digest.update(np.ascontiguousarray(array).data.cast("B"))
+        options = {
+            "version": _RUN_VERSION,
+            "config": asdict(self._config),
+            "seed": self._facts.seed,
+            "rows": digest.hexdigest(),
+        }
+        return run_key({"mask": self._embedding.attention_mask}, options)
+
+    def _save(
+        self,
+        step: int,
+        network: PredictorNetwork,
+        optimiser: torch.optim.Optimizer,
+        checkpoint: Checkpoint,
+    ) -> None:
+        moments: dict[str, npt.NDArray[Any]] = {}
+        for number, values in optimiser.state_dict()["state"].items():
+            for name, value in values.items():
+                moments[f"{number}.{name}"] = value.cpu().numpy()
+        state = {name: values.cpu().numpy() for name, values in network.state_dict().items()}
+        facts = {"step": step, "losses": self._losses, "accuracy": self._accuracy}
+        checkpoint.put(_MOMENTS, moments, {})
+        checkpoint.put(_STATE, state, facts, now=True)
+
+    def _restore(
+        self, checkpoint: Checkpoint, network: PredictorNetwork, optimiser: torch.optim.Optimizer
+    ) -> int:
+        """Put a stored run's state into place and return the steps that it has done."""
+        stored, moments = checkpoint.get(_STATE), checkpoint.get(_MOMENTS)
+        if stored is None or moments is None:
+            return 0
+        network.load_state_dict(
+            {name: torch.tensor(values) for name, values in stored.arrays.items()}
+        )
+        state = optimiser.state_dict()
+        for name, values in moments.arrays.items():
+            number, _, what = name.partition(".")
+            state["state"].setdefault(int(number), {})[what] = torch.tensor(values)
+        optimiser.load_state_dict(state)
+        self._losses = list(stored.metadata["losses"])
+        self._accuracy = stored.metadata["accuracy"]
+        return int(stored.metadata["step"])
+
+
+class _Batches:
+    """Cuts each epoch's order into batches; the order depends on seed and epoch alone."""
+
+    def __init__(
+        self,
+        rows: LabelRows,
+        training_index: npt.NDArray[np.int64],
+        config: PredictorConfig,
+        facts: TrainingFacts,
+        device: torch.device,
+    ) -> None:
+        self._rows, self._training_index = rows, training_index
+        self._batch_rows, self._facts, self._device = config.batch_rows, facts, device
+        self._epoch = -1
+        self._order = training_index
+
+    def at(self, epoch: int, number: int) -> tuple[torch.Tensor, Targets]:
+        """Return batch `number` of an epoch: codes and targets."""
+        if epoch != self._epoch:
+            self._epoch = epoch
+            rng = np.random.default_rng([self._facts.seed, epoch])
+            self._order = rng.permutation(self._training_index)
+        start = number * self._batch_rows
+        index = self._order[start : start + self._batch_rows]
+        rows, scale = self._rows, self._facts.energy_scale
+        targets = (
+            rows.domain_energy[index] / scale,
+            rows.energy[index] / scale,
+            rows.n_pairs[index] > 0,
+        )
+        return self._tensor(rows.latent[index]), Targets(*map(self._tensor, targets))
+
+    def _tensor(self, values: npt.NDArray[Any]) -> torch.Tensor:
+        tensor = torch.from_numpy(values.astype(np.float32, copy=False))
+        return tensor.to(self._device, non_blocking=True)
+
+
+def rate_at(step: int, total: int, config: PredictorConfig) -> float:
+    """Return Adam's step size for a step of the run, counted from 0."""
+    if config.schedule == "constant":
+        return config.rate
+    peak = _WARM_UP * total
+    if step < peak:
+        share = 0.5 * (1.0 - math.cos(math.pi * (step + 1) / (peak + 1)))
+        return config.rate * (_LEAST_RATE + (1.0 - _LEAST_RATE) * share)
+    return config.rate * 0.5 * (1.0 + math.cos(math.pi * (step - peak) / (total - peak)))

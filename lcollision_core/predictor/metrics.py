@@ -1,0 +1,171 @@
+"""How well a predictor tells what it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.meshes.topology import FloatArray
+
+CALIBRATION_BINS = 10
+
+_PAIRING_SEED = 0
+"""Of the pairs of RANK, so that equal predictions get equal scores."""
+
+
+@dataclass(frozen=True)
+class CalibrationBin:
+    """The poses whose predicted probability lies in one tenth of [0, 1].
+
+    Attributes
+    ----------
+    samples : how many
+    probability : their mean prediction, None without samples
+    colliding_share : how many of them collide, None without samples
+    """
+
+    samples: int
+    probability: float | None
+    colliding_share: float | None
+
+
+@dataclass(frozen=True)
+class PredictorMetrics:
+    """Scores over samples that did not train the predictor; rates are shares from 0 to 1.
+
+    None stands for what the samples or the losses trained upon leave undefined.
+
+    Attributes
+    ----------
+    samples : how many
+    accuracy : CLASSIFY, verdicts at probability 0.5 that are right
+    false_positive_rate : free poses called colliding
+    false_negative_rate : colliding poses called free
+    majority_rate : accuracy of always saying what most samples are
+    energy_mse : MSE of PDe-sum, in scaled energies
+    ranking_margin : RANK, mean of max(0, alpha - sign dS_sum) over random pairs of unequal
+        PDe-sum, in scaled energies
+    spearman : rank correlation of predicted and true PDe-sum over colliding samples
+    calibration_error : expected calibration error over `calibration`
+    calibration : the curve, `CALIBRATION_BINS` equal bins of the predicted probability
+    """
+
+    samples: int
+    accuracy: float
+    false_positive_rate: float | None
+    false_negative_rate: float | None
+    majority_rate: float
+    energy_mse: float | None
+    ranking_margin: float | None
+    spearman: float | None
+    calibration_error: float
+    calibration: tuple[CalibrationBin, ...]
+
+    def to_metadata(self) -> dict[str, Any]:
+        """Return the metrics as JSON values."""
+        values = asdict(self)
+        values["calibration"] = list(values["calibration"])
+        return values
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, Any]) -> PredictorMetrics:
+        """Rebuild metrics from JSON values; KeyError or TypeError if it cannot."""
+        values = dict(metadata)
+        values["calibration"] = tuple(CalibrationBin(**entry) for entry in values["calibration"])
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class EnergyScores:
+    """Which scores of the energies mean anything: those whose losses were trained upon."""
+
+    depth: bool
+    rank: bool
+
+
+def measure(
+    probability: FloatArray,
+    predicted_energy: FloatArray,
+    colliding: npt.NDArray[np.bool_],
+    energy: FloatArray,
+    margin: float,
+    scores: EnergyScores,
+) -> PredictorMetrics:
+    """Score predictions against exact labels.
+
+    Parameters
+    ----------
+    probability : (B,) predicted, B >= 1
+    predicted_energy : (B,) S_sum, scaled
+    colliding : (B,) the truth
+    energy : (B,) PDe-sum, scaled
+    margin : alpha, scaled
+    scores : of the energies that are wanted
+    """
+    called = probability > 0.5
+    n_colliding = int(colliding.sum())
+    n_free = len(colliding) - n_colliding
+    both = scores.depth or scores.rank
+    bins, calibration_error = _calibration(probability, colliding)
+    return PredictorMetrics(
+        samples=len(colliding),
+        accuracy=float((called == colliding).mean()),
+        false_positive_rate=_ratio(int((called & ~colliding).sum()), n_free),
+        false_negative_rate=_ratio(int((~called & colliding).sum()), n_colliding),
+        majority_rate=max(n_free, n_colliding) / len(colliding),
+        energy_mse=float(((predicted_energy - energy) ** 2).mean()) if scores.depth else None,
+        ranking_margin=_ranking_margin(predicted_energy, energy, margin) if both else None,
+        spearman=_spearman(predicted_energy[colliding], energy[colliding]) if both else None,
+        calibration_error=calibration_error,
+        calibration=bins,
+    )
+
+
+def mean_difference(values: FloatArray) -> float:
+    """Return the mean of |a - b| over all pairs of different places, 0 for fewer than two."""
+    n_values = len(values)
+    if n_values < 2:
+        return 0.0
+    weights = 2.0 * np.arange(n_values) - (n_values - 1)
+    return float(2.0 * np.dot(weights, np.sort(values)) / (n_values * (n_values - 1)))
+
+
+def _ratio(count: int, total: int) -> float | None:
+    return count / total if total else None
+
+
+def _ranking_margin(predicted: FloatArray, energy: FloatArray, margin: float) -> float | None:
+    partner = np.random.default_rng(_PAIRING_SEED).permutation(len(energy))
+    sign = np.sign(energy[partner] - energy)
+    shortfall = np.maximum(0.0, margin - sign * (predicted[partner] - predicted))
+    return float(shortfall[sign != 0.0].mean()) if (sign != 0.0).any() else None
+
+
+def _spearman(predicted: FloatArray, energy: FloatArray) -> float | None:
+    from scipy.stats import rankdata
+
+    ranks = rankdata(predicted), rankdata(energy)
+    if len(energy) < 2 or any(np.ptp(rank) == 0.0 for rank in ranks):
+        return None
+    return float(np.corrcoef(*ranks)[0, 1])
+
+
+def _calibration(
+    probability: FloatArray, colliding: npt.NDArray[np.bool_]
+) -> tuple[tuple[CalibrationBin, ...], float]:
+    place = np.minimum((probability * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
+    bins, error = [], 0.0
+    for number in range(CALIBRATION_BINS):
+        chosen = place == number
+        count = int(chosen.sum())
+        if not count:
+            bins.append(CalibrationBin(0, None, None))
+            continue
+        mean, share = float(probability[chosen].mean()), float(colliding[chosen].mean())
+        bins.append(CalibrationBin(count, mean, share))
+        error += abs(mean - share) * count / len(colliding)
+    return tuple(bins), error

@@ -1,0 +1,264 @@
+"""The networks of the presets: latent codes in, scaled energies and one logit out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from lcollision_core.embedding import Embedding
+from lcollision_core.labels import LabelRows
+from lcollision_core.predictor.config import PredictorConfig
+from lcollision_core.predictor.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
+
+ENCODER_SIZES = (512, 256, 256)
+PREDICTOR_SIZES = (512, 256, 256, 128)
+CLASSIFIER_SIZE = 64
+UNDIVIDED_SIZE = 128
+
+
+class NetworkOutput(NamedTuple):
+    """What a network says of B poses.
+
+    Attributes
+    ----------
+    domain_energy : (B, K) S_k, scaled, may be below 0; (B, 1) from a network without domains
+    logit : (B,) of the probability of a collision
+    auxiliary : what else the network's own loss needs
+    """
+
+    domain_energy: torch.Tensor
+    logit: torch.Tensor
+    auxiliary: tuple[torch.Tensor, ...] = ()
+
+
+class Targets(NamedTuple):
+    """The truth of B poses: scaled energies (B, K) and (B,), and (B,) 1 where they collide."""
+
+    domain_energy: torch.Tensor
+    energy: torch.Tensor
+    colliding: torch.Tensor
+
+    def part(self, start: int, stop: int) -> Targets:
+        """Return rows `start` to `stop` - 1."""
+        return Targets(*(values[start:stop] for values in self))
+
+
+class PredictorNetwork(nn.Module, ABC):
+    """A preset's network: differentiable from latent codes to energies and a logit.
+
+    Its state dict is all that a model file keeps of it, in float32. `build` must need the training
+    rows only for what the state dict holds.
+    """
+
+    @classmethod
+    @abstractmethod
+    def build(
+        cls,
+        embedding: Embedding,
+        config: PredictorConfig,
+        rows: LabelRows | None = None,
+        seed: int = 0,
+    ) -> PredictorNetwork:
+        """Make the network of an embedding.
+
+        Parameters
+        ----------
+        embedding : whose latent codes come in
+        config : the choices
+        rows : to train on, as they are in the store; None where a state dict will be loaded
+        seed : of the initial weights
+        """
+
+    @classmethod
+    def restore(
+        cls, embedding: Embedding, config: PredictorConfig, state: dict[str, torch.Tensor]
+    ) -> PredictorNetwork:
+        """Make a trained network from its state dict.
+
+        Raises
+        ------
+        RuntimeError : the state dict does not fit the embedding.
+        """
+        network = cls.build(embedding, config)
+        network.load_state_dict(state)
+        return network
+
+    @abstractmethod
+    def forward(self, latent: torch.Tensor) -> NetworkOutput:
+        """Predict from (B, D) latent codes."""
+
+    def loss(
+        self,
+        output: NetworkOutput,
+        batch: Targets,
+        part: tuple[int, int],
+        config: PredictorConfig,
+        margin: float,
+    ) -> torch.Tensor:
+        """Sum up this process's share of the batch's mean loss.
+
+        Parameters
+        ----------
+        output : for the rows of `part`
+        batch : the truth of the whole batch
+        part : first and last + 1 of this process's rows in the batch; the first is even
+        config : the terms' weights
+        margin : of the ranking loss, scaled
+        """
+        own = batch.part(*part)
+        n_rows = len(batch.energy)
+        total = config.entropy_weight / n_rows * entropy_loss(output.logit, own.colliding).sum()
+        if config.depth_weight:
+            divided = own.domain_energy if config.by_domain else own.domain_energy[:, :0]
+            losses = depth_loss(output.domain_energy, divided, own.energy)
+            total = total + config.depth_weight / n_rows * losses.sum()
+        if config.rank_weight:
+            losses = rank_loss(output.domain_energy.sum(dim=1), own.energy, margin)
+            n_pairs = max(ranked_pairs(batch.energy), 1)
+            total = total + config.rank_weight / n_pairs * losses.sum()
+        return total
+
+
+class StackedLinear(nn.Module):
+    """K linear layers of one size as a single batched product: (K, B, n_in) to (K, B, n_out).
+
+    Parameters
+    ----------
+    n_stacked, n_in, n_out : K and the sizes
+    generator : of the initial weights, uniform within 1/sqrt(fan-in) as PyTorch's own
+    fan_in : (K,) inputs that count, where the others are always 0; default `n_in` each
+    """
+
+    def __init__(
+        self,
+        n_stacked: int,
+        n_in: int,
+        n_out: int,
+        generator: torch.Generator,
+        fan_in: Sequence[int] | None = None,
+    ) -> None:
+        super().__init__()
+        counted = torch.tensor(fan_in or [n_in] * n_stacked, dtype=torch.float32)
+        bound = counted.rsqrt()[:, None, None]
+        weight = torch.rand((n_stacked, n_in, n_out), generator=generator) * 2.0 - 1.0
+        bias = torch.rand((n_stacked, 1, n_out), generator=generator) * 2.0 - 1.0
+        self.weight = nn.Parameter(weight * bound)
+        self.bias = nn.Parameter(bias * bound)
+
+    def forward(self, values: torch.Tensor) -> torch.Tensor:
+        """Apply layer k to values k."""
+        return torch.baddbmm(self.bias, values, self.weight)
+
+
+def linear(n_in: int, n_out: int, generator: torch.Generator) -> nn.Linear:
+    """Make a linear layer whose initial weights come from a generator."""
+    layer = nn.utils.skip_init(nn.Linear, n_in, n_out)
+    bound = n_in**-0.5
+    with torch.no_grad():
+        layer.weight.uniform_(-bound, bound, generator=generator)
+        layer.bias.uniform_(-bound, bound, generator=generator)
+    return layer
+
+
+class PaperNetwork(PredictorNetwork):
+    """CSE, one CP for each domain and the classifier, in the paper's sizes, with ReLU.
+
+    S_0 = CSE(Z_all); S_k = CP_k(S_0, Z_k); logit = MLP(S_1, ..., S_K). Without domains (ND) one
+    head on S_0 gives S_sum, and the classifier reads that alone. Tan et al. 2021, sections
+    "Collision Detection Architecture" and "Evaluation".
+
+    Parameters
+    ----------
+    group_sizes : (|Z_0|, |Z_1|, ..., |Z_K|)
+    by_domain : False for ND
+    seed : of the initial weights
+    """
+
+    activation: type[nn.Module] = nn.ReLU
+
+    def __init__(self, group_sizes: Sequence[int], by_domain: bool, seed: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.act = self.activation()
+        sizes = (sum(group_sizes), *ENCODER_SIZES)
+        self.encoder = nn.Sequential(
+            *(
+                layer
+                for n_in, n_out in zip(sizes, sizes[1:], strict=False)
+                for layer in (linear(n_in, n_out, generator), self.activation())
+            )
+        )
+        self.by_domain = by_domain
+        n_outputs = len(group_sizes) - 1 if by_domain else 1
+        state = ENCODER_SIZES[-1]
+        if by_domain:
+            widest = max(group_sizes[1:])
+            self.predictors = nn.ModuleList()
+            n_in = state + widest
+            for number, n_out in enumerate((*PREDICTOR_SIZES, 1)):
+                fan_in = [state + size for size in group_sizes[1:]] if number == 0 else None
+                self.predictors.append(StackedLinear(n_outputs, n_in, n_out, generator, fan_in))
+                n_in = n_out
+            self._code_index = _padded_codes(group_sizes)
+        else:
+            self.undivided = nn.Sequential(
+                linear(state, UNDIVIDED_SIZE, generator),
+                self.activation(),
+                linear(UNDIVIDED_SIZE, 1, generator),
+            )
+        self.classifier = nn.Sequential(
+            linear(n_outputs, CLASSIFIER_SIZE, generator),
+            self.activation(),
+            linear(CLASSIFIER_SIZE, 1, generator),
+        )
+
+    @classmethod
+    def build(
+        cls,
+        embedding: Embedding,
+        config: PredictorConfig,
+        rows: LabelRows | None = None,  # noqa: ARG003
+        seed: int = 0,
+    ) -> PredictorNetwork:
+        """Make the network of an embedding; the rows do not matter."""
+        return cls(embedding.group_sizes, config.by_domain, seed)
+
+    def forward(self, latent: torch.Tensor) -> NetworkOutput:
+        """Predict from (B, D) latent codes."""
+        state = self.encoder(latent)
+        energy = self._domain_energy(state, latent) if self.by_domain else self.undivided(state)
+        return NetworkOutput(energy, self.classifier(energy)[:, 0])
+
+    def _domain_energy(self, state: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
+        index = self._code_index.to(latent.device)
+        padded = torch.cat([latent, latent.new_zeros((len(latent), 1))], dim=1)
+        codes = padded[:, index.flatten()].unflatten(1, index.shape).transpose(0, 1)
+        values = torch.cat([state.expand(len(index), -1, -1), codes], dim=2)
+        for layer in self.predictors[:-1]:
+            values = self.act(layer(values))
+        return self.predictors[-1](values)[:, :, 0].T
+
+
+def _padded_codes(group_sizes: Sequence[int]) -> torch.Tensor:
+    """Return (K, widest) which code of (Z_all, 0) is code j of domain k; past its last, the 0."""
+    latent_size, widest = sum(group_sizes), max(group_sizes[1:])
+    index = torch.full((len(group_sizes) - 1, widest), latent_size)
+    start = group_sizes[0]
+    for domain, size in enumerate(group_sizes[1:]):
+        index[domain, :size] = torch.arange(start, start + size)
+        start += size
+    return index
+
+
+class SmoothNetwork(PaperNetwork):
+    """The paper's sizes with a smooth activation, which leaves solvers a curvature."""
+
+    activation = nn.SiLU
+
+
+NETWORKS: dict[str, type[PredictorNetwork]] = {"default": SmoothNetwork, "paper": PaperNetwork}
+"""The network of each preset."""

@@ -1,0 +1,368 @@
+"""A trained predictor: what the model file keeps, and what predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.embedding import Embedding
+from lcollision_core.errors import LabelStoreError, ModelFileError, ShapeError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.labels import LabelRows, StoreIdentity
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.model_file import Section
+from lcollision_core.predictor.config import PRESETS, PredictorConfig
+from lcollision_core.predictor.metrics import EnergyScores, PredictorMetrics, measure
+
+if TYPE_CHECKING:
+    import torch
+
+    from lcollision_core.predictor.networks import PredictorNetwork
+
+BATCH_ROWS = 500
+"""Rows that are predicted at a time: their hidden layers stay in the caches."""
+
+_ROWS_A_REPORT = 50 * BATCH_ROWS
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a predictor says of B poses; read-only arrays.
+
+    Attributes
+    ----------
+    domain_energy : (B, K) float64 array, S_k >= 0, in squared heights; a predictor without
+        domains spreads its sum over all alike
+    energy : (B,) float64 array, S_sum, their sum
+    collision_logit : (B,) float64 array
+    collision_probability : (B,) float64 array, its sigmoid; over 0.5 the pose is called colliding
+    """
+
+    domain_energy: FloatArray
+    energy: FloatArray
+    collision_logit: FloatArray
+    collision_probability: FloatArray
+
+
+@dataclass(frozen=True)
+class TrainingFacts:
+    """What a predictor was trained upon.
+
+    Attributes
+    ----------
+    rows : M, labelled rows given, those held out among them
+    training_rows : of them, that trained
+    colliding_share : of all rows
+    seed : of the initial weights and the order
+    energy_scale : mean PDe-sum of the colliding training rows, in squared heights; energies are
+        divided by it
+    margin : alpha of the ranking loss, scaled
+    store : what the rows label, None if they came without a store
+    """
+
+    rows: int
+    training_rows: int
+    colliding_share: float
+    seed: int
+    energy_scale: float
+    margin: float
+    store: StoreIdentity | None
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, Any]) -> TrainingFacts:
+        """Rebuild the facts from JSON values; KeyError, TypeError or ValueError if it cannot."""
+        values = dict(metadata)
+        if values["store"] is not None:
+            values["store"] = StoreIdentity.from_metadata(values["store"])
+        facts = cls(**values)
+        if not facts.energy_scale > 0.0:
+            raise ValueError("no energy scale")
+        return facts
+
+
+class CollisionPredictor:
+    """Predicts energy per domain and collision from latent codes.
+
+    Immutable, and safe to share between threads. Made by `train_predictor` or `from_section`.
+
+    Parameters
+    ----------
+    network : on the device that is to predict; it must not change any more
+    config : how it was trained
+    facts : what it was trained upon
+    n_domains : K
+    latent_size : D
+    metrics : measured on held-out rows, None before they are
+    """
+
+    def __init__(
+        self,
+        network: PredictorNetwork,
+        config: PredictorConfig,
+        facts: TrainingFacts,
+        n_domains: int,
+        latent_size: int,
+        metrics: PredictorMetrics | None = None,
+    ) -> None:
+        self.config, self.facts, self.metrics = config, facts, metrics
+        self.n_domains, self.latent_size = n_domains, latent_size
+        self._network = network.requires_grad_(False).eval()
+
+    @property
+    def preset(self) -> str:
+        """The network's kind: "default" or "paper"."""
+        return self.config.preset
+
+    def predict(self, latent: npt.NDArray[Any]) -> Prediction:
+        """Predict the collisions of latent poses.
+
+        Parameters
+        ----------
+        latent : (B, D) finite array, used as float32
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        scaled, logit = self.scaled_outputs(latent)
+        domain_energy = np.maximum(scaled, 0.0) * self.facts.energy_scale
+        if domain_energy.shape[1] != self.n_domains:
+            domain_energy = np.repeat(domain_energy / self.n_domains, self.n_domains, axis=1)
+        results = (domain_energy, domain_energy.sum(axis=1), logit, _sigmoid(logit))
+        for array in results:
+            array.flags.writeable = False
+        return Prediction(*results)
+
+    def scaled_outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        """Return what the network itself says: scaled energies, also below 0, and the logit.
+
+        Parameters
+        ----------
+        latent : (B, D) finite array, used as float32
+
+        Returns
+        -------
+        domain_energy : (B, K) float64 array; (B, 1) from a predictor without domains
+        collision_logit : (B,) float64 array
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        import torch
+
+        self._require(latent)
+        codes = np.ascontiguousarray(latent, dtype=np.float32)
+        n_outputs = self.n_domains if self.config.by_domain else 1
+        domain_energy, logit = np.empty((len(codes), n_outputs)), np.empty(len(codes))
+        with torch.inference_mode():
+            for start in range(0, len(codes), BATCH_ROWS):
+                rows = slice(start, start + BATCH_ROWS)
+                output = self._network(torch.tensor(codes[rows], device=self._device))
+                domain_energy[rows] = output.domain_energy.double().cpu().numpy()
+                logit[rows] = output.logit.double().cpu().numpy()
+        return domain_energy, logit
+
+    def logit_and_gradient(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        """Return the logit of the collision probability and its derivative, in double precision.
+
+        Parameters
+        ----------
+        latent : (B, D) finite array
+
+        Returns
+        -------
+        collision_logit : (B,) float64 array
+        gradient : (B, D) float64 array, of each pose's logit by its codes
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        import torch
+
+        self._require(latent)
+        codes = torch.tensor(np.asarray(latent, dtype=np.float64), device=self._device)
+        with torch.enable_grad():
+            codes.requires_grad_()
+            logit = self._exact_network(codes).logit
+            (gradient,) = torch.autograd.grad(logit.sum(), codes)
+        return logit.detach().cpu().numpy(), gradient.cpu().numpy()
+
+    def on(self, device: str) -> CollisionPredictor:
+        """Return the same predictor with its network on a device, such as "cuda" or "cpu"."""
+        from copy import deepcopy
+
+        return self._copy(deepcopy(self._network).to(device), self.metrics)
+
+    def with_metrics(self, metrics: PredictorMetrics) -> CollisionPredictor:
+        """Return the same predictor with what was measured of it."""
+        return self._copy(self._network, metrics)
+
+    def to_section(self) -> Section:
+        """Return what the model file keeps: the weights in float32, and JSON values."""
+        arrays = {
+            name: values.detach().cpu().numpy()
+            for name, values in self._network.state_dict().items()
+        }
+        metadata = {
+            "preset": self.preset,
+            "config": asdict(self.config),
+            "facts": asdict(self.facts),
+            "metrics": self.metrics and self.metrics.to_metadata(),
+        }
+        return Section(arrays, metadata)
+
+    @classmethod
+    def from_section(cls, section: Section, embedding: Embedding) -> CollisionPredictor:
+        """Rebuild a predictor from what `to_section` gave.
+
+        Parameters
+        ----------
+        section : of the model file
+        embedding : of the same file
+
+        Raises
+        ------
+        ModelFileError : the preset is unknown, or the weights do not fit the embedding.
+        """
+        import torch
+
+        from lcollision_core.predictor.networks import NETWORKS
+
+        preset = section.metadata.get("preset")
+        if preset not in PRESETS:
+            raise ModelFileError(
+                f"the model's predictor has the preset {preset!r}, this program knows "
+                f"{', '.join(PRESETS)}; update the program or train the predictor again"
+            )
+        try:
+            config = PredictorConfig(**section.metadata["config"])
+            facts = TrainingFacts.from_metadata(section.metadata["facts"])
+            measured = section.metadata["metrics"]
+            metrics = None if measured is None else PredictorMetrics.from_metadata(measured)
+            state = {name: torch.tensor(array) for name, array in section.arrays.items()}
+            network = NETWORKS[config.preset].restore(embedding, config, state)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise ModelFileError(
+                "the model's predictor does not fit its latent space; train the predictor again"
+            ) from error
+        return cls(network, config, facts, embedding.n_domains, embedding.latent_size, metrics)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_exact_network"}
+
+    @property
+    def _device(self) -> torch.device:
+        return next(self._network.parameters()).device
+
+    @cached_property
+    def _exact_network(self) -> PredictorNetwork:
+        """The network in double precision, which solvers need close to their solution."""
+        from copy import deepcopy
+
+        return deepcopy(self._network).double()
+
+    def _copy(
+        self, network: PredictorNetwork, metrics: PredictorMetrics | None
+    ) -> CollisionPredictor:
+        return CollisionPredictor(
+            network, self.config, self.facts, self.n_domains, self.latent_size, metrics
+        )
+
+    def _require(self, latent: npt.NDArray[Any]) -> None:
+        if np.ndim(latent) != 2 or np.shape(latent)[1] != self.latent_size:
+            raise ShapeError(
+                f"latent must have shape (B, {self.latent_size}), got {np.shape(latent)}"
+            )
+        if not np.isfinite(latent).all():
+            raise ShapeError("a latent pose has a number that is not finite")
+
+
+def evaluate_predictor(
+    predictor: CollisionPredictor,
+    rows: LabelRows,
+    *,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> PredictorMetrics:
+    """Score a predictor against exact labels of the same latent box.
+
+    Parameters
+    ----------
+    predictor : of the model that the rows label
+    rows : at least one, none of which trained the predictor
+    progress : in rows
+    cancel : polled every few thousand rows
+
+    Raises
+    ------
+    LabelStoreError : there are no rows.
+    ShapeError : the rows are of another latent space, or not finite.
+    CancelledError : `cancel` was set.
+    """
+    if not len(rows):
+        raise LabelStoreError(
+            "there are no rows to evaluate on; label more with `lcollision label`"
+        )
+    probability, predicted = np.empty(len(rows)), np.empty(len(rows))
+    for start in range(0, len(rows), _ROWS_A_REPORT):
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        part = slice(start, start + _ROWS_A_REPORT)
+        scaled, logit = predictor.scaled_outputs(rows.latent[part])
+        probability[part], predicted[part] = _sigmoid(logit), scaled.sum(axis=1)
+        progress(min(start + _ROWS_A_REPORT, len(rows)), len(rows))
+    scale = predictor.facts.energy_scale
+    config = predictor.config
+    return measure(
+        probability,
+        predicted,
+        rows.colliding,
+        rows.energy / scale,
+        predictor.facts.margin,
+        EnergyScores(depth=config.depth_weight > 0.0, rank=config.rank_weight > 0.0),
+    )
+
+
+def _sigmoid(logit: FloatArray) -> FloatArray:
+    probability: FloatArray = np.exp(-np.logaddexp(0.0, -logit))
+    return probability
+
+
+def require_model(rows: LabelRows, embedding: Embedding) -> None:
+    """Refuse rows of another latent space, or with a number that is not finite.
+
+    Raises
+    ------
+    ShapeError : as said, naming the first row that is wrong.
+    """
+    n_domains, latent_size = rows.domain_energy.shape[1], rows.latent.shape[1]
+    if (n_domains, latent_size) != (embedding.n_domains, embedding.latent_size):
+        raise ShapeError(
+            f"the labelled rows have {latent_size} codes and {n_domains} domains, the model has "
+            f"{embedding.latent_size} and {embedding.n_domains}; label samples of this model"
+        )
+    for start in range(0, len(rows), _ROWS_A_REPORT):
+        part = slice(start, start + _ROWS_A_REPORT)
+        finite = np.isfinite(rows.energy[part])
+        for values in (rows.latent[part], rows.domain_energy[part]):
+            finite &= np.isfinite(values).all(axis=1)
+        if not finite.all():
+            row = start + int(np.flatnonzero(~finite)[0])
+            raise ShapeError(
+                f"row {row} (from 0) has a number that is not finite; label the samples again"
+            )
+
+
+def taken(rows: LabelRows, index: npt.NDArray[Any]) -> LabelRows:
+    """Return copies of the rows chosen by an index or a boolean array."""
+    return replace(
+        rows,
+        **{name: getattr(rows, name)[index] for name in LabelRows.__dataclass_fields__},
+    )

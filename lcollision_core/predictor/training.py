@@ -1,0 +1,130 @@
+"""Stage 2: learn to predict collisions from labelled samples of the latent box."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lcollision_core.embedding import Embedding
+from lcollision_core.errors import LabelStoreError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
+from lcollision_core.predictor.config import PRESETS, PredictorConfig
+from lcollision_core.predictor.metrics import mean_difference
+from lcollision_core.predictor.predictor import (
+    CollisionPredictor,
+    TrainingFacts,
+    evaluate_predictor,
+    require_model,
+    taken,
+)
+
+
+@dataclass(frozen=True)
+class PredictorStatus:
+    """How far a training run is.
+
+    Attributes
+    ----------
+    epoch, epochs : passes over the rows, finished and in all
+    done, total : steps of the whole run
+    loss : mean over the steps of this epoch so far, None before the first
+    held_out_accuracy : of some held-out rows after the last epoch, None before that
+    """
+
+    epoch: int
+    epochs: int
+    done: int
+    total: int
+    loss: float | None
+    held_out_accuracy: float | None
+
+
+StatusCallback = Callable[[PredictorStatus], None]
+
+
+def no_status(status: PredictorStatus) -> None:
+    """Report to nobody."""
+
+
+def train_predictor(
+    rows: LabelRows,
+    embedding: Embedding,
+    config: PredictorConfig | None = None,
+    *,
+    store: StoreIdentity | None = None,
+    device: str = "auto",
+    checkpoint: Path | None = None,
+    progress: StatusCallback = no_status,
+    cancel: CancelToken | None = None,
+    seed: int = 0,
+) -> CollisionPredictor:
+    """Train a predictor on labelled samples and measure it on those held out.
+
+    Rows whose index `is_held_out` never train. A killed run that is started again with the same
+    checkpoint goes on where it was and ends with the same bits, on one machine with one number of
+    threads. Under torchrun every process calls this with the same arguments: they share each
+    batch, and all return the same predictor.
+
+    Parameters
+    ----------
+    rows : samples 0, 1, 2, ... of a store; at least one free and one colliding one to train on
+    embedding : of the model that the rows label
+    config : the choices, by default the preset "default"
+    store : what the rows label, kept with the predictor
+    device : "cpu", "cuda", or "auto" for CUDA where there is one
+    checkpoint : a file to go on from and to save to; kept when the run ends
+    progress : called every few steps and after every epoch
+    cancel : polled after every step
+    seed : of the initial weights and of the order
+
+    Returns
+    -------
+    predictor : CollisionPredictor, on the CPU, with its metrics
+
+    Raises
+    ------
+    ShapeError : the rows are of another latent space, or not finite.
+    LabelStoreError : all rows collide, or none does, or none is held out.
+    LCollisionError : the checkpoint belongs to another run or is damaged, the training diverges,
+        or there is no such device.
+    CancelledError : `cancel` was set; the checkpoint holds the last step.
+    """
+    # Here, so that reading a predictor's types loads no torch.
+    from lcollision_core.predictor.loop import TrainingLoop
+
+    config = PRESETS["default"] if config is None else config
+    require_model(rows, embedding)
+    held_out = is_held_out(np.arange(len(rows)))
+    colliding = rows.colliding & ~held_out
+    n_training, n_colliding = int((~held_out).sum()), int(colliding.sum())
+    if not 0 < n_colliding < n_training or not held_out.any():
+        raise LabelStoreError(
+            f"{n_colliding} of the {n_training} rows to train on collide and "
+            f"{int(held_out.sum())} are held out; training needs some of each: label more samples"
+        )
+    scale = float(rows.energy[colliding].mean())
+    if not scale > 0.0:
+        raise LabelStoreError("no colliding row has any depth to learn; label more samples")
+    facts = TrainingFacts(
+        rows=len(rows),
+        training_rows=n_training,
+        colliding_share=float(rows.colliding.mean()),
+        seed=seed,
+        energy_scale=scale,
+        margin=mean_difference(rows.energy[~held_out]) / scale,
+        store=store,
+    )
+    loop = TrainingLoop(
+        rows, embedding, config, facts, device, checkpoint, progress, cancel or CancelToken()
+    )
+    network = loop.run()
+    predictor = CollisionPredictor(
+        network.cpu(), config, facts, embedding.n_domains, embedding.latent_size
+    )
+    return predictor.with_metrics(
+        evaluate_predictor(predictor, taken(rows, held_out), cancel=cancel)
+    )
