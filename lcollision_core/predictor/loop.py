@@ -117,7 +117,7 @@ class TrainingLoop:
             output = shared(latent[part[0] : part[1]])
             loss = network.loss(output, targets, part, config, self._facts.margin)
             # Processes average their gradients, but each holds a share of the sum.
-            (loss * processes.count).backward()
+            torch.autograd.backward(loss * processes.count)
             optimiser.step()
             step += 1
             self._losses.append(processes.sum_of(loss))

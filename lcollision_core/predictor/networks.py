@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -154,14 +155,26 @@ class StackedLinear(nn.Module):
         return torch.baddbmm(self.bias, values, self.weight)
 
 
-def linear(n_in: int, n_out: int, generator: torch.Generator) -> nn.Linear:
-    """Make a linear layer whose initial weights come from a generator."""
-    layer = nn.utils.skip_init(nn.Linear, n_in, n_out)
-    bound = n_in**-0.5
-    with torch.no_grad():
-        layer.weight.uniform_(-bound, bound, generator=generator)
-        layer.bias.uniform_(-bound, bound, generator=generator)
-    return layer
+class SeededLinear(nn.Module):
+    """A linear layer whose initial weights come from a generator, uniform as PyTorch's own.
+
+    Parameters
+    ----------
+    n_in, n_out : the sizes
+    generator : of the initial weights
+    """
+
+    def __init__(self, n_in: int, n_out: int, generator: torch.Generator) -> None:
+        super().__init__()
+        bound = n_in**-0.5
+        weight = torch.rand((n_in, n_out), generator=generator) * 2.0 - 1.0
+        bias = torch.rand(n_out, generator=generator) * 2.0 - 1.0
+        self.weight = nn.Parameter(weight * bound)
+        self.bias = nn.Parameter(bias * bound)
+
+    def forward(self, values: torch.Tensor) -> torch.Tensor:
+        """Map (B, n_in) to (B, n_out)."""
+        return torch.addmm(self.bias, values, self.weight)
 
 
 class PaperNetwork(PredictorNetwork):
@@ -188,8 +201,8 @@ class PaperNetwork(PredictorNetwork):
         self.encoder = nn.Sequential(
             *(
                 layer
-                for n_in, n_out in zip(sizes, sizes[1:], strict=False)
-                for layer in (linear(n_in, n_out, generator), self.activation())
+                for n_in, n_out in pairwise(sizes)
+                for layer in (SeededLinear(n_in, n_out, generator), self.activation())
             )
         )
         self.by_domain = by_domain
@@ -206,14 +219,14 @@ class PaperNetwork(PredictorNetwork):
             self._code_index = _padded_codes(group_sizes)
         else:
             self.undivided = nn.Sequential(
-                linear(state, UNDIVIDED_SIZE, generator),
+                SeededLinear(state, UNDIVIDED_SIZE, generator),
                 self.activation(),
-                linear(UNDIVIDED_SIZE, 1, generator),
+                SeededLinear(UNDIVIDED_SIZE, 1, generator),
             )
         self.classifier = nn.Sequential(
-            linear(n_outputs, CLASSIFIER_SIZE, generator),
+            SeededLinear(n_outputs, CLASSIFIER_SIZE, generator),
             self.activation(),
-            linear(CLASSIFIER_SIZE, 1, generator),
+            SeededLinear(CLASSIFIER_SIZE, 1, generator),
         )
 
     @classmethod
@@ -236,11 +249,12 @@ class PaperNetwork(PredictorNetwork):
     def _domain_energy(self, state: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
         index = self._code_index.to(latent.device)
         padded = torch.cat([latent, latent.new_zeros((len(latent), 1))], dim=1)
-        codes = padded[:, index.flatten()].unflatten(1, index.shape).transpose(0, 1)
+        codes = padded[:, index].transpose(0, 1)
         values = torch.cat([state.expand(len(index), -1, -1), codes], dim=2)
         for layer in self.predictors[:-1]:
             values = self.act(layer(values))
-        return self.predictors[-1](values)[:, :, 0].T
+        energy: torch.Tensor = self.predictors[-1](values)[:, :, 0].T
+        return energy
 
 
 def _padded_codes(group_sizes: Sequence[int]) -> torch.Tensor:

@@ -15,7 +15,7 @@ from lcollision_core.errors import LCollisionError
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among those that train together; one alone has rank 0 of 1."""
+    """One process among those that train together; one alone has rank 0 of 1."""
 
     rank: int
     count: int
