@@ -1,0 +1,495 @@
+"""The pose that is being edited, without any widget: what panels and viewport look at."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QObject, Signal, Slot
+
+from app import tasks
+from app.commands import ChangeState, DocumentState
+from app.engine import Failure, LivePose, LongWork
+from app.frames import ExactVerdict, LiveFrame, PosePrediction
+from app.history import UNNAMED, PoseHistory, read_only
+from lcollision_core.errors import LCollisionError, ModelFileError
+
+if TYPE_CHECKING:
+    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.resolve import ResolveOptions
+
+__all__ = ["ExactVerdict", "Failure", "LiveFrame", "PoseDocument", "PosePrediction"]
+
+FloatArray = npt.NDArray[np.float64]
+
+REST_MILLISECONDS = 60
+"""How long a pose stays before it is checked exactly: a hand that pauses has come to rest."""
+
+
+class PoseDocument(PoseHistory):
+    """One model, one pose of it, the user's library, and their history.
+
+    Lives in the thread of the window and computes nothing there: each change asks two workers,
+    and the newest request wins. Until the first model is in, `has_model` is False and only
+    `open_model`, `set_model` and `close` may be called.
+
+    Every change of the pose or of the library is one step of `undo_stack`. Between
+    `begin_gesture` and `end_gesture` changes show at once but make one step together, and none
+    where they end as they began. A step on a slider outside a gesture, as from the keyboard,
+    merges with the one before when it is the same slider within a second.
+
+    Signals
+    -------
+    model_changed : another model is in; latent, library, locks and history are new too
+    latent_changed, locks_changed, ghost_changed, library_changed, file_changed : look again;
+        `file_changed` covers `file` and `pose_name`
+    frame_changed, exact_changed : `frame`, `exact` are new, or None as they are not yet known
+    modified_changed : bool
+    outcome_changed : `outcome` is new, or None as the pose has been changed since
+    solve_started, solve_progressed(object), solve_finished(object) : around a Resolve; the last
+        carries its ResolveResult, or None where it was cancelled or failed
+    busy_changed : str, what the long work is, or "" where there is none
+    message : str, one sentence for the status bar
+    failed : Failure, one sentence and its details, for a dialog
+    """
+
+    model_changed = Signal()
+    frame_changed = Signal()
+    exact_changed = Signal()
+    locks_changed = Signal()
+    solve_started = Signal()
+    solve_progressed = Signal(object)
+    solve_finished = Signal(object)
+    busy_changed = Signal(str)
+    message = Signal(str)
+    failed = Signal(object)
+
+    def __init__(self, model: PoseModel | None = None, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self._model: PoseModel | None = None
+        self._mirror: npt.NDArray[np.int32] | None = None
+        self._locked: frozenset[int] = frozenset()
+        self._frame: LiveFrame | None = None
+        self._exact: ExactVerdict | None = None
+
+        self._solve: int | None = None
+        self._mirroring = 0
+        self._closed = False
+        self._live = LivePose(REST_MILLISECONDS, self)
+        self._live.frame_computed.connect(self._on_frame_computed)
+        self._live.verdict_computed.connect(self._on_verdict_computed)
+        self._live.failed.connect(self.failed)
+        self._long = LongWork(self)
+        self._long.busy_changed.connect(self.busy_changed)
+        self._long.progressed.connect(self._on_progressed)
+        self._long.failed.connect(self.failed)
+        if model is not None:
+            self.set_model(model)
+
+    # What there is to look at.
+
+    @property
+    def has_model(self) -> bool:
+        """Whether the first model is in."""
+        return self._model is not None
+
+    @property
+    def model(self) -> PoseModel:
+        """The model that the pose belongs to."""
+        if self._model is None:
+            raise LCollisionError("no model is open yet; open one first")
+        return self._model
+
+    @property
+    def locked_domains(self) -> frozenset[int]:
+        """Domains that Resolve, Randomise and Reset all leave as they are."""
+        return self._locked
+
+    @property
+    def frame(self) -> LiveFrame | None:
+        """The newest computed frame; while a slider moves, an instant behind `latent`."""
+        return self._frame
+
+    @property
+    def exact(self) -> ExactVerdict | None:
+        """The exact check of `latent`; None until it is known."""
+        return self._exact
+
+    @property
+    def solving(self) -> bool:
+        """Whether a Resolve runs."""
+        return self._solve is not None
+
+    @property
+    def busy(self) -> str:
+        """What the long work is, or "" where there is none."""
+        return self._long.busy
+
+    @property
+    def can_resolve(self) -> bool:
+        """Whether Resolve can be asked for: the model has a predictor."""
+        return self._model is not None and self._model.predictor is not None
+
+    @property
+    def can_mirror(self) -> bool:
+        """Whether the model's mesh has a left and a right that mirror each other."""
+        return self._mirror is not None
+
+    # Editing.
+
+    def set_code(self, index: int, value: float) -> None:
+        """Set one number of the latent; a number that is not finite is ignored.
+
+        Parameters
+        ----------
+        index : from 0, in the latent's order
+        value : beyond the sliders' range too, as in poses that came in as meshes
+        """
+        if not np.isfinite(value) or value == self.latent[index]:
+            return
+        latent = self.latent.copy()
+        latent[index] = value
+        self._edit(f"Move {self.code_name(index)}", latent, run=index)
+
+    def set_latent(self, latent: npt.ArrayLike, label: str) -> None:
+        """Set the whole pose, in one step.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        label : what the menu calls the step
+        """
+        self._edit(label, np.array(latent, dtype=np.float64))
+
+    def reset_code(self, index: int) -> None:
+        """Set one number of the latent to 0."""
+        latent = self.latent.copy()
+        latent[index] = 0.0
+        self._edit(f"Reset {self.code_name(index)}", latent)
+
+    def reset_all(self) -> None:
+        """Set all numbers to 0, but for those of locked domains."""
+        self._edit("Reset all", self._with_locked(np.zeros_like(self.latent)))
+
+    def randomise(self, amount: float, seed: int) -> None:
+        """Move the pose towards a random one, but for its locked domains.
+
+        Parameters
+        ----------
+        amount : 0 leaves the pose, 1 goes all the way to a pose drawn uniformly from the sliders'
+            range
+        seed : equal seeds draw equal poses
+        """
+        drawn = self.model.latent_space.sample(1, np.random.default_rng(seed))[0]
+        latent = (1.0 - amount) * self.latent + amount * drawn
+        self._edit("Randomise", self._with_locked(latent))
+
+    def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
+        """Blend between the pose at the gesture's begin and another one.
+
+        Parameters
+        ----------
+        latent : (D,) finite array, the other pose
+        share : 0 for the one at the begin, 1 for the other
+        """
+        start = self._gesture[1].latent if self._gesture else self.latent
+        target = np.asarray(latent, dtype=np.float64)
+        self._edit("Blend", target.copy() if share == 1.0 else start + share * (target - start))
+
+    def mirror(self) -> None:
+        """Exchange left and right, in the long worker, as the mirrored mesh is encoded."""
+        if self._mirror is None:
+            raise LCollisionError(f"{self.model.name} has no left and right to exchange")
+        self.end_gesture()
+        self._long.cancel(self._mirroring)
+        work = tasks.mirrored(self.model, self.latent, self._mirror)
+        self._mirroring = self._long.start("Mirroring", work, self._on_mirrored)
+
+    def code_name(self, index: int) -> str:
+        """Return what a person would call one number of the latent."""
+        names = [name for group in self.model.latent_space.groups for name in group.code_names]
+        return names[index]
+
+    def set_locked(self, domain: int, locked: bool) -> None:
+        """Lock a domain against Resolve, Randomise and Reset all, or let it go."""
+        changed = self._locked | {domain} if locked else self._locked - {domain}
+        if changed != self._locked:
+            self._locked = changed
+            self.cancel_resolve()
+            self.locks_changed.emit()
+
+    # The library.
+
+    def load_pose(self, pose: NamedPose) -> None:
+        """Make a pose of the library, or a training pose, the one that is edited."""
+        self._load(f"Load {pose.name}", pose)
+
+    def training_pose(self, number: int) -> NamedPose:
+        """Return a training pose of the model by its number, from 0."""
+        from lcollision_core.model import NamedPose
+
+        return NamedPose(self.model.pose_names[number], self.model.training_latent[number])
+
+    def add_pose_to_library(self, name: str) -> None:
+        """Keep the pose in the library; a taken name gets a number.
+
+        Parameters
+        ----------
+        name : of the pose, which is called so from then on
+        """
+        from lcollision_core.model import NamedPose, unique_names
+
+        taken = [pose.name for pose in self.poses]
+        free = unique_names([*taken, name or UNNAMED])[-1]
+        added = NamedPose(free, self.latent, self.placement)
+        state = replace(self._state, pose_name=free, poses=(*self.poses, added))
+        self._push(f"Keep {free}", state)
+
+    def remove_pose_from_library(self, name: str) -> None:
+        """Drop a pose of the library."""
+        kept = tuple(pose for pose in self.poses if pose.name != name)
+        self._push(f"Remove {name}", replace(self._state, poses=kept))
+
+    def rename_pose(self, old: str, new: str) -> None:
+        """Rename a pose of the library, and the edited pose where it is that one.
+
+        Raises
+        ------
+        ModelFileError : the new name is empty or another pose's.
+        """
+        if not new or any(pose.name == new != old for pose in self.poses):
+            raise ModelFileError(f"a pose cannot be called {new!r}; choose another name")
+        poses = tuple(replace(p, name=new) if p.name == old else p for p in self.poses)
+        name = new if self.pose_name == old else self.pose_name
+        self._push(f"Rename {old}", replace(self._state, poses=poses, pose_name=name))
+
+    # Models and files.
+
+    def set_model(self, model: PoseModel, mirror: npt.NDArray[np.int32] | None = None) -> None:
+        """Put in another model, with a new pose and an empty library.
+
+        Parameters
+        ----------
+        model : may lack a predictor
+        mirror : (V,) each vertex's mirror image, for a model that can be mirrored; `open_model`
+            finds it
+        """
+        self._model = model
+        self._mirror = mirror
+        self._locked = frozenset()
+        self.cancel_all()
+        self._live.stop()
+        self._frame = self._exact = None
+        # Whoever looks when told of the model finds a pose of that model.
+        self._state = self._blank()
+        self.model_changed.emit()
+        self._begin(self._blank(), None)
+        for changed in (self.frame_changed, self.exact_changed, self.locks_changed):
+            changed.emit()
+
+    def open_model(self, name_or_path: str | Path) -> None:
+        """Read a model in the long worker and put it in."""
+        self._long.start(
+            f"Opening {name_or_path}", tasks.opened_model(name_or_path), self._on_model
+        )
+
+    def new_pose(self) -> None:
+        """Start anew: an unnamed pose, no library, no file, no history."""
+        self._begin(self._blank(), None)
+
+    def open_poses(self, path: str | Path) -> None:
+        """Read a poses file in the long worker; its poses are the library, its first is edited."""
+        self._long.start(
+            f"Opening {Path(path).name}", tasks.read(self.model, Path(path)), self._on_poses
+        )
+
+    def save(self, path: str | Path | None = None) -> None:
+        """Write the library and the edited pose, under its name, and clear the modified mark.
+
+        Parameters
+        ----------
+        path : a .json file; the one that was opened or saved last where None
+
+        Raises
+        ------
+        ModelFileError : there is no file yet, or it cannot be written.
+        """
+        from lcollision_core.model import write_poses
+
+        self.end_gesture()
+        target = Path(path) if path is not None else self._file
+        if target is None:
+            raise ModelFileError("the pose has no file yet; save it under a name")
+        write_poses(target, self.model, self.all_poses())
+        self._file = target
+        self.undo_stack.setClean()
+        self.file_changed.emit()
+        self.message.emit(f"Saved {target.name}")
+
+    def all_poses(self) -> tuple[NamedPose, ...]:
+        """Return what Save writes: the edited pose first, then the rest of the library."""
+        from lcollision_core.model import NamedPose
+
+        edited = NamedPose(self.pose_name, self.latent, self.placement)
+        return (edited, *(pose for pose in self.poses if pose.name != edited.name))
+
+    def import_mesh(self, path: str | Path) -> None:
+        """Encode a mesh of the model's topology in the long worker and make it the pose."""
+        self._long.start(
+            f"Importing {Path(path).name}", tasks.encoded(self.model, Path(path)), self._on_encoded
+        )
+
+    def export_mesh(self, path: str | Path) -> None:
+        """Write the mesh on the screen in the long worker, bit by bit, but back in its place.
+
+        Parameters
+        ----------
+        path : its extension says the format
+        """
+        self._long.start(
+            f"Exporting {Path(path).name}",
+            tasks.exported(self.model, self.latent, self.placement, Path(path)),
+            self._on_exported,
+        )
+
+    # Resolve.
+
+    def resolve(self, options: ResolveOptions | None = None) -> None:
+        """Find the nearest free pose in the long worker; locked domains stay.
+
+        Parameters
+        ----------
+        options : `locked_domains` is set to the document's
+
+        Raises
+        ------
+        ModelFileError : the model has no predictor.
+        """
+        from lcollision_core.resolve import ResolveOptions
+
+        if not self.can_resolve:
+            raise ModelFileError(
+                f"{self.model.name} cannot resolve, as it has no predictor; train one for it"
+            )
+        self.end_gesture()
+        self.cancel_resolve()
+        chosen = replace(options or ResolveOptions(), locked_domains=self._locked)
+        work = tasks.resolved(self.model, self.latent, chosen)
+        self._solve = self._long.start("Resolving", work, self._on_resolved, self._on_solve_failed)
+        self.solve_started.emit()
+
+    def cancel_resolve(self) -> None:
+        """Stop a running Resolve; the pose stays as it is."""
+        if self._solve is not None:
+            self._long.cancel(self._solve)
+            self._solve = None
+            self.solve_finished.emit(None)
+
+    def cancel_all(self) -> None:
+        """Stop all long work."""
+        self.cancel_resolve()
+        self._long.cancel_all()
+
+    def close(self, timeout: float = 5.0) -> bool:
+        """Stop all work and end the threads, before any window closes.
+
+        Returns
+        -------
+        ended : whether all threads have ended within `timeout` seconds
+        """
+        if self._closed:
+            return True
+        self._closed = True
+        self.cancel_all()
+        deadline = time.monotonic() + timeout
+        ended = [self._live.close(deadline), self._long.close(deadline)]
+        return all(ended)
+
+    # What the workers answer.
+
+    @Slot(object)
+    def _on_frame_computed(self, frame: LiveFrame) -> None:
+        self._frame = frame
+        self.frame_changed.emit()
+
+    @Slot(object)
+    def _on_verdict_computed(self, verdict: ExactVerdict) -> None:
+        self._exact = verdict
+        self.exact_changed.emit()
+
+    @Slot(int, object)
+    def _on_progressed(self, number: int, status: object) -> None:
+        if number == self._solve:
+            self.solve_progressed.emit(status)
+
+    def _on_model(self, opened: tasks.OpenedModel) -> None:
+        self.set_model(opened.model, opened.mirror)
+        self.message.emit(f"Opened {opened.model.name}")
+
+    def _on_poses(self, read: tasks.ReadPoses) -> None:
+        first = read.poses[0]
+        state = DocumentState(read_only(first.latent), first.name, first.placement, read.poses)
+        self._begin(state, read.path)
+        n_poses = len(read.poses)
+        self.message.emit(f"Opened {read.path.name}: {n_poses} pose{'s' * (n_poses != 1)}")
+
+    def _on_encoded(self, pose: NamedPose) -> None:
+        self._load(f"Import {pose.name}", pose)
+        self.message.emit(
+            f"Imported {pose.name}: the pose lies {pose.fit_error_mean:.2%} of the height from "
+            f"the mesh on average, {pose.fit_error_max:.2%} at most"
+        )
+
+    def _on_mirrored(self, latent: FloatArray) -> None:
+        self._edit("Mirror", latent)
+
+    def _on_exported(self, path: Path) -> None:
+        self.message.emit(f"Exported {path.name}")
+
+    def _on_resolved(self, resolved: tasks.Resolved) -> None:
+        result, self._solve = resolved.result, None
+        if np.array_equal(result.latent, self.latent):
+            # Nothing to undo, but the reasons are worth seeing.
+            self._apply(replace(self._state, outcome=result))
+        else:
+            after = replace(
+                self._state,
+                latent=read_only(np.array(result.latent, dtype=np.float64)),
+                ghost=resolved.ghost,
+                outcome=result,
+            )
+            self.undo_stack.push(ChangeState("Resolve", self._apply, self._state, after))
+        self.solve_finished.emit(result)
+
+    def _on_solve_failed(self) -> None:
+        self._solve = None
+        self.solve_finished.emit(None)
+
+    def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
+        self._push(label, replace(self._state, latent=read_only(latent), outcome=None), run)
+
+    def _load(self, label: str, pose: NamedPose) -> None:
+        latent = read_only(np.array(pose.latent, dtype=np.float64))
+        self._push(label, DocumentState(latent, pose.name, pose.placement, self.poses))
+
+    def _blank(self) -> DocumentState:
+        return DocumentState(read_only(np.zeros(self.model.latent_size)), UNNAMED)
+
+    def _follow_latent(self) -> None:
+        self.cancel_resolve()
+        self._long.cancel(self._mirroring)
+        self._live.follow(self.model, self.latent)
+        if self._exact is not None:
+            self._exact = None
+            self.exact_changed.emit()
+
+    def _with_locked(self, latent: FloatArray) -> FloatArray:
+        """Return the latent with the present codes of locked domains."""
+        for domain in self._locked:
+            codes = self.model.latent_space.groups[1 + domain].codes
+            latent[codes] = self.latent[codes]
+        return latent

@@ -1,0 +1,372 @@
+"""The threads behind the window: one follows the live pose, one does the long work.
+
+Neither is ever given a second request while it works on a first, except to cancel it: the
+document keeps what is wanted next, so that the newest request wins and nothing queues up.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QObject, QThread, QTimer, Signal, Slot
+
+from app.frames import LiveFrame, PoseShower
+from lcollision_core.errors import CancelledError, LCollisionError
+from lcollision_core.jobs import CancelToken, Progress
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PoseModel
+
+_log = logging.getLogger(__name__)
+
+Work = Callable[[Progress, CancelToken], Any]
+"""Long work: called in another thread; its value is the result."""
+
+_PROGRESS_SECONDS = 0.05
+"""Between two reports of progress: more would only keep the window busy."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What went wrong, for people and for the log.
+
+    Attributes
+    ----------
+    sentence : what happened and what to do, fit to be shown as it is
+    details : the traceback
+    """
+
+    sentence: str
+    details: str
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRequest:
+    """Ask for the frame of a pose. `latent` is a (D,) float64 array, read-only."""
+
+    request_id: int
+    model: PoseModel
+    latent: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class VerdictRequest:
+    """Ask for the exact check of a frame that is on the screen."""
+
+    request_id: int
+    model: PoseModel
+    frame: LiveFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Long work on a snapshot.
+
+    Attributes
+    ----------
+    request_id : rises from job to job
+    label : what is done, as in "Opening poses.json"
+    work : called in the worker's thread
+    cancel : set by the document to stop the work
+    """
+
+    request_id: int
+    label: str
+    work: Work
+    cancel: CancelToken
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What came of a request: a value, a failure, or neither where it was cancelled."""
+
+    request_id: int
+    value: Any = None
+    failure: Failure | None = None
+    cancelled: bool = False
+
+
+def _nothing() -> None:
+    """Do nothing: the default of what may be told."""
+
+
+class LiveWorker(QObject):
+    """Computes frames and verdicts, in its own thread."""
+
+    answered = Signal(object)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._shower: PoseShower | None = None
+
+    @Slot(object)
+    def answer(self, request: FrameRequest | VerdictRequest) -> None:
+        """Answer one request, whatever happens."""
+        self.answered.emit(_guarded(request.request_id, "following the pose", self._value, request))
+
+    def _value(self, request: FrameRequest | VerdictRequest) -> object:
+        if self._shower is None or self._shower.model is not request.model:
+            self._shower = PoseShower(request.model)
+        if isinstance(request, FrameRequest):
+            return self._shower.frame(request.latent, request.request_id)
+        return self._shower.verdict(request.frame)
+
+
+class LongWorker(QObject):
+    """Does one job after the other, in its own thread."""
+
+    answered = Signal(object)
+    progressed = Signal(int, object)
+
+    @Slot(object)
+    def answer(self, job: Job) -> None:
+        """Do one job, whatever happens."""
+        self.answered.emit(_guarded(job.request_id, job.label, self._value, job))
+
+    def _value(self, job: Job) -> object:
+        job.cancel.raise_if_cancelled()
+        last = -_PROGRESS_SECONDS
+
+        def report(*status: Any) -> None:
+            nonlocal last
+            now = time.monotonic()
+            if now - last >= _PROGRESS_SECONDS:
+                last = now
+                self.progressed.emit(job.request_id, status[0] if len(status) == 1 else status)
+
+        return job.work(report, job.cancel)
+
+
+class LivePose(QObject):
+    """Follows one pose: its frame as soon as can be, its verdict when it rests.
+
+    Changes within one turn of the event loop are one request; while the worker is busy, only the
+    newest pose waits. A failure is told once for each pose.
+
+    Parameters
+    ----------
+    rest_milliseconds : how long a pose must have stayed before it is checked exactly
+    """
+
+    frame_computed = Signal(object)
+    verdict_computed = Signal(object)
+    failed = Signal(object)
+
+    _wanted = Signal(object)
+
+    def __init__(self, rest_milliseconds: int, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self._worker = LiveWorker()
+        self._thread = _started_thread("live pose", self._worker, self)
+        self._wanted.connect(self._worker.answer)
+        self._worker.answered.connect(self._on_answered)
+        self._model: PoseModel | None = None
+        self._next: FrameRequest | None = None
+        self._asked: FrameRequest | VerdictRequest | None = None
+        self._shown: tuple[FrameRequest, LiveFrame] | None = None
+        self._last_id = 0
+        self._due = _single_shot(self, 0, self._ask)
+        self._rested = _single_shot(self, rest_milliseconds, self._ask)
+
+    def follow(self, model: PoseModel, latent: npt.NDArray[np.float64]) -> None:
+        """Want the frame, and later the verdict, of another pose.
+
+        Parameters
+        ----------
+        latent : (D,) float64 array, read-only, as the worker reads it too
+        """
+        self._last_id += 1
+        self._model = model
+        self._next = FrameRequest(self._last_id, model, latent)
+        self._shown = None
+        self._rested.stop()
+        self._due.start()
+
+    def stop(self) -> None:
+        """Want nothing any more."""
+        self._due.stop()
+        self._rested.stop()
+        self._next = self._shown = self._model = None
+
+    def close(self, deadline: float) -> bool:
+        """End the thread; see `LongWork.close`."""
+        self.stop()
+        return _end_thread(self._thread, deadline)
+
+    @Slot()
+    def _ask(self) -> None:
+        if self._asked is not None:
+            return
+        if self._next is not None:
+            self._asked, self._next = self._next, None
+        elif self._shown is not None and not self._rested.isActive():
+            request, frame = self._shown
+            self._asked = VerdictRequest(request.request_id, request.model, frame)
+            self._shown = None
+        if self._asked is not None:
+            self._wanted.emit(self._asked)
+
+    @Slot(object)
+    def _on_answered(self, answer: Answer) -> None:
+        request, self._asked = self._asked, None
+        # What is next is handed on before the answer is drawn: the worker need not wait for that.
+        self._ask()
+        if request is None or request.model is not self._model:
+            return
+        if answer.failure is not None:
+            self.failed.emit(answer.failure)
+        elif isinstance(request, FrameRequest) and answer.value is not None:
+            if request.request_id == self._last_id:
+                self._shown = (request, answer.value)
+                self._rested.start()
+            self.frame_computed.emit(answer.value)
+        elif answer.value is not None and answer.request_id == self._last_id:
+            self.verdict_computed.emit(answer.value)
+
+
+class LongWork(QObject):
+    """Does jobs one after the other in its own thread, and tells of them in the window's.
+
+    `busy_changed` carries the label of the oldest job that is not done, "" where there is none;
+    `failed` a `Failure`; `progressed` the job's number and what its work told.
+    """
+
+    busy_changed = Signal(str)
+    progressed = Signal(int, object)
+    failed = Signal(object)
+
+    _wanted = Signal(object)
+
+    def __init__(self, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self._worker = LongWorker()
+        self._thread = _started_thread("long work", self._worker, self)
+        self._wanted.connect(self._worker.answer)
+        self._worker.answered.connect(self._on_answered)
+        self._worker.progressed.connect(self._on_progressed)
+        self._jobs: dict[int, tuple[Job, Callable[[Any], None], Callable[[], None]]] = {}
+        self._last_id = 0
+
+    @property
+    def busy(self) -> str:
+        """What is being done, or ""."""
+        return next((job.label for job, _, _ in self._jobs.values()), "")
+
+    def start(
+        self,
+        label: str,
+        work: Work,
+        done: Callable[[Any], None],
+        failed: Callable[[], None] = _nothing,
+    ) -> int:
+        """Do some work when what was started before is done.
+
+        Parameters
+        ----------
+        label : as in "Opening poses.json"
+        work : called in the other thread with (progress, cancel)
+        done : called in this thread with the work's value; not after `cancel`
+        failed : called in this thread where the work fails, before `LongWork.failed` tells why
+
+        Returns
+        -------
+        number : of the job
+        """
+        self._last_id += 1
+        job = Job(self._last_id, label, work, CancelToken())
+        self._jobs[job.request_id] = (job, done, failed)
+        self._wanted.emit(job)
+        self.busy_changed.emit(self.busy)
+        return job.request_id
+
+    def cancel(self, number: int) -> None:
+        """Stop a job; nothing more is heard of it. Does nothing where it is done."""
+        held = self._jobs.pop(number, None)
+        if held is not None:
+            held[0].cancel.cancel()
+            self.busy_changed.emit(self.busy)
+
+    def cancel_all(self) -> None:
+        """Stop all jobs."""
+        for number in list(self._jobs):
+            self.cancel(number)
+
+    def close(self, deadline: float) -> bool:
+        """Cancel all jobs and end the thread.
+
+        Parameters
+        ----------
+        deadline : until when to wait, on `time.monotonic`
+
+        Returns
+        -------
+        ended : a thread that has not is left to end with the process
+        """
+        self.cancel_all()
+        return _end_thread(self._thread, deadline)
+
+    @Slot(int, object)
+    def _on_progressed(self, number: int, status: object) -> None:
+        if number in self._jobs:
+            self.progressed.emit(number, status)
+
+    @Slot(object)
+    def _on_answered(self, answer: Answer) -> None:
+        held = self._jobs.pop(answer.request_id, None)
+        if held is None:
+            return
+        _, done, failed = held
+        if answer.failure is not None:
+            failed()
+            self.failed.emit(answer.failure)
+        elif not answer.cancelled:
+            done(answer.value)
+        self.busy_changed.emit(self.busy)
+
+
+def _started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
+    thread = QThread(parent)
+    thread.setObjectName(name)
+    worker.moveToThread(thread)
+    thread.start()
+    return thread
+
+
+def _end_thread(thread: QThread, deadline: float) -> bool:
+    thread.quit()
+    return thread.wait(max(1, int(1000 * (deadline - time.monotonic()))))
+
+
+def _single_shot(parent: QObject, milliseconds: int, slot: Callable[[], None]) -> QTimer:
+    timer = QTimer(parent)
+    timer.setSingleShot(True)
+    timer.setInterval(milliseconds)
+    timer.timeout.connect(slot)
+    return timer
+
+
+def _guarded(
+    request_id: int, label: str, work: Callable[..., object], *arguments: object
+) -> Answer:
+    """Run some work and turn whatever it raises into an answer."""
+    try:
+        return Answer(request_id, work(*arguments))
+    except CancelledError:
+        return Answer(request_id, cancelled=True)
+    except LCollisionError as error:
+        _log.info("%s: %s", label, error, exc_info=True)
+        return Answer(request_id, failure=Failure(str(error), traceback.format_exc()))
+    except Exception as error:
+        _log.exception("%s failed", label)
+        sentence = (
+            f"{label} failed ({type(error).__name__}: {error}); nothing was changed, try again or "
+            f"look into the log"
+        )
+        return Answer(request_id, failure=Failure(sentence, traceback.format_exc()))

@@ -1,0 +1,180 @@
+"""What is computed of a pose for the screen: the mesh, its normals, the prediction, the truth."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PoseModel
+
+Float32Array = npt.NDArray[np.float32]
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrediction:
+    """What the model's network believes of one pose; never the truth.
+
+    Attributes
+    ----------
+    domain_energy : (K,) float64 array, read-only, >= 0, in squared heights
+    energy : their total, in squared heights
+    collision_logit, collision_probability : above 0, and above 0.5, where a collision is likelier
+    """
+
+    domain_energy: FloatArray
+    energy: float
+    collision_logit: float
+    collision_probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """One pose as it is drawn; all of it belongs to one latent.
+
+    Attributes
+    ----------
+    request_id : rises from frame to frame
+    latent : (D,) float64 array, read-only
+    vertices : (V, 3) float32 array, read-only, in the data's unit, in the reference's frame
+    normals : (V, 3) float32 array, read-only, of length 1, area-weighted
+    prediction : None for a model without a predictor
+    seconds : what decoding, normals and prediction took
+    """
+
+    request_id: int
+    latent: FloatArray
+    vertices: Float32Array
+    normals: Float32Array
+    prediction: PosePrediction | None
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class ExactVerdict:
+    """The exact check of the vertices of one frame, as they are drawn and exported.
+
+    Attributes
+    ----------
+    request_id : of the frame that was checked
+    pairs : (P, 2) int32 array, read-only, the colliding faces, the smaller first
+    n_near_pairs : pairs that are folds of the skin and do not count
+    energy : of the whole pose, in squared heights
+    vertex_energy : (V,) float64 array, read-only, in squared heights
+    domain_energy : (K,) float64 array, read-only, in squared heights
+    colliding : whether there is a pair that counts
+    seconds : what the check took
+    """
+
+    request_id: int
+    pairs: npt.NDArray[np.int32]
+    n_near_pairs: int
+    energy: float
+    vertex_energy: FloatArray
+    domain_energy: FloatArray
+    colliding: bool
+    seconds: float
+
+
+class PoseShower:
+    """Computes frames and verdicts of one model; used by one thread at a time.
+
+    Parameters
+    ----------
+    model : of all poses
+    """
+
+    def __init__(self, model: PoseModel) -> None:
+        from scipy.sparse import csr_matrix
+
+        self.model = model
+        self._corners = tuple(np.ascontiguousarray(corner) for corner in model.faces.T)
+        n_faces = len(model.faces)
+        # Sums the faces' normals into their vertices: one product instead of a scattered sum.
+        self._faces_of_vertex = csr_matrix(
+            (
+                np.ones(3 * n_faces, dtype=np.float32),
+                (model.faces.ravel(), np.repeat(np.arange(n_faces), 3)),
+            ),
+            shape=(model.n_vertices, n_faces),
+        )
+
+    def frame(self, latent: FloatArray, request_id: int) -> LiveFrame:
+        """Decode, shade and predict one pose.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        request_id : is handed on
+        """
+        start = time.perf_counter()
+        vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
+        normals = self.normals(vertices)
+        prediction = None
+        if self.model.predictor is not None:
+            predicted = self.model.predict(latent[None])
+            prediction = PosePrediction(
+                domain_energy=_frozen(predicted.domain_energy[0]),
+                energy=float(predicted.energy[0]),
+                collision_logit=float(predicted.collision_logit[0]),
+                collision_probability=float(predicted.collision_probability[0]),
+            )
+        return LiveFrame(
+            request_id=request_id,
+            latent=latent,
+            vertices=_frozen(vertices),
+            normals=_frozen(normals),
+            prediction=prediction,
+            seconds=time.perf_counter() - start,
+        )
+
+    def verdict(self, frame: LiveFrame) -> ExactVerdict:
+        """Check the vertices of a frame exactly."""
+        from lcollision_core.contact import domain_energy
+
+        start = time.perf_counter()
+        found = self.model.detector.detect(frame.vertices)
+        by_domain = domain_energy(found.vertex_energy[None], self.model.attention_mask)[0]
+        return ExactVerdict(
+            request_id=frame.request_id,
+            pairs=_frozen(found.pairs),
+            n_near_pairs=len(found.near_pairs),
+            energy=found.energy,
+            vertex_energy=_frozen(found.vertex_energy),
+            domain_energy=_frozen(by_domain),
+            colliding=found.colliding,
+            seconds=time.perf_counter() - start,
+        )
+
+    def normals(self, vertices: Float32Array) -> Float32Array:
+        """Return the vertices' normals.
+
+        Parameters
+        ----------
+        vertices : (V, 3) float32 array
+
+        Returns
+        -------
+        normals : (V, 3) float32 array: the mean of the faces' normals by area, of length 1; 0 at
+            a vertex whose faces have no area
+        """
+        a, b, c = (vertices[corner] for corner in self._corners)
+        edge_b, edge_c = (b - a).T, (c - a).T
+        face_normals = np.empty((len(a), 3), dtype=np.float32)
+        for axis in range(3):
+            u, v = (axis + 1) % 3, (axis + 2) % 3
+            face_normals[:, axis] = edge_b[u] * edge_c[v] - edge_b[v] * edge_c[u]
+        normals: Float32Array = self._faces_of_vertex @ face_normals
+        lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals))
+        normals /= np.maximum(lengths, np.finfo(np.float32).tiny)[:, None]
+        return normals
+
+
+def _frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    array.flags.writeable = False
+    return array

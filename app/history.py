@@ -1,0 +1,188 @@
+"""The state of a document and its undo: gestures, merged steps, the modified mark."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QObject, Signal, Slot
+from PySide6.QtGui import QUndoStack
+
+from app.commands import ChangeState, DocumentState
+
+if TYPE_CHECKING:
+    from lcollision_core.meshes import RigidTransform
+    from lcollision_core.model import NamedPose
+    from lcollision_core.resolve import ResolveResult
+
+FloatArray = npt.NDArray[np.float64]
+
+UNNAMED = "pose"
+"""What a pose without a name is called."""
+
+UNDO_STEPS = 1000
+"""Kept at most: a step is a few kilobytes, so that memory stays small however long one edits."""
+
+
+class PoseHistory(QObject):
+    """One pose and the user's library, and how both came to be.
+
+    Every change is one step of `undo_stack`. Between `begin_gesture` and `end_gesture` changes
+    show at once but make one step together, and none where they end as they began.
+    `PoseDocument`, which is what the window holds, tells what the signals mean.
+    """
+
+    latent_changed = Signal()
+    ghost_changed = Signal()
+    outcome_changed = Signal()
+    modified_changed = Signal(bool)
+    file_changed = Signal()
+    library_changed = Signal()
+
+    def __init__(self, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self._state = DocumentState(read_only(np.zeros(0)), UNNAMED)
+        self._gesture: tuple[str, DocumentState] | None = None
+        self._file: Path | None = None
+        self._ghost_shown = True
+        self._told_modified = False
+        self.undo_stack = QUndoStack(self)
+        self.undo_stack.setUndoLimit(UNDO_STEPS)
+        self.undo_stack.cleanChanged.connect(self._on_clean_changed)
+
+    @property
+    def latent(self) -> FloatArray:
+        """(D,) float64 array, read-only."""
+        return self._state.latent
+
+    @property
+    def pose_name(self) -> str:
+        """The name under which Save stores the pose."""
+        return self._state.pose_name
+
+    @property
+    def placement(self) -> RigidTransform | None:
+        """Where the decoded pose belongs, for one that came in as a mesh."""
+        return self._state.placement
+
+    @property
+    def poses(self) -> tuple[NamedPose, ...]:
+        """The user's library, which Save stores beside the pose."""
+        return self._state.poses
+
+    @property
+    def file(self) -> Path | None:
+        """The poses file that Save writes; None asks for one."""
+        return self._file
+
+    @property
+    def modified(self) -> bool:
+        """Whether there is something to save."""
+        return not self.undo_stack.isClean() or self._changed_in_gesture()
+
+    @property
+    def ghost(self) -> npt.NDArray[np.float32] | None:
+        """(V, 3) float32 array, read-only: the mesh before Resolve, while that is to be seen."""
+        return self._state.ghost if self._ghost_shown else None
+
+    @property
+    def ghost_shown(self) -> bool:
+        """Whether a ghost is drawn where there is one."""
+        return self._ghost_shown
+
+    @property
+    def outcome(self) -> ResolveResult | None:
+        """What the Resolve that ended in this pose reported."""
+        return self._state.outcome
+
+    def show_ghost(self, shown: bool) -> None:
+        """Draw or hide the mesh before Resolve."""
+        if shown != self._ghost_shown:
+            self._ghost_shown = shown
+            self.ghost_changed.emit()
+
+    def begin_gesture(self, label: str) -> None:
+        """Start a drag: what follows until `end_gesture` is one step of undo."""
+        self.end_gesture()
+        self._gesture = (label, self._state)
+
+    def end_gesture(self) -> None:
+        """End a drag; does nothing where none has begun."""
+        if self._gesture is None:
+            return
+        label, before = self._gesture
+        self._gesture = None
+        if not before.same_as(self._state):
+            self.undo_stack.push(ChangeState(label, self._apply, before, self._state))
+        self._tell_modified()
+
+    def cancel_gesture(self) -> None:
+        """End a drag and go back to where it began, as for Escape."""
+        if self._gesture is not None:
+            _, before = self._gesture
+            self._gesture = None
+            self._apply(before)
+
+    def undo(self) -> None:
+        """Take back the last step; a drag that has not ended is that step."""
+        self.end_gesture()
+        self.undo_stack.undo()
+
+    def redo(self) -> None:
+        """Do again the step that was taken back last."""
+        self.end_gesture()
+        self.undo_stack.redo()
+
+    def _push(self, label: str, state: DocumentState, run: int | None = None) -> None:
+        """Go to another state, as a step of its own or as part of the gesture."""
+        if self._gesture is not None:
+            self._apply(state)
+        elif not state.same_as(self._state):
+            self.undo_stack.push(ChangeState(label, self._apply, self._state, state, run))
+
+    def _begin(self, state: DocumentState, file: Path | None) -> None:
+        """Put in a state without a past."""
+        self._gesture = None
+        self._file = file
+        self._apply(state)
+        self.undo_stack.clear()
+        self.file_changed.emit()
+
+    def _apply(self, state: DocumentState) -> None:
+        """Put in a state and tell what has changed: the one place where the pose changes."""
+        before, self._state = self._state, state
+        if state.latent is not before.latent:
+            self._follow_latent()
+            self.latent_changed.emit()
+        if state.ghost is not before.ghost:
+            self.ghost_changed.emit()
+        if state.outcome is not before.outcome:
+            self.outcome_changed.emit()
+        if state.poses is not before.poses:
+            self.library_changed.emit()
+        if state.pose_name != before.pose_name:
+            self.file_changed.emit()
+        self._tell_modified()
+
+    def _follow_latent(self) -> None:
+        """Tell the workers, before the widgets, that the pose is another."""
+
+    def _tell_modified(self) -> None:
+        if self.modified != self._told_modified:
+            self._told_modified = self.modified
+            self.modified_changed.emit(self._told_modified)
+
+    @Slot(bool)
+    def _on_clean_changed(self, _: bool) -> None:
+        self._tell_modified()
+
+    def _changed_in_gesture(self) -> bool:
+        return self._gesture is not None and not self._gesture[1].same_as(self._state)
+
+
+def read_only(array: FloatArray) -> FloatArray:
+    """Return the array itself, from now on read-only, as other threads read it."""
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,153 @@
+"""The long work of the editor, as functions of a snapshot that run in another thread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from app.engine import Work
+from app.frames import PoseShower
+from app.symmetry import mirror_vertices
+from lcollision_core.errors import ModelFileError
+from lcollision_core.jobs import CancelToken, Progress
+
+if TYPE_CHECKING:
+    from lcollision_core.meshes import RigidTransform
+    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.resolve import ResolveOptions, ResolveResult
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedModel:
+    """A model that is ready for the first drag.
+
+    Attributes
+    ----------
+    model : has been used once, so that nothing is left to compile or to load
+    mirror : (V,) each vertex's mirror image, or None where the mesh has no two sides
+    """
+
+    model: PoseModel
+    mirror: npt.NDArray[np.int32] | None
+
+
+@dataclass(frozen=True, eq=False)
+class ReadPoses:
+    """A poses file: at least one pose."""
+
+    path: Path
+    poses: tuple[NamedPose, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Resolved:
+    """What Resolve found, and the mesh before, (V, 3) float32, read-only."""
+
+    result: ResolveResult
+    ghost: npt.NDArray[np.float32]
+
+
+def drawn_vertices(model: PoseModel, latent: FloatArray) -> npt.NDArray[np.float32]:
+    """Return the (V, 3) vertices, read-only, that a frame of the pose has, to the bit."""
+    vertices = model.decode(latent, n_threads=1).astype(np.float32)
+    vertices.flags.writeable = False
+    return vertices
+
+
+def opened_model(name_or_path: str | Path) -> Work:
+    """Read a model and warm it up."""
+
+    def work(_: Progress, cancel: CancelToken) -> OpenedModel:
+        from lcollision_core.model import PoseModel
+
+        model = PoseModel.load(name_or_path)
+        cancel.raise_if_cancelled()
+        warm_up(model)
+        return OpenedModel(model, mirror_vertices(model.reference, model.faces, model.up_axis))
+
+    return work
+
+
+def warm_up(model: PoseModel) -> None:
+    """Compute all that a first drag needs once, in the thread that has the time."""
+    shower = PoseShower(model)
+    latent = np.zeros(model.latent_size)
+    latent.flags.writeable = False
+    shower.verdict(shower.frame(latent, 0))
+    _ = model.fingerprint, model.latent_space
+
+
+def read(model: PoseModel, path: Path) -> Work:
+    """Read a poses file of a model."""
+
+    def work(_: Progress, cancel: CancelToken) -> ReadPoses:
+        from lcollision_core.model import read_poses
+
+        poses = read_poses(path, model)
+        cancel.raise_if_cancelled()
+        if not poses:
+            raise ModelFileError(f"{path} holds no poses; open a file that has some")
+        return ReadPoses(path, poses)
+
+    return work
+
+
+def encoded(model: PoseModel, path: Path) -> Work:
+    """Read a mesh of a model's topology as a latent pose, named after its file."""
+
+    def work(_: Progress, cancel: CancelToken) -> NamedPose:
+        from lcollision_core.meshes import read_mesh
+        from lcollision_core.model import NamedPose
+
+        mesh = read_mesh(path, topology=model.topology)
+        model.require_topology(mesh.topology, str(path))
+        cancel.raise_if_cancelled()
+        return NamedPose.of_mesh(path.stem, model.encode(mesh.vertices, cancel=cancel))
+
+    return work
+
+
+def mirrored(model: PoseModel, latent: FloatArray, mirror: npt.NDArray[np.int32]) -> Work:
+    """Find the latent of the mirrored mesh."""
+
+    def work(_: Progress, cancel: CancelToken) -> FloatArray:
+        # Through any plane, as encoding finds the rigid motion.
+        image = model.decode(latent, n_threads=1)[mirror] * np.array([-1.0, 1.0, 1.0])
+        return model.encode(image, cancel=cancel).latent
+
+    return work
+
+
+def exported(
+    model: PoseModel,
+    latent: FloatArray,
+    placement: RigidTransform | None,
+    path: Path,
+) -> Work:
+    """Write the mesh that is drawn of a pose, moved back to where it came from."""
+
+    def work(_: Progress, __: CancelToken) -> Path:
+        from lcollision_core.meshes import write_mesh
+
+        vertices = drawn_vertices(model, latent)
+        placed = vertices if placement is None else placement.apply(vertices).astype(np.float32)
+        write_mesh(path, placed, model.faces)
+        return path
+
+    return work
+
+
+def resolved(model: PoseModel, latent: FloatArray, options: ResolveOptions) -> Work:
+    """Find the nearest free pose."""
+
+    def work(progress: Progress, cancel: CancelToken) -> Resolved:
+        ghost = drawn_vertices(model, latent)
+        return Resolved(model.resolve(latent, options, progress=progress, cancel=cancel), ghost)
+
+    return work
