@@ -60,7 +60,7 @@ class ChangeState(QUndoCommand):
     ----------
     label : what the menu calls the act
     apply : puts a state into the document; a method of the document, as commands know no widget
-    before, after : the two states
+    before, after : the two states, which `PoseHistory` may amend
     run : steps of one run on one slider merge when they follow fast; None never merges
     """
 
@@ -74,18 +74,18 @@ class ChangeState(QUndoCommand):
     ) -> None:
         super().__init__(label)
         self._apply = apply
-        self._before = before
-        self._after = after
+        self.before = before
+        self.after = after
         self._run = run
         self._time = time.monotonic()
 
     def redo(self) -> None:
         """Go to the later state."""
-        self._apply(self._after)
+        self._apply(self.after)
 
     def undo(self) -> None:
         """Go back to the earlier state."""
-        self._apply(self._before)
+        self._apply(self.before)
 
     def id(self) -> int:
         """Tell Qt whether to ask `mergeWith`."""
@@ -97,6 +97,6 @@ class ChangeState(QUndoCommand):
             return False
         if other._time - self._time > MERGE_SECONDS:
             return False
-        self._after, self._time = other._after, other._time
-        self.setObsolete(self._before.same_as(self._after))
+        self.after, self._time = other.after, other._time
+        self.setObsolete(self.before.same_as(self.after))
         return True

@@ -55,6 +55,7 @@ class PoseDocument(PoseHistory):
     busy_changed : str, what the long work is, or "" where there is none
     message : str, one sentence for the status bar
     failed : Failure, one sentence and its details, for a dialog
+    recovered : Path, the poses file that `recover` has put in
     """
 
     model_changed = Signal()
@@ -67,10 +68,12 @@ class PoseDocument(PoseHistory):
     busy_changed = Signal(str)
     message = Signal(str)
     failed = Signal(object)
+    recovered = Signal(object)
 
     def __init__(self, model: PoseModel | None = None, parent: QObject | None = None) -> None:
         super().__init__(parent)
         self._model: PoseModel | None = None
+        self._model_file = ""
         self._mirror: npt.NDArray[np.int32] | None = None
         self._locked: frozenset[int] = frozenset()
         self._frame: LiveFrame | None = None
@@ -103,6 +106,11 @@ class PoseDocument(PoseHistory):
         if self._model is None:
             raise LCollisionError("no model is open yet; open one first")
         return self._model
+
+    @property
+    def model_file(self) -> str:
+        """The file that the model was read from, or the name of one that was not."""
+        return self._model_file
 
     @property
     def locked_domains(self) -> frozenset[int]:
@@ -222,64 +230,28 @@ class PoseDocument(PoseHistory):
             self.cancel_resolve()
             self.locks_changed.emit()
 
-    # The library.
-
-    def load_pose(self, pose: NamedPose) -> None:
-        """Make a pose of the library, or a training pose, the one that is edited."""
-        self._load(f"Load {pose.name}", pose)
-
     def training_pose(self, number: int) -> NamedPose:
         """Return a training pose of the model by its number, from 0."""
         from lcollision_core.model import NamedPose
 
         return NamedPose(self.model.pose_names[number], self.model.training_latent[number])
 
-    def add_pose_to_library(self, name: str) -> None:
-        """Keep the pose in the library; a taken name gets a number.
-
-        Parameters
-        ----------
-        name : of the pose, which is called so from then on
-        """
-        from lcollision_core.model import NamedPose, unique_names
-
-        taken = [pose.name for pose in self.poses]
-        free = unique_names([*taken, name or UNNAMED])[-1]
-        added = NamedPose(free, self.latent, self.placement)
-        state = replace(self._state, pose_name=free, poses=(*self.poses, added))
-        self._push(f"Keep {free}", state)
-
-    def remove_pose_from_library(self, name: str) -> None:
-        """Drop a pose of the library."""
-        kept = tuple(pose for pose in self.poses if pose.name != name)
-        self._push(f"Remove {name}", replace(self._state, poses=kept))
-
-    def rename_pose(self, old: str, new: str) -> None:
-        """Rename a pose of the library, and the edited pose where it is that one.
-
-        Raises
-        ------
-        ModelFileError : the new name is empty or another pose's.
-        """
-        if not new or any(pose.name == new != old for pose in self.poses):
-            raise ModelFileError(f"a pose cannot be called {new!r}; choose another name")
-        poses = tuple(replace(p, name=new) if p.name == old else p for p in self.poses)
-        name = new if self.pose_name == old else self.pose_name
-        self._push(f"Rename {old}", replace(self._state, poses=poses, pose_name=name))
-
     # Models and files.
 
-    def set_model(self, model: PoseModel, mirror: npt.NDArray[np.int32] | None = None) -> None:
+    def set_model(self, model: PoseModel) -> None:
         """Put in another model, with a new pose and an empty library.
 
         Parameters
         ----------
-        model : may lack a predictor
-        mirror : (V,) each vertex's mirror image, for a model that can be mirrored; `open_model`
-            finds it
+        model : may lack a predictor; `open_model` is kinder to the window, as it compiles and
+            loads in the long worker what a first drag needs
         """
-        self._model = model
-        self._mirror = mirror
+        self._put_in(tasks.OpenedModel(model, model.name, tasks.mirror_of(model)))
+
+    def _put_in(self, opened: tasks.OpenedModel) -> None:
+        self._model = opened.model
+        self._model_file = opened.file
+        self._mirror = opened.mirror
         self._locked = frozenset()
         self.cancel_all()
         self._live.stop()
@@ -307,6 +279,23 @@ class PoseDocument(PoseHistory):
             f"Opening {Path(path).name}", tasks.read(self.model, Path(path)), self._on_poses
         )
 
+    def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
+        """Read what a crash left, in the long worker, and make it the pose, unsaved.
+
+        Parameters
+        ----------
+        poses_file : what was left
+        model_file : of the model that was open
+        name : of the pose that was edited
+        file : that it came from
+        """
+        if model_file == self._model_file:
+            opened = tasks.OpenedModel(self.model, model_file, self._mirror)
+        else:
+            opened = None
+        work = tasks.recovered(opened, model_file, poses_file, name, file)
+        self._long.start(f"Recovering {name}", work, self._on_recovered)
+
     def save(self, path: str | Path | None = None) -> None:
         """Write the library and the edited pose, under its name, and clear the modified mark.
 
@@ -321,21 +310,17 @@ class PoseDocument(PoseHistory):
         from lcollision_core.model import write_poses
 
         self.end_gesture()
+        poses = self.all_poses()
         target = Path(path) if path is not None else self._file
         if target is None:
             raise ModelFileError("the pose has no file yet; save it under a name")
-        write_poses(target, self.model, self.all_poses())
+        write_poses(target, self.model, poses)
         self._file = target
+        # The library is now what the file is, whichever way undo comes back to this pose.
+        self._amend(replace(self._state, poses=poses))
         self.undo_stack.setClean()
         self.file_changed.emit()
         self.message.emit(f"Saved {target.name}")
-
-    def all_poses(self) -> tuple[NamedPose, ...]:
-        """Return what Save writes: the edited pose first, then the rest of the library."""
-        from lcollision_core.model import NamedPose
-
-        edited = NamedPose(self.pose_name, self.latent, self.placement)
-        return (edited, *(pose for pose in self.poses if pose.name != edited.name))
 
     def import_mesh(self, path: str | Path) -> None:
         """Encode a mesh of the model's topology in the long worker and make it the pose."""
@@ -427,7 +412,7 @@ class PoseDocument(PoseHistory):
             self.solve_progressed.emit(status)
 
     def _on_model(self, opened: tasks.OpenedModel) -> None:
-        self.set_model(opened.model, opened.mirror)
+        self._put_in(opened)
         self.message.emit(f"Opened {opened.model.name}")
 
     def _on_poses(self, read: tasks.ReadPoses) -> None:
@@ -436,6 +421,17 @@ class PoseDocument(PoseHistory):
         self._begin(state, read.path)
         n_poses = len(read.poses)
         self.message.emit(f"Opened {read.path.name}: {n_poses} pose{'s' * (n_poses != 1)}")
+
+    def _on_recovered(self, found: tasks.RecoveredPoses) -> None:
+        if found.opened.model is not self._model:
+            self._put_in(found.opened)
+        edited = next((p for p in found.poses if p.name == found.name), found.poses[0])
+        latent = read_only(edited.latent)
+        state = DocumentState(latent, edited.name, edited.placement, found.poses)
+        self._begin(state, found.file)
+        self.undo_stack.resetClean()
+        self.message.emit(f"Recovered {edited.name}")
+        self.recovered.emit(found.poses_file)
 
     def _on_encoded(self, pose: NamedPose) -> None:
         self._load(f"Import {pose.name}", pose)
@@ -454,7 +450,7 @@ class PoseDocument(PoseHistory):
         result, self._solve = resolved.result, None
         if np.array_equal(result.latent, self.latent):
             # Nothing to undo, but the reasons are worth seeing.
-            self._apply(replace(self._state, outcome=result))
+            self._amend(replace(self._state, outcome=result))
         else:
             after = replace(
                 self._state,
@@ -472,10 +468,6 @@ class PoseDocument(PoseHistory):
     def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
         self._push(label, replace(self._state, latent=read_only(latent), outcome=None), run)
 
-    def _load(self, label: str, pose: NamedPose) -> None:
-        latent = read_only(np.array(pose.latent, dtype=np.float64))
-        self._push(label, DocumentState(latent, pose.name, pose.placement, self.poses))
-
     def _blank(self) -> DocumentState:
         return DocumentState(read_only(np.zeros(self.model.latent_size)), UNNAMED)
 
@@ -490,6 +482,8 @@ class PoseDocument(PoseHistory):
     def _with_locked(self, latent: FloatArray) -> FloatArray:
         """Return the latent with the present codes of locked domains."""
         for domain in self._locked:
+            # As in Resolve: the domain's own codes, and the whole body's code that is its.
+            latent[domain] = self.latent[domain]
             codes = self.model.latent_space.groups[1 + domain].codes
             latent[codes] = self.latent[codes]
         return latent

@@ -148,7 +148,7 @@ class LivePose(QObject):
     """Follows one pose: its frame as soon as can be, its verdict when it rests.
 
     Changes within one turn of the event loop are one request; while the worker is busy, only the
-    newest pose waits. A failure is told once for each pose.
+    newest pose waits. A failure that repeats itself from pose to pose is told once.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ class LivePose(QObject):
     def __init__(self, rest_milliseconds: int, parent: QObject | None = None) -> None:
         super().__init__(parent)
         self._worker = LiveWorker()
-        self._thread = _started_thread("live pose", self._worker, self)
+        self._thread = started_thread("live pose", self._worker, self)
         self._wanted.connect(self._worker.answer)
         self._worker.answered.connect(self._on_answered)
         self._model: PoseModel | None = None
@@ -172,8 +172,9 @@ class LivePose(QObject):
         self._asked: FrameRequest | VerdictRequest | None = None
         self._shown: tuple[FrameRequest, LiveFrame] | None = None
         self._last_id = 0
-        self._due = _single_shot(self, 0, self._ask)
-        self._rested = _single_shot(self, rest_milliseconds, self._ask)
+        self._told = ""
+        self._due = single_shot(self, 0, self._ask)
+        self._rested = single_shot(self, rest_milliseconds, self._ask)
 
     def follow(self, model: PoseModel, latent: npt.NDArray[np.float64]) -> None:
         """Want the frame, and later the verdict, of another pose.
@@ -198,7 +199,7 @@ class LivePose(QObject):
     def close(self, deadline: float) -> bool:
         """End the thread; see `LongWork.close`."""
         self.stop()
-        return _end_thread(self._thread, deadline)
+        return end_thread(self._thread, deadline)
 
     @Slot()
     def _ask(self) -> None:
@@ -221,11 +222,14 @@ class LivePose(QObject):
         if request is None or request.model is not self._model:
             return
         if answer.failure is not None:
-            self.failed.emit(answer.failure)
+            if answer.failure.sentence != self._told:
+                self._told = answer.failure.sentence
+                self.failed.emit(answer.failure)
         elif isinstance(request, FrameRequest) and answer.value is not None:
             if request.request_id == self._last_id:
                 self._shown = (request, answer.value)
                 self._rested.start()
+            self._told = ""
             self.frame_computed.emit(answer.value)
         elif answer.value is not None and answer.request_id == self._last_id:
             self.verdict_computed.emit(answer.value)
@@ -247,7 +251,7 @@ class LongWork(QObject):
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
         self._worker = LongWorker()
-        self._thread = _started_thread("long work", self._worker, self)
+        self._thread = started_thread("long work", self._worker, self)
         self._wanted.connect(self._worker.answer)
         self._worker.answered.connect(self._on_answered)
         self._worker.progressed.connect(self._on_progressed)
@@ -310,7 +314,7 @@ class LongWork(QObject):
         ended : a thread that has not is left to end with the process
         """
         self.cancel_all()
-        return _end_thread(self._thread, deadline)
+        return end_thread(self._thread, deadline)
 
     @Slot(int, object)
     def _on_progressed(self, number: int, status: object) -> None:
@@ -331,7 +335,8 @@ class LongWork(QObject):
         self.busy_changed.emit(self.busy)
 
 
-def _started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
+def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
+    """Move a worker, which has no parent, into a thread of its own."""
     thread = QThread(parent)
     thread.setObjectName(name)
     worker.moveToThread(thread)
@@ -339,12 +344,14 @@ def _started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
     return thread
 
 
-def _end_thread(thread: QThread, deadline: float) -> bool:
+def end_thread(thread: QThread, deadline: float) -> bool:
+    """Let a thread end after what it does now, and tell whether it has by the deadline."""
     thread.quit()
     return thread.wait(max(1, int(1000 * (deadline - time.monotonic()))))
 
 
-def _single_shot(parent: QObject, milliseconds: int, slot: Callable[[], None]) -> QTimer:
+def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], None]) -> QTimer:
+    """Make a timer that calls a slot once each time it is started."""
     timer = QTimer(parent)
     timer.setSingleShot(True)
     timer.setInterval(milliseconds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from PySide6.QtCore import QObject, Signal, Slot
 from PySide6.QtGui import QUndoStack
 
 from app.commands import ChangeState, DocumentState
+from lcollision_core.errors import ModelFileError
 
 if TYPE_CHECKING:
     from lcollision_core.meshes import RigidTransform
@@ -135,12 +137,73 @@ class PoseHistory(QObject):
         self.end_gesture()
         self.undo_stack.redo()
 
+    def load_pose(self, pose: NamedPose) -> None:
+        """Make a pose of the library, or a training pose, the one that is edited."""
+        self._load(f"Load {pose.name}", pose)
+
+    def add_pose_to_library(self, name: str) -> None:
+        """Keep the pose in the library; a taken name gets a number.
+
+        Parameters
+        ----------
+        name : of the pose, which is called so from then on
+        """
+        from lcollision_core.model import NamedPose, unique_names
+
+        taken = [pose.name for pose in self.poses]
+        free = unique_names([*taken, name or UNNAMED])[-1]
+        added = NamedPose(free, self.latent, self.placement)
+        state = replace(self._state, pose_name=free, poses=(*self.poses, added))
+        self._push(f"Keep {free}", state)
+
+    def remove_pose_from_library(self, name: str) -> None:
+        """Drop a pose of the library."""
+        kept = tuple(pose for pose in self.poses if pose.name != name)
+        self._push(f"Remove {name}", replace(self._state, poses=kept))
+
+    def rename_pose(self, old: str, new: str) -> None:
+        """Rename a pose of the library, and the edited pose where it is that one.
+
+        Raises
+        ------
+        ModelFileError : the new name is empty or another pose's.
+        """
+        if not new or any(pose.name == new != old for pose in self.poses):
+            raise ModelFileError(f"a pose cannot be called {new!r}; choose another name")
+        poses = tuple(replace(p, name=new) if p.name == old else p for p in self.poses)
+        name = new if self.pose_name == old else self.pose_name
+        self._push(f"Rename {old}", replace(self._state, poses=poses, pose_name=name))
+
+    def all_poses(self) -> tuple[NamedPose, ...]:
+        """Return what Save writes: the library, with the edited pose in its place or at the end."""
+        from lcollision_core.model import NamedPose
+
+        edited = NamedPose(self.pose_name, self.latent, self.placement)
+        if all(pose.name != edited.name for pose in self.poses):
+            return (*self.poses, edited)
+        return tuple(edited if pose.name == edited.name else pose for pose in self.poses)
+
+    def _load(self, label: str, pose: NamedPose) -> None:
+        latent = read_only(np.array(pose.latent, dtype=np.float64))
+        self._push(label, DocumentState(latent, pose.name, pose.placement, self.poses))
+
     def _push(self, label: str, state: DocumentState, run: int | None = None) -> None:
         """Go to another state, as a step of its own or as part of the gesture."""
         if self._gesture is not None:
             self._apply(state)
         elif not state.same_as(self._state):
             self.undo_stack.push(ChangeState(label, self._apply, self._state, state, run))
+
+    def _amend(self, state: DocumentState) -> None:
+        """Put in a state that the undo steps on both sides of it lead to, in the place of this."""
+        place = self.undo_stack.index()
+        earlier = self.undo_stack.command(place - 1)
+        later = self.undo_stack.command(place)
+        if isinstance(earlier, ChangeState):
+            earlier.after = state
+        if isinstance(later, ChangeState):
+            later.before = state
+        self._apply(state)
 
     def _begin(self, state: DocumentState, file: Path | None) -> None:
         """Put in a state without a past."""

@@ -30,10 +30,12 @@ class OpenedModel:
     Attributes
     ----------
     model : has been used once, so that nothing is left to compile or to load
+    file : that it was read from
     mirror : (V,) each vertex's mirror image, or None where the mesh has no two sides
     """
 
     model: PoseModel
+    file: str
     mirror: npt.NDArray[np.int32] | None
 
 
@@ -43,6 +45,26 @@ class ReadPoses:
 
     path: Path
     poses: tuple[NamedPose, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RecoveredPoses:
+    """What a crash left: at least one pose, `name` being the edited one.
+
+    Attributes
+    ----------
+    opened : the model that the poses belong to
+    poses_file : where they were kept
+    poses : the library, with the edited pose
+    name : of the edited pose
+    file : that it came from
+    """
+
+    opened: OpenedModel
+    poses_file: Path
+    poses: tuple[NamedPose, ...]
+    name: str
+    file: Path | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,14 +86,20 @@ def opened_model(name_or_path: str | Path) -> Work:
     """Read a model and warm it up."""
 
     def work(_: Progress, cancel: CancelToken) -> OpenedModel:
-        from lcollision_core.model import PoseModel
+        from lcollision_core.model import PoseModel, find_model
 
-        model = PoseModel.load(name_or_path)
+        path = find_model(name_or_path).absolute()
+        model = PoseModel.load(path)
         cancel.raise_if_cancelled()
         warm_up(model)
-        return OpenedModel(model, mirror_vertices(model.reference, model.faces, model.up_axis))
+        return OpenedModel(model, str(path), mirror_of(model))
 
     return work
+
+
+def mirror_of(model: PoseModel) -> npt.NDArray[np.int32] | None:
+    """Return (V,) each vertex's mirror image, or None where the mesh has no two sides."""
+    return mirror_vertices(model.reference, model.faces, model.up_axis)
 
 
 def warm_up(model: PoseModel) -> None:
@@ -94,6 +122,19 @@ def read(model: PoseModel, path: Path) -> Work:
         if not poses:
             raise ModelFileError(f"{path} holds no poses; open a file that has some")
         return ReadPoses(path, poses)
+
+    return work
+
+
+def recovered(
+    opened: OpenedModel | None, model_file: str, poses_file: Path, name: str, file: Path | None
+) -> Work:
+    """Read what a crash left, with its model unless that is open already."""
+
+    def work(progress: Progress, cancel: CancelToken) -> RecoveredPoses:
+        model = opened or opened_model(model_file)(progress, cancel)
+        poses = read(model.model, poses_file)(progress, cancel).poses
+        return RecoveredPoses(model, poses_file, poses, name, file)
 
     return work
 
