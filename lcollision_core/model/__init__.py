@@ -1,6 +1,7 @@
 """A trained body: one file in, everything that a front end needs out."""
 
 from lcollision_core.model.card import ModelCard
+from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace
 from lcollision_core.model.library import (
     MODEL_SUFFIX,
@@ -11,7 +12,7 @@ from lcollision_core.model.library import (
     user_models_folder,
 )
 from lcollision_core.model.pose_file import NamedPose, read_poses, unique_names, write_poses
-from lcollision_core.model.pose_model import EncodedPose, PoseModel
+from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.model.sampling import sample_poses
 
 __all__ = [

@@ -6,9 +6,9 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,38 +17,29 @@ from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.errors import ModelFileError, PoseSetError, ShapeError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, RigidTransform, Topology, height, up_axis
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.colours import domain_colours
+from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_space import WHOLE_BODY, LatentGroup, LatentSpace
 from lcollision_core.model.library import find_model
+from lcollision_core.model.matching import require_same_faces
 from lcollision_core.model.naming import checked_name, names_from_labels, numbered_names
 from lcollision_core.model_file import Section, read_model_file, write_model_file
+
+if TYPE_CHECKING:
+    from lcollision_core.predictor import CollisionPredictor, Prediction
+    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
 
 _EMBEDDING = "embedding"
 _CARD = "model"
+_PREDICTOR = "predictor"
+_FREE_POSES = "free_poses"
 
 _LARGEST_SIZE = 20.0
-
-
-@dataclass(frozen=True)
-class EncodedPose:
-    """A mesh as a latent pose.
-
-    Attributes
-    ----------
-    latent : (D,) float64 array
-    placement : takes the decoded pose to where the mesh was, in the data's unit
-    fit_error_mean, fit_error_max : distance of the decoded vertices from the mesh's, in heights
-    """
-
-    latent: FloatArray
-    placement: RigidTransform
-    fit_error_mean: float
-    fit_error_max: float
 
 
 class PoseModel:
@@ -214,6 +205,44 @@ class PoseModel:
         vertices *= self.card.height
         return vertices[0] if codes.ndim == 1 else vertices
 
+    def predict(self, latent: npt.ArrayLike) -> Prediction:
+        """Predict whether poses collide, and how deeply in which domain, without decoding them.
+
+        Parameters
+        ----------
+        latent : (D,) or (B, D) finite array; one pose is a batch of 1
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        ModelFileError : the model has no predictor, or a damaged one.
+        """
+        return self._needed_predictor().predict(np.atleast_2d(np.asarray(latent, np.float64)))
+
+    def resolve(
+        self,
+        latent: npt.ArrayLike,
+        options: ResolveOptions | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> ResolveResult:
+        """Find the nearest pose that is exactly free of collisions.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        options : the solver, what is kept small, locked domains and limits
+        progress : called with (steps of the ladder done, all steps)
+        cancel : polled at every evaluation
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        ModelFileError : the model has no predictor, or a damaged one.
+        CancelledError : `cancel` was set.
+        """
+        return self.resolver.resolve(latent, options, progress, cancel)
+
     def encode(self, vertices: npt.ArrayLike, cancel: CancelToken | None = None) -> EncodedPose:
         """Find the latent pose whose mesh lies nearest to a given one, wherever that lies.
 
@@ -266,22 +295,7 @@ class PoseModel:
         ------
         PoseSetError : another number of vertices or faces, or other faces.
         """
-        for noun, found, needed in (
-            ("vertices", topology.n_vertices, self.n_vertices),
-            ("faces", topology.n_faces, self.topology.n_faces),
-        ):
-            if found != needed:
-                raise PoseSetError(
-                    f"{source} has {found} {noun}, the model {self.name!r} has {needed}; export "
-                    f"it with the model's topology"
-                )
-        if topology != self.topology and not np.array_equal(
-            _sorted_faces(topology.faces), _sorted_faces(self.faces)
-        ):
-            raise PoseSetError(
-                f"{source} has other faces than the model {self.name!r}; export it with the "
-                f"model's topology and vertex order"
-            )
+        require_same_faces(topology, self.topology, source, self.name)
 
     def rename_domains(self, names: Mapping[int, str]) -> PoseModel:
         """Return the same model with some domains called otherwise.
@@ -306,6 +320,73 @@ class PoseModel:
                 raise ModelFileError(f"two domains would be called {name!r}; choose another name")
         card = replace(self.card, domain_names=tuple(renamed))
         return PoseModel(self.name, self.embedding, card, self._other_sections)
+
+    def with_predictor(self, predictor: CollisionPredictor) -> PoseModel:
+        """Return the same model with a predictor, in the place of any that it had."""
+        return self._with_section(_PREDICTOR, predictor.to_section())
+
+    def with_free_poses(self, latent: npt.ArrayLike) -> PoseModel:
+        """Return the same model with (F, D) poses that were found exactly free, F >= 0."""
+        codes = np.asarray(latent, dtype=np.float32).reshape(-1, self.latent_size)
+        return self._with_section(_FREE_POSES, Section({"latent": codes}))
+
+    def _with_section(self, name: str, section: Section) -> PoseModel:
+        sections = {**self._other_sections, name: section}
+        return PoseModel(self.name, self.embedding, self.card, sections)
+
+    @cached_property
+    def predictor(self) -> CollisionPredictor | None:
+        """What predicts collisions; None where none was trained yet.
+
+        Raises
+        ------
+        ModelFileError : it is damaged.
+        """
+        section = self._other_sections.get(_PREDICTOR)
+        if section is None:
+            return None
+        from lcollision_core.predictor import CollisionPredictor
+
+        return CollisionPredictor.from_section(section, self.embedding)
+
+    def _needed_predictor(self) -> CollisionPredictor:
+        predictor = self.predictor
+        if predictor is None:
+            raise ModelFileError(
+                f"the model {self.name!r} has no predictor; run `lcollision label` and then "
+                f"`lcollision train predictor`"
+            )
+        return predictor
+
+    @cached_property
+    def free_latent(self) -> FloatArray:
+        """(F, D) poses that were found exactly free when the predictor was made, read-only."""
+        section = self._other_sections.get(_FREE_POSES)
+        codes = None if section is None else section.arrays.get("latent")
+        if codes is None or codes.ndim != 2 or codes.shape[1] != self.latent_size:
+            return _read_only(np.empty((0, self.latent_size)))
+        return _read_only(codes.astype(np.float64))
+
+    @cached_property
+    def resolver(self) -> PoseResolver:
+        """Moves this model's poses free of self-collision.
+
+        Raises
+        ------
+        ModelFileError : the model has no predictor, or a damaged one.
+        """
+        from lcollision_core.labels import LatentBox
+        from lcollision_core.resolve import PoseResolver
+
+        box = LatentBox.of(self.embedding)
+        return PoseResolver(
+            self.embedding,
+            self._needed_predictor(),
+            self.detector,
+            self.height,
+            self.free_latent,
+            (box.low, box.high),
+        )
 
     @cached_property
     def fingerprint(self) -> str:
@@ -401,13 +482,6 @@ class PoseModel:
     def metrics(self) -> EmbeddingMetrics | None:
         """What training measured, lengths in heights."""
         return self.embedding.metrics
-
-
-def _sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-    """Turn each face until its least vertex comes first, then sort the faces."""
-    turned = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
-    rows = np.take_along_axis(faces, turned, axis=1)
-    return rows[np.lexsort(rows.T)]
 
 
 def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
