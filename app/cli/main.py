@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from app.cli import benchmark, check, dataset, label, models, poses, train
+from app.cli import benchmark, check, dataset, evaluate, label, models, poses, train
 from app.cli.console import ExitStatus
 from lcollision_core.errors import CancelledError, LCollisionError
 
@@ -85,6 +85,7 @@ app.command("encode")(poses.encode)
 app.command("decode")(poses.decode)
 app.command("sample")(poses.sample)
 app.command("label")(label.label)
+app.command("evaluate")(evaluate.evaluate)
 app.add_typer(dataset.app, name="dataset")
 app.add_typer(train.app, name="train")
 app.add_typer(benchmark.app, name="benchmark")

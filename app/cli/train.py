@@ -13,12 +13,14 @@ import typer
 from app.cli.console import note
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import describe, error_sentence
+from app.cli.train_predictor import predictor
 from lcollision_core.errors import CancelledError
 
 if TYPE_CHECKING:
     from lcollision_core.embedding.training import StatusCallback, TrainingStatus
 
 app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
+app.command("predictor")(predictor)
 
 
 @app.command("embedding")

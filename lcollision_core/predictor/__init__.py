@@ -7,6 +7,7 @@ from lcollision_core.predictor.predictor import (
     Prediction,
     TrainingFacts,
     evaluate_predictor,
+    held_out_rows,
 )
 from lcollision_core.predictor.training import (
     PredictorStatus,
@@ -28,6 +29,7 @@ __all__ = [
     "StatusCallback",
     "TrainingFacts",
     "evaluate_predictor",
+    "held_out_rows",
     "no_status",
     "train_predictor",
 ]

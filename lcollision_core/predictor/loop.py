@@ -101,7 +101,7 @@ class TrainingLoop:
         learnt = [values for values in network.parameters() if values.requires_grad]
         optimiser = torch.optim.Adam(learnt, lr=config.rate, fused=True)
         step = self._restore(checkpoint, network, optimiser)
-        processes.wait()
+        processes.require_same(step)
         shared: torch.nn.Module = network
         if processes.count > 1:
             shared = DistributedDataParallel(network, find_unused_parameters=True)

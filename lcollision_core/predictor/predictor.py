@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.labels import LabelRows, StoreIdentity
+from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
@@ -358,6 +358,11 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
             raise ShapeError(
                 f"row {row} (from 0) has a number that is not finite; label the samples again"
             )
+
+
+def held_out_rows(rows: LabelRows) -> LabelRows:
+    """Return copies of the rows that never train, of rows 0, 1, 2, ... of a store."""
+    return taken(rows, is_held_out(np.arange(len(rows))))
 
 
 def taken(rows: LabelRows, index: npt.NDArray[Any]) -> LabelRows:

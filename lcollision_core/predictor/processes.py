@@ -42,6 +42,23 @@ class Processes:
             dist.all_reduce(total)
         return float(total)
 
+    def require_same(self, number: int) -> None:
+        """Refuse to go on where the processes begin at different steps.
+
+        Raises
+        ------
+        LCollisionError : they do.
+        """
+        if self.count == 1:
+            return
+        largest = torch.tensor([number, -number], device=self.device)
+        dist.all_reduce(largest, dist.ReduceOp.MAX)
+        if int(largest[0]) != -int(largest[1]):
+            raise LCollisionError(
+                "the processes do not see the same checkpoint; put it into a folder that all "
+                "machines share, or delete it"
+            )
+
     def wait(self) -> None:
         """Wait until all processes are here."""
         if self.count > 1:

@@ -18,8 +18,8 @@ from lcollision_core.predictor.predictor import (
     CollisionPredictor,
     TrainingFacts,
     evaluate_predictor,
+    held_out_rows,
     require_model,
-    taken,
 )
 
 
@@ -125,6 +125,4 @@ def train_predictor(
     predictor = CollisionPredictor(
         network.cpu(), config, facts, embedding.n_domains, embedding.latent_size
     )
-    return predictor.with_metrics(
-        evaluate_predictor(predictor, taken(rows, held_out), cancel=cancel)
-    )
+    return predictor.with_metrics(evaluate_predictor(predictor, held_out_rows(rows)))

@@ -1,0 +1,117 @@
+"""``lcollision evaluate``: how well a model's predictor does on labelled samples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from app.cli.console import counted, print_json, progress_bar
+from app.cli.interrupt import cancel_on_interrupt
+from app.cli.models import ModelArgument
+from lcollision_core.errors import LabelStoreError, ModelFileError
+
+if TYPE_CHECKING:
+    from lcollision_core.labels import LabelRows, LabelStore
+    from lcollision_core.model import PoseModel
+    from lcollision_core.predictor import CollisionPredictor, PredictorMetrics
+
+
+def evaluate(
+    model_name: ModelArgument,
+    store_path: Annotated[
+        Path, typer.Argument(metavar="STORE", help="Samples of the model, by `lcollision label`.")
+    ],
+    n_rows: Annotated[
+        int | None,
+        typer.Option("--rows", min=1, metavar="N", help="Use the first N rows. Default: all."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+) -> None:
+    """Score a model's predictor against exact labels.
+
+    On the store that it was trained upon only the rows that were held out count, on any other
+    store of the model every row does. MSE and RANK are in energies divided by the mean of the
+    colliding training samples.
+    """
+    from lcollision_core.labels import LabelStore
+    from lcollision_core.model import PoseModel
+    from lcollision_core.predictor import evaluate_predictor
+
+    model = PoseModel.load(model_name)
+    trained = model.predictor
+    if trained is None:
+        raise ModelFileError(
+            f"the model {model.name!r} has no predictor; run `lcollision train predictor` first"
+        )
+    store = LabelStore.open(store_path)
+    require_store_of(store, model)
+    rows = _unseen(store, store.load(n_rows), trained)
+    with cancel_on_interrupt() as cancel, progress_bar("Evaluating") as progress:
+        metrics = evaluate_predictor(trained, rows, progress=progress, cancel=cancel)
+    if as_json:
+        print_json(metrics.to_metadata())
+        return
+    near = store.identity.near_exclusion
+    typer.echo(f"{model.name}, preset {trained.preset}: {scores_sentence(metrics)}")
+    typer.echo(
+        f"  {100.0 * rows.colliding.mean():.1f} % of these {counted(len(rows), 'sample')} collide"
+        + (f", pairs within {near:g} heights along the surface left out" if near else "")
+    )
+    typer.echo(
+        f"  MSE {_number(metrics.energy_mse)}, RANK {_number(metrics.ranking_margin)}, "
+        f"Spearman {_number(metrics.spearman)}, calibration error "
+        f"{_number(metrics.calibration_error)}"
+    )
+    typer.echo("  predicted probability: share that collides (samples)")
+    for entry in metrics.calibration:
+        if entry.probability is not None and entry.colliding_share is not None:
+            typer.echo(
+                f"    {entry.probability:.2f}: {entry.colliding_share:.2f} ({entry.samples})"
+            )
+
+
+def require_store_of(store: LabelStore, model: PoseModel) -> None:
+    """Refuse a store that labels another model than this.
+
+    Raises
+    ------
+    LabelStoreError : naming the first difference.
+    """
+    from lcollision_core.labels import Labeller, StoreIdentity
+
+    labeller = Labeller(model.embedding, model.height, model.near_exclusion, model.fingerprint)
+    store.require(StoreIdentity.of(labeller, store.identity.seed))
+
+
+def scores_sentence(metrics: PredictorMetrics) -> str:
+    """Put the verdicts' scores into words."""
+    return (
+        f"{_percent(metrics.accuracy)} of {metrics.samples} unseen samples right (always saying "
+        f"the commoner: {_percent(metrics.majority_rate)}), false alarms "
+        f"{_percent(metrics.false_positive_rate)} of the free, missed "
+        f"{_percent(metrics.false_negative_rate)} of the colliding"
+    )
+
+
+def _unseen(store: LabelStore, rows: LabelRows, trained: CollisionPredictor) -> LabelRows:
+    """Return the rows that did not train the predictor."""
+    from lcollision_core.predictor import held_out_rows
+
+    if trained.facts.store != store.identity:
+        return rows
+    held_out = held_out_rows(rows)
+    if not len(held_out):
+        raise LabelStoreError(
+            f"{store.path} has {counted(len(rows), 'row')}, none of which is held out; label more"
+        )
+    return held_out
+
+
+def _percent(share: float | None) -> str:
+    return "none" if share is None else f"{100.0 * share:.1f} %"
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.3f}"

@@ -1,0 +1,163 @@
+"""``lcollision train predictor``: learn to predict collisions from labelled samples."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from app.cli.console import note
+from app.cli.evaluate import require_store_of, scores_sentence
+from app.cli.interrupt import cancel_on_interrupt
+from app.cli.models import ModelArgument
+from lcollision_core.errors import CancelledError
+
+if TYPE_CHECKING:
+    from lcollision_core.predictor import PredictorStatus, StatusCallback
+
+
+class Preset(StrEnum):
+    """What ``--preset`` takes."""
+
+    DEFAULT = "default"
+    PAPER = "paper"
+
+
+class LossName(StrEnum):
+    """What ``--loss`` takes: the rows of the paper's Table 1."""
+
+    FULL = "full"
+    NO_RANK = "no-rank"
+    NO_DEPTH = "no-depth"
+    ENTROPY = "entropy"
+
+
+class Device(StrEnum):
+    """What ``--device`` takes."""
+
+    AUTO = "auto"
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
+def predictor(
+    model_name: ModelArgument,
+    store_path: Annotated[
+        Path, typer.Argument(metavar="STORE", help="The model's store, by `lcollision label`.")
+    ],
+    output: Annotated[
+        str,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="M2",
+            help="The .safetensors file to write; a name alone stores it with your models.",
+        ),
+    ],
+    preset: Annotated[
+        Preset, typer.Option(help="What measures best, or the paper's network and training.")
+    ] = Preset.DEFAULT,
+    loss: Annotated[
+        LossName, typer.Option(help="Leave out the ranking loss, the depth loss, or both.")
+    ] = LossName.FULL,
+    no_domains: Annotated[
+        bool, typer.Option("--no-domains", help="Predict the whole body's energy alone (ND).")
+    ] = False,
+    n_rows: Annotated[
+        int | None,
+        typer.Option("--rows", min=1, metavar="N", help="Use the first N rows. Default: all."),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, metavar="S", help="Equal seeds, equal predictors.")
+    ] = 0,
+    device: Annotated[
+        Device, typer.Option(help="Where to train; auto takes a GPU when there is one.")
+    ] = Device.AUTO,
+) -> None:
+    """Learn to predict collisions from labelled samples.
+
+    Three tenths of the rows are held out to measure the predictor. A checkpoint beside the output
+    lets a run that was stopped or killed go on when it is started again; it is removed at the end.
+    To use several devices or machines, start it with `torchrun -m app train predictor ...`.
+    """
+    from lcollision_core.labels import LabelStore
+    from lcollision_core.meshes import require_writable
+    from lcollision_core.model import PoseModel, model_destination
+    from lcollision_core.predictor import PRESETS, train_predictor
+
+    destination = model_destination(output)
+    require_writable(destination)
+    model = PoseModel.load(model_name)
+    store = LabelStore.open(store_path)
+    require_store_of(store, model)
+    config = PRESETS[preset.value].with_loss(loss.value)
+    # torchrun starts this command many times; the first process writes for all.
+    leads = os.environ.get("RANK", "0") == "0"
+    checkpoint = destination.with_name(destination.name + ".checkpoint")
+    if leads and checkpoint.exists():
+        note(f"going on from {checkpoint}")
+    try:
+        with cancel_on_interrupt() as cancel, _training_bar(leads) as progress:
+            trained = train_predictor(
+                store.load(n_rows),
+                model.embedding,
+                replace(config, by_domain=not no_domains),
+                store=store.identity,
+                device=device.value,
+                checkpoint=checkpoint,
+                progress=progress,
+                cancel=cancel,
+                seed=seed,
+            )
+    except CancelledError:
+        if leads and checkpoint.exists():
+            note(f"stopped; run the same command again to go on from {checkpoint}")
+        raise
+    if leads:
+        model.with_predictor(trained).save(destination)
+        checkpoint.unlink(missing_ok=True)
+        if trained.metrics is not None:
+            note(f"wrote {destination}: {scores_sentence(trained.metrics)}")
+
+
+@contextmanager
+def _training_bar(leads: bool) -> Iterator[StatusCallback]:
+    """Give a callback that draws steps, loss and held-out accuracy on a terminal."""
+    from lcollision_core.predictor import no_status
+
+    if not leads or not sys.stderr.isatty():
+        yield no_status
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = (
+        rich_progress.TextColumn("{task.description}"),
+        rich_progress.BarColumn(),
+        rich_progress.TaskProgressColumn(),
+        rich_progress.TimeRemainingColumn(),
+        rich_progress.TextColumn("{task.fields[facts]}"),
+    )
+    with rich_progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        bar = bars.add_task("reading rows", total=None, facts="")
+
+        def show(status: PredictorStatus) -> None:
+            facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
+            if status.held_out_accuracy is not None:
+                facts.append(f"{100.0 * status.held_out_accuracy:.1f} % right")
+            bars.update(
+                bar,
+                description=f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}",
+                completed=status.done,
+                total=status.total,
+                facts=", ".join(facts),
+            )
+
+        yield show
