@@ -39,7 +39,8 @@ _WARM_UP = 0.2
 _LEAST_RATE = 1e-2
 """Where the one-cycle schedule begins, in its largest rate."""
 
-_STATE, _MOMENTS = "network", "optimiser"
+_PART = "training"
+_NETWORK, _OPTIMISER = "network:", "optimiser:"
 
 
 class TrainingLoop:
@@ -195,29 +196,31 @@ class TrainingLoop:
         optimiser: torch.optim.Optimizer,
         checkpoint: Checkpoint,
     ) -> None:
-        moments: dict[str, npt.NDArray[Any]] = {}
-        for number, values in optimiser.state_dict()["state"].items():
-            for name, value in values.items():
-                moments[f"{number}.{name}"] = value.cpu().numpy()
-        state = {name: values.cpu().numpy() for name, values in network.state_dict().items()}
+        state = {
+            _NETWORK + name: values.cpu().numpy() for name, values in network.state_dict().items()
+        }
+        for number, moments in optimiser.state_dict()["state"].items():
+            for name, values in moments.items():
+                state[f"{_OPTIMISER}{number}:{name}"] = values.cpu().numpy()
         facts = {"step": step, "losses": self._losses, "accuracy": self._accuracy}
-        checkpoint.put(_MOMENTS, moments, {})
-        checkpoint.put(_STATE, state, facts, now=True)
+        checkpoint.put(_PART, state, facts, now=True)
 
     def _restore(
         self, checkpoint: Checkpoint, network: PredictorNetwork, optimiser: torch.optim.Optimizer
     ) -> int:
         """Put a stored run's state into place and return the steps that it has done."""
-        stored, moments = checkpoint.get(_STATE), checkpoint.get(_MOMENTS)
-        if stored is None or moments is None:
+        stored = checkpoint.get(_PART)
+        if stored is None:
             return 0
-        network.load_state_dict(
-            {name: torch.tensor(values) for name, values in stored.arrays.items()}
-        )
-        state = optimiser.state_dict()
-        for name, values in moments.arrays.items():
-            number, _, what = name.partition(".")
-            state["state"].setdefault(int(number), {})[what] = torch.tensor(values)
+        weights, state = {}, optimiser.state_dict()
+        for name, array in stored.arrays.items():
+            values = torch.tensor(array)
+            if name.startswith(_NETWORK):
+                weights[name.removeprefix(_NETWORK)] = values
+            else:
+                _, number, what = name.split(":")
+                state["state"].setdefault(int(number), {})[what] = values
+        network.load_state_dict(weights)
         optimiser.load_state_dict(state)
         self._losses = list(stored.metadata["losses"])
         self._accuracy = stored.metadata["accuracy"]

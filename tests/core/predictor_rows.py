@@ -1,0 +1,42 @@
+"""Rows whose energies are known functions of the latent, and configurations that train fast."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lcollision_core.embedding import Embedding
+from lcollision_core.labels import LabelRows
+from lcollision_core.predictor import PRESETS, PredictorConfig
+
+N_ROWS = 1500
+
+PAPER = PRESETS["paper"]
+QUICK = replace(PAPER, batch_rows=64, epochs=4)
+
+
+def made_up_rows(embedding: Embedding, n_rows: int = N_ROWS, seed: int = 1) -> LabelRows:
+    """Draw latents of which those collide whose first code is over a third of a unit."""
+    rng = np.random.default_rng(seed)
+    latent = rng.uniform(-1.0, 1.0, (n_rows, embedding.latent_size)).astype(np.float32)
+    depth = np.maximum(latent[:, 0] - 1.0 / 3.0, 0.0).astype(np.float64)
+    share = 0.5 + 0.4 * np.sign(latent[:, 1])
+    domain_energy = np.zeros((n_rows, embedding.n_domains))
+    domain_energy[:, 0], domain_energy[:, 1] = 1e-4 * depth * share, 1e-4 * depth * (1.0 - share)
+    return LabelRows(
+        latent=latent,
+        domain_energy=domain_energy,
+        energy=domain_energy.sum(axis=1),
+        n_pairs=(depth > 0.0).astype(np.int32),
+        n_near_pairs=np.zeros(n_rows, dtype=np.int32),
+    )
+
+
+def weights_of(section_arrays: dict[str, np.ndarray]) -> bytes:
+    """Return all weights' bytes: predictors are the same when these are."""
+    return b"".join(section_arrays[name].tobytes() for name in sorted(section_arrays))
+
+
+def config(**changes: object) -> PredictorConfig:
+    return replace(QUICK, **changes)  # type: ignore[arg-type]

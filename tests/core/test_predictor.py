@@ -1,0 +1,233 @@
+"""What a predictor is: the paper's network, its file section, its predictions and gradient."""
+
+from __future__ import annotations
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError, ShapeError
+from lcollision_core.labels import LabelRows
+from lcollision_core.model import PoseModel
+from lcollision_core.model_file import Section, read_model_file, write_model_file
+from lcollision_core.predictor import (
+    PRESETS,
+    CollisionPredictor,
+    PredictorConfig,
+    evaluate_predictor,
+    held_out_rows,
+    train_predictor,
+)
+from lcollision_core.predictor.networks import PaperNetwork
+from tests.core.predictor_rows import PAPER, config, made_up_rows
+
+GROUPS = (3, 2, 4, 1)
+
+
+@pytest.fixture(scope="module")
+def rows(tube_model: PoseModel) -> LabelRows:
+    return made_up_rows(tube_model.embedding)
+
+
+@pytest.fixture(scope="module", params=["paper", "default", "no domains"])
+def predictor(
+    tube_model: PoseModel, rows: LabelRows, request: pytest.FixtureRequest
+) -> CollisionPredictor:
+    """Return a predictor that was trained for a moment."""
+    chosen = {
+        "paper": config(epochs=1),
+        "default": replace(PRESETS["default"], epochs=1, batch_rows=64),
+        "no domains": config(epochs=1, by_domain=False),
+    }[request.param]
+    return train_predictor(rows, tube_model.embedding, chosen)
+
+
+def test_the_paper_s_preset_is_the_paper_s() -> None:
+    assert (
+        PredictorConfig(
+            preset="paper",
+            depth_weight=5.0,
+            rank_weight=2.0,
+            entropy_weight=2.0,
+            rate=1e-3,
+            schedule="constant",
+            batch_rows=32,
+            epochs=30,
+        )
+        == PAPER
+    )
+    network = PaperNetwork(GROUPS, True, 0)
+    shapes = [tuple(layer.weight.shape) for layer in network.modules() if hasattr(layer, "weight")]
+    assert shapes == [
+        (10, 512),
+        (512, 256),
+        (256, 256),
+        (3, 256 + 4, 512),
+        (3, 512, 256),
+        (3, 256, 256),
+        (3, 256, 128),
+        (3, 128, 1),
+        (3, 64),
+        (64, 1),
+    ]
+    undivided = PaperNetwork(GROUPS, False, 0)
+    shapes = [tuple(part.weight.shape) for part in undivided.modules() if hasattr(part, "weight")]
+    assert shapes[3:] == [(256, 128), (128, 1), (1, 64), (64, 1)]
+
+
+def test_all_collision_predictors_at_once_are_each_on_its_own() -> None:
+    network = PaperNetwork(GROUPS, True, 3).double()
+    latent = torch.randn((5, sum(GROUPS)), dtype=torch.float64)
+    relu = torch.relu
+    state = latent
+    for layer in list(network.encoder)[::2]:
+        state = relu(state @ layer.weight + layer.bias)
+    expected = []
+    for domain, codes in enumerate(latent.split(GROUPS, dim=1)[1:]):
+        values = torch.cat([state, codes], dim=1)
+        for number, stacked in enumerate(network.predictors):
+            # The first layer's rows past the domain's codes have nothing to multiply.
+            weight = stacked.weight[domain, : values.shape[1]]
+            values = values @ weight + stacked.bias[domain]
+            values = values if number == 4 else relu(values)
+        expected.append(values[:, 0])
+    energy = torch.stack(expected, dim=1)
+    first, _, last = network.classifier
+    logit = relu(energy @ first.weight + first.bias) @ last.weight + last.bias
+    output = network(latent)
+    assert output.domain_energy.std() > 0.0
+    torch.testing.assert_close(output.domain_energy, energy)
+    torch.testing.assert_close(output.logit, logit[:, 0])
+
+
+def test_initial_weights_depend_on_the_seed_alone() -> None:
+    torch.manual_seed(1)
+    one = PaperNetwork(GROUPS, True, 5).state_dict()
+    torch.manual_seed(2)
+    before = torch.get_rng_state()
+    same, other = (PaperNetwork(GROUPS, True, seed).state_dict() for seed in (5, 6))
+    assert torch.equal(before, torch.get_rng_state())
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not any(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_predictions_are_of_the_right_form(predictor: CollisionPredictor, rows: LabelRows) -> None:
+    result = predictor.predict(rows.latent[:700])
+    assert result.domain_energy.shape == (700, 2)
+    assert result.domain_energy.dtype == result.collision_logit.dtype == np.float64
+    assert result.domain_energy.min() >= 0.0 < result.domain_energy.max()
+    np.testing.assert_allclose(result.energy, result.domain_energy.sum(axis=1))
+    probability = 1.0 / (1.0 + np.exp(-result.collision_logit))
+    np.testing.assert_allclose(result.collision_probability, probability)
+    assert not result.energy.flags.writeable
+    alone = predictor.predict(rows.latent[699:700])
+    np.testing.assert_allclose(alone.collision_logit, result.collision_logit[699:], rtol=1e-4)
+    assert len(predictor.predict(rows.latent[:0]).energy) == 0
+
+
+def test_gradient_is_the_logit_s_derivative(predictor: CollisionPredictor, rows: LabelRows) -> None:
+    latent = rows.latent[:6].astype(np.float64)
+    logit, gradient = predictor.logit_and_gradient(latent)
+    expected = predictor.predict(latent).collision_logit
+    np.testing.assert_allclose(logit, expected, rtol=1e-4, atol=1e-5)
+    assert np.abs(gradient).max(axis=1).min() > 0.0
+    step = 1e-7
+    for code in range(latent.shape[1]):
+        moved = np.zeros_like(latent)
+        moved[:, code] = step
+        ahead, _ = predictor.logit_and_gradient(latent + moved)
+        behind, _ = predictor.logit_and_gradient(latent - moved)
+        slope = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(gradient[:, code], slope, atol=1e-6, rtol=1e-5)
+
+
+def test_threads_may_share_a_predictor(predictor: CollisionPredictor, rows: LabelRows) -> None:
+    latent = rows.latent[:8].astype(np.float64)
+    expected = predictor.logit_and_gradient(latent)
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(predictor.logit_and_gradient, [latent] * 40))
+    for logit, gradient in results:
+        np.testing.assert_array_equal(logit, expected[0])
+        np.testing.assert_array_equal(gradient, expected[1])
+
+
+def test_a_model_file_and_a_pickle_keep_all(
+    predictor: CollisionPredictor, rows: LabelRows, tube_model: PoseModel, tmp_path: Path
+) -> None:
+    path = tmp_path / "predictor"
+    write_model_file(path, {"predictor": predictor.to_section()})
+    section = read_model_file(path)["predictor"]
+    expected = predictor.predict(rows.latent[:50])
+    read = CollisionPredictor.from_section(section, tube_model.embedding)
+    predictor.logit_and_gradient(rows.latent[:1])
+    for copy in (read, pickle.loads(pickle.dumps(predictor))):
+        assert (copy.config, copy.facts, copy.metrics) == (
+            predictor.config,
+            predictor.facts,
+            predictor.metrics,
+        )
+        found = copy.predict(rows.latent[:50])
+        np.testing.assert_array_equal(found.domain_energy, expected.domain_energy)
+        np.testing.assert_array_equal(found.collision_logit, expected.collision_logit)
+
+
+def test_a_section_that_does_not_fit_is_refused(
+    predictor: CollisionPredictor, tube_model: PoseModel
+) -> None:
+    section = predictor.to_section()
+    unknown = Section(section.arrays, {**section.metadata, "preset": "oracle"})
+    with pytest.raises(ModelFileError, match="preset 'oracle', this program knows default, paper"):
+        CollisionPredictor.from_section(unknown, tube_model.embedding)
+    name = min(section.arrays)
+    short = {**section.arrays, name: section.arrays[name][..., :1]}
+    fewer = {key: array for key, array in section.arrays.items() if key != name}
+    without_facts = {key: value for key, value in section.metadata.items() if key != "facts"}
+    for broken in (
+        Section(short, section.metadata),
+        Section(fewer, section.metadata),
+        Section(section.arrays, without_facts),
+    ):
+        with pytest.raises(ModelFileError, match="does not fit its latent space; train"):
+            CollisionPredictor.from_section(broken, tube_model.embedding)
+
+
+def test_wrong_latents_are_refused(predictor: CollisionPredictor) -> None:
+    size = predictor.latent_size
+    for call in (predictor.predict, predictor.logit_and_gradient):
+        with pytest.raises(ShapeError, match=rf"shape \(B, {size}\), got \({size},\)"):
+            call(np.zeros(size))
+        with pytest.raises(ShapeError, match="not finite"):
+            call(np.full((2, size), np.nan))
+
+
+def test_evaluation_counts_what_it_is_given(
+    predictor: CollisionPredictor, rows: LabelRows, tube_model: PoseModel
+) -> None:
+    kept = held_out_rows(rows)
+    assert len(kept) == 450
+    np.testing.assert_array_equal(kept.latent[:4], rows.latent[[7, 8, 9, 17]])
+    assert evaluate_predictor(predictor, kept) == predictor.metrics
+    others = made_up_rows(tube_model.embedding, 300, seed=2)
+    metrics = evaluate_predictor(predictor, others)
+    called = predictor.predict(others.latent).collision_probability > 0.5
+    assert metrics.accuracy == (called == others.colliding).mean()
+    assert sum(entry.samples for entry in metrics.calibration) == 300
+    with pytest.raises(LabelStoreError, match="no rows to evaluate"):
+        evaluate_predictor(predictor, rows.head(0))
+
+
+def test_values_out_of_range_are_refused() -> None:
+    for changes, sentence in (
+        ({"batch_rows": 3}, "batch_rows must be even, got 3"),
+        ({"epochs": 0}, "epochs must be at least 1, got 0"),
+        ({"rank_weight": -1.0}, "rank_weight must be at least 0"),
+        ({"rate": 0.0}, "rate must be over 0"),
+        ({"entropy_weight": float("nan")}, "entropy_weight must be over 0"),
+    ):
+        with pytest.raises(LCollisionError, match=sentence):
+            config(**changes)

@@ -1,0 +1,120 @@
+"""The paper's losses and scores against numbers worked by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from lcollision_core.predictor.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
+from lcollision_core.predictor.metrics import EnergyScores, mean_difference, measure
+
+BOTH = EnergyScores(depth=True, rank=True)
+
+
+def _double(*values: object) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _require_gradient(loss: object, values: torch.Tensor) -> None:
+    """Compare autograd with central differences, and ask for a gradient that is not 0."""
+    values = values.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(values).sum(), values)  # type: ignore[operator]
+    assert gradient.abs().max() > 0.0
+    step = 1e-6
+    for place in np.ndindex(*values.shape):
+        ahead, behind = values.detach().clone(), values.detach().clone()
+        ahead[place] += step
+        behind[place] -= step
+        slope = (loss(ahead).sum() - loss(behind).sum()) / (2 * step)  # type: ignore[operator]
+        assert gradient[place] == pytest.approx(float(slope), abs=1e-7)
+
+
+def test_depth_loss_adds_squares_of_domains_and_the_sum_s_error() -> None:
+    predicted = _double([1.0, 3.0], [0.5, 0.0])
+    truth, energy = _double([2.0, 1.0], [0.0, 0.0]), _double(3.0, 0.0)
+    # (1-2)^2 + (3-1)^2 + |4-3| and 0.5^2 + 0 + |0.5|.
+    assert depth_loss(predicted, truth, energy).tolist() == [6.0, 0.75]
+    _require_gradient(lambda values: depth_loss(values, truth, energy), predicted)
+
+
+def test_depth_loss_without_domains_is_the_sum_s_error_alone() -> None:
+    predicted, energy = _double([1.0], [4.0]), _double(3.0, 0.0)
+    none = torch.zeros((2, 0), dtype=torch.float64)
+    assert depth_loss(predicted, none, energy).tolist() == [2.0, 4.0]
+
+
+def test_depth_loss_vanishes_for_the_truth_when_the_masks_conserve_energy() -> None:
+    shares = np.random.default_rng(0).dirichlet(np.ones(4), 50)
+    energy = np.random.default_rng(1).random(50)
+    truth = torch.tensor(shares * energy[:, None])
+    assert depth_loss(truth, truth, torch.tensor(energy)).max() < 1e-15
+
+
+def test_rank_loss_wants_the_larger_to_lead_by_the_margin() -> None:
+    energy = _double(1.0, 5.0, 5.0, 1.0, 1.0, 5.0, 2.0, 2.0, 9.0)
+    predicted = _double(0.5, 0.7, 0.5, 0.7, 0.0, 4.0, 3.0, 1.0, 7.0)
+    # A lead of 0.2 where 1 is wanted, of -0.2, of 4, a tie; the ninth row has no partner.
+    losses = rank_loss(predicted, energy, 1.0)
+    assert losses.tolist() == pytest.approx([0.8, 1.2, 0.0, 0.0])
+    assert ranked_pairs(energy) == 3
+    _require_gradient(lambda values: rank_loss(values, energy, 1.0), predicted)
+
+
+def test_entropy_loss_is_minus_the_log_of_the_right_answer_s_probability() -> None:
+    logit, colliding = _double(math.log(3.0), math.log(3.0), -800.0), _double(1.0, 0.0, 1.0)
+    expected = [-math.log(0.75), -math.log(0.25), 800.0]
+    assert entropy_loss(logit, colliding).tolist() == pytest.approx(expected)
+    _require_gradient(lambda values: entropy_loss(values, colliding[:2]), logit[:2])
+
+
+def test_scores_of_eight_poses_worked_by_hand() -> None:
+    probability = np.array([0.05, 0.15, 0.55, 0.95, 0.95, 0.45, 1.0, 0.5])
+    colliding = np.array([False, False, False, True, True, True, True, True])
+    energy = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+    predicted = np.array([0.0, 0.5, 0.0, 1.0, 2.0, 4.0, 3.0, 5.0])
+    scores = measure(probability, predicted, colliding, energy, 0.25, BOTH)
+    assert scores.samples == 8
+    assert scores.accuracy == 5 / 8
+    assert scores.false_positive_rate == 1 / 3
+    # 0.5 is not called colliding.
+    assert scores.false_negative_rate == 2 / 5
+    assert scores.majority_rate == 5 / 8
+    assert scores.energy_mse == pytest.approx((0.25 + 1.0 + 1.0) / 8)
+    # One exchange of neighbours among five: 1 - 6 (1 + 1) / (5 24).
+    assert scores.spearman == pytest.approx(0.9)
+    bins = {place: entry for place, entry in enumerate(scores.calibration) if entry.samples}
+    assert [entry.samples for entry in bins.values()] == [1, 1, 1, 2, 3]
+    assert bins[5].probability == pytest.approx(0.525)
+    assert bins[5].colliding_share == 0.5
+    errors = 0.05 + 0.15 + (1.0 - 0.45) + 2 * abs(0.525 - 0.5) + 3 * (1.0 - 2.9 / 3)
+    assert scores.calibration_error == pytest.approx(errors / 8)
+
+
+def test_ranking_score_is_the_mean_shortfall_over_random_pairs() -> None:
+    energy = np.arange(400.0)
+    truth = np.ones(400, dtype=bool)
+    right = measure(np.ones(400), energy, truth, energy, 0.5, BOTH)
+    assert right.ranking_margin == 0.0
+    silent = measure(np.ones(400), 0.0 * energy, truth, energy, 0.5, BOTH)
+    assert silent.ranking_margin == 0.5
+    # The other way round each pair falls short by its difference and the margin.
+    reverse = measure(np.ones(400), -energy, truth, energy, 0.5, BOTH)
+    assert reverse.ranking_margin == pytest.approx(0.5 + 400 / 3, rel=0.1)
+
+
+def test_undefined_scores_are_none() -> None:
+    none = np.zeros(3, dtype=bool)
+    scores = measure(np.zeros(3), np.zeros(3), none, np.zeros(3), 1.0, BOTH)
+    assert (scores.false_negative_rate, scores.spearman, scores.ranking_margin) == (None,) * 3
+    untrained = measure(np.zeros(3), np.zeros(3), none, np.zeros(3), 1.0, EnergyScores(False, True))
+    assert untrained.energy_mse is None
+
+
+def test_mean_difference_is_that_of_all_pairs() -> None:
+    values = np.random.default_rng(2).exponential(size=60)
+    pairs = np.abs(values[:, None] - values)[~np.eye(60, dtype=bool)]
+    assert mean_difference(values) == pytest.approx(pairs.mean())
+    assert mean_difference(values[:1]) == 0.0

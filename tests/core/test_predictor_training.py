@@ -1,0 +1,256 @@
+"""Stage 2: what it learns, that it does so again, and that nothing interrupts it for good."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, ShapeError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.labels import LabelRows, is_held_out
+from lcollision_core.model import PoseModel
+from lcollision_core.predictor import LOSSES, PRESETS, PredictorStatus, train_predictor
+from lcollision_core.predictor.loop import rate_at
+from tests.core.predictor_rows import PAPER, config, made_up_rows, weights_of
+
+SECONDS_TO_WAIT = 120.0
+
+TRAIN = """
+import pickle, sys
+from pathlib import Path
+from lcollision_core.predictor import train_predictor
+with open(sys.argv[1], "rb") as file:
+    rows, embedding, config, checkpoint = pickle.load(file)
+predictor = train_predictor(rows, embedding, config, checkpoint=checkpoint, device="cpu")
+section = predictor.to_section()
+if "rank" in sys.argv:
+    import os
+    sys.argv[2] += os.environ["RANK"]
+Path(sys.argv[2]).write_bytes(pickle.dumps((dict(section.arrays), predictor.metrics)))
+"""
+
+
+@pytest.fixture(scope="module")
+def rows(tube_model: PoseModel) -> LabelRows:
+    return made_up_rows(tube_model.embedding)
+
+
+def test_both_presets_learn_what_collides_and_how_deep(
+    tube_model: PoseModel, rows: LabelRows
+) -> None:
+    for preset in PRESETS.values():
+        chosen = replace(preset, batch_rows=32, epochs=12)
+        metrics = train_predictor(rows, tube_model.embedding, chosen).metrics
+        assert metrics is not None
+        assert metrics.samples == 450
+        assert 0.6 < metrics.majority_rate < 0.72
+        assert metrics.accuracy > metrics.majority_rate + 0.15
+        assert metrics.spearman is not None
+        assert metrics.spearman > 0.8
+        assert metrics.energy_mse is not None
+        assert metrics.energy_mse < 0.1
+
+
+def test_domains_get_their_own_energy(tube_model: PoseModel, rows: LabelRows) -> None:
+    trained = train_predictor(rows, tube_model.embedding, config(epochs=6))
+    deep = is_held_out(np.arange(len(rows))) & (rows.latent[:, 0] > 0.6)
+    predicted = trained.predict(rows.latent[deep]).domain_energy
+    right = predicted.argmax(axis=1) == rows.domain_energy[deep].argmax(axis=1)
+    assert len(right) > 50
+    assert right.mean() > 0.9
+    ratio = predicted.sum() / rows.domain_energy[deep].sum()
+    assert 0.8 < ratio < 1.2
+
+
+def test_equal_seeds_give_equal_bits_and_held_out_rows_teach_nothing(
+    tube_model: PoseModel, rows: LabelRows
+) -> None:
+    held_out = is_held_out(np.arange(len(rows)))
+    tampered = replace(
+        rows,
+        latent=np.where(held_out[:, None], np.float32(0.1), rows.latent),
+        n_pairs=np.where(held_out, 1 - rows.n_pairs, rows.n_pairs).astype(np.int32),
+        energy=np.where(held_out, 1.0, rows.energy),
+    )
+    embedding, chosen = tube_model.embedding, config(epochs=1)
+    first, again, unseen, other = (
+        weights_of(train_predictor(data, embedding, chosen, seed=seed).to_section().arrays)
+        for data, seed in ((rows, 4), (rows, 4), (tampered, 4), (rows, 5))
+    )
+    assert first == again == unseen
+    assert first != other
+
+
+def test_every_row_of_table_1_trains(tube_model: PoseModel, rows: LabelRows) -> None:
+    scores = {}
+    for loss in LOSSES:
+        trained = train_predictor(rows, tube_model.embedding, config(epochs=1).with_loss(loss))
+        metrics = trained.metrics
+        assert metrics is not None
+        assert metrics.accuracy > metrics.majority_rate - 0.1
+        scores[loss] = (metrics.energy_mse is not None, metrics.ranking_margin is not None)
+    assert scores == {
+        "full": (True, True),
+        "no-rank": (True, True),
+        "no-depth": (False, True),
+        "entropy": (False, False),
+    }
+    chosen = config(epochs=4, by_domain=False)
+    undivided = train_predictor(rows, tube_model.embedding, chosen)
+    assert undivided.metrics is not None
+    assert undivided.metrics.accuracy > undivided.metrics.majority_rate + 0.1
+    energy = undivided.predict(rows.latent[:9]).domain_energy
+    np.testing.assert_array_equal(energy[:, 0], energy[:, 1])
+
+
+def test_progress_ends_at_the_last_step(tube_model: PoseModel, rows: LabelRows) -> None:
+    seen: list[PredictorStatus] = []
+    train_predictor(rows, tube_model.embedding, config(epochs=2), progress=seen.append)
+    # 1050 rows in batches of 64 are 17 steps an epoch.
+    assert (seen[0].done, seen[0].total, seen[0].loss) == (0, 34, None)
+    assert (seen[-1].done, seen[-1].epoch, seen[-1].epochs) == (34, 2, 2)
+    assert [status.done for status in seen] == sorted(status.done for status in seen)
+    assert seen[-1].loss is not None
+    assert seen[-1].held_out_accuracy is not None
+    assert seen[-1].held_out_accuracy > 0.5
+
+
+def test_a_cancelled_run_goes_on_to_the_same_bits(
+    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+) -> None:
+    embedding, checkpoint, cancel = tube_model.embedding, tmp_path / "checkpoint", CancelToken()
+    steps: list[int] = []
+
+    def stop_in_the_second_epoch(status: PredictorStatus) -> None:
+        steps.append(status.done)
+        if status.done >= 17:
+            cancel.cancel()
+
+    with pytest.raises(CancelledError):
+        train_predictor(
+            rows,
+            embedding,
+            config(),
+            checkpoint=checkpoint,
+            progress=stop_in_the_second_epoch,
+            cancel=cancel,
+        )
+    later: list[PredictorStatus] = []
+    resumed = train_predictor(
+        rows, embedding, config(), checkpoint=checkpoint, progress=later.append
+    )
+    assert later[0].done == steps[-1] + 1
+    whole = train_predictor(rows, embedding, config())
+    assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
+    assert resumed.metrics == whole.metrics
+    with pytest.raises(LCollisionError, match="checkpoint of another training run"):
+        train_predictor(rows, embedding, config(), checkpoint=checkpoint, seed=9)
+
+
+def _written(path: Path, *parts: object) -> Path:
+    path.write_bytes(pickle.dumps(parts))
+    return path
+
+
+def test_a_killed_run_goes_on_to_the_same_bits(
+    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+) -> None:
+    embedding, chosen = tube_model.embedding, config(epochs=12)
+    checkpoint = tmp_path / "checkpoint"
+    job = _written(tmp_path / "job", rows, embedding, chosen, checkpoint)
+    write_always = (
+        "from lcollision_core.embedding import checkpoint\n"
+        "checkpoint._SECONDS_BETWEEN_WRITES = 0.0\n"
+        f"import torch; torch.set_num_threads({torch.get_num_threads()})\n"
+    )
+    command = [sys.executable, "-c", write_always + TRAIN, job, tmp_path / "killed"]
+    process = subprocess.Popen(command)
+    deadline = time.monotonic() + SECONDS_TO_WAIT
+    while not checkpoint.exists():
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    seen: list[PredictorStatus] = []
+    resumed, whole = (
+        train_predictor(rows, embedding, chosen, checkpoint=path, progress=seen.append)
+        for path in (checkpoint, None)
+    )
+    assert 0 < seen[0].done < seen[0].total
+    assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
+    assert resumed.metrics == whole.metrics
+
+
+def test_two_processes_learn_what_one_does(
+    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+) -> None:
+    # The last batch of each epoch has 26 rows: the shares of the two processes differ.
+    embedding, chosen = tube_model.embedding, config(epochs=2)
+    job = _written(tmp_path / "job", rows, embedding, chosen, tmp_path / "checkpoint")
+    script = tmp_path / "train.py"
+    script.write_text(TRAIN)
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "torch.distributed.run", "--standalone"),
+            *("--nproc-per-node", "2", script, job, tmp_path / "shared", "rank"),
+        ],
+        check=True,
+        timeout=SECONDS_TO_WAIT,
+        capture_output=True,
+    )
+    first, second = (pickle.loads((tmp_path / f"shared{rank}").read_bytes()) for rank in (0, 1))
+    assert weights_of(first[0]) == weights_of(second[0])
+    alone = train_predictor(rows, embedding, chosen)
+    arrays = alone.to_section().arrays
+    untrained = train_predictor(rows, embedding, replace(chosen, rate=1e-12)).to_section().arrays
+    moved = np.concatenate([(arrays[name] - untrained[name]).ravel() for name in arrays])
+    differs = np.concatenate([(arrays[name] - first[0][name]).ravel() for name in arrays])
+    assert np.linalg.norm(differs) < 0.02 * np.linalg.norm(moved)
+    assert alone.metrics is not None
+    assert first[1].accuracy == pytest.approx(alone.metrics.accuracy, abs=0.01)
+
+
+def test_rows_that_cannot_teach_are_refused(tube_model: PoseModel, rows: LabelRows) -> None:
+    embedding = tube_model.embedding
+    energy, latent = rows.energy.copy(), rows.latent.copy()
+    energy[11], latent[17, 2] = np.nan, np.inf
+    for broken, row in ((replace(rows, energy=energy), 11), (replace(rows, latent=latent), 17)):
+        with pytest.raises(ShapeError, match=rf"row {row} \(from 0\) has a number that is not fin"):
+            train_predictor(broken, embedding, PAPER)
+    foreign = replace(rows, latent=rows.latent[:, :-1])
+    size = embedding.latent_size
+    with pytest.raises(ShapeError, match=f"have {size - 1} codes .* the model has {size}"):
+        train_predictor(foreign, embedding, PAPER)
+    none = replace(rows, n_pairs=0 * rows.n_pairs)
+    with pytest.raises(LabelStoreError, match="0 of the 1050 rows to train on collide"):
+        train_predictor(none, embedding, PAPER)
+    with pytest.raises(LabelStoreError, match="0 are held out"):
+        train_predictor(rows.head(6), embedding, PAPER)
+    with pytest.raises(LCollisionError, match="no device 'abacus'"):
+        train_predictor(rows, embedding, PAPER, device="abacus")
+
+
+def test_a_diverging_run_says_so(tube_model: PoseModel, rows: LabelRows) -> None:
+    with pytest.raises(LCollisionError, match="diverged in step"):
+        train_predictor(rows, tube_model.embedding, config(rate=1e30))
+
+
+def test_the_one_cycle_schedule_rises_and_falls_to_nothing() -> None:
+    chosen = config(schedule="one-cycle", rate=0.5)
+    rates = [rate_at(step, 100, chosen) for step in range(100)]
+    assert max(rates) == rates[20] == 0.5
+    assert rates[0] < 0.01
+    assert rates[-1] < 0.001
+    assert (np.diff(rates[:21]) > 0).all()
+    assert (np.diff(rates[20:]) < 0).all()
+    assert {rate_at(step, 100, config()) for step in range(100)} == {1e-3}
