@@ -1,0 +1,146 @@
+"""From where a body is looked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+CAMERAS = ("Three-quarter", "Front", "Back", "Left", "Right", "Top")
+"""Names of the preset views; left and right are the body's own."""
+
+VIEW_ANGLE = 24.0
+"""Degrees from the picture's bottom to its top: narrow, so that near limbs do not swell."""
+
+_MARGIN = 1.12
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A perspective camera.
+
+    Attributes
+    ----------
+    position, focus : (3,) float64 arrays, in the data's unit
+    up : (3,) float64 array, of length 1
+    """
+
+    position: FloatArray
+    focus: FloatArray
+    up: FloatArray
+
+
+def preset_view(
+    name: str, vertices: npt.NDArray[Any], up_axis: int, front: FloatArray, aspect: float
+) -> View:
+    """Look at a whole mesh from a side.
+
+    Parameters
+    ----------
+    name : one of `CAMERAS`
+    vertices : (V, 3) array
+    up_axis : 0, 1 or 2
+    front : (3,) array of length 1, in which the body looks
+    aspect : the picture's width over its height
+
+    Raises
+    ------
+    KeyError : `name` is no preset.
+    """
+    up = np.eye(3)[up_axis]
+    left = np.cross(up, front)
+    towards = {
+        "Three-quarter": 0.86 * front + 0.44 * left + 0.22 * up,
+        "Front": front,
+        "Back": -front,
+        "Left": left,
+        "Right": -left,
+        # Straight from above, a camera that keeps upright has no direction to turn in.
+        "Top": up + 0.02 * front,
+    }[name]
+    towards = towards / np.linalg.norm(towards)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    focus = 0.5 * (low + high).astype(np.float64)
+    upward = up - (up @ towards) * towards
+    upward /= np.linalg.norm(upward)
+    half_height = np.tan(np.radians(0.5 * VIEW_ANGLE))
+    offset = vertices - focus
+    depth = offset @ towards
+    # The nearest distance at which each vertex is inside the picture.
+    needed = np.maximum(
+        np.abs(offset @ upward) / half_height,
+        np.abs(offset @ np.cross(upward, towards)) / (half_height * aspect),
+    )
+    distance = float((_MARGIN * needed + depth).max())
+    return View(focus + distance * towards, focus, up)
+
+
+def turned(view: View, angle: float) -> View:
+    """Turn a camera round its focus about its upright.
+
+    Parameters
+    ----------
+    angle : radians, to the right-hand side of `up`
+    """
+    arm = view.position - view.focus
+    along = (arm @ view.up) * view.up
+    across = arm - along
+    turned_arm = along + np.cos(angle) * across + np.sin(angle) * np.cross(view.up, across)
+    return View(view.focus + turned_arm, view.focus, view.up)
+
+
+def between(start: View, end: View, share: float) -> View:
+    """Blend two cameras, on an arc round their focus.
+
+    Parameters
+    ----------
+    share : 0 at the start, 1 at the end
+    """
+    if share >= 1.0:
+        return end
+    focus = (1.0 - share) * start.focus + share * end.focus
+    arms = [view.position - view.focus for view in (start, end)]
+    lengths = [float(np.linalg.norm(arm)) for arm in arms]
+    a, b = (arm / length for arm, length in zip(arms, lengths, strict=True))
+    angle = float(np.arccos(np.clip(a @ b, -1.0, 1.0)))
+    if np.pi - angle < 1e-3:
+        # From front to back there are many ways: the one round the upright.
+        quarter = np.cross(end.up, a)
+        direction = np.cos(share * np.pi) * a + np.sin(share * np.pi) * quarter
+    elif angle < 1e-6:
+        direction = b
+    else:
+        direction = (np.sin((1.0 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
+    length = (1.0 - share) * lengths[0] + share * lengths[1]
+    return View(focus + length * direction, focus, end.up)
+
+
+def front_direction(vertices: npt.NDArray[Any], up_axis: int) -> FloatArray:
+    """Guess the direction in which a body looks: across its flat side, where its toes point.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array, the reference
+    up_axis : 0, 1 or 2
+
+    Returns
+    -------
+    direction : (3,) float64 array, of length 1, along an axis
+    """
+    levels = [axis for axis in range(3) if axis != up_axis]
+    depth = min(levels, key=lambda axis: float(np.ptp(vertices[:, axis])))
+    height = vertices[:, up_axis]
+    direction: FloatArray = np.eye(3)[depth]
+    lowest = vertices[height < height.min() + 0.04 * np.ptp(height), depth]
+    ankles = vertices[
+        (height > height.min() + 0.06 * np.ptp(height))
+        & (height < height.min() + 0.12 * np.ptp(height)),
+        depth,
+    ]
+    if len(lowest) and len(ankles) and lowest.mean() < ankles.mean():
+        direction = -direction
+    return direction

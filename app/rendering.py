@@ -1,0 +1,113 @@
+"""Pictures of poses, drawn off the screen: thumbnails, screenshots and turntables."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from app.camera import View, front_direction, preset_view
+from app.frames import PoseShower
+from app.scene import Scene
+from app.shading import Shader, Shading
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PoseModel
+
+ImageArray = npt.NDArray[np.uint8]
+
+
+class PoseRenderer:
+    """Draws poses of one model into arrays; for the thread of the window.
+
+    Parameters
+    ----------
+    model : of all poses
+    width, height : in pixels
+    dark : for a dark theme
+    transparent : nothing but the mesh, without a background
+    background : "#rrggbb" instead of the theme's gradient
+    """
+
+    def __init__(
+        self,
+        model: PoseModel,
+        width: int,
+        height: int,
+        dark: bool = False,
+        transparent: bool = False,
+        background: str | None = None,
+    ) -> None:
+        import pyvista as pv
+        from vtkmodules.vtkCommonCore import vtkLogger
+
+        # Without a display VTK warns of that, then draws all the same.
+        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+        self._model = model
+        self._aspect = width / height
+        self._transparent = transparent
+        self._plotter = pv.Plotter(
+            off_screen=True, window_size=(width, height), lighting="light kit"
+        )
+        self._plotter.enable_anti_aliasing("ssaa")
+        self.scene = Scene(
+            self._plotter, model.faces, model.n_vertices, model.up_axis, model.height, dark
+        )
+        self.scene.show_floor(not transparent)
+        if background is not None or transparent:
+            self.scene.set_plain_background(background or "#ffffff")
+        self._shower = PoseShower(model)
+        self._shader = Shader(model.attention_mask, model.domain_names, model.domain_colours, dark)
+        self._front = front_direction(model.reference, model.up_axis)
+
+    def picture(
+        self,
+        vertices: npt.NDArray[Any],
+        colours: npt.NDArray[np.uint8] | None = None,
+        view: View | None = None,
+    ) -> ImageArray:
+        """Draw one pose.
+
+        Parameters
+        ----------
+        vertices : (V, 3) array, in the data's unit
+        colours : (V, 3) uint8 array; plain where None
+        view : the camera; three-quarter, round the whole pose, where None
+
+        Returns
+        -------
+        pixels : (height, width, 4) uint8 array, red, green, blue and alpha, which is 255
+            throughout unless `transparent`
+        """
+        points = np.asarray(vertices, dtype=np.float32)
+        painted = self._shader.colours(Shading.PLAIN) if colours is None else colours
+        self.scene.show(points, self._shower.normals(points), painted)
+        self.scene.view = view or self.preset("Three-quarter", points)
+        return self.drawn()
+
+    def drawn(self) -> ImageArray:
+        """Draw the scene as it is; as `picture` returns it."""
+        # Or else pyvista hands out the last picture again.
+        self._plotter.render()
+        pixels = np.asarray(
+            self._plotter.screenshot(return_img=True, transparent_background=self._transparent)
+        )
+        if pixels.shape[2] == 4:
+            return pixels
+        opaque = np.full((*pixels.shape[:2], 1), 255, dtype=np.uint8)
+        return np.concatenate([pixels, opaque], axis=2)
+
+    def preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
+        """Return the preset camera that shows a whole pose.
+
+        Parameters
+        ----------
+        name : one of `app.camera.CAMERAS`
+        vertices : (V, 3) array
+        """
+        return preset_view(name, vertices, self._model.up_axis, self._front, self._aspect)
+
+    def close(self) -> None:
+        """Free the picture's memory on the graphics card."""
+        self._plotter.close()

@@ -1,0 +1,473 @@
+"""The mesh in the middle of the window: what is drawn of a document, and what the mouse says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import (
+    QEasingCurve,
+    QEvent,
+    QPointF,
+    QSize,
+    QTimer,
+    QVariantAnimation,
+    Signal,
+    Slot,
+)
+from PySide6.QtGui import QCloseEvent, QResizeEvent
+from PySide6.QtOpenGLWidgets import QOpenGLWidget
+from PySide6.QtWidgets import QStackedLayout, QWidget
+
+from app.camera import View, between, front_direction, preset_view
+from app.frames import LiveFrame, PoseShower
+from app.legend import DomainTag, LegendCard
+from app.shading import Shader, Shading
+from app.theme import NORMAL, current_theme
+from app.waiting import WaitingPage
+
+if TYPE_CHECKING:
+    from app.canvas import Canvas
+    from app.document import PoseDocument
+    from app.scene import Scene
+
+GLIDE_MILLISECONDS = 320
+"""From the pose before Resolve to the one after."""
+
+_TURN_MILLISECONDS = 260
+
+Float32Array = npt.NDArray[np.float32]
+
+
+class Viewport(QWidget):
+    """Draws the newest frame of a document, and nothing twice.
+
+    Cheap to construct: VTK is imported when the first model is in; until then a page says what is
+    waited for. Call `shut_down` before the window closes.
+
+    Parameters
+    ----------
+    document : may have no model yet
+    parent : of the widget
+
+    Signals
+    -------
+    domain_hovered : int, the domain under the pointer, or None
+    shading_changed : Shading
+    painted : float, the seconds that drawing one picture took
+    """
+
+    domain_hovered = Signal(object)
+    shading_changed = Signal(object)
+    painted = Signal(float)
+
+    def __init__(self, document: PoseDocument, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._document = document
+        self._shading = Shading.PLAIN
+        self._highlight: int | None = None
+        self._hovered: int | None = None
+        self._canvas: Canvas | None = None
+        self._scene: Scene | None = None
+        self._shader: Shader | None = None
+        self._shower: PoseShower | None = None
+        self._front = np.zeros(3)
+        self._shown: LiveFrame | None = None
+        self._pose_stale = self._colours_stale = self._crossing_stale = False
+        self._glide_next = self._place_camera = False
+
+        self._layout = QStackedLayout(self)
+        self._layout.setStackingMode(QStackedLayout.StackingMode.StackOne)
+        self._waiting = WaitingPage(self)
+        self._layout.addWidget(self._waiting)
+        # A window that gets its first OpenGL widget when it is already shown is made anew, and
+        # flickers.
+        self._first_gl_widget = QOpenGLWidget(self)
+        self._first_gl_widget.resize(1, 1)
+        self._first_gl_widget.lower()
+
+        self._glide = _animation(self, GLIDE_MILLISECONDS)
+        self._glide.valueChanged.connect(self._on_glided)
+        self._glide_ends: tuple[Float32Array, Float32Array] | None = None
+        self._turn = _animation(self, _TURN_MILLISECONDS)
+        self._turn.valueChanged.connect(self._on_turned)
+        self._turn_ends: tuple[View, View] | None = None
+
+        document.model_changed.connect(self._on_model_changed)
+        document.frame_changed.connect(self._on_frame_changed)
+        document.exact_changed.connect(self._on_exact_changed)
+        document.ghost_changed.connect(self._on_ghost_changed)
+        document.solve_finished.connect(self._on_solve_finished)
+        document.busy_changed.connect(self._waiting.set_text)
+        self._waiting.set_text(document.busy)
+        if document.has_model:
+            # After the window is on the screen.
+            QTimer.singleShot(0, self, self._on_model_changed)
+
+    # What is shown.
+
+    @property
+    def shading(self) -> Shading:
+        """What the colours say."""
+        return self._shading
+
+    @property
+    def shown_frame(self) -> LiveFrame | None:
+        """The frame that the last picture shows, or glides towards."""
+        return self._shown
+
+    @property
+    def shown_vertices(self) -> Float32Array:
+        """(V, 3) float32 array that VTK draws, overwritten by each frame; for looking at."""
+        if self._scene is None:
+            return np.zeros((0, 3), dtype=np.float32)
+        return self._scene.surface.vertices
+
+    @property
+    def shown_colours(self) -> npt.NDArray[np.uint8]:
+        """(V, 3) uint8 array that VTK draws, likewise."""
+        if self._scene is None:
+            return np.zeros((0, 3), dtype=np.uint8)
+        return self._scene.surface.colours
+
+    @property
+    def n_painted(self) -> int:
+        """How many pictures have been drawn since the model came in."""
+        return self._canvas.n_painted if self._canvas is not None else 0
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the mesh is on the screen instead of the waiting page."""
+        return self._canvas is not None and self._shown is not None
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether what is on the screen is the newest pose, smooth, and nothing moves."""
+        return (
+            self._canvas is not None
+            and self._shown is self._document.frame
+            and not self._pose_stale
+            and not self._colours_stale
+            and self._glide.state() is QVariantAnimation.State.Stopped
+            and self._turn.state() is QVariantAnimation.State.Stopped
+            and self._canvas.is_smooth
+        )
+
+    def set_shading(self, shading: Shading) -> None:
+        """Choose what the colours say."""
+        if shading is self._shading:
+            return
+        self._shading = shading
+        self._recolour(crossing=True)
+        self.shading_changed.emit(shading)
+
+    def highlight_domain(self, domain: int | None) -> None:
+        """Bring out a domain, or none.
+
+        Parameters
+        ----------
+        domain : index from 0
+        """
+        if domain != self._highlight:
+            self._highlight = domain
+            self._recolour()
+
+    # The camera.
+
+    def set_camera(self, name: str, glide: bool = True) -> None:
+        """Look at the whole pose from a side.
+
+        Parameters
+        ----------
+        name : one of `app.camera.CAMERAS`
+        glide : False jumps there
+
+        Raises
+        ------
+        KeyError : `name` is no preset.
+        """
+        if self._canvas is None or self._scene is None or self._shown is None:
+            return
+        end = self._preset(name, self._shown.vertices)
+        if not glide:
+            self._turn.stop()
+            self._scene.view = end
+            self._canvas.redraw()
+            return
+        self._turn_ends = (self._scene.view, end)
+        self._turn.stop()
+        self._turn.start()
+
+    def reset_camera(self) -> None:
+        """Look at the whole pose as at the start."""
+        self.set_camera("Three-quarter")
+
+    @property
+    def view(self) -> View | None:
+        """From where the mesh is looked at; None before there is one."""
+        return self._scene.view if self._scene is not None else None
+
+    # Moving without the document.
+
+    def glide(self, from_vertices: npt.NDArray[Any], to_vertices: npt.NDArray[Any]) -> None:
+        """Move the mesh from one pose to another in a third of a second.
+
+        A frame of the document that arrives meanwhile ends it.
+
+        Parameters
+        ----------
+        from_vertices, to_vertices : (V, 3) arrays, in the data's unit
+        """
+        if self._canvas is None:
+            return
+        self._glide.stop()
+        self._glide_ends = (
+            np.array(from_vertices, dtype=np.float32),
+            np.array(to_vertices, dtype=np.float32),
+        )
+        self._glide.start()
+
+    def shut_down(self) -> None:
+        """Stop everything that moves and free what VTK holds; the widget stays empty."""
+        self._glide.stop()
+        self._turn.stop()
+        self._waiting.stop()
+        if self._canvas is not None:
+            self._canvas.shut_down()
+            self._layout.removeWidget(self._canvas)
+            self._canvas.deleteLater()
+        self._canvas = self._scene = None
+
+    # Qt's.
+
+    def sizeHint(self) -> QSize:  # noqa: N802 - Qt's name
+        """Return a size at which a body is seen well."""
+        return QSize(720, 720)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Keep the legend in its corner."""
+        super().resizeEvent(event)
+        if self._canvas is not None:
+            self._place_legend()
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
+        """Follow the theme."""
+        super().changeEvent(event)
+        if event.type() is QEvent.Type.PaletteChange and self._scene is not None:
+            self._scene.set_dark(current_theme().is_dark)
+            self._make_shader()
+            self._recolour()
+
+    def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
+        """Free VTK's memory."""
+        self.shut_down()
+        super().closeEvent(event)
+
+    # The document's.
+
+    @Slot()
+    def _on_model_changed(self) -> None:
+        from app.canvas import Canvas
+        from app.scene import Scene
+
+        self._glide.stop()
+        self._turn.stop()
+        model = self._document.model
+        if self._canvas is not None:
+            self._canvas.shut_down()
+            self._layout.removeWidget(self._canvas)
+            self._canvas.deleteLater()
+        self._canvas = Canvas(self._bring_up_to_date, self)
+        self._canvas.hovered.connect(self._on_hovered)
+        self._canvas.painted.connect(self.painted)
+        self._canvas.camera_moved.connect(self._turn.stop)
+        self._scene = Scene(
+            self._canvas,
+            model.faces,
+            model.n_vertices,
+            model.up_axis,
+            model.height,
+            current_theme().is_dark,
+        )
+        self._shower = PoseShower(model)
+        self._front = front_direction(model.reference, model.up_axis)
+        self._legend = LegendCard(self)
+        self._tag = DomainTag(self)
+        self._make_shader()
+        self._shown = None
+        self._highlight = self._hovered = None
+        self._place_camera = True
+        if self._document.frame is not None:
+            self._on_frame_changed()
+        self._on_ghost_changed()
+
+    @Slot()
+    def _on_frame_changed(self) -> None:
+        if self._canvas is None or self._document.frame is None:
+            return
+        if self._layout.currentWidget() is not self._canvas:
+            self._layout.addWidget(self._canvas)
+            self._layout.setCurrentWidget(self._canvas)
+            self._waiting.stop()
+            self._legend.raise_()
+            self._tag.raise_()
+        self._pose_stale = True
+        self._recolour()
+
+    @Slot()
+    def _on_exact_changed(self) -> None:
+        if self._shading is Shading.EXACT:
+            self._recolour(crossing=True)
+
+    @Slot()
+    def _on_ghost_changed(self) -> None:
+        if self._canvas is None or self._scene is None or self._shower is None:
+            return
+        ghost = self._document.ghost
+        self._scene.show_ghost(ghost, None if ghost is None else self._shower.normals(ghost))
+        self._canvas.redraw()
+
+    @Slot(object)
+    def _on_solve_finished(self, result: object) -> None:
+        self._glide_next = result is not None
+
+    # Drawing.
+
+    def _recolour(self, crossing: bool = False) -> None:
+        self._colours_stale = True
+        self._crossing_stale = self._crossing_stale or crossing
+        if self._canvas is not None:
+            self._canvas.redraw()
+
+    def _bring_up_to_date(self) -> None:
+        """Write the newest pose and its colours, just before they are drawn.
+
+        However many frames come between two pictures, only the last is written.
+        """
+        frame, scene = self._document.frame, self._scene
+        if scene is None or frame is None:
+            return
+        if self._pose_stale:
+            self._pose_stale = False
+            self._put(scene, frame)
+        if self._colours_stale:
+            self._colours_stale = False
+            scene.paint(self._colours(frame))
+            self._explain(frame)
+        if self._crossing_stale:
+            self._crossing_stale = False
+            exact = self._document.exact
+            shown = self._shading is Shading.EXACT and exact is not None
+            scene.show_crossing(exact.pairs if exact is not None and shown else None)
+
+    def _put(self, scene: Scene, frame: LiveFrame) -> None:
+        before = self._shown
+        self._shown = frame
+        self._glide.stop()
+        if self._place_camera:
+            self._place_camera = False
+            scene.show(frame.vertices, frame.normals)
+            scene.view = self._preset("Three-quarter", frame.vertices)
+        elif self._glide_next and before is not None:
+            self._glide_next = False
+            # Not from within a picture: the first step of an animation asks for one.
+            QTimer.singleShot(0, self, self._glide.start)
+            self._glide_ends = (scene.surface.vertices.copy(), frame.vertices)
+        else:
+            scene.show(frame.vertices, frame.normals)
+        if self._shading is Shading.EXACT:
+            self._crossing_stale = True
+
+    def _colours(self, frame: LiveFrame) -> npt.NDArray[np.uint8]:
+        assert self._shader is not None
+        return self._shader.colours(
+            self._shading, *self._energies(frame), highlight=self._highlight
+        )
+
+    def _energies(
+        self, frame: LiveFrame
+    ) -> tuple[npt.NDArray[np.float64] | None, npt.NDArray[np.float64] | None]:
+        predicted, exact = frame.prediction, self._document.exact
+        return (
+            predicted.domain_energy if predicted is not None else None,
+            exact.vertex_energy if exact is not None else None,
+        )
+
+    def _explain(self, frame: LiveFrame) -> None:
+        assert self._shader is not None
+        self._legend.set_legend(
+            self._shader.legend(
+                self._shading,
+                *self._energies(frame),
+                has_predictor=self._document.model.predictor is not None,
+            )
+        )
+        self._place_legend()
+
+    def _place_legend(self) -> None:
+        self._legend.move(NORMAL, self.height() - self._legend.height() - NORMAL)
+
+    def _make_shader(self) -> None:
+        model = self._document.model
+        self._shader = Shader(
+            model.attention_mask,
+            model.domain_names,
+            model.domain_colours,
+            current_theme().is_dark,
+        )
+
+    def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
+        aspect = self.width() / max(1, self.height())
+        return preset_view(name, vertices, self._document.model.up_axis, self._front, aspect)
+
+    # Motion.
+
+    @Slot(object)
+    def _on_glided(self, share: float) -> None:
+        if self._glide_ends is None or self._scene is None or self._canvas is None:
+            return
+        start, end = self._glide_ends
+        assert self._shower is not None
+        frame = self._shown
+        if share >= 1.0 and frame is not None and end is frame.vertices:
+            self._scene.show(frame.vertices, frame.normals)
+        else:
+            between_poses = start + np.float32(share) * (end - start)
+            self._scene.show(between_poses, self._shower.normals(between_poses))
+        self._canvas.redraw()
+
+    @Slot(object)
+    def _on_turned(self, share: float) -> None:
+        if self._turn_ends is None or self._scene is None or self._canvas is None:
+            return
+        self._scene.view = between(*self._turn_ends, share)
+        self._canvas.redraw()
+
+    # The pointer.
+
+    @Slot(object)
+    def _on_hovered(self, place: QPointF | None) -> None:
+        if self._canvas is None or self._scene is None or self._shader is None:
+            return
+        vertex = None
+        if place is not None and self._shown is not None:
+            vertex = self._canvas.pick_vertex(place, self._scene.body)
+        domain = None if vertex is None else self._shader.leading_domain(vertex)
+        if domain is None or place is None:
+            self._tag.hide()
+        else:
+            model = self._document.model
+            self._tag.point_at(place, model.domain_names[domain], model.domain_colours[domain])
+        if domain != self._hovered:
+            self._hovered = domain
+            self.domain_hovered.emit(domain)
+
+
+def _animation(parent: Viewport, milliseconds: int) -> QVariantAnimation:
+    animation = QVariantAnimation(parent)
+    animation.setStartValue(0.0)
+    animation.setEndValue(1.0)
+    animation.setDuration(milliseconds)
+    animation.setEasingCurve(QEasingCurve.Type.InOutCubic)
+    return animation
