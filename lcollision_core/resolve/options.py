@@ -35,6 +35,7 @@ class Step(StrEnum):
     """
 
     UNCHANGED = "unchanged"
+    NEIGHBOUR = "neighbour"
     SOLVER = "solver"
     MARGIN = "margin"
     START = "start"

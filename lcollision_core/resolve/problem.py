@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -62,15 +63,24 @@ class ResolveProblem:
     ----------
     target : (D,) float64 array Z*
     metric : d
+    code_weights : (D,) float64 array > 0, of the solvers' own distance
     low, high : (D,) float64 arrays; equal where a code is locked
     limit : the threshold's logit
     model : of the constraint
     watch : asked before each evaluation
     evaluations : poses that the model was asked about so far
+
+    Notes
+    -----
+    The solvers keep the plain distance of the codes small, times the user's weights, whatever
+    `metric` is: where moves that the eye does not see are cheap they find the model's blind spots,
+    poses that it calls free and that are not. What they find is then shortened in `metric` against
+    the exact check.
     """
 
     target: FloatArray
     metric: LatentMetric
+    code_weights: FloatArray
     low: FloatArray
     high: FloatArray
     limit: float
@@ -84,9 +94,22 @@ class ResolveProblem:
         free: npt.NDArray[np.bool_] = self.high > self.low
         return free
 
+    @cached_property
+    def whitening(self) -> FloatArray:
+        """(M, M) array R of the M movable codes, with ||y||^2 = d for a move of R y."""
+        kept = np.flatnonzero(self.movable)
+        lower = np.linalg.cholesky(self.metric.gram[np.ix_(kept, kept)])
+        root: FloatArray = np.linalg.inv(lower).T
+        return root
+
     def distance(self, latent: FloatArray) -> FloatArray:
         """Measure d of (..., D) poses from Z*: (...)."""
         return self.metric.squared(latent - self.target)
+
+    def search_distance(self, latent: FloatArray) -> FloatArray:
+        """Measure the solvers' squared distance of (..., D) poses from Z*: (...)."""
+        squared: FloatArray = (latent - self.target) ** 2 @ self.code_weights
+        return squared
 
     def excess(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Evaluate (B, D) poses: how far the logits are above the limit, (B,), and (B, D) slopes.
@@ -120,3 +143,12 @@ class SolverOutcome:
     converged: bool
     feasible: bool
     iterations: int
+
+
+FEASIBLE = 1e-3
+"""In the logit: a constraint that is violated by less holds."""
+
+
+def rank(distance: float, violation: float) -> tuple[float, float]:
+    """Order iterates: feasible ones by distance, before all others, those by violation."""
+    return (0.0, distance) if violation <= FEASIBLE else (violation, distance)

@@ -15,7 +15,7 @@ from lcollision_core.jobs import CancelToken, Progress, available_cores, no_prog
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.exact import ExactCheck
-from lcollision_core.resolve.ladder import climb
+from lcollision_core.resolve.ladder import Ladder
 from lcollision_core.resolve.metric import LatentMetric
 from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult
 from lcollision_core.resolve.problem import CollisionModel, ResolveProblem, Watch
@@ -88,7 +88,20 @@ class PoseResolver:
         problem = self._problem(target, chosen, cancel)
         check = ExactCheck(self._embedding, self._detector, self._height, placement)
         correction = None if near is None else self._checked(near)
-        return climb(problem, check, self._free_latents, chosen, correction, progress)
+        outside = int(np.count_nonzero((target < self._low) | (target > self._high)))
+        remark = (
+            f"{outside} of {len(target)} codes are outside the box that the model was trained on"
+        )
+        ladder = Ladder(
+            problem,
+            check,
+            chosen,
+            self._free_latents,
+            correction,
+            progress,
+            remark if outside else None,
+        )
+        return ladder.climb() if chosen.verify else ladder.solve_only()
 
     def resolve_many(
         self,
@@ -150,13 +163,15 @@ class PoseResolver:
         self, target: FloatArray, options: ResolveOptions, cancel: CancelToken | None
     ) -> ResolveProblem:
         metric = self._eye if options.metric == Metric.EYE else LatentMetric.latent(len(target))
+        code_weights = np.ones(len(target))
         if options.group_weights is not None:
             n_groups = len(self._embedding.group_sizes)
             if len(options.group_weights) != n_groups:
                 raise ShapeError(
                     f"{n_groups} group weights are needed, got {len(options.group_weights)}"
                 )
-            metric = metric.weighted(np.array(options.group_weights)[self._group_of_code])
+            code_weights = np.array(options.group_weights, np.float64)[self._group_of_code]
+            metric = metric.weighted(code_weights)
         low, high = np.minimum(self._low, target), np.maximum(self._high, target)
         for domain in sorted(options.locked_domains):
             if not 0 <= domain < self._embedding.n_domains:
@@ -169,5 +184,12 @@ class PoseResolver:
             low[locked] = high[locked] = target[locked]
         watch = Watch(options.time_budget, cancel)
         return ResolveProblem(
-            target, metric, low, high, options.threshold_logit, self._predictor, watch
+            target,
+            metric,
+            code_weights,
+            low,
+            high,
+            options.threshold_logit,
+            self._predictor,
+            watch,
         )

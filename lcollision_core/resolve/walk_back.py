@@ -7,44 +7,13 @@ import numpy as np
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.exact import ExactCheck
 from lcollision_core.resolve.problem import ResolveProblem
+from lcollision_core.resolve.shorten import bisect
 
 WALKS = 6
 """Known free poses that are walked to, the nearest ones: the nearest of all often has not the
 shortest walk."""
 
 HALVINGS = 8
-
-
-def bisect(
-    check: ExactCheck, problem: ResolveProblem, free: FloatArray, colliding: FloatArray, n: int
-) -> tuple[FloatArray, FloatArray]:
-    """Halve a segment `n` times between a free and a colliding pose.
-
-    Along a segment the free set need not be one interval: this finds a boundary of it, not always
-    the one that is nearest to the colliding end.
-
-    Parameters
-    ----------
-    check, problem : of the pose
-    free, colliding : (D,) float64 arrays
-    n : how often, >= 0
-
-    Returns
-    -------
-    free, colliding : the ends of what is left
-
-    Raises
-    ------
-    CancelledError : the problem's watch said so.
-    """
-    for _ in range(n):
-        problem.watch.poll()
-        middle = 0.5 * (free + colliding)
-        if check.is_free(middle):
-            free = middle
-        else:
-            colliding = middle
-    return free, colliding
 
 
 def walk_back(
