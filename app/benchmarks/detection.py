@@ -150,7 +150,8 @@ def _disjoint_pairs(contacts: npt.NDArray[np.int64], faces: IntArray) -> set[tup
     return set(map(tuple, np.sort(contacts[~share], axis=1).tolist()))
 
 
-def _contacts_of_fcl(vertices: FloatArray, faces: IntArray) -> npt.NDArray[np.int64]:
+def contacts_of_fcl(vertices: FloatArray, faces: IntArray) -> npt.NDArray[np.int64]:
+    """Return (P, 2) faces that python-fcl finds to touch, those that share a vertex among them."""
     import fcl
 
     model = fcl.BVHModel()
@@ -185,4 +186,4 @@ def _contacts_of_coal(vertices: FloatArray, faces: IntArray) -> npt.NDArray[np.i
 
 
 _MODULES = {"python-fcl": "fcl", "coal": "coal"}
-_PEERS: dict[str, FindPairs] = {"python-fcl": _contacts_of_fcl, "coal": _contacts_of_coal}
+_PEERS: dict[str, FindPairs] = {"python-fcl": contacts_of_fcl, "coal": _contacts_of_coal}

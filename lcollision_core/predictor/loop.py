@@ -31,6 +31,9 @@ _RUN_VERSION = 1
 _WATCHED_ROWS = 4000
 """Held-out rows whose accuracy is shown while training."""
 
+_BUILDING_ROWS = 65_536
+"""Training rows that a network may see when it is built: enough for its statistics."""
+
 _SECONDS_BETWEEN_REPORTS = 0.25
 _STEPS_BETWEEN_TALKS = 20
 """Processes agree this often on whether to stop or to save: each time costs a round trip."""
@@ -94,10 +97,8 @@ class TrainingLoop:
     def _run(self, processes: Processes) -> PredictorNetwork:
         config = self._config
         checkpoint = Checkpoint(self._path, self._key())
-        # The constructor wants the rows that train, and only briefly.
-        network = NETWORKS[config.preset].build(
-            self._embedding, config, taken(self._rows, self._training_index), self._facts.seed
-        )
+        some = taken(self._rows, self._training_index[:_BUILDING_ROWS])
+        network = NETWORKS[config.preset].build(self._embedding, config, some, self._facts.seed)
         network = network.to(processes.device)
         learnt = [values for values in network.parameters() if values.requires_grad]
         optimiser = torch.optim.Adam(learnt, lr=config.rate, fused=True)
@@ -108,7 +109,7 @@ class TrainingLoop:
             shared = DistributedDataParallel(network, find_unused_parameters=True)
         batches = _Batches(self._rows, self._training_index, config, self._facts, processes.device)
         network.train()
-        self._report(step, network)
+        self._report(step)
         while step < self._total:
             latent, targets = batches.at(*divmod(step, self._steps_an_epoch))
             part = processes.share(len(latent))
@@ -149,12 +150,12 @@ class TrainingLoop:
             self._cancel.raise_if_cancelled()
         if step % self._steps_an_epoch == 0:
             self._accuracy = self._watched_accuracy(network)
-            self._report(step, network)
+            self._report(step)
             self._losses.clear()
         elif time.monotonic() - self._reported > _SECONDS_BETWEEN_REPORTS:
-            self._report(step, network)
+            self._report(step)
 
-    def _report(self, step: int, network: PredictorNetwork) -> None:  # noqa: ARG002
+    def _report(self, step: int) -> None:
         self._reported = time.monotonic()
         self._progress(
             PredictorStatus(

@@ -70,7 +70,8 @@ class PredictorNetwork(nn.Module, ABC):
         ----------
         embedding : whose latent codes come in
         config : the choices
-        rows : to train on, as they are in the store; None where a state dict will be loaded
+        rows : some of those to train on, as they are in the store; None where a state dict will be
+            loaded
         seed : of the initial weights
         """
 

@@ -194,6 +194,18 @@ class CollisionPredictor:
             (gradient,) = torch.autograd.grad(logit.sum(), codes)
         return logit.detach().cpu().numpy(), gradient.cpu().numpy()
 
+    def flops(self, n_rows: int) -> int:
+        """Count the floating-point operations of the matrix products that predict `n_rows` poses.
+
+        A multiplication and its addition count as two.
+        """
+        import torch
+        from torch.utils.flop_counter import FlopCounterMode
+
+        with torch.no_grad(), FlopCounterMode(display=False) as counter:
+            self._network(torch.zeros((n_rows, self.latent_size), device=self._device))
+        return int(counter.get_total_flops())
+
     def on(self, device: str) -> CollisionPredictor:
         """Return the same predictor with its network on a device, such as "cuda" or "cpu"."""
         from copy import deepcopy

@@ -1,0 +1,226 @@
+"""The predictor against the exact check, on poses drawn from a model's latent box.
+
+The exact check stops at a pose's first pair and spreads the poses over all cores, as the paper's
+Table 3 lets its peer do; it needs the mesh, so decoding counts as its cost. python-fcl cannot stop
+at the first pair that counts (faces that share a vertex touch), so it finds all; it is timed on
+few poses and one core, and its time is scaled as if it spread over all cores without loss.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from app.benchmarks.detection import contacts_of_fcl, missing_peers
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.labels import ROWS_A_BLOCK, LatentBox
+from lcollision_core.model import PoseModel
+from lcollision_core.predictor import CollisionPredictor
+
+FloatArray = npt.NDArray[np.float64]
+
+BATCH = 500
+TABLE_POSES = 15_000
+"""Poses of the paper's Table 3."""
+
+ROUNDS = 7
+GRADIENT_ROUNDS = 60
+FCL_POSES = 8
+GEMM_SIZE = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class PredictorTiming:
+    """One device's row of ``lcollision benchmark predictor``; times of poses from latent codes.
+
+    Attributes
+    ----------
+    device : "cpu" or "cuda"
+    preset : of the predictor
+    batch : poses predicted at a time
+    cores : that the CPU's times may use, all but `gradient_ms`
+    us_per_pose : prediction in such batches, microseconds, median of the rounds
+    gradient_ms : logit and gradient of one pose, on one core or the GPU, median
+    exact_ms_per_pose : exact verdict of a decoded pose, on all cores
+    decode_ms_per_pose : decoding, on all cores
+    speedup : (decode + exact) over predicted
+    gemm_fraction : the network's multiplications per second over those of one large matrix
+        product on the device
+    table_poses : 15 000, of the paper's Table 3
+    predicted_seconds : for as many, measured
+    exact_seconds : for as many, decoding included, scaled up from `exact_poses`
+    exact_poses : poses that the exact check was timed on
+    colliding_share : of these
+    fcl_seconds : for as many, without decoding, scaled up from one core and `fcl_poses` poses
+        without any loss; None without python-fcl
+    fcl_poses : poses that python-fcl was timed on
+    """
+
+    device: str
+    preset: str
+    batch: int
+    cores: int
+    us_per_pose: float
+    gradient_ms: float
+    exact_ms_per_pose: float
+    decode_ms_per_pose: float
+    speedup: float
+    gemm_fraction: float
+    table_poses: int
+    predicted_seconds: float
+    exact_seconds: float
+    exact_poses: int
+    colliding_share: float
+    fcl_seconds: float | None
+    fcl_poses: int
+
+
+@dataclass(frozen=True)
+class _Exact:
+    """What finding the truth costs, per pose in seconds."""
+
+    decode: float
+    check: float
+    colliding_share: float
+    fcl: float | None
+
+
+def time_predictor(
+    model: PoseModel,
+    predictor: CollisionPredictor,
+    n_poses: int,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> list[PredictorTiming]:
+    """Time a model's predictor on the CPU and, where there is one, on the GPU.
+
+    Parameters
+    ----------
+    model : decodes
+    predictor : the model's
+    n_poses : for the exact check
+    progress : in those poses
+    cancel : polled between batches
+    """
+    import torch
+
+    latent = drawn_poses(model, TABLE_POSES)
+    exact = _time_exact(model, latent[:n_poses], progress, cancel or CancelToken())
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    return [
+        _time_on(device, predictor.on(device), latent, exact, min(n_poses, TABLE_POSES))
+        for device in devices
+    ]
+
+
+def drawn_poses(model: PoseModel, n_poses: int) -> npt.NDArray[np.float32]:
+    """Draw the first (n, D) samples of seed 0 from a model's latent box."""
+    box = LatentBox.of(model.embedding)
+    blocks = range(-(-n_poses // ROWS_A_BLOCK))
+    return np.concatenate([box.draw(0, block) for block in blocks])[:n_poses]
+
+
+def _time_exact(
+    model: PoseModel, latent: npt.NDArray[np.float32], progress: Progress, cancel: CancelToken
+) -> _Exact:
+    detector = CollisionDetector(
+        model.topology, model.reference, near_exclusion=model.near_exclusion
+    )
+    # Compiling and the trees are not what a pose costs.
+    first = model.decode(latent[:BATCH])
+    detector.are_colliding(first[:8])
+    decode = check = 0.0
+    n_colliding = 0
+    for start in range(0, len(latent), BATCH):
+        cancel.raise_if_cancelled()
+        part = latent[start : start + BATCH]
+        began = time.perf_counter()
+        vertices = model.decode(part)
+        decoded = time.perf_counter()
+        n_colliding += int(detector.are_colliding(vertices).sum())
+        decode += decoded - began
+        check += time.perf_counter() - decoded
+        progress(min(start + BATCH, len(latent)), len(latent))
+    fcl = None
+    if "python-fcl" not in missing_peers():
+        faces = np.asarray(model.faces)
+        fcl = _median_seconds([partial(contacts_of_fcl, pose, faces) for pose in first[:FCL_POSES]])
+    count = len(latent)
+    return _Exact(decode / count, check / count, n_colliding / count, fcl)
+
+
+def _time_on(
+    device: str,
+    predictor: CollisionPredictor,
+    latent: npt.NDArray[np.float32],
+    exact: _Exact,
+    n_exact: int,
+) -> PredictorTiming:
+    import torch
+
+    batch = latent[:BATCH]
+    predictor.predict(batch)
+    predicted = _median_seconds([lambda: predictor.predict(batch)] * ROUNDS) / BATCH
+    began = time.perf_counter()
+    for start in range(0, len(latent), BATCH):
+        predictor.predict(latent[start : start + BATCH])
+    predicted_all = time.perf_counter() - began
+    one = latent[:1].astype(np.float64)
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        predictor.logit_and_gradient(one)
+        gradient = _median_seconds([lambda: predictor.logit_and_gradient(one)] * GRADIENT_ROUNDS)
+    finally:
+        torch.set_num_threads(n_threads)
+    cores = available_cores()
+    truth = exact.decode + exact.check
+    return PredictorTiming(
+        device=device,
+        preset=predictor.preset,
+        batch=BATCH,
+        cores=cores,
+        us_per_pose=1e6 * predicted,
+        gradient_ms=1e3 * gradient,
+        exact_ms_per_pose=1e3 * exact.check,
+        decode_ms_per_pose=1e3 * exact.decode,
+        speedup=truth / predicted,
+        gemm_fraction=predictor.flops(BATCH) / (BATCH * predicted) / _gemm_rate(device),
+        table_poses=len(latent),
+        predicted_seconds=predicted_all,
+        exact_seconds=truth * len(latent),
+        exact_poses=n_exact,
+        colliding_share=exact.colliding_share,
+        fcl_seconds=None if exact.fcl is None else exact.fcl * len(latent) / cores,
+        fcl_poses=0 if exact.fcl is None else FCL_POSES,
+    )
+
+
+def _gemm_rate(device: str) -> float:
+    """Return the floating-point operations per second of a large single-precision product."""
+    import torch
+
+    left = torch.rand((GEMM_SIZE, GEMM_SIZE), device=device)
+
+    def multiply() -> None:
+        # The sum fetched from the device waits for the product.
+        float((left @ left)[0, 0])
+
+    multiply()
+    return 2.0 * GEMM_SIZE**3 / _median_seconds([multiply] * ROUNDS)
+
+
+def _median_seconds(calls: list[Callable[[], object]]) -> float:
+    seconds = []
+    for call in calls:
+        began = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - began)
+    return statistics.median(seconds)
