@@ -1,7 +1,9 @@
 """The nearest collision-free pose: the paper's problem, then a ladder that ends exactly free."""
 
+from lcollision_core.resolve.free_poses import find_free_poses
 from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult, Solver, Step
 from lcollision_core.resolve.resolver import PoseResolver
+from lcollision_core.resolve.sequence import largest_correction_change
 
 __all__ = [
     "Metric",
@@ -10,4 +12,6 @@ __all__ = [
     "ResolveResult",
     "Solver",
     "Step",
+    "find_free_poses",
+    "largest_correction_change",
 ]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
+from itertools import pairwise
+from threading import Lock
 
 import numpy as np
 import numpy.typing as npt
@@ -110,16 +113,26 @@ class PoseResolver:
         workers: int | None = None,
         progress: Progress = no_progress,
         cancel: CancelToken | None = None,
+        *,
+        placements: Sequence[RigidTransform | None] | None = None,
+        sequence: bool = False,
+        keep: Callable[[int, ResolveResult], None] | None = None,
     ) -> list[ResolveResult]:
-        """Resolve (B, D) poses, each on its own, on several threads.
+        """Resolve (B, D) poses on several threads.
 
         Parameters
         ----------
         latents : (B, D) finite array
         options : the defaults if None
         workers : threads, one for each available core by default; results do not depend on it
-        progress : called with (poses done, B)
+        progress : called with (poses done, B), from one thread at a time
         cancel : polled at every evaluation
+        placements : where each pose is exported to
+        sequence : the poses are the frames of a motion: a frame starts from the correction of the
+            one before, so that the motion does not flicker. Frames that collide in a row are one
+            thread's work.
+        keep : called with each result and its place as soon as it is there, from one thread at a
+            time: what was done is known whatever interrupts the rest
 
         Returns
         -------
@@ -129,17 +142,41 @@ class PoseResolver:
         ------
         ShapeError, CancelledError : as of `resolve`.
         """
-        rows = np.atleast_2d(np.asarray(latents, dtype=np.float64))
-        results = []
+        rows = [self._checked(row) for row in np.atleast_2d(np.asarray(latents, np.float64))]
+        placed = [None] * len(rows) if placements is None else placements
+        results: dict[int, ResolveResult] = {}
+        guard = Lock()
+
+        def solve(run: range) -> None:
+            near = None
+            for place in run:
+                result = self.resolve(
+                    rows[place], options, no_progress, cancel, placed[place], near
+                )
+                near = result.latent - rows[place] if sequence else None
+                with guard:
+                    results[place] = result
+                    if keep is not None:
+                        keep(place, result)
+                    progress(len(results), len(rows))
+
         pool = ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="resolve")
         try:
-            solving = [pool.submit(self.resolve, row, options, no_progress, cancel) for row in rows]
-            for solved in solving:
-                results.append(solved.result())
-                progress(len(results), len(rows))
+            if sequence:
+                colliding = list(pool.map(self._is_colliding, rows, placed))
+                starts = [at for at in range(len(rows)) if at == 0 or not colliding[at]]
+            else:
+                starts = list(range(len(rows)))
+            runs = [range(*pair) for pair in pairwise([*starts, len(rows)])]
+            for solved in [pool.submit(solve, run) for run in runs]:
+                solved.result()
         finally:
             pool.shutdown(cancel_futures=True)
-        return results
+        return [results[place] for place in range(len(rows))]
+
+    def _is_colliding(self, latent: FloatArray, placement: RigidTransform | None) -> bool:
+        check = ExactCheck(self._embedding, self._detector, self._height, placement)
+        return not check.is_free(latent)
 
     @cached_property
     def _eye(self) -> LatentMetric:
