@@ -87,6 +87,8 @@ def joined_processes(device: str) -> Iterator[Processes]:
     if not dist.is_torchelastic_launched():
         yield Processes(0, 1, torch.device(kind))
         return
+    if kind == "cuda":
+        torch.cuda.set_device(chosen)
     own_group = not dist.is_initialized()
     if own_group:
         dist.init_process_group("nccl" if kind == "cuda" else "gloo")
