@@ -254,14 +254,25 @@ class PoseDocument(PoseHistory):
         self._mirror = opened.mirror
         self._locked = frozenset()
         self.cancel_all()
-        self._live.stop()
-        self._frame = self._exact = None
-        # Whoever looks when told of the model finds a pose of that model.
+        self._frame = self._exact = self._gesture = self._file = None
         self._state = self._blank()
-        self.model_changed.emit()
-        self._begin(self._blank(), None)
-        for changed in (self.frame_changed, self.exact_changed, self.locks_changed):
+        self._live.follow(self.model, self.latent)
+        self.undo_stack.clear()
+        # All of it is in before anyone is told: who looks finds poses of that model only, and
+        # may edit at once.
+        for changed in (
+            self.model_changed,
+            self.latent_changed,
+            self.frame_changed,
+            self.exact_changed,
+            self.ghost_changed,
+            self.outcome_changed,
+            self.locks_changed,
+            self.library_changed,
+            self.file_changed,
+        ):
             changed.emit()
+        self._tell_modified()
 
     def open_model(self, name_or_path: str | Path) -> None:
         """Read a model in the long worker and put it in."""

@@ -1,11 +1,16 @@
-"""What the tests of the command line share."""
+"""What the tests of the command line and of the editor share."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pytestqt.qtbot import QtBot
 
+from app.document import PoseDocument
+from lcollision_core.model import PoseModel
+from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 
 
@@ -23,3 +28,20 @@ def apart(tmp_path: Path) -> Path:
     path = tmp_path / "apart.obj"
     path.write_text(STABBED.replace("-0.1", "0.1"))
     return path
+
+
+@pytest.fixture(scope="session")
+def editor_model() -> PoseModel:
+    """Return a small model with a predictor."""
+    return trained_tube()
+
+
+@pytest.fixture
+def document(qtbot: QtBot, editor_model: PoseModel) -> Iterator[PoseDocument]:
+    """Return a document whose first pose is computed and checked; its threads end with the test."""
+    held = PoseDocument()
+    with qtbot.waitSignal(held.exact_changed, check_params_cb=lambda: held.exact is not None):
+        held.set_model(editor_model)
+    yield held
+    assert held.close()
+    held.deleteLater()

@@ -1,0 +1,26 @@
+"""A small model with a predictor, trained once for all tests of the editor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lcollision_core.labels import Labeller
+from lcollision_core.model import PoseModel
+from tests.bending_tube import bending_tube
+
+
+def trained_tube() -> PoseModel:
+    """Return a model of a tube that bends at two joints, with two domains of three codes."""
+    from lcollision_core.embedding.config import EmbeddingConfig
+    from lcollision_core.embedding.training import train_embedding
+    from lcollision_core.predictor import PRESETS, train_predictor
+
+    poses = bending_tube(labelled=True)
+    config = EmbeddingConfig(
+        n_domains=2, n_domain_codes=3, level1_epochs=60, level2_epochs=20, held_out_stride=0
+    )
+    bare = PoseModel.from_training("tube", train_embedding(poses, config), poses, "a tube", "CC0")
+    labeller = Labeller(bare.embedding, bare.height, bare.near_exclusion, bare.fingerprint)
+    rows = labeller.label_block(0, 0)
+    predictor = train_predictor(rows, bare.embedding, replace(PRESETS["paper"], epochs=2))
+    return bare.with_predictor(predictor)

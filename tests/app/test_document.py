@@ -1,0 +1,389 @@
+"""The document: every change is undone to the bit, and files hold what is on the screen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pytestqt.qtbot import QtBot
+
+from app.document import Failure, PoseDocument
+from app.frames import PoseShower
+from lcollision_core.errors import ModelFileError
+from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
+from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
+from tests.bending_tube import LENGTH_IN_FILES, RADIUS, SIDES
+
+QUARTER_TURN = RigidTransform(
+    np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([5.0, -3.0, 2.0])
+)
+
+
+@pytest.fixture(scope="module")
+def colliding(editor_model: PoseModel) -> np.ndarray:
+    """Return a latent pose that collides."""
+    return sample_poses(editor_model, 1, 0, colliding=True)[0]
+
+
+def settle(qtbot: QtBot, document: PoseDocument) -> None:
+    """Wait until the frame and the verdict are those of the pose."""
+    qtbot.waitUntil(lambda: document.exact is not None and not document.busy)
+    assert document.frame is not None
+    assert document.frame.latent.tobytes() == document.latent.tobytes()
+
+
+def resolve(qtbot: QtBot, document: PoseDocument) -> None:
+    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
+        document.resolve()
+
+
+def test_the_frame_is_what_the_model_decodes_and_predicts(
+    qtbot: QtBot, document: PoseDocument, colliding: np.ndarray
+) -> None:
+    document.set_latent(colliding, "Jump")
+    settle(qtbot, document)
+    frame, exact, model = document.frame, document.exact, document.model
+    assert frame is not None
+    assert exact is not None
+    assert frame.prediction is not None
+    assert (frame.vertices == model.decode(colliding).astype(np.float32)).all()
+    predicted = model.predict(colliding)
+    assert frame.prediction.collision_probability == predicted.collision_probability[0]
+    assert (frame.prediction.domain_energy == predicted.domain_energy[0]).all()
+    found = model.detector.detect(frame.vertices)
+    assert exact.colliding
+    assert (exact.pairs == found.pairs).all()
+    assert exact.energy == found.energy > 0.0
+    assert exact.domain_energy.sum() == pytest.approx(found.energy)
+    assert exact.request_id == frame.request_id
+
+
+def test_normals_of_a_straight_tube_point_away_from_it(editor_model: PoseModel) -> None:
+    straight = editor_model.reference.astype(np.float32)
+    normals = PoseShower(editor_model).normals(straight)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(normals[-2:], [[0, -1, 0], [0, 1, 0]], atol=1e-5)
+    inner = slice(SIDES, -2 - SIDES)
+    walls = straight[inner] - straight[-2] * [1, 0, 1]
+    outward = walls * [1, 0, 1] / (RADIUS * LENGTH_IN_FILES)
+    np.testing.assert_allclose(normals[inner], outward, atol=1e-4)
+
+
+def test_a_drag_is_one_step_and_undo_is_exact(document: PoseDocument) -> None:
+    before = document.latent.tobytes()
+    document.begin_gesture("Drag")
+    for value in np.linspace(0.1, 1.0, 20):
+        document.set_code(2, value)
+        assert document.latent[2] == value
+    assert document.modified
+    document.end_gesture()
+    after = document.latent.tobytes()
+    assert document.undo_stack.count() == 1
+    document.undo()
+    assert document.latent.tobytes() == before
+    assert not document.modified
+    document.redo()
+    assert document.latent.tobytes() == after
+
+
+def test_a_drag_that_ends_where_it_began_is_no_step(document: PoseDocument) -> None:
+    document.begin_gesture("Drag")
+    document.set_code(0, 1.0)
+    document.set_code(0, 0.0)
+    document.end_gesture()
+    assert document.undo_stack.count() == 0
+    assert not document.modified
+
+
+def test_escape_takes_a_drag_back(document: PoseDocument) -> None:
+    document.begin_gesture("Drag")
+    document.set_code(0, 1.0)
+    document.cancel_gesture()
+    assert document.latent[0] == 0.0
+    assert document.undo_stack.count() == 0
+    assert not document.modified
+
+
+def test_undo_within_a_drag_takes_the_drag_back(document: PoseDocument) -> None:
+    document.set_code(0, 1.0)
+    document.begin_gesture("Drag")
+    document.set_code(1, 1.0)
+    document.undo()
+    assert document.latent[:2].tolist() == [1.0, 0.0]
+    document.undo()
+    assert document.latent[:2].tolist() == [0.0, 0.0]
+    document.redo()
+    document.redo()
+    assert document.latent[:2].tolist() == [1.0, 1.0]
+
+
+def test_steps_on_one_slider_merge_and_vanish_at_their_start(document: PoseDocument) -> None:
+    for value in (0.1, 0.2, 0.3):
+        document.set_code(0, value)
+    assert document.undo_stack.count() == 1
+    document.set_code(1, 0.1)
+    assert document.undo_stack.count() == 2
+    document.set_code(1, 0.0)
+    assert document.undo_stack.count() == 1
+    document.undo()
+    assert not document.latent.any()
+
+
+def test_steps_a_while_apart_do_not_merge(
+    document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr("app.commands.time.monotonic", lambda: now[0])
+    document.set_code(0, 0.1)
+    now[0] += 1.5
+    document.set_code(0, 0.2)
+    assert document.undo_stack.count() == 2
+
+
+def test_a_number_that_is_not_finite_is_ignored(document: PoseDocument) -> None:
+    document.set_code(0, float("nan"))
+    assert document.undo_stack.count() == 0
+    assert not document.latent.any()
+
+
+def test_randomise_repeats_itself_and_spares_what_is_locked(document: PoseDocument) -> None:
+    space = document.model.latent_space
+    document.set_locked(1, True)
+    document.randomise(1.0, 7)
+    drawn = space.sample(1, np.random.default_rng(7))[0]
+    locked = np.zeros(len(drawn), dtype=bool)
+    locked[space.groups[2].codes] = True
+    locked[1] = True
+    assert (document.latent[~locked] == drawn[~locked]).all()
+    assert not document.latent[locked].any()
+    document.undo()
+    document.randomise(0.0, 7)
+    assert not document.latent.any()
+
+
+def test_blending_starts_from_where_the_hand_took_hold(document: PoseDocument) -> None:
+    target = document.model.training_latent[3]
+    document.set_code(0, 0.5)
+    start = document.latent.copy()
+    document.begin_gesture("Blend")
+    for share in (0.2, 0.9, 0.5):
+        document.blend_towards(target, share)
+    np.testing.assert_allclose(document.latent, 0.5 * (start + target), rtol=1e-12, atol=1e-12)
+    document.blend_towards(target, 1.0)
+    assert (document.latent == target).all()
+    document.end_gesture()
+    document.undo()
+    assert (document.latent == start).all()
+
+
+def test_resolve_is_one_step_that_is_never_solved_again(
+    qtbot: QtBot, document: PoseDocument, colliding: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document.set_latent(colliding, "Jump")
+    settle(qtbot, document)
+    old_mesh = document.frame.vertices if document.frame else None
+    assert old_mesh is not None
+    resolve(qtbot, document)
+    outcome = document.outcome
+    assert outcome is not None
+    assert outcome.exactly_free
+    solved = document.latent.tobytes()
+    settle(qtbot, document)
+    assert document.exact is not None
+    assert not document.exact.colliding
+    assert document.ghost is not None
+    assert (document.ghost == old_mesh).all()
+    document.show_ghost(False)
+    assert document.ghost is None
+    monkeypatch.delattr(PoseModel, "resolve")
+    document.undo()
+    assert document.latent.tobytes() == colliding.tobytes()
+    assert document.outcome is None
+    settle(qtbot, document)
+    assert document.frame is not None
+    assert document.frame.vertices.tobytes() == old_mesh.tobytes()
+    document.redo()
+    assert document.latent.tobytes() == solved
+    assert document.outcome is outcome
+
+
+def test_resolve_leaves_locked_domains(
+    qtbot: QtBot, document: PoseDocument, colliding: np.ndarray
+) -> None:
+    document.set_latent(colliding, "Jump")
+    document.set_locked(1, True)
+    resolve(qtbot, document)
+    codes = document.model.latent_space.groups[2].codes
+    assert (document.latent[codes] == colliding[codes]).all()
+    assert document.latent[1] == colliding[1]
+    assert document.latent[0] != colliding[0]
+
+
+def test_saving_clears_the_mark_and_undo_brings_it_back(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    path = tmp_path / "poses.json"
+    with pytest.raises(ModelFileError, match="save it under a name"):
+        document.save()
+    document.set_code(0, 0.25)
+    with qtbot.waitSignal(document.modified_changed, check_params_cb=lambda on: not on):
+        document.save(path)
+    assert document.file == path
+    document.undo()
+    assert document.modified
+    document.redo()
+    assert not document.modified
+    (saved,) = read_poses(path, document.model)
+    assert saved.latent.tobytes() == document.latent.tobytes()
+
+
+def test_no_edit_is_lost_between_saves(document: PoseDocument, tmp_path: Path) -> None:
+    path = tmp_path / "poses.json"
+    document.add_pose_to_library("first")
+    document.set_code(0, 0.5)
+    document.save(path)
+    document.undo()
+    document.redo()
+    document.load_pose(document.training_pose(2))
+    document.save(path)
+    saved = {pose.name: pose.latent for pose in read_poses(path, document.model)}
+    assert list(saved) == ["first", "bend 2"]
+    assert saved["first"][0] == 0.5
+    assert (saved["bend 2"] == document.model.training_latent[2]).all()
+
+
+def test_the_library_is_undone_like_the_pose(document: PoseDocument) -> None:
+    document.add_pose_to_library("kick")
+    document.add_pose_to_library("kick")
+    assert [pose.name for pose in document.poses] == ["kick", "kick 2"]
+    assert document.pose_name == "kick 2"
+    with pytest.raises(ModelFileError, match="choose another name"):
+        document.rename_pose("kick", "kick 2")
+    document.rename_pose("kick 2", "jump")
+    assert document.pose_name == "jump"
+    document.remove_pose_from_library("kick")
+    assert [pose.name for pose in document.poses] == ["jump"]
+    for _ in range(4):
+        document.undo()
+    assert document.poses == ()
+    assert not document.modified
+
+
+def test_open_replaces_the_pose_the_library_and_the_history(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    path = tmp_path / "two.json"
+    latent = document.model.training_latent
+    poses = [NamedPose("a", latent[1], QUARTER_TURN), NamedPose("b", latent[2])]
+    write_poses(path, document.model, poses)
+    document.set_code(0, 0.5)
+    with qtbot.waitSignal(document.message):
+        document.open_poses(path)
+    assert [pose.name for pose in document.poses] == ["a", "b"]
+    assert (document.latent == latent[1]).all()
+    assert document.pose_name == "a"
+    assert document.placement is not None
+    assert not document.modified
+    assert document.undo_stack.count() == 0
+
+
+def test_garbage_is_refused_in_a_sentence_and_changes_nothing(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    garbage = tmp_path / "garbage.json"
+    garbage.write_bytes(b"\x00\xff not a pose")
+    mesh = tmp_path / "garbage.obj"
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    state = document.latent
+    for act in (
+        lambda: document.open_poses(garbage),
+        lambda: document.import_mesh(mesh),
+        lambda: document.open_model(tmp_path / "none.safetensors"),
+        lambda: document.export_mesh(tmp_path / "mesh.xyz"),
+    ):
+        failure = failure_of(qtbot, document, act)
+        assert failure.sentence.count("\n") == 0
+        assert "Traceback" in failure.details
+    assert document.latent is state
+    assert not document.modified
+
+
+def failure_of(qtbot: QtBot, document: PoseDocument, act: Callable[[], None]) -> Failure:
+    with qtbot.waitSignal(document.failed) as caught:
+        act()
+    assert caught.args is not None
+    (failure,) = caught.args
+    assert isinstance(failure, Failure)
+    return failure
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".glb"])
+def test_an_exported_mesh_is_the_one_on_the_screen_in_its_place(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path, suffix: str
+) -> None:
+    pose = NamedPose("placed", document.model.training_latent[4], QUARTER_TURN)
+    document.load_pose(pose)
+    settle(qtbot, document)
+    path = tmp_path / f"placed{suffix}"
+    with qtbot.waitSignal(document.message):
+        document.export_mesh(path)
+    assert document.frame is not None
+    placed = QUARTER_TURN.apply(document.frame.vertices).astype(np.float32)
+    mesh = read_mesh(path)
+    assert (mesh.vertices.astype(np.float32)[mesh.faces] == placed[document.model.faces]).all()
+
+
+def test_an_exported_mesh_comes_back_as_the_same_mesh(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    document.load_pose(NamedPose("placed", document.model.training_latent[4], QUARTER_TURN))
+    with qtbot.waitSignal(document.message):
+        document.export_mesh(tmp_path / "placed.obj")
+    document.new_pose()
+    with qtbot.waitSignal(document.message, timeout=20_000) as told:
+        document.import_mesh(tmp_path / "placed.obj")
+    assert told.args is not None
+    assert "of the height" in told.args[0]
+    assert document.pose_name == "placed"
+    with qtbot.waitSignal(document.message):
+        document.export_mesh(tmp_path / "again.obj")
+    first, again = (read_mesh(tmp_path / name) for name in ("placed.obj", "again.obj"))
+    off = np.abs(first.vertices - again.vertices).max() / document.model.height
+    assert off < 1e-3
+    document.undo()
+    assert not document.latent.any()
+    assert document.placement is None
+
+
+def test_a_mesh_at_rest_imports_in_its_own_place(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    model = document.model
+    placed = QUARTER_TURN.apply(model.reference)
+    write_mesh(tmp_path / "rest.ply", placed, model.faces)
+    with qtbot.waitSignal(document.message, timeout=20_000):
+        document.import_mesh(tmp_path / "rest.ply")
+    assert document.placement is not None
+    back = document.placement.apply(model.decode(document.latent))
+    assert np.abs(back - placed).max() / model.height < 0.05
+
+
+def test_a_model_without_predictor_shows_poses_but_does_not_resolve(
+    qtbot: QtBot, document: PoseDocument
+) -> None:
+    model = document.model
+    document.set_code(0, 0.5)
+    document.set_locked(1, True)
+    document.set_model(PoseModel("bare", model.embedding, model.card))
+    assert document.undo_stack.count() == 0
+    assert document.locked_domains == frozenset()
+    assert not document.latent.any()
+    settle(qtbot, document)
+    assert document.frame is not None
+    assert document.frame.prediction is None
+    assert not document.can_resolve
+    assert not document.can_mirror
+    with pytest.raises(ModelFileError, match="no predictor"):
+        document.resolve()

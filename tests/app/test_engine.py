@@ -1,0 +1,277 @@
+"""The threads: the newest request wins, nothing old is shown, and a failure breaks nothing."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QTimer
+from pytestqt.qtbot import QtBot
+
+from app.document import PoseDocument
+from app.engine import Failure, LongWork
+from app.frames import LiveFrame, PoseShower
+from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.model import PoseModel, sample_poses
+
+
+def settle(qtbot: QtBot, document: PoseDocument) -> None:
+    qtbot.waitUntil(lambda: document.exact is not None and not document.busy)
+
+
+def test_a_burst_of_changes_is_one_frame(qtbot: QtBot, document: PoseDocument) -> None:
+    frames: list[LiveFrame | None] = []
+    document.frame_changed.connect(lambda: frames.append(document.frame))
+    for value in np.linspace(0.0, 1.0, 200):
+        document.set_code(0, value)
+    settle(qtbot, document)
+    assert [frame.latent[0] for frame in frames if frame] == [1.0]
+
+
+def test_the_mesh_follows_250_events_in_two_seconds_and_ends_right(
+    qtbot: QtBot, document: PoseDocument
+) -> None:
+    values = iter(np.linspace(-1.0, 1.0, 250))
+    shown: list[tuple[int, float]] = []
+    last_event = 0.0
+
+    def note() -> None:
+        if document.frame is not None:
+            shown.append((document.frame.request_id, float(document.frame.latent[0])))
+
+    def step() -> None:
+        nonlocal last_event
+        value = next(values, None)
+        if value is None:
+            timer.stop()
+            return
+        last_event = time.monotonic()
+        document.set_code(0, value)
+
+    document.frame_changed.connect(note)
+    timer = QTimer(document)
+    timer.timeout.connect(step)
+    document.begin_gesture("Drag")
+    timer.start(8)
+    qtbot.waitUntil(lambda: bool(shown) and shown[-1][1] == 1.0, timeout=20_000)
+    lag = time.monotonic() - last_event
+    document.end_gesture()
+    settle(qtbot, document)
+    ids, drawn = zip(*shown, strict=True)
+    assert list(ids) == sorted(set(ids))
+    # No frame goes back to an earlier pose of a drag in one direction.
+    assert list(drawn) == sorted(drawn)
+    assert len(shown) > 20
+    assert lag < 1.0
+    assert document.frame is not None
+    expected = document.model.decode(document.latent).astype(np.float32)
+    assert document.frame.vertices.tobytes() == expected.tobytes()
+
+
+def test_a_verdict_of_a_pose_that_has_moved_on_is_not_told(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checking, go_on = threading.Event(), threading.Event()
+    check = PoseShower.verdict
+
+    def slow(shower: PoseShower, frame: LiveFrame) -> object:
+        checking.set()
+        go_on.wait(10)
+        return check(shower, frame)
+
+    monkeypatch.setattr(PoseShower, "verdict", slow)
+    told = []
+    document.exact_changed.connect(lambda: told.append(document.exact))
+    document.set_code(0, 0.1)
+    qtbot.waitUntil(checking.is_set)
+    document.set_code(0, 0.2)
+    go_on.set()
+    settle(qtbot, document)
+    assert document.frame is not None
+    assert [verdict.request_id for verdict in told if verdict] == [document.frame.request_id]
+
+
+def test_cancel_ends_a_solve_at_once_and_leaves_the_pose(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    working, ended = endless_resolve(monkeypatch)
+    state = document.latent
+    document.resolve()
+    assert document.solving
+    assert document.busy == "Resolving"
+    qtbot.waitUntil(working.is_set)
+    document.cancel_resolve()
+    assert not document.solving
+    assert document.busy == ""
+    qtbot.waitUntil(ended.is_set)
+    assert document.latent is state
+    assert document.undo_stack.count() == 0
+
+
+def test_an_edit_cancels_a_solve(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    working, ended = endless_resolve(monkeypatch)
+    document.resolve()
+    qtbot.waitUntil(working.is_set)
+    with qtbot.waitSignal(document.solve_finished, check_params_cb=lambda result: result is None):
+        document.set_code(0, 0.5)
+    qtbot.waitUntil(ended.is_set)
+    settle(qtbot, document)
+    assert document.latent[0] == 0.5
+    assert document.undo_stack.count() == 1
+
+
+def test_the_window_stays_live_in_a_solve(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    working, ended = endless_resolve(monkeypatch)
+    document.resolve()
+    qtbot.waitUntil(working.is_set)
+    turns = []
+    timer = QTimer(document)
+    timer.timeout.connect(lambda: turns.append(time.monotonic()))
+    timer.start(5)
+    qtbot.waitUntil(lambda: len(turns) > 20)
+    timer.stop()
+    assert document.solving
+    assert np.median(np.diff(turns)) < 0.05
+    document.cancel_resolve()
+    qtbot.waitUntil(ended.is_set)
+
+
+def test_closing_in_a_solve_ends_the_threads(
+    qtbot: QtBot, editor_model: PoseModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    working, ended = endless_resolve(monkeypatch)
+    document = PoseDocument(editor_model)
+    document.resolve()
+    qtbot.waitUntil(working.is_set)
+    assert document.close()
+    assert ended.is_set()
+    assert document.close()
+
+
+def endless_resolve(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Make Resolve work until it is cancelled; return what it sets when it begins and ends."""
+    working, ended = threading.Event(), threading.Event()
+
+    def resolve(*_: object, progress: Progress, cancel: CancelToken) -> None:
+        working.set()
+        try:
+            while True:
+                cancel.raise_if_cancelled()
+                progress(1, 2)
+        finally:
+            ended.set()
+
+    monkeypatch.setattr(PoseModel, "resolve", resolve)
+    return working, ended
+
+
+def test_progress_of_a_solve_is_told(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, ended = endless_resolve(monkeypatch)
+    with qtbot.waitSignal(document.solve_progressed) as told:
+        document.resolve()
+    assert told.args == [(1, 2)]
+    document.cancel_resolve()
+    qtbot.waitUntil(ended.is_set)
+
+
+def test_a_solve_that_fails_leaves_the_editor_usable(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latent = sample_poses(document.model, 1, 0, colliding=True)[0]
+    document.set_latent(latent, "Jump")
+    failures: list[Failure] = []
+    document.failed.connect(failures.append)
+    with monkeypatch.context() as broken:
+        broken.setattr(PoseModel, "resolve", lambda *_, **__: 1 / 0)
+        with qtbot.waitSignal(document.solve_finished) as finished:
+            document.resolve()
+    assert finished.args == [None]
+    qtbot.waitUntil(lambda: bool(failures))
+    assert "ZeroDivisionError" in failures[0].sentence
+    assert not document.solving
+    assert document.latent.tobytes() == latent.tobytes()
+    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
+        document.resolve()
+    assert document.outcome is not None
+    assert document.outcome.exactly_free
+
+
+def test_a_live_worker_that_fails_tells_once_and_goes_on(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures = []
+    document.failed.connect(failures.append)
+    calls = []
+
+    def fail(*_: object) -> None:
+        calls.append(1)
+        raise MemoryError("no more")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(PoseShower, "frame", fail)
+        for value in (0.1, 0.2, 0.3):
+            n_calls = len(calls)
+            document.set_code(0, value)
+            qtbot.waitUntil(lambda before=n_calls: len(calls) > before)
+        qtbot.waitUntil(lambda: bool(failures))
+    document.set_code(0, 0.4)
+    settle(qtbot, document)
+    assert len(failures) == 1
+    assert "MemoryError" in failures[0].sentence
+    assert document.frame is not None
+    assert document.frame.latent[0] == 0.4
+
+
+def test_a_frame_of_another_model_is_not_shown(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, go_on = threading.Event(), threading.Event()
+    compute = PoseShower.frame
+
+    def slow(shower: PoseShower, latent: np.ndarray, request_id: int) -> LiveFrame:
+        started.set()
+        go_on.wait(10)
+        return compute(shower, latent, request_id)
+
+    old = document.model
+    frames: list[LiveFrame | None] = []
+    document.frame_changed.connect(lambda: frames.append(document.frame))
+    with monkeypatch.context() as patched:
+        patched.setattr(PoseShower, "frame", slow)
+        document.set_code(0, 0.7)
+        qtbot.waitUntil(started.is_set)
+        document.set_model(PoseModel("other", old.embedding, old.card))
+        go_on.set()
+        settle(qtbot, document)
+    assert [frame.latent[0] for frame in frames if frame] == [0.0]
+
+
+def test_jobs_run_in_turn_and_a_cancelled_one_is_not_heard_of(qtbot: QtBot) -> None:
+    work = LongWork()
+    done: list[str] = []
+    labels: list[str] = []
+    work.busy_changed.connect(labels.append)
+    started = threading.Event()
+
+    def endless(_: Progress, cancel: CancelToken) -> str:
+        started.set()
+        while True:
+            cancel.raise_if_cancelled()
+
+    first = work.start("first", endless, done.append)
+    work.start("second", lambda *_: "second", done.append)
+    qtbot.waitUntil(started.is_set)
+    assert done == []
+    work.cancel(first)
+    qtbot.waitUntil(lambda: done == ["second"])
+    assert work.busy == ""
+    assert labels == ["first", "first", "second", ""]
+    assert work.close(time.monotonic() + 5)

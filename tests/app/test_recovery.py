@@ -1,0 +1,182 @@
+"""Autosave: what is not saved outlives the editor, and nobody's session is taken from him."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pytestqt.qtbot import QtBot
+
+from app.document import PoseDocument
+from app.recovery import Autosave, Session, find_lost_poses
+from lcollision_core.model import PoseModel
+
+EDITOR = """
+import sys
+from pathlib import Path
+from PySide6.QtCore import QTimer
+from PySide6.QtGui import QGuiApplication
+from app.document import PoseDocument
+from app.recovery import Autosave
+
+application = QGuiApplication(sys.argv)
+document = PoseDocument()
+autosave = Autosave(document, Path(sys.argv[2]), seconds=0.1)
+autosave.written.connect(lambda: print("written", flush=True))
+autosave.failed.connect(lambda failure: print(failure.sentence, flush=True))
+
+def edit():
+    document.add_pose_to_library("kick")
+    document.set_code(2, 0.625)
+
+document.failed.connect(lambda failure: print(failure.sentence, flush=True))
+QTimer.singleShot(60_000, application.quit)
+document.model_changed.connect(edit)
+document.open_model(sys.argv[1])
+application.exec()
+"""
+
+
+@pytest.fixture(scope="module")
+def model_file(editor_model: PoseModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("models") / "tube.safetensors"
+    editor_model.save(path)
+    return path
+
+
+@pytest.fixture
+def autosave(document: PoseDocument, tmp_path: Path) -> Iterator[Autosave]:
+    held = Autosave(document, tmp_path / "sessions", seconds=0.05)
+    yield held
+    assert held.close()
+
+
+def test_a_killed_editor_loses_nothing_that_was_written(
+    qtbot: QtBot, document: PoseDocument, model_file: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "sessions"
+    editor = subprocess.Popen(
+        [sys.executable, "-c", EDITOR, str(model_file), str(folder)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert editor.stdout is not None
+        assert editor.stdout.readline() == "written\n"
+        assert find_lost_poses(folder) == []
+    finally:
+        editor.send_signal(signal.SIGKILL)
+        editor.wait()
+        editor.stdout.close()
+    (lost,) = find_lost_poses(folder)
+    assert lost.pose_name == "kick"
+    assert Path(lost.model) == model_file
+    assert lost.file is None
+    # Another editor that starts now finds nothing: this one holds it.
+    assert find_lost_poses(folder) == []
+
+    autosave = Autosave(document, folder, seconds=0.05)
+    with qtbot.waitSignal(document.recovered, timeout=20_000):
+        autosave.recover(lost)
+    assert document.latent[2] == 0.625
+    assert document.pose_name == "kick"
+    assert [pose.name for pose in document.poses] == ["kick"]
+    assert document.modified
+    assert document.model_file == str(model_file)
+    # The session lives on until what is in it is saved.
+    assert lost.poses_file.is_file()
+    document.save(tmp_path / "kick.json")
+    qtbot.waitUntil(lambda: not lost.poses_file.exists())
+    assert autosave.close()
+    assert list(folder.iterdir()) == []
+
+
+def test_nothing_is_kept_of_what_is_saved(
+    qtbot: QtBot, document: PoseDocument, autosave: Autosave, tmp_path: Path
+) -> None:
+    with qtbot.waitSignal(autosave.written):
+        document.set_code(0, 0.5)
+    (kept,) = (tmp_path / "sessions").glob("*/poses.json")
+    document.undo()
+    qtbot.waitUntil(lambda: not kept.exists())
+    with qtbot.waitSignal(autosave.written):
+        document.redo()
+    document.save(tmp_path / "pose.json")
+    qtbot.waitUntil(lambda: not kept.exists())
+
+
+def test_a_long_drag_is_kept_while_it_lasts(
+    qtbot: QtBot, document: PoseDocument, autosave: Autosave
+) -> None:
+    document.begin_gesture("Drag")
+    document.set_code(0, 0.5)
+    with qtbot.waitSignal(autosave.written):
+        document.set_code(0, 0.6)
+    document.end_gesture()
+
+
+@pytest.mark.usefixtures("autosave")
+def test_sessions_of_living_editors_are_left_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "sessions"
+    (mine,) = folder.iterdir()
+    assert Session.held(mine) is None
+    assert find_lost_poses(folder) == []
+    assert mine.is_dir()
+
+
+def test_a_session_without_a_pose_is_cleared_away(tmp_path: Path) -> None:
+    session = Session.new(tmp_path)
+    session.release()
+    (session.folder / "session.json").write_text("{ this is no JSON")
+    assert find_lost_poses(tmp_path) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recovery_that_fails_keeps_what_there_is(
+    qtbot: QtBot, document: PoseDocument, autosave: Autosave, tmp_path: Path
+) -> None:
+    lost_folder = tmp_path / "lost"
+    session = Session.new(lost_folder)
+    session.release()
+    (session.folder / "poses.json").write_text("[]")
+    (session.folder / "session.json").write_text(
+        '{"model": "/no/such/model.safetensors", "pose_name": "kick", "file": null}'
+    )
+    (lost,) = find_lost_poses(lost_folder)
+    with qtbot.waitSignal(document.failed):
+        autosave.recover(lost)
+    assert lost.poses_file.is_file()
+    assert not document.modified
+    lost.session.discard()
+    assert list(lost_folder.iterdir()) == []
+
+
+def test_an_editor_without_a_disk_to_write_to_works(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    blocked = tmp_path / "blocked"
+    blocked.write_text("a file, where the folder should be")
+    autosave = Autosave(document, blocked, seconds=0.01)
+    document.set_code(0, 0.5)
+    qtbot.waitUntil(lambda: document.exact is not None)
+    assert autosave.close()
+
+
+def test_a_failing_disk_is_told_of_once(
+    qtbot: QtBot, document: PoseDocument, autosave: Autosave, tmp_path: Path
+) -> None:
+    (folder,) = (tmp_path / "sessions").iterdir()
+    (folder / "poses.json").mkdir()
+    failures = []
+    autosave.failed.connect(failures.append)
+    with qtbot.waitSignal(autosave.failed):
+        document.set_code(0, 0.5)
+    (folder / "poses.json").rmdir()
+    with qtbot.waitSignal(autosave.written):
+        document.set_code(0, 0.6)
+    assert len(failures) == 1
+    assert "save them to a file" in failures[0].sentence
