@@ -16,7 +16,7 @@ CAMERAS = ("Three-quarter", "Front", "Back", "Left", "Right", "Top")
 VIEW_ANGLE = 24.0
 """Degrees from the picture's bottom to its top: narrow, so that near limbs do not swell."""
 
-_MARGIN = 1.12
+_MARGIN = 1.2
 
 
 @dataclass(frozen=True, eq=False)

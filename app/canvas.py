@@ -19,7 +19,7 @@ _HOVER_MILLISECONDS = 30
 _SMOOTH_SAMPLES = 4
 
 
-class Canvas(QtInteractor):
+class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
     """Draws when told to, and as often as Qt paints, never twice for one event.
 
     Parameters
@@ -146,6 +146,7 @@ class Canvas(QtInteractor):
     def leaveEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
         """Tell that the pointer has gone."""
         self._hover.stop()
+        self._pointer = None
         if not self._shut:
             super().leaveEvent(event)
             self.hovered.emit(None)
@@ -154,6 +155,9 @@ class Canvas(QtInteractor):
     def _on_rest(self) -> None:
         self.ren_win.SetMultiSamples(_SMOOTH_SAMPLES)
         self.update()
+        if self.underMouse() and self._pointer is not None:
+            # Something else may lie beneath the pointer now.
+            self._hover.start()
 
     @Slot()
     def _on_hover(self) -> None:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import io
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+
+from app.camera import front_direction
+from app.shading import mask_colours
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -53,30 +56,6 @@ def draw_masks(model: PoseModel, path: str | os.PathLike[str]) -> None:
         file.write(encoded.getbuffer())
 
 
-def mask_colours(
-    attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ...]
-) -> npt.NDArray[np.uint8]:
-    """Colour each vertex by the domain that owns most of it, darker the more that is.
-
-    Parameters
-    ----------
-    attention_mask : (K, V) array, each column sums to 1
-    domain_colours : K strings "#rrggbb"
-
-    Returns
-    -------
-    colours : (V, 3) uint8 array, red, green, blue
-    """
-    # Mixed hues would look like a domain that is not there; white cannot be mistaken for one.
-    leading = attention_mask.argmax(axis=0)
-    share = attention_mask.max(axis=0)[:, None]
-    full = np.array([_rgb(colour) for colour in domain_colours], dtype=np.float64)
-    colours: npt.NDArray[np.uint8] = np.round(255.0 - share * (255.0 - full[leading])).astype(
-        np.uint8
-    )
-    return colours
-
-
 def _two_sides(
     model: PoseModel, colours: npt.NDArray[np.uint8]
 ) -> tuple[npt.NDArray[np.uint8], ...]:
@@ -89,7 +68,7 @@ def _two_sides(
     surface = pv.PolyData.from_regular_faces(model.reference.astype(np.float32), model.faces)
     surface.point_data["colours"] = colours
     up = np.eye(3)[model.up_axis]
-    front = _front(model.reference, model.up_axis)
+    front = front_direction(model.reference, model.up_axis)
     centre = 0.5 * (model.reference.min(axis=0) + model.reference.max(axis=0))
     views = []
     for direction in (front, -front):
@@ -115,23 +94,6 @@ def _two_sides(
     return tuple(views)
 
 
-def _front(vertices: npt.NDArray[np.float64], up: int) -> npt.NDArray[np.float64]:
-    """Guess the direction in which a body looks: across its flat side, where its toes point."""
-    levels = [axis for axis in range(3) if axis != up]
-    depth = min(levels, key=lambda axis: np.ptp(vertices[:, axis]))
-    height = vertices[:, up]
-    direction: npt.NDArray[np.float64] = np.eye(3)[depth]
-    lowest = vertices[height < height.min() + 0.04 * np.ptp(height), depth]
-    ankles = vertices[
-        (height > height.min() + 0.06 * np.ptp(height))
-        & (height < height.min() + 0.12 * np.ptp(height)),
-        depth,
-    ]
-    if len(lowest) and len(ankles) and lowest.mean() < ankles.mean():
-        direction = -direction
-    return direction
-
-
 def _legend(model: PoseModel, width: int) -> Image:
     """Draw each domain's name beside its colour, from pale to full."""
     from PIL import Image, ImageDraw, ImageFont
@@ -155,8 +117,3 @@ def _legend(model: PoseModel, width: int) -> Image:
         draw.rectangle((x, y, x + 60, y + 30), outline=(200, 200, 205))
         draw.text((x + 76, y + 15), name, fill=_INK, font=font, anchor="lm")
     return legend
-
-
-def _rgb(colour: str) -> tuple[int, int, int]:
-    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
-    return red, green, blue

@@ -61,7 +61,7 @@ class LegendCard(QWidget):
             width = max(width, _SWATCH + CLOSE + longest)
         return QSize(round(width + 2 * NORMAL + 1), round(height + 2 * NORMAL))
 
-    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802 - Qt's names
         """Draw the card."""
         theme = current_theme()
         painter = QPainter(self)
@@ -145,6 +145,7 @@ class DomainTag(QWidget):
 
     def __init__(self, parent: QWidget) -> None:
         super().__init__(parent)
+        self._parent = parent
         self.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
         self._name, self._colour = "", ""
         self.hide()
@@ -162,12 +163,12 @@ class DomainTag(QWidget):
             width = line.horizontalAdvance(name) + _SWATCH + CLOSE + 2 * CLOSE
             self.resize(round(width), round(line.height() + 2 * TIGHT))
             self.update()
-        x = min(place.x() + 16.0, self.parentWidget().width() - self.width() - TIGHT)
-        y = min(place.y() + 16.0, self.parentWidget().height() - self.height() - TIGHT)
+        x = min(place.x() + 16.0, self._parent.width() - self.width() - TIGHT)
+        y = min(place.y() + 16.0, self._parent.height() - self.height() - TIGHT)
         self.move(round(x), round(y))
         self.show()
 
-    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802 - Qt's names
         """Draw the tag."""
         painter = QPainter(self)
         painter.setRenderHint(QPainter.RenderHint.Antialiasing)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,13 +11,15 @@ import numpy.typing as npt
 
 from app.camera import View, front_direction, preset_view
 from app.frames import PoseShower
-from app.scene import Scene
 from app.shading import Shader, Shading
 
 if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
 
 ImageArray = npt.NDArray[np.uint8]
+
+_FINEST = 512 * 512
+"""Pixels up to which a picture is drawn 16 times as large and shrunk."""
 
 
 class PoseRenderer:
@@ -42,6 +46,8 @@ class PoseRenderer:
         import pyvista as pv
         from vtkmodules.vtkCommonCore import vtkLogger
 
+        from app.scene import Scene
+
         # Without a display VTK warns of that, then draws all the same.
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
         self._model = model
@@ -50,7 +56,10 @@ class PoseRenderer:
         self._plotter = pv.Plotter(
             off_screen=True, window_size=(width, height), lighting="light kit"
         )
-        self._plotter.enable_anti_aliasing("ssaa")
+        if width * height <= _FINEST:
+            self._plotter.enable_anti_aliasing("ssaa")
+        else:
+            self._plotter.enable_anti_aliasing("msaa", multi_samples=8)
         self.scene = Scene(
             self._plotter, model.faces, model.n_vertices, model.up_axis, model.height, dark
         )
@@ -107,6 +116,28 @@ class PoseRenderer:
         vertices : (V, 3) array
         """
         return preset_view(name, vertices, self._model.up_axis, self._front, self._aspect)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Draw the scene as it is into a file.
+
+        Parameters
+        ----------
+        path : a .png file, written whole or not at all
+
+        Raises
+        ------
+        MeshFileError : the file cannot be written.
+        """
+        from PIL import Image
+
+        from lcollision_core.meshes import atomic_write
+
+        pixels = self.drawn()
+        picture = Image.fromarray(pixels if self._transparent else pixels[:, :, :3].copy())
+        encoded = io.BytesIO()
+        picture.save(encoded, format="PNG")
+        with atomic_write(path) as file:
+            file.write(encoded.getbuffer())
 
     def close(self) -> None:
         """Free the picture's memory on the graphics card."""

@@ -24,6 +24,8 @@ BACKGROUND = {False: ("#e4e8ed", "#fafbfc"), True: ("#191c21", "#343a44")}
 _FLOOR = {False: ("#d3d9e1", "#c2c9d3"), True: ("#2a2f37", "#1d2127")}
 _GHOST = {False: "#6b7c93", True: "#a9b8cc"}
 _GHOST_OPACITY = 0.3
+_THROUGH_OPACITY = 0.22
+_TO_THE_FRONT = -3.0e7  # in steps of a depth buffer of 24 bits: all of its range
 _FLOOR_RADIUS = 0.62
 _FLOOR_SIDES = 96
 
@@ -98,8 +100,8 @@ class Scene:
         self.body = _actor(self.surface.polydata)
         self.body.GetMapper().SetScalarVisibility(True)
         shine = self.body.GetProperty()
-        shine.SetAmbient(0.18)
-        shine.SetDiffuse(0.86)
+        shine.SetAmbient(0.22)
+        shine.SetDiffuse(0.92)
         shine.SetSpecular(0.1)
         shine.SetSpecularPower(18.0)
 
@@ -124,6 +126,18 @@ class Scene:
         nearer.SetResolveCoincidentTopologyToPolygonOffset()
         nearer.SetRelativeCoincidentTopologyPolygonOffsetParameters(-2.0, -4.0)
 
+        # A collision on the far side, or inside a limb, shines through.
+        self._through_actor = _actor(self._crossing)
+        self._through_actor.SetPickable(False)
+        self._through_actor.SetVisibility(False)
+        through = self._through_actor.GetProperty()
+        through.SetColor(*_share(COLLIDING_FACE))
+        through.SetOpacity(_THROUGH_OPACITY)
+        through.LightingOff()
+        foremost = self._through_actor.GetMapper()
+        foremost.SetResolveCoincidentTopologyToPolygonOffset()
+        foremost.SetRelativeCoincidentTopologyPolygonOffsetParameters(0.0, _TO_THE_FRONT)
+
         self._floor_actor = _actor(_disc(up_axis, _FLOOR_RADIUS * height))
         self._floor_actor.GetProperty().BackfaceCullingOn()
         self._shadow_actor = _actor(self.surface.polydata)
@@ -137,6 +151,7 @@ class Scene:
             self.body,
             self._crossing_actor,
             self._ghost_actor,
+            self._through_actor,
         ):
             self._renderer.AddActor(actor)
         self._plotter = plotter
@@ -213,6 +228,20 @@ class Scene:
             self._crossing.SetPolys(_cells(self._faces[chosen]))
             self._crossing.Modified()
         self._crossing_actor.SetVisibility(len(chosen) > 0)
+        self._through_actor.SetVisibility(len(chosen) > 0)
+
+    def look_like(self, other: Scene) -> None:
+        """Show what another scene of the same mesh shows, from where it is looked at."""
+        self.show(other.surface.vertices, other.surface.normals, other.surface.colours)
+        self._crossing.SetPolys(other._crossing.GetPolys())
+        if other.ghost_shown:
+            self.show_ghost(other._ghost.vertices, other._ghost.normals)
+        for actor, like in (
+            (self._crossing_actor, other._crossing_actor),
+            (self._through_actor, other._through_actor),
+        ):
+            actor.SetVisibility(like.GetVisibility())
+        self.view = other.view
 
     @property
     def ghost_shown(self) -> bool:

@@ -23,7 +23,7 @@ FULL_EXACT = 0.006
 COLLIDING_FACE = "#e0191f"
 """Faces that intersect another, in both themes."""
 
-_SKIN = {False: "#d8d3cc", True: "#c9c6c2"}
+_SKIN = {False: "#e9e5df", True: "#d3d1ce"}
 _RAMP_STEPS = 256
 _RAMPS = {
     # Two hues, so that nobody takes what is believed for what is known.
@@ -246,7 +246,8 @@ def rgb(colour: str) -> ColourArray:
 
 def _on_ramp(share: npt.NDArray[Any], colours: ColourArray) -> ColourArray:
     step = np.minimum(share * (_RAMP_STEPS - 1), _RAMP_STEPS - 1)
-    return colours[step.astype(np.intp)]
+    picked: ColourArray = colours[step.astype(np.intp)]
+    return picked
 
 
 def _ticks(full: float) -> tuple[tuple[float, str], ...]:

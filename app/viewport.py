@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import os
+from importlib import import_module
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import (
-    QEasingCurve,
     QEvent,
     QPointF,
     QSize,
     QTimer,
-    QVariantAnimation,
     Signal,
     Slot,
 )
@@ -20,22 +21,24 @@ from PySide6.QtGui import QCloseEvent, QResizeEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QStackedLayout, QWidget
 
-from app.camera import View, between, front_direction, preset_view
+from app.camera import View, front_direction, preset_view
 from app.frames import LiveFrame, PoseShower
 from app.legend import DomainTag, LegendCard
-from app.shading import Shader, Shading
+from app.motion import CameraTurn, Glide
+from app.pictures import Pictures
+from app.shading import Legend, Shader, Shading
 from app.theme import NORMAL, current_theme
 from app.waiting import WaitingPage
+from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
     from app.canvas import Canvas
     from app.document import PoseDocument
     from app.scene import Scene
+    from app.turntable import Turntable
 
-GLIDE_MILLISECONDS = 320
-"""From the pose before Resolve to the one after."""
-
-_TURN_MILLISECONDS = 260
+_ROOM = 1.15
+"""How much larger than its first pose a body may grow before a limb leaves the view."""
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -81,18 +84,22 @@ class Viewport(QWidget):
         self._layout.setStackingMode(QStackedLayout.StackingMode.StackOne)
         self._waiting = WaitingPage(self)
         self._layout.addWidget(self._waiting)
+        self._legend = LegendCard(self)
+        self._tag = DomainTag(self)
         # A window that gets its first OpenGL widget when it is already shown is made anew, and
         # flickers.
         self._first_gl_widget = QOpenGLWidget(self)
         self._first_gl_widget.resize(1, 1)
         self._first_gl_widget.lower()
 
-        self._glide = _animation(self, GLIDE_MILLISECONDS)
-        self._glide.valueChanged.connect(self._on_glided)
-        self._glide_ends: tuple[Float32Array, Float32Array] | None = None
-        self._turn = _animation(self, _TURN_MILLISECONDS)
-        self._turn.valueChanged.connect(self._on_turned)
-        self._turn_ends: tuple[View, View] | None = None
+        self._glide = Glide(self)
+        self._glide.moved.connect(self._on_glided)
+        self._turn = CameraTurn(self)
+        self._turn.moved.connect(self._on_turned)
+        self._pictures = Pictures(document, self)
+        # VTK takes a second to import: meanwhile the window is alive.
+        self._importer = Thread(target=import_module, args=("app.canvas",), name="import VTK")
+        self._importer.start()
 
         document.model_changed.connect(self._on_model_changed)
         document.frame_changed.connect(self._on_frame_changed)
@@ -149,8 +156,8 @@ class Viewport(QWidget):
             and self._shown is self._document.frame
             and not self._pose_stale
             and not self._colours_stale
-            and self._glide.state() is QVariantAnimation.State.Stopped
-            and self._turn.state() is QVariantAnimation.State.Stopped
+            and not self._glide.is_running
+            and not self._turn.is_running
             and self._canvas.is_smooth
         )
 
@@ -195,9 +202,7 @@ class Viewport(QWidget):
             self._scene.view = end
             self._canvas.redraw()
             return
-        self._turn_ends = (self._scene.view, end)
-        self._turn.stop()
-        self._turn.start()
+        self._turn.begin(self._scene.view, end)
 
     def reset_camera(self) -> None:
         """Look at the whole pose as at the start."""
@@ -219,20 +224,63 @@ class Viewport(QWidget):
         ----------
         from_vertices, to_vertices : (V, 3) arrays, in the data's unit
         """
-        if self._canvas is None:
-            return
-        self._glide.stop()
-        self._glide_ends = (
-            np.array(from_vertices, dtype=np.float32),
-            np.array(to_vertices, dtype=np.float32),
-        )
-        self._glide.start()
+        if self._canvas is not None:
+            self._glide.begin(from_vertices, to_vertices)
+
+    # Pictures.
+
+    def screenshot(
+        self, path: str | os.PathLike[str], width: int, height: int, transparent: bool
+    ) -> None:
+        """Save what is seen, without legend, in another size.
+
+        Parameters
+        ----------
+        path : a .png file
+        width, height : in pixels; as much is seen from bottom to top as in the window
+        transparent : without background, floor and shadow
+
+        Raises
+        ------
+        MeshFileError : the file cannot be written.
+        """
+        self._pictures.screenshot(self._scene_now(), path, width, height, transparent)
+
+    def turntable(
+        self,
+        path: str | os.PathLike[str],
+        seconds: float = 4.0,
+        width: int = 640,
+        height: int = 640,
+    ) -> Turntable:
+        """Begin a film of one turn round what is seen; the document tells when it is saved.
+
+        Parameters
+        ----------
+        path : a .gif or .webp file
+        seconds : that one turn lasts
+        width, height : in pixels
+
+        Raises
+        ------
+        MeshFileError : `path` has another extension.
+        """
+        return self._pictures.turntable(self._scene_now(), path, seconds, width, height)
+
+    def _scene_now(self) -> Scene:
+        """Return the scene with what waits for the next picture on the screen."""
+        if self._scene is None or self._shown is None:
+            raise LCollisionError("the mesh is not on the screen yet; try again in a moment")
+        self._bring_up_to_date()
+        return self._scene
 
     def shut_down(self) -> None:
         """Stop everything that moves and free what VTK holds; the widget stays empty."""
         self._glide.stop()
         self._turn.stop()
         self._waiting.stop()
+        self._importer.join()
+        self._pictures.stop()
         if self._canvas is not None:
             self._canvas.shut_down()
             self._layout.removeWidget(self._canvas)
@@ -268,6 +316,7 @@ class Viewport(QWidget):
 
     @Slot()
     def _on_model_changed(self) -> None:
+        self._importer.join()
         from app.canvas import Canvas
         from app.scene import Scene
 
@@ -292,8 +341,8 @@ class Viewport(QWidget):
         )
         self._shower = PoseShower(model)
         self._front = front_direction(model.reference, model.up_axis)
-        self._legend = LegendCard(self)
-        self._tag = DomainTag(self)
+        self._tag.hide()
+        self._legend.set_legend(Legend())
         self._make_shader()
         self._shown = None
         self._highlight = self._hovered = None
@@ -368,12 +417,11 @@ class Viewport(QWidget):
         if self._place_camera:
             self._place_camera = False
             scene.show(frame.vertices, frame.normals)
-            scene.view = self._preset("Three-quarter", frame.vertices)
+            middle = frame.vertices.mean(axis=0)
+            scene.view = self._preset("Three-quarter", middle + _ROOM * (frame.vertices - middle))
         elif self._glide_next and before is not None:
             self._glide_next = False
-            # Not from within a picture: the first step of an animation asks for one.
-            QTimer.singleShot(0, self, self._glide.start)
-            self._glide_ends = (scene.surface.vertices.copy(), frame.vertices)
+            self._glide.begin(scene.surface.vertices.copy(), frame.vertices)
         else:
             scene.show(frame.vertices, frame.normals)
         if self._shading is Shading.EXACT:
@@ -424,25 +472,20 @@ class Viewport(QWidget):
     # Motion.
 
     @Slot(object)
-    def _on_glided(self, share: float) -> None:
-        if self._glide_ends is None or self._scene is None or self._canvas is None:
+    def _on_glided(self, vertices: Float32Array) -> None:
+        if self._scene is None or self._canvas is None or self._shower is None:
             return
-        start, end = self._glide_ends
-        assert self._shower is not None
         frame = self._shown
-        if share >= 1.0 and frame is not None and end is frame.vertices:
-            self._scene.show(frame.vertices, frame.normals)
-        else:
-            between_poses = start + np.float32(share) * (end - start)
-            self._scene.show(between_poses, self._shower.normals(between_poses))
+        arrived = frame is not None and vertices is frame.vertices
+        normals = frame.normals if frame and arrived else self._shower.normals(vertices)
+        self._scene.show(vertices, normals)
         self._canvas.redraw()
 
     @Slot(object)
-    def _on_turned(self, share: float) -> None:
-        if self._turn_ends is None or self._scene is None or self._canvas is None:
-            return
-        self._scene.view = between(*self._turn_ends, share)
-        self._canvas.redraw()
+    def _on_turned(self, view: View) -> None:
+        if self._scene is not None and self._canvas is not None:
+            self._scene.view = view
+            self._canvas.redraw()
 
     # The pointer.
 
@@ -462,12 +505,3 @@ class Viewport(QWidget):
         if domain != self._hovered:
             self._hovered = domain
             self.domain_hovered.emit(domain)
-
-
-def _animation(parent: Viewport, milliseconds: int) -> QVariantAnimation:
-    animation = QVariantAnimation(parent)
-    animation.setStartValue(0.0)
-    animation.setEndValue(1.0)
-    animation.setDuration(milliseconds)
-    animation.setEasingCurve(QEasingCurve.Type.InOutCubic)
-    return animation

@@ -47,7 +47,7 @@ class WaitingPage(QWidget):
         """Stand still, for good."""
         self._timer.stop()
 
-    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802 - Qt's names
         """Draw the page."""
         theme = current_theme()
         painter = QPainter(self)

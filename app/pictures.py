@@ -1,0 +1,82 @@
+"""Screenshots and turntables of what a viewport shows, in other sizes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, Slot
+
+from app.rendering import PoseRenderer
+from app.theme import current_theme
+from app.turntable import Turntable
+
+if TYPE_CHECKING:
+    from app.document import PoseDocument
+    from app.scene import Scene
+
+
+class Pictures(QObject):
+    """Copies a viewport's scene off the screen, and writes what is seen of it.
+
+    Parameters
+    ----------
+    document : whose mesh the scene shows; tells the user what has been saved
+    parent : of the object
+    """
+
+    def __init__(self, document: PoseDocument, parent: QObject) -> None:
+        super().__init__(parent)
+        self._document = document
+        self._film: Turntable | None = None
+
+    def screenshot(
+        self,
+        scene: Scene,
+        path: str | os.PathLike[str],
+        width: int,
+        height: int,
+        transparent: bool,
+    ) -> None:
+        """Save a scene as a .png file; see `Viewport.screenshot`."""
+        renderer = self._copy(scene, width, height, transparent)
+        try:
+            renderer.save(path)
+        finally:
+            renderer.close()
+
+    def turntable(
+        self, scene: Scene, path: str | os.PathLike[str], seconds: float, width: int, height: int
+    ) -> Turntable:
+        """Begin a film of a scene, in place of one that is being drawn."""
+        self.stop()
+        renderer = self._copy(scene, width, height, transparent=False)
+        self._film = Turntable(renderer, scene.view, Path(path), seconds, self)
+        self._film.progressed.connect(self._on_progressed)
+        self._film.finished.connect(self._on_finished)
+        self._film.failed.connect(self._document.failed)
+        return self._film
+
+    def stop(self) -> None:
+        """Cancel a film that is being drawn, and wait for one that is being packed."""
+        if self._film is not None:
+            self._film.wait()
+            self._film.deleteLater()
+            self._film = None
+
+    def _copy(self, scene: Scene, width: int, height: int, transparent: bool) -> PoseRenderer:
+        renderer = PoseRenderer(
+            self._document.model, width, height, current_theme().is_dark, transparent
+        )
+        renderer.scene.look_like(scene)
+        return renderer
+
+    @Slot(int, int)
+    def _on_progressed(self, n_drawn: int, n_frames: int) -> None:
+        self._document.message.emit(f"Turntable: frame {n_drawn} of {n_frames}")
+
+    @Slot(object)
+    def _on_finished(self, path: Path | None) -> None:
+        words = f"Saved {path.name}" if path is not None else "The turntable was cancelled"
+        self._document.message.emit(words)
