@@ -106,7 +106,7 @@ class TrainingLoop:
         processes.require_same(step)
         shared: torch.nn.Module = network
         if processes.count > 1:
-            shared = DistributedDataParallel(network, find_unused_parameters=True)
+            shared = DistributedDataParallel(network)
         batches = _Batches(self._rows, self._training_index, config, self._facts, processes.device)
         network.train()
         self._report(step)
@@ -118,8 +118,11 @@ class TrainingLoop:
             optimiser.zero_grad(set_to_none=True)
             output = shared(latent[part[0] : part[1]])
             loss = network.loss(output, targets, part, config, self._facts.margin)
-            # Processes average their gradients, but each holds a share of the sum.
-            torch.autograd.backward(loss * processes.count)
+            # Processes average their gradients, but each holds a share of the sum; and they wait
+            # for every parameter's, those among them that this loss leaves out.
+            outputs = (output.domain_energy, output.logit, *output.auxiliary)
+            idle = sum((0.0 * values.sum() for values in outputs), start=0.0 * loss)
+            torch.autograd.backward(loss * processes.count + idle)
             optimiser.step()
             step += 1
             self._losses.append(processes.sum_of(loss))

@@ -15,7 +15,14 @@ from lcollision_core.errors import LCollisionError
 
 @dataclass(frozen=True)
 class Processes:
-    """One process among those that train together; one alone has rank 0 of 1."""
+    """One process among those that train together.
+
+    Attributes
+    ----------
+    rank : its number from 0; the first writes for all
+    count : of the processes, 1 for one alone
+    device : it trains on
+    """
 
     rank: int
     count: int
