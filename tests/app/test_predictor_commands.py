@@ -61,7 +61,7 @@ def trained(model: Path, store: Path) -> Path:
     )
     assert result.stdout == ""
     assert result.stderr.startswith(f"lcollision: wrote {path}: ")
-    assert " of 600 unseen samples right" in result.stderr
+    assert f" of {3 * N_ROWS // 10} unseen samples right" in result.stderr
     assert not path.with_name("trained.safetensors.checkpoint").exists()
     return path
 
@@ -95,7 +95,7 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
         "calibration_error",
     }
     assert report["samples"] == 3 * N_ROWS // 10
-    assert report["accuracy"] > report["majority_rate"] + 0.05
+    assert report["accuracy"] > report["majority_rate"] + 0.03
     assert report["spearman"] > 0.7
     assert sum(entry["samples"] for entry in curve) == report["samples"]
     # What training measured on the rows it held out is what the file holds.
