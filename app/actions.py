@@ -1,0 +1,127 @@
+"""Every action of the window: what it is called, its shortcut, its tool tip and its icon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from PySide6.QtCore import QObject
+from PySide6.QtGui import QAction, QKeySequence
+
+from app.camera import CAMERAS
+from app.icons import icon
+from app.shading import Shading
+
+
+@dataclass(frozen=True)
+class ActionSpec:
+    """One action.
+
+    Attributes
+    ----------
+    text : as the menu shows it
+    shortcut : in Qt's portable words; several are parted by ", "
+    tip : what it does, in plain words
+    icon : name of its icon, or ""
+    checkable : whether it is on or off
+    """
+
+    text: str
+    shortcut: str
+    tip: str
+    icon: str = ""
+    checkable: bool = False
+
+
+ACTIONS: dict[str, ActionSpec] = {
+    "new": ActionSpec("&New pose", "Ctrl+N", "Start again from the body at rest", "new"),
+    "open": ActionSpec("&Open…", "Ctrl+O", "Open poses, a mesh or a model", "open"),
+    "open_model": ActionSpec("Open &model…", "Ctrl+Shift+O", "Choose another body"),
+    "save": ActionSpec("&Save", "Ctrl+S", "Save the pose and your library", "save"),
+    "save_as": ActionSpec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
+    "import": ActionSpec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),
+    "export": ActionSpec("&Export mesh…", "Ctrl+E", "Write the mesh on the screen", "export"),
+    "screenshot": ActionSpec("S&creenshot…", "Ctrl+P", "Save a picture of the view", "screenshot"),
+    "turntable": ActionSpec("&Turntable…", "Ctrl+T", "Save a film of one turn", "turntable"),
+    "quit": ActionSpec("&Quit", "Ctrl+Q", "Close the editor"),
+    "undo": ActionSpec("&Undo", "Ctrl+Z", "Take back the last change", "undo"),
+    "redo": ActionSpec("&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Do again what was taken back", "redo"),
+    "reset": ActionSpec("Reset &all", "Ctrl+Backspace", "All sliders back to zero", "reset"),
+    "randomise": ActionSpec("Ra&ndomise", "Ctrl+D", "Move towards a pose by chance", "random"),
+    "mirror": ActionSpec("&Mirror", "Ctrl+M", "Exchange left and right", "mirror"),
+    "filter": ActionSpec("&Find a slider", "Ctrl+F", "Type what a slider is called", "search"),
+    "unlock": ActionSpec("Un&lock everything", "Ctrl+L", "Let all locked parts move again"),
+    "resolve": ActionSpec(
+        "&Resolve", "Ctrl+R", "Find the nearest pose that does not collide", "resolve"
+    ),
+    "cancel": ActionSpec("&Cancel", "Escape", "Stop what is being computed", "cancel"),
+    "resolve_options": ActionSpec("Resolve &options…", "Ctrl+Shift+R", "Choose how Resolve works"),
+    "keep": ActionSpec("&Keep this pose…", "Ctrl+K", "Put this pose into your library", "add"),
+    "load": ActionSpec("&Load chosen pose", "Ctrl+Return", "Edit the chosen pose of the library"),
+    "rename": ActionSpec("Re&name chosen pose…", "F2", "Give a pose of yours another name"),
+    "remove": ActionSpec(
+        "R&emove chosen pose", "Ctrl+Delete", "Drop a pose of yours from the library", "remove"
+    ),
+    "ghost": ActionSpec(
+        "&Ghost", "Ctrl+G", "Show the pose before Resolve, see-through", "ghost", checkable=True
+    ),
+    "reset_camera": ActionSpec("Show the &whole body", "Ctrl+Home", "Bring the whole body in view"),
+    "full_screen": ActionSpec("&Full screen", "F11", "Give the editor the whole screen", "", True),
+    "reset_layout": ActionSpec("Reset la&yout", "Ctrl+Alt+0", "All panels back to their places"),
+    "shortcuts": ActionSpec("&Keyboard and mouse", "F1", "All shortcuts", "info"),
+    "log": ActionSpec("Open &log file", "Ctrl+Shift+L", "What went wrong, in detail"),
+    "about": ActionSpec("&About LCollision", "Shift+F1", "Version, licence and model"),
+}
+"""All actions that stand alone, by key."""
+
+SHADINGS: dict[Shading, ActionSpec] = {
+    Shading.PLAIN: ActionSpec("&Plain", "Ctrl+1", "The bare body", "", True),
+    Shading.DOMAINS: ActionSpec(
+        "&Domains", "Ctrl+2", "Each part in its colour, darker where it owns more", "", True
+    ),
+    Shading.PREDICTED: ActionSpec(
+        "P&redicted", "Ctrl+3", "Where the model believes it collides, and how deep", "", True
+    ),
+    Shading.EXACT: ActionSpec(
+        "E&xact", "Ctrl+4", "Where it collides in truth; crossing faces in red", "", True
+    ),
+}
+"""The ways to colour the body."""
+
+CAMERA_ACTIONS: dict[str, ActionSpec] = {
+    name: ActionSpec(name, f"Alt+{number}", f"Look at the body: {name.lower()}", "camera")
+    for number, name in enumerate(CAMERAS, start=1)
+}
+
+THEMES: dict[str, ActionSpec] = {
+    "system": ActionSpec("As the &system", "Ctrl+Alt+S", "Follow the desktop", "", True),
+    "light": ActionSpec("&Light", "Ctrl+Alt+L", "Dark text on light", "", True),
+    "dark": ActionSpec("&Dark", "Ctrl+Alt+D", "Light text on dark", "", True),
+}
+
+DOCKS: dict[str, ActionSpec] = {
+    "sliders": ActionSpec("&Sliders", "Ctrl+Alt+1", "Show or hide the sliders", "", True),
+    "collision": ActionSpec(
+        "&Collisions", "Ctrl+Alt+2", "Show or hide prediction, check and Resolve", "", True
+    ),
+    "library": ActionSpec("&Poses", "Ctrl+Alt+3", "Show or hide the pose library", "", True),
+}
+
+
+def make_action(spec: ActionSpec, parent: QObject) -> QAction:
+    """Make an action as its line says; its tool tip names the shortcut."""
+    action = QAction(spec.text, parent)
+    equip_action(action, spec)
+    return action
+
+
+def equip_action(action: QAction, spec: ActionSpec) -> None:
+    """Give an action, perhaps one of Qt's own, what its line says."""
+    action.setText(spec.text)
+    keys = QKeySequence.listFromString(spec.shortcut.replace(", ", "; "))
+    action.setShortcuts(keys)
+    shown = keys[0].toString(QKeySequence.SequenceFormat.NativeText)
+    action.setToolTip(f"{spec.tip} ({shown})")
+    action.setStatusTip(spec.tip)
+    action.setCheckable(spec.checkable)
+    if spec.icon:
+        action.setIcon(icon(spec.icon))

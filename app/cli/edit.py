@@ -1,0 +1,39 @@
+"""``lcollision edit``, and ``lcollision`` alone: the editor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def edit(
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[POSE|MESH]",
+            readable=False,
+            help="A .json file of poses, a mesh of the model's topology, or a model.",
+        ),
+    ] = None,
+    model_name: Annotated[
+        str | None,
+        typer.Option("--model", metavar="M", help="A model file, or the name of a model."),
+    ] = None,
+) -> None:
+    """Open the editor."""
+    from app.editor import open_editor
+    from lcollision_core.errors import LCollisionError
+
+    if file is not None and not file.is_file():
+        raise LCollisionError(
+            f"{file} is not there; name a file of poses, a mesh or a model, or none to begin anew"
+        )
+    raise typer.Exit(open_editor(file, model_name))
+
+
+def edit_without_command(context: typer.Context) -> None:
+    """Open the editor where no command was given; for the callback of the whole program."""
+    if context.invoked_subcommand is None:
+        edit()

@@ -1,0 +1,95 @@
+"""What went wrong, in one sentence with what to do; the details stay folded."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import QUrl
+from PySide6.QtGui import QDesktopServices
+from PySide6.QtWidgets import (
+    QDialog,
+    QDialogButtonBox,
+    QHBoxLayout,
+    QLabel,
+    QPlainTextEdit,
+    QPushButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.engine import Failure
+from app.icons import pixmap
+from app.log import log_file
+from app.theme import NORMAL, WIDE, current_theme
+
+
+class FailureDialog(QDialog):
+    """Tells of a failure and leaves the window usable behind it.
+
+    Parameters
+    ----------
+    failure : its sentence may say what to do behind its last semicolon
+    parent : the window that it belongs to
+    """
+
+    def __init__(self, failure: Failure, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.setWindowTitle("That did not work")
+        self.setMinimumWidth(480)
+        what, advice = split_sentence(failure.sentence)
+        sign = QLabel()
+        sign.setPixmap(pixmap("warning", current_theme().colliding, 36, self.devicePixelRatioF()))
+        self.what = QLabel(what)
+        self.what.setObjectName("verdict")
+        self.what.setWordWrap(True)
+        self.advice = QLabel(advice)
+        self.advice.setWordWrap(True)
+        self.advice.setVisible(bool(advice))
+        self.details = QPlainTextEdit(failure.details or failure.sentence)
+        self.details.setReadOnly(True)
+        self.details.setMinimumHeight(200)
+        self.details.hide()
+        words = QVBoxLayout()
+        words.setSpacing(NORMAL)
+        words.addWidget(self.what)
+        words.addWidget(self.advice)
+        top = QHBoxLayout()
+        top.setSpacing(WIDE)
+        top.addWidget(sign)
+        top.addLayout(words, 1)
+        self.unfold = QPushButton("Show details")
+        self.unfold.setCheckable(True)
+        log = QPushButton("Open log file")
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
+        buttons.addButton(self.unfold, QDialogButtonBox.ButtonRole.ActionRole)
+        buttons.addButton(log, QDialogButtonBox.ButtonRole.ActionRole)
+        buttons.button(QDialogButtonBox.StandardButton.Close).setDefault(True)
+        column = QVBoxLayout(self)
+        column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
+        column.setSpacing(WIDE)
+        column.addLayout(top)
+        column.addWidget(self.details)
+        column.addWidget(buttons)
+        self.unfold.toggled.connect(self._on_unfold)
+        log.clicked.connect(open_log_file)
+        buttons.rejected.connect(self.reject)
+
+    def _on_unfold(self, unfolded: bool) -> None:
+        self.details.setVisible(unfolded)
+        self.unfold.setText("Hide details" if unfolded else "Show details")
+        self.adjustSize()
+
+
+def split_sentence(sentence: str) -> tuple[str, str]:
+    """Split an error's sentence into what happened and what to do, each with its capital."""
+    what, _, advice = sentence.rpartition("; ")
+    if not what:
+        what, advice = advice, ""
+    what, advice = (part[:1].upper() + part[1:] for part in (what, advice))
+    return what, advice + "." * bool(advice and not advice.endswith((".", "?", "!")))
+
+
+def open_log_file() -> None:
+    """Show the log file in whatever the desktop shows text files with."""
+    path = log_file()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    QDesktopServices.openUrl(QUrl.fromLocalFile(str(path)))

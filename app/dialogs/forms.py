@@ -1,0 +1,151 @@
+"""Short forms: how large a picture, how long a film, how Resolve works."""
+
+from __future__ import annotations
+
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QComboBox,
+    QDialog,
+    QDialogButtonBox,
+    QFormLayout,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.panels.parts import QuietIntegerBox, QuietSpinBox, labelled
+from app.settings import SETTINGS, Settings
+from app.theme import NORMAL, WIDE
+
+
+class Form(QDialog):
+    """Fields that show settings and write them back when they are accepted.
+
+    Parameters
+    ----------
+    title : of the dialog
+    action : what the button that accepts is called
+    settings : read and written
+    parent : the window that it belongs to
+    """
+
+    def __init__(self, title: str, action: str, settings: Settings, parent: QWidget) -> None:
+        super().__init__(parent)
+        self.setWindowTitle(title)
+        self.setMinimumWidth(380)
+        self._settings = settings
+        self._fields: dict[str, QuietIntegerBox | QuietSpinBox | QCheckBox | QComboBox] = {}
+        self._form = QFormLayout()
+        self._form.setHorizontalSpacing(WIDE)
+        self._form.setVerticalSpacing(NORMAL)
+        self._buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
+        accept = self._buttons.addButton(action, QDialogButtonBox.ButtonRole.AcceptRole)
+        accept.setDefault(True)
+        column = QVBoxLayout(self)
+        column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
+        column.setSpacing(WIDE)
+        column.addLayout(self._form)
+        column.addWidget(self._buttons)
+        self._buttons.accepted.connect(self.accept)
+        self._buttons.rejected.connect(self.reject)
+
+    def accept(self) -> None:
+        """Remember what the fields say, and close."""
+        for key, field in self._fields.items():
+            if isinstance(field, QCheckBox):
+                self._settings[key] = field.isChecked()
+            elif isinstance(field, QComboBox):
+                self._settings[key] = field.currentData()
+            else:
+                self._settings[key] = field.value()
+        super().accept()
+
+    def add_whole_number(self, key: str, label: str, suffix: str) -> None:
+        """Add a field for a whole number."""
+        field = QuietIntegerBox()
+        setting = SETTINGS[key]
+        field.setRange(int(setting.low or 0), int(setting.high or 0))
+        field.setSuffix(suffix)
+        field.setValue(self._settings[key])
+        self._add(key, label, field)
+
+    def add_number(self, key: str, label: str, suffix: str, step: float, tip: str = "") -> None:
+        """Add a field for a number."""
+        field = QuietSpinBox()
+        setting = SETTINGS[key]
+        field.setDecimals(2 if step < 0.1 else 1)
+        field.setRange(setting.low or 0.0, setting.high or 0.0)
+        field.setSingleStep(step)
+        field.setSuffix(suffix)
+        field.setValue(self._settings[key])
+        field.setToolTip(tip)
+        self._add(key, label, field)
+
+    def add_choice(self, key: str, label: str, names: dict[str, str], tip: str) -> None:
+        """Add a field for one of several values, by what they are called."""
+        field = QComboBox()
+        for value, name in names.items():
+            field.addItem(name, value)
+        field.setCurrentIndex(list(names).index(self._settings[key]))
+        field.setToolTip(tip)
+        self._add(key, label, field)
+
+    def add_check(self, key: str, label: str) -> None:
+        """Add a box to tick."""
+        field = QCheckBox(label)
+        field.setChecked(self._settings[key])
+        self._fields[key] = field
+        self._form.addRow("", field)
+
+    def add_note(self, text: str) -> None:
+        """Add a line of explanation."""
+        note = labelled(text, "caption")
+        note.setWordWrap(True)
+        self._form.addRow(note)
+
+    def _add(self, key: str, label: str, field: QuietIntegerBox | QuietSpinBox | QComboBox) -> None:
+        self._fields[key] = field
+        self._form.addRow(label, field)
+
+
+def screenshot_form(settings: Settings, parent: QWidget) -> Form:
+    """Ask how large a screenshot is to be."""
+    form = Form("Screenshot", "Choose file…", settings, parent)
+    form.add_whole_number("screenshot_width", "Width", " px")
+    form.add_whole_number("screenshot_height", "Height", " px")
+    form.add_check("screenshot_transparent", "Transparent background")
+    return form
+
+
+def turntable_form(settings: Settings, parent: QWidget) -> Form:
+    """Ask how long a turntable is to be."""
+    form = Form("Turntable", "Choose file…", settings, parent)
+    form.add_number("turntable_seconds", "One turn takes", " s", 0.5)
+    form.add_note("The body turns once round its upright, as it is shaded now.")
+    return form
+
+
+def resolve_form(settings: Settings, parent: QWidget) -> Form:
+    """Ask how Resolve is to work."""
+    form = Form("How Resolve works", "Keep", settings, parent)
+    form.add_choice(
+        "resolve_metric",
+        "Stay close",
+        {"eye": "to how the pose looks", "latent": "to the sliders' numbers"},
+        "What Resolve tries to change as little as possible",
+    )
+    form.add_number(
+        "resolve_threshold",
+        "Free enough at",
+        " probability",
+        0.05,
+        "Below this predicted probability of a collision a pose counts as predicted free",
+    )
+    form.add_number(
+        "resolve_time_budget",
+        "Take at most",
+        " s",
+        1.0,
+        "After this time Resolve takes the nearest way out that it knows",
+    )
+    form.add_note("Whatever you choose, the exact check has the last word.")
+    return form

@@ -1,0 +1,260 @@
+"""What the File menu does: every dialog that asks for a file, and what is opened where."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
+
+from app.dialogs.forms import screenshot_form, turntable_form
+from app.dialogs.questions import Answer, ask_about_changes
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    from app.document import PoseDocument
+    from app.settings import Settings
+    from app.viewport import Viewport
+
+POSES_SUFFIX = ".json"
+_EXPORTS = {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
+_FILMS = {"GIF": ".gif", "MP4": ".mp4"}
+
+
+def _kinds(*wanted: str) -> str:
+    """Return the filter of a file dialog for "poses", "meshes" and "models"."""
+    suffixes = {"poses": (POSES_SUFFIX,), "meshes": _mesh_suffixes(), "models": (_model_suffix(),)}
+    masks = {kind: " ".join(f"*{suffix}" for suffix in found) for kind, found in suffixes.items()}
+    filters = [f"{kind.capitalize()} ({masks[kind]})" for kind in wanted]
+    if len(wanted) > 1:
+        filters.insert(0, f"All that can be opened ({' '.join(masks[kind] for kind in wanted)})")
+    return ";;".join(filters)
+
+
+def _mesh_suffixes() -> tuple[str, ...]:
+    # Loads SciPy: not before the window is on the screen.
+    from lcollision_core.meshes import READABLE_SUFFIXES
+
+    return READABLE_SUFFIXES
+
+
+def _model_suffix() -> str:
+    from lcollision_core.model import MODEL_SUFFIX
+
+    return MODEL_SUFFIX
+
+
+class FileActions(QObject):
+    """Opens, saves, imports and exports, asking for files where it must.
+
+    Whatever a user can mend is raised as `LCollisionError`, for the window to show.
+
+    Parameters
+    ----------
+    window : that dialogs belong to
+    document : opened into and saved from
+    settings : remembers the last folder and the recent files
+    attempt : does something and shows what a user can mend of what goes wrong
+    """
+
+    def __init__(
+        self,
+        window: QWidget,
+        document: PoseDocument,
+        settings: Settings,
+        attempt: Callable[[Callable[[], object]], None],
+    ) -> None:
+        super().__init__(window)
+        self._attempt = attempt
+        self._window = window
+        self._document = document
+        self._settings = settings
+        self._recent: QMenu | None = None
+        document.file_changed.connect(self._on_file)
+
+    def open(self) -> None:
+        """Ask for any file that can be opened, and open it."""
+        path = self._ask_open("Open", _kinds("poses", "meshes", "models"))
+        if path is not None:
+            self.open_path(path)
+
+    def open_model(self) -> None:
+        """Ask for a model, and open it."""
+        path = self._ask_open("Open a model", _kinds("models"))
+        if path is not None:
+            self.open_path(path)
+
+    def import_mesh(self) -> None:
+        """Ask for a mesh, and make it the pose."""
+        path = self._ask_open("Import a mesh", _kinds("meshes"))
+        if path is not None:
+            self.open_path(path)
+
+    def open_path(self, path: Path) -> None:
+        """Open a file as what its extension says: poses, a model, or a mesh.
+
+        Raises
+        ------
+        LCollisionError : the extension is none of these, or there is no such file.
+        """
+        suffix = path.suffix.lower()
+        if not path.is_file():
+            self._settings.forget_file(str(path))
+            kind = "is a folder" if path.is_dir() else "is not there"
+            raise LCollisionError(f"{path} {kind}; choose a file of poses, a mesh or a model")
+        if suffix == POSES_SUFFIX:
+            if not self.may_lose_changes():
+                return
+            self._document.open_poses(path)
+        elif suffix == _model_suffix():
+            if not self.may_lose_changes():
+                return
+            self._document.open_model(path)
+        elif suffix in _mesh_suffixes():
+            self._document.import_mesh(path)
+        else:
+            raise LCollisionError(
+                f"{path.name} is nothing that the editor knows; open poses ({POSES_SUFFIX}), a "
+                f"mesh ({', '.join(_mesh_suffixes())}) or a model ({_model_suffix()})"
+            )
+        self._remember(path)
+
+    def new_pose(self) -> None:
+        """Start anew, once unsaved changes are settled."""
+        if self.may_lose_changes():
+            self._document.new_pose()
+
+    def save(self) -> bool:
+        """Save; ask for a file where there is none.
+
+        Returns
+        -------
+        saved : whether it was, not given up
+        """
+        if self._document.file is None:
+            return self.save_as()
+        self._document.save()
+        return True
+
+    def save_as(self) -> bool:
+        """Ask for a file, and save there; returns whether it was saved."""
+        proposed = self._folder() / f"{self._document.pose_name}{POSES_SUFFIX}"
+        path = self._ask_save("Save poses", proposed, {"Poses": POSES_SUFFIX})
+        if path is None:
+            return False
+        self._document.save(path)
+        self._remember(path)
+        return True
+
+    def export(self) -> None:
+        """Ask for a file, and write the mesh on the screen."""
+        proposed = self._folder() / f"{self._document.pose_name}.obj"
+        path = self._ask_save("Export the mesh", proposed, _EXPORTS)
+        if path is not None:
+            self._document.export_mesh(path)
+
+    def screenshot(self, viewport: Viewport) -> None:
+        """Ask for size and file, and save a picture of the viewport."""
+
+        def shoot() -> None:
+            proposed = self._folder() / f"{self._document.pose_name}.png"
+            path = self._ask_save("Save the screenshot", proposed, {"PNG": ".png"})
+            if path is not None:
+                settings = self._settings
+                viewport.screenshot(
+                    path,
+                    settings["screenshot_width"],
+                    settings["screenshot_height"],
+                    settings["screenshot_transparent"],
+                )
+                self._document.message.emit(f"Saved {path.name}")
+
+        self._after(screenshot_form(self._settings, self._window), shoot)
+
+    def turntable(self, viewport: Viewport) -> None:
+        """Ask for duration and file, and save a film of one turn."""
+
+        def shoot() -> None:
+            proposed = self._folder() / f"{self._document.pose_name}.gif"
+            path = self._ask_save("Save the turntable", proposed, _FILMS)
+            if path is not None:
+                viewport.turntable(path, seconds=self._settings["turntable_seconds"])
+                self._document.message.emit(f"Saved {path.name}")
+
+        self._after(turntable_form(self._settings, self._window), shoot)
+
+    def may_lose_changes(self) -> bool:
+        """Settle unsaved changes with the user; False where they want to go on editing."""
+        if not (self._document.has_model and self._document.modified):
+            return True
+        answer = ask_about_changes(self._window, self._document.pose_name)
+        if answer is Answer.SAVE:
+            return self.save()
+        return answer is Answer.DISCARD
+
+    def fill_recent(self, menu: QMenu) -> None:
+        """Keep a menu filled with the recent files."""
+        self._recent = menu
+        menu.aboutToShow.connect(self._on_recent)
+        self._on_recent()
+
+    @Slot()
+    def _on_recent(self) -> None:
+        if self._recent is None:
+            return
+        self._recent.clear()
+        for place, name in enumerate(self._settings["recent_files"], start=1):
+            action = self._recent.addAction(f"&{place}  {Path(name).name}")
+            action.setData(name)
+            action.setToolTip(name)
+            action.triggered.connect(self._on_recent_chosen)
+        if self._recent.isEmpty():
+            self._recent.addAction("No files yet").setEnabled(False)
+
+    @Slot()
+    def _on_recent_chosen(self) -> None:
+        action = self.sender()
+        if isinstance(action, QAction):
+            path = Path(action.data())
+            self._attempt(lambda: self.open_path(path))
+
+    @Slot()
+    def _on_file(self) -> None:
+        if self._document.file is not None:
+            self._remember(self._document.file)
+
+    def _remember(self, path: Path) -> None:
+        self._settings.remember_file(str(path.resolve()))
+        self._settings["last_folder"] = str(path.resolve().parent)
+
+    def _folder(self) -> Path:
+        folder = Path(self._settings["last_folder"] or Path.home())
+        return folder if folder.is_dir() else Path.home()
+
+    def _ask_open(self, title: str, kinds: str) -> Path | None:
+        name, _ = QFileDialog.getOpenFileName(self._window, title, str(self._folder()), kinds)
+        return Path(name) if name else None
+
+    def _ask_save(self, title: str, proposed: Path, kinds: dict[str, str]) -> Path | None:
+        """Ask for a name; the chosen kind's extension is added to a name without one."""
+        filters = {f"{kind} (*{suffix})": suffix for kind, suffix in kinds.items()}
+        name, chosen = QFileDialog.getSaveFileName(
+            self._window, title, str(proposed), ";;".join(filters)
+        )
+        if not name:
+            return None
+        path = Path(name)
+        self._settings["last_folder"] = str(path.resolve().parent)
+        if path.suffix.lower() in kinds.values():
+            return path
+        return path.with_name(path.name + filters.get(chosen, next(iter(kinds.values()))))
+
+    @staticmethod
+    def _after(form: QDialog, act: Callable[[], None]) -> None:
+        accepted = form.exec() == QDialog.DialogCode.Accepted
+        form.deleteLater()
+        if accepted:
+            act()

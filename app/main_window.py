@@ -1,0 +1,457 @@
+"""The editor's window: the viewport in the middle, panels round it, menus above."""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from PySide6.QtCore import QSize, Qt, QTimer, Signal, Slot
+from PySide6.QtGui import (
+    QAction,
+    QActionGroup,
+    QCloseEvent,
+    QDragEnterEvent,
+    QDropEvent,
+    QGuiApplication,
+    QShowEvent,
+)
+from PySide6.QtWidgets import (
+    QApplication,
+    QDockWidget,
+    QLabel,
+    QMainWindow,
+    QMenu,
+    QProgressBar,
+    QToolButton,
+    QWidget,
+)
+
+from app.action_handlers import ActionHandlers
+from app.actions import (
+    ACTIONS,
+    CAMERA_ACTIONS,
+    DOCKS,
+    SHADINGS,
+    THEMES,
+    ActionSpec,
+    equip_action,
+    make_action,
+)
+from app.dialogs.failure import FailureDialog
+from app.engine import Failure
+from app.file_actions import FileActions
+from app.icons import icon, program_icon
+from app.menus import fill_menus, make_bar
+from app.panels.collision import CollisionPanel
+from app.panels.library import LibraryPanel
+from app.panels.parts import silent
+from app.panels.randomise import RandomiseCard
+from app.panels.sliders import SlidersPanel
+from app.settings import Settings
+from app.shading import Shading
+from app.theme import apply_theme, wanted_theme
+from app.viewport import Viewport
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    from app.document import PoseDocument
+    from app.recovery import Autosave, LostPose
+
+_log = logging.getLogger(__name__)
+
+_LAYOUT_VERSION = 1
+_MESSAGE_MILLISECONDS = 8000
+_SIZE = QSize(1440, 900)
+_SIDE_WIDTHS = {"sliders": 330, "collision": 296}
+_AREAS = {
+    "sliders": Qt.DockWidgetArea.LeftDockWidgetArea,
+    "collision": Qt.DockWidgetArea.RightDockWidgetArea,
+    "library": Qt.DockWidgetArea.BottomDockWidgetArea,
+}
+
+
+class MainWindow(QMainWindow):
+    """Everything that the user sees of one document.
+
+    Parameters
+    ----------
+    document : may have no model yet
+    settings : of the user
+
+    Signals
+    -------
+    ready : once, when the first model is in and its pose is on the screen
+    """
+
+    ready = Signal()
+
+    def __init__(self, document: PoseDocument, settings: Settings) -> None:
+        super().__init__()
+        self.document = document
+        self.settings = settings
+        self._autosave: Autosave | None = None
+        self._announced = False
+        self.setObjectName("editor")
+        self.setWindowIcon(program_icon())
+        self.setAcceptDrops(True)
+        self.setDockNestingEnabled(True)
+        for corner in (Qt.Corner.TopLeftCorner, Qt.Corner.BottomLeftCorner):
+            self.setCorner(corner, Qt.DockWidgetArea.LeftDockWidgetArea)
+        for corner in (Qt.Corner.TopRightCorner, Qt.Corner.BottomRightCorner):
+            self.setCorner(corner, Qt.DockWidgetArea.RightDockWidgetArea)
+
+        self.files = FileActions(self, document, settings, self.attempt)
+        self.viewport = Viewport(document)
+        self.setCentralWidget(self.viewport)
+        self.actions_by_key = {key: self._action(key, spec) for key, spec in ACTIONS.items()}
+        self._shadings = self._choices(
+            SHADINGS, Shading[settings["shading"].upper()], self._on_shading_chosen
+        )
+        self._themes = self._choices(THEMES, settings["theme"], self._on_theme_chosen)
+        self._cameras = {name: make_action(spec, self) for name, spec in CAMERA_ACTIONS.items()}
+        for name, action in self._cameras.items():
+            action.setData(name)
+            action.triggered.connect(self._on_camera_chosen)
+
+        act = self.actions_by_key
+        self.sliders = SlidersPanel(document)
+        self.randomise = RandomiseCard(act["randomise"], settings["randomise_amount"])
+        self.sliders.add_card(self.randomise)
+        self.collision = CollisionPanel(document, act["resolve"])
+        self.library = LibraryPanel(document)
+        self.docks = {
+            "sliders": self._dock("sliders", "Sliders", self.sliders),
+            "collision": self._dock("collision", "Collisions", self.collision),
+            "library": self._dock("library", "Poses", self.library),
+        }
+        self._camera_menu = self._submenu("&Camera", self._cameras.values())
+        self._theme_menu = self._submenu("&Theme", self._themes.values())
+        recent = self._submenu("Open &recent", ())
+        self.menus = fill_menus(
+            self,
+            act,
+            {
+                "shading": self._shadings.values(),
+                "docks": [dock.toggleViewAction() for dock in self.docks.values()],
+            },
+            {"recent": recent, "cameras": self._camera_menu, "themes": self._theme_menu},
+        )
+        self.files.fill_recent(recent)
+        self._bar = make_bar(act, self._shadings.values(), self._camera_menu)
+        self.addToolBar(self._bar)
+        self._handlers = ActionHandlers(self)
+        self._make_status_bar()
+        self._connect()
+        self.viewport.set_shading(Shading[settings["shading"].upper()])
+        document.show_ghost(settings["show_ghost"])
+        act["ghost"].setChecked(settings["show_ghost"])
+        self._restore()
+        self._on_model()
+
+    # What others may do to it.
+
+    def attempt(self, act: Callable[[], object]) -> None:
+        """Do something, and show what a user can mend of what goes wrong."""
+        try:
+            act()
+        except LCollisionError as error:
+            _log.info("shown to the user: %s", error, exc_info=True)
+            self.show_failure(Failure(str(error), traceback.format_exc()))
+
+    def set_autosave(self, autosave: Autosave) -> None:
+        """Take charge of an autosave: its failures are shown, and it ends with the window."""
+        self._autosave = autosave
+        autosave.failed.connect(self.show_failure)
+
+    def recover(self, lost: LostPose) -> None:
+        """Go on with a pose that a crash left."""
+        if self._autosave is not None:
+            self._autosave.recover(lost)
+
+    @Slot(object)
+    def show_failure(self, failure: Failure) -> None:
+        """Tell what went wrong, in a dialog that leaves all else running."""
+        dialog = FailureDialog(failure, self)
+        dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        dialog.open()
+
+    def set_theme(self, choice: str) -> None:
+        """Take on a theme: "system", "light" or "dark"."""
+        application = QApplication.instance()
+        assert isinstance(application, QApplication)
+        self.settings["theme"] = choice
+        apply_theme(application, wanted_theme(choice))
+        for key, spec in ACTIONS.items():
+            if spec.icon:
+                self.actions_by_key[key].setIcon(icon(spec.icon))
+        for action in self._cameras.values():
+            action.setIcon(icon("camera"))
+        button = self._bar.findChild(QToolButton, "cameras")
+        if isinstance(button, QToolButton):
+            button.setIcon(icon("camera"))
+        self.collision.refresh_icons()
+        self.randomise.refresh_icons()
+        self.library.redraw()
+
+    def reset_layout(self) -> None:
+        """Put all panels back to their places."""
+        for key, dock in self.docks.items():
+            dock.setFloating(False)
+            self.addDockWidget(_AREAS[key], dock)
+            dock.show()
+        self._size_docks()
+
+    # Qt's.
+
+    def showEvent(self, event: QShowEvent) -> None:  # noqa: N802 - Qt's name
+        """Give the panels their widths, which only a shown window keeps."""
+        super().showEvent(event)
+        if self.settings["window_layout"].isEmpty():
+            QTimer.singleShot(0, self, self._size_docks)
+
+    def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
+        """Settle unsaved changes, then end all work before the view goes."""
+        may_close = False
+
+        def settle() -> None:
+            nonlocal may_close
+            may_close = self.files.may_lose_changes()
+
+        self.attempt(settle)
+        if not may_close:
+            event.ignore()
+            return
+        self.settings["window_geometry"] = self.saveGeometry()
+        self.settings["window_layout"] = self.saveState(_LAYOUT_VERSION)
+        self.settings["randomise_amount"] = self.randomise.amount.value() / 100
+        if self._autosave is not None:
+            self._autosave.close()
+        if not self.document.close():
+            _log.warning("a thread was still busy when the window closed")
+        self.library.close_renderer()
+        self.viewport.shut_down()
+        super().closeEvent(event)
+
+    def dragEnterEvent(self, event: QDragEnterEvent) -> None:  # noqa: N802 - Qt's name
+        """Welcome files."""
+        if any(url.isLocalFile() for url in event.mimeData().urls()):
+            event.acceptProposedAction()
+
+    def dropEvent(self, event: QDropEvent) -> None:  # noqa: N802 - Qt's name
+        """Open the first file that is dropped."""
+        paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
+        if not paths:
+            return
+        event.acceptProposedAction()
+        if len(paths) > 1:
+            self._on_message(f"Of {len(paths)} files {paths[0].name} was opened")
+        # The program that is dragged from waits until this returns.
+        QTimer.singleShot(0, self, lambda: self.attempt(lambda: self.files.open_path(paths[0])))
+
+    # Building.
+
+    def _action(self, key: str, spec: ActionSpec) -> QAction:
+        action = make_action(spec, self)
+        action.setObjectName(key)
+        action.triggered.connect(self._on_action)
+        return action
+
+    def _choices(
+        self, specs: Mapping[Any, ActionSpec], chosen: Any, slot: Callable[[], None]
+    ) -> dict[Any, QAction]:
+        """Make actions of which one is on; each carries its key as data."""
+        group = QActionGroup(self)
+        actions = {}
+        for key, spec in specs.items():
+            action = make_action(spec, self)
+            action.setData(key)
+            action.setChecked(key == chosen)
+            action.triggered.connect(slot)
+            group.addAction(action)
+            actions[key] = action
+        return actions
+
+    def _submenu(self, title: str, actions: Iterable[QAction]) -> QMenu:
+        menu = QMenu(title, self)
+        menu.addActions(list(actions))
+        return menu
+
+    def _dock(self, key: str, title: str, content: QWidget) -> QDockWidget:
+        dock = QDockWidget(title, self)
+        dock.setObjectName(key)
+        dock.setWidget(content)
+        equip_action(dock.toggleViewAction(), DOCKS[key])
+        self.addDockWidget(_AREAS[key], dock)
+        return dock
+
+    def _make_status_bar(self) -> None:
+        self._busy_text = QLabel()
+        self._busy_bar = QProgressBar()
+        self._busy_bar.setFixedWidth(120)
+        self._busy_bar.setTextVisible(False)
+        self._facts = QLabel()
+        self._facts.setObjectName("caption")
+        for widget in (self._busy_text, self._busy_bar, self._facts):
+            self.statusBar().addPermanentWidget(widget)
+        self.statusBar().setSizeGripEnabled(False)
+        self._on_busy("")
+
+    def _connect(self) -> None:
+        document = self.document
+        for panel in (self.sliders, self.collision):
+            panel.domain_hovered.connect(self.viewport.highlight_domain)
+        self.viewport.domain_hovered.connect(self.sliders.light_domain)
+        self.viewport.domain_hovered.connect(self.collision.prediction.light_domain)
+        self.viewport.shading_changed.connect(self._on_shading)
+        self.collision.resolve.options_wanted.connect(self._handlers.choose_resolve_options)
+        self.library.keep_wanted.connect(self._handlers.keep_pose)
+        self.library.list.currentRowChanged.connect(self._update_actions)
+        self.library.list.itemActivated.connect(self.library.load_chosen)
+        self.randomise.wanted.connect(document.randomise)
+        document.model_changed.connect(self._on_model)
+        document.frame_changed.connect(self._on_frame)
+        document.file_changed.connect(self._update_title)
+        document.modified_changed.connect(self._update_title)
+        document.library_changed.connect(self._update_actions)
+        document.locks_changed.connect(self._update_actions)
+        document.ghost_changed.connect(self._on_ghost)
+        document.solve_started.connect(self._update_actions)
+        document.solve_finished.connect(self._update_actions)
+        document.busy_changed.connect(self._on_busy)
+        document.message.connect(self._on_message)
+        document.failed.connect(self.show_failure)
+        stack = document.undo_stack
+        stack.indexChanged.connect(self._update_actions)
+        QGuiApplication.styleHints().colorSchemeChanged.connect(self._on_system_theme)
+
+    def _restore(self) -> None:
+        screen = QGuiApplication.primaryScreen().availableGeometry().size()
+        self.resize(_SIZE.boundedTo(screen))
+        self.restoreGeometry(self.settings["window_geometry"])
+        self.restoreState(self.settings["window_layout"], _LAYOUT_VERSION)
+
+    @Slot()
+    def _size_docks(self) -> None:
+        sides = [self.docks[key] for key in _SIDE_WIDTHS]
+        self.resizeDocks(sides, list(_SIDE_WIDTHS.values()), Qt.Orientation.Horizontal)
+        self.resizeDocks(
+            [self.docks["library"]],
+            [self.library.sizeHint().height()],
+            Qt.Orientation.Vertical,
+        )
+
+    # Following the document.
+
+    @Slot()
+    def _on_model(self) -> None:
+        has_model = self.document.has_model
+        for dock in self.docks.values():
+            dock.widget().setEnabled(has_model)
+        if has_model:
+            model = self.document.model
+            self._facts.setText(f"{model.name} · {model.n_vertices} vertices")
+        self._update_title()
+        self._update_actions()
+
+    @Slot()
+    def _on_frame(self) -> None:
+        if self._announced or self.document.frame is None:
+            return
+        self._announced = True
+        self.ready.emit()
+        # Pictures only once the pose itself has been drawn.
+        QTimer.singleShot(300, self.library, self.library.allow_pictures)
+
+    @Slot()
+    def _update_title(self) -> None:
+        document = self.document
+        if not document.has_model:
+            self.setWindowTitle("LCollision")
+            return
+        file = f" — {document.file.name}" if document.file is not None else ""
+        self.setWindowTitle(f"{document.pose_name}{file}[*] — {document.model.name}")
+        self.setWindowModified(document.modified)
+
+    @Slot()
+    def _update_actions(self) -> None:
+        document, stack = self.document, self.document.undo_stack
+        has_model = document.has_model
+        own_chosen = self.library.shows_own and self.library.chosen is not None
+        allowed = {
+            "undo": stack.canUndo(),
+            "redo": stack.canRedo(),
+            "mirror": document.can_mirror,
+            "unlock": bool(document.locked_domains),
+            "resolve": document.can_resolve and not document.solving,
+            "resolve_options": document.can_resolve,
+            "cancel": bool(document.busy),
+            "load": self.library.chosen is not None,
+            "rename": own_chosen,
+            "remove": own_chosen,
+        }
+        always = ("open_model", "quit", "reset_layout", "full_screen", "shortcuts", "log", "about")
+        for key, action in self.actions_by_key.items():
+            action.setEnabled(key in always or (has_model and allowed.get(key, True)))
+        for key, name, text in (
+            ("undo", "Undo", stack.undoText()),
+            ("redo", "Redo", stack.redoText()),
+        ):
+            self.actions_by_key[key].setText(f"&{name} {text[:1].lower() + text[1:]}".rstrip())
+        for action in (*self._shadings.values(), *self._cameras.values()):
+            action.setEnabled(has_model)
+        self._shadings[Shading.PREDICTED].setEnabled(document.can_resolve)
+
+    @Slot(object)
+    def _on_shading(self, shading: Shading) -> None:
+        self._shadings[shading].setChecked(True)
+        self.settings["shading"] = shading.name.lower()
+
+    @Slot()
+    def _on_ghost(self) -> None:
+        with silent(self.actions_by_key["ghost"]):
+            self.actions_by_key["ghost"].setChecked(self.document.ghost_shown)
+        self.settings["show_ghost"] = self.document.ghost_shown
+
+    @Slot(str)
+    def _on_busy(self, work: str) -> None:
+        self._busy_text.setText(f"{work}…" if work else "")
+        for widget in (self._busy_text, self._busy_bar):
+            widget.setVisible(bool(work))
+        # An endless bar is animated even while nobody sees it.
+        self._busy_bar.setRange(0, 0 if work else 1)
+        self._update_actions()
+
+    @Slot(str)
+    def _on_message(self, sentence: str) -> None:
+        self.statusBar().showMessage(sentence, _MESSAGE_MILLISECONDS)
+
+    @Slot()
+    def _on_system_theme(self) -> None:
+        if self.settings["theme"] == "system":
+            self.set_theme("system")
+
+    @Slot()
+    def _on_action(self) -> None:
+        action = self.sender()
+        if isinstance(action, QAction):
+            self.attempt(self._handlers.acts[action.objectName()])
+
+    @Slot()
+    def _on_shading_chosen(self) -> None:
+        self.viewport.set_shading(self._sender_data())
+
+    @Slot()
+    def _on_theme_chosen(self) -> None:
+        self.set_theme(self._sender_data())
+
+    @Slot()
+    def _on_camera_chosen(self) -> None:
+        self.viewport.set_camera(self._sender_data())
+
+    def _sender_data(self) -> Any:
+        action = self.sender()
+        assert isinstance(action, QAction)
+        return action.data()

@@ -1,0 +1,1 @@
+"""What stands round the viewport: sliders, prediction, exact check, Resolve, pose library."""

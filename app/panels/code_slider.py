@@ -1,0 +1,164 @@
+"""One number of the pose: its name, a slider, the number itself."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import Qt, Signal
+from PySide6.QtGui import QKeyEvent, QMouseEvent
+from PySide6.QtWidgets import QHBoxLayout, QWidget
+
+from app.panels.parts import ElidedLabel, HoverRow, QuietSpinBox, Slider, silent
+from app.theme import CLOSE, ROW_HEIGHT, TIGHT
+
+_STEPS = 1000
+
+
+class CodeSlider(Slider):
+    """A slider whose bar grows from zero to its handle.
+
+    Arrow keys, page keys, Home and End move it, Delete and a double click reset it; the wheel
+    moves it only when it has the focus. Shift makes a drag ten times finer.
+
+    Signals
+    -------
+    drag_started, drag_ended, drag_abandoned : around a drag; the last where Escape ended it
+    reset_wanted : to zero
+
+    Parameters
+    ----------
+    low, high : range of the number, the first below 0 and the second above
+    colour : "#rrggbb" of the bar, None for that of the theme
+    """
+
+    drag_started = Signal()
+    drag_ended = Signal()
+    drag_abandoned = Signal()
+    reset_wanted = Signal()
+
+    def __init__(self, low: float, high: float, colour: str | None) -> None:
+        super().__init__(colour)
+        self._low, self._high = low, high
+        self.setRange(0, _STEPS)
+        self.setSingleStep(_STEPS // 100)
+        self.setPageStep(_STEPS // 10)
+        self.show_number(0.0)
+
+    @property
+    def number(self) -> float:
+        """The number that the handle stands for."""
+        return self._low + (self._high - self._low) * self.value() / _STEPS
+
+    def show_number(self, number: float) -> None:
+        """Move the handle without any signal; beyond the range it stays at the end."""
+        share = (number - self._low) / (self._high - self._low)
+        with silent(self):
+            self.setValue(round(min(max(share, 0.0), 1.0) * _STEPS))
+        self.update()
+
+    @property
+    def origin(self) -> float:
+        """Zero."""
+        return -self._low / (self._high - self._low)
+
+    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Begin a drag before the handle jumps to the pointer."""
+        if event.button() is Qt.MouseButton.LeftButton:
+            self.drag_started.emit()
+        super().mousePressEvent(event)
+
+    def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """End the drag, unless Escape did."""
+        dragged = self.isSliderDown()
+        super().mouseReleaseEvent(event)
+        if dragged:
+            self.drag_ended.emit()
+
+    def mouseDoubleClickEvent(self, event: QMouseEvent) -> None:  # noqa: ARG002, N802
+        """Reset."""
+        self.reset_wanted.emit()
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Reset, abandon a drag, or move as any slider does."""
+        if event.key() in (Qt.Key.Key_Delete, Qt.Key.Key_Backspace):
+            self.reset_wanted.emit()
+        elif event.key() == Qt.Key.Key_Escape and self.isSliderDown():
+            self.setSliderDown(False)
+            self.drag_abandoned.emit()
+        else:
+            super().keyPressEvent(event)
+
+
+class CodeRow(HoverRow):
+    """Name, slider and number of one code.
+
+    Signals
+    -------
+    number_changed : float, by the user
+    number_typed : float, by the user, in the number's field
+    reset_wanted, drag_started, drag_ended, drag_abandoned : as of the slider
+
+    Parameters
+    ----------
+    code : index from 0 in the latent
+    name : what a person would call it
+    domain : that it moves
+    low, high : range of the slider
+    colour : of the bar
+    """
+
+    number_changed = Signal(int, float)
+    reset_wanted = Signal(int)
+
+    def __init__(
+        self, code: int, name: str, domain: int, low: float, high: float, colour: str | None
+    ) -> None:
+        super().__init__(domain)
+        self.code = code
+        label = ElidedLabel(name)
+        self.slider = CodeSlider(low, high, colour)
+        self.field = QuietSpinBox()
+        self.field.setObjectName("code")
+        self.field.setDecimals(3)
+        self.field.setRange(-1e4, 1e4)
+        self.field.setSingleStep((high - low) / 100)
+        self.field.setAlignment(Qt.AlignmentFlag.AlignRight)
+        self.field.setFixedWidth(62)
+        self.slider.setAccessibleName(name)
+        self.field.setAccessibleName(f"{name}, number")
+        self.slider.setToolTip(
+            f"{name}: drag to move, hold Shift for small steps, double-click to reset"
+        )
+        self.field.setToolTip(f"{name}: type a number; the arrow keys change it in small steps")
+        row = QHBoxLayout(self)
+        row.setContentsMargins(TIGHT, 0, TIGHT, 0)
+        row.setSpacing(CLOSE)
+        row.addWidget(label, 1)
+        row.addWidget(self.slider, 1)
+        row.addWidget(self.field)
+        self.setFixedHeight(ROW_HEIGHT)
+        self.slider.valueChanged.connect(self._on_slider)
+        self.slider.reset_wanted.connect(self._on_reset)
+        self.field.valueChanged.connect(self._on_field)
+
+    def show_number(self, number: float) -> None:
+        """Follow the document."""
+        self.slider.show_number(number)
+        with silent(self.field):
+            self.field.setValue(number)
+
+    def _on_slider(self) -> None:
+        self.number_changed.emit(self.code, self.slider.number)
+
+    def _on_field(self, number: float) -> None:
+        self.number_changed.emit(self.code, number)
+
+    def _on_reset(self) -> None:
+        self.reset_wanted.emit(self.code)
+
+
+def tab_order(rows: list[CodeRow], before: QWidget) -> QWidget:
+    """Put rows behind a widget in the order of the Tab key; return the last widget."""
+    for row in rows:
+        QWidget.setTabOrder(before, row.slider)
+        QWidget.setTabOrder(row.slider, row.field)
+        before = row.field
+    return before

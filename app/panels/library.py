@@ -1,0 +1,325 @@
+"""The pose library: training poses and the user's own, as pictures."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PySide6.QtCore import QSize, Qt, QTimer, Signal, Slot
+from PySide6.QtGui import QIcon, QImage, QPixmap
+from PySide6.QtWidgets import (
+    QButtonGroup,
+    QHBoxLayout,
+    QListWidget,
+    QListWidgetItem,
+    QPushButton,
+    QSizePolicy,
+    QToolButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.panels.parts import ElidedLabel, Slider, labelled, silent
+from app.theme import CLOSE, NORMAL, TIGHT, current_theme
+
+if TYPE_CHECKING:
+    from app.document import PoseDocument
+    from app.rendering import PoseRenderer
+    from lcollision_core.model import NamedPose
+
+THUMBNAIL = 88
+"""Side of a picture, in device-independent pixels."""
+
+_PAUSE = 25
+"""Milliseconds between two pictures, so that the window stays live while they are drawn."""
+
+_BLEND_STEPS = 100
+
+
+class PoseList(QListWidget):
+    """Pictures of poses with their names beneath; the wheel scrolls them sideways too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setViewMode(QListWidget.ViewMode.IconMode)
+        self.setFlow(QListWidget.Flow.LeftToRight)
+        self.setResizeMode(QListWidget.ResizeMode.Adjust)
+        self.setMovement(QListWidget.Movement.Static)
+        self.setIconSize(QSize(THUMBNAIL, THUMBNAIL))
+        self.setGridSize(QSize(THUMBNAIL + 20, THUMBNAIL + 34))
+        self.setUniformItemSizes(True)
+        self.setTextElideMode(Qt.TextElideMode.ElideRight)
+        self.setVerticalScrollMode(QListWidget.ScrollMode.ScrollPerPixel)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for one row of pictures."""
+        return QSize(400, THUMBNAIL + 42)
+
+    def minimumSizeHint(self) -> QSize:  # noqa: N802
+        """Manage with one picture."""
+        return QSize(THUMBNAIL + 40, THUMBNAIL + 40)
+
+
+class LibraryPanel(QWidget):
+    """Poses to load by a double click, to blend towards, and to keep.
+
+    Signals
+    -------
+    keep_wanted : the user wants to keep the pose
+
+    Parameters
+    ----------
+    document : followed and changed
+    """
+
+    keep_wanted = Signal()
+
+    def __init__(self, document: PoseDocument) -> None:
+        super().__init__()
+        self._document = document
+        self._poses: list[NamedPose] = []
+        self._pictures: dict[bytes, QIcon] = {}
+        self._renderer: PoseRenderer | None = None
+        self._may_draw = False
+        self._due = QTimer(self)
+        self._due.setSingleShot(True)
+        self._due.setInterval(_PAUSE)
+        self.list = PoseList()
+        self.list.setAccessibleName("Pose library")
+        self._sources = QButtonGroup(self)
+        sources = QHBoxLayout()
+        sources.setSpacing(0)
+        self.training, self.own = (
+            self._source(text, place, tip)
+            for text, place, tip in (
+                ("Training", "first", "The poses that the model learned from"),
+                ("Yours", "last", "The poses that you keep; Save writes them"),
+            )
+        )
+        sources.addWidget(self.training)
+        sources.addWidget(self.own)
+        self.keep = QPushButton("Keep this pose…")
+        self.keep.setToolTip("Put this pose into your library (Ctrl+K)")
+        self._target = ElidedLabel("Choose a pose to blend")
+        self._target.setObjectName("caption")
+        self._share = labelled("", "caption")
+        self.blend = Slider()
+        self.blend.setRange(0, _BLEND_STEPS)
+        self.blend.setEnabled(False)
+        self.blend.setAccessibleName("Blend towards the chosen pose")
+        self.blend.setToolTip("Drag to blend the pose towards the chosen one")
+        side = QWidget()
+        side.setFixedWidth(182)
+        column = QVBoxLayout(side)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(CLOSE)
+        column.addLayout(sources)
+        column.addWidget(self.keep)
+        column.addStretch()
+        line = QHBoxLayout()
+        line.addWidget(self._target, 1)
+        line.addWidget(self._share)
+        column.addLayout(line)
+        column.addWidget(self.blend)
+        row = QHBoxLayout(self)
+        row.setContentsMargins(NORMAL, TIGHT, NORMAL, CLOSE)
+        row.setSpacing(NORMAL)
+        row.addWidget(side)
+        row.addWidget(self.list, 1)
+        self.training.setChecked(True)
+        self._due.timeout.connect(self._draw_next)
+        self._sources.buttonClicked.connect(self.refresh)
+        self.keep.clicked.connect(self.keep_wanted)
+        self.list.itemDoubleClicked.connect(self._on_double_click)
+        self.list.currentRowChanged.connect(self._on_chosen)
+        self.list.verticalScrollBar().valueChanged.connect(self._draw_soon)
+        self.blend.sliderPressed.connect(self._on_blend_pressed)
+        self.blend.valueChanged.connect(self._on_blend)
+        self.blend.sliderReleased.connect(self._on_blend_released)
+        document.model_changed.connect(self._on_model)
+        document.library_changed.connect(self.refresh)
+        if document.has_model:
+            self._on_model()
+
+    @property
+    def chosen(self) -> NamedPose | None:
+        """The pose that is selected, None for none."""
+        row = self.list.currentRow()
+        return self._poses[row] if 0 <= row < len(self._poses) else None
+
+    @property
+    def shows_own(self) -> bool:
+        """Whether the user's own poses are shown, not the training poses."""
+        return self.own.isChecked()
+
+    def allow_pictures(self) -> None:
+        """Start drawing pictures: everything else is on the screen."""
+        self._may_draw = True
+        self._draw_soon()
+
+    def redraw(self) -> None:
+        """Draw all pictures again, as for another theme."""
+        self._forget_pictures()
+        self.refresh()
+
+    def close_renderer(self) -> None:
+        """Give back what drawing holds, before the window goes."""
+        self._due.stop()
+        self._may_draw = False
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def load_chosen(self) -> None:
+        """Edit the selected pose."""
+        if self.chosen is not None:
+            self._document.load_pose(self.chosen)
+
+    def show_own(self) -> None:
+        """Show the user's own poses."""
+        self.own.setChecked(True)
+        self.refresh()
+
+    @Slot()
+    def refresh(self) -> None:
+        """Show the poses as they are now."""
+        document = self._document
+        if not document.has_model:
+            return
+        if self.shows_own:
+            self._poses = list(document.poses)
+        else:
+            self._poses = [
+                document.training_pose(number) for number in range(len(document.model.pose_names))
+            ]
+        row = self.list.currentRow()
+        with silent(self.list):
+            self.list.clear()
+            for pose in self._poses:
+                item = QListWidgetItem(pose.name)
+                item.setToolTip(f"{pose.name}: double-click to load")
+                item.setTextAlignment(Qt.AlignmentFlag.AlignHCenter)
+                item.setIcon(self._pictures.get(pose.latent.tobytes(), self._blank()))
+                self.list.addItem(item)
+            if 0 <= row < len(self._poses):
+                self.list.setCurrentRow(row)
+        self.own.setText(f"Yours ({len(document.poses)})" if document.poses else "Yours")
+        self._on_chosen(self.list.currentRow())
+        self._draw_soon()
+
+    def _source(self, text: str, place: str, tip: str) -> QToolButton:
+        button = QToolButton()
+        button.setObjectName("segment")
+        button.setProperty("place", place)
+        button.setText(text)
+        button.setToolTip(tip)
+        button.setCheckable(True)
+        button.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self._sources.addButton(button)
+        return button
+
+    @staticmethod
+    def _blank() -> QIcon:
+        blank = QPixmap(THUMBNAIL, THUMBNAIL)
+        blank.fill(Qt.GlobalColor.transparent)
+        return QIcon(blank)
+
+    @Slot()
+    def _on_model(self) -> None:
+        self._forget_pictures()
+        self.refresh()
+
+    def _forget_pictures(self) -> None:
+        self._pictures.clear()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    @Slot()
+    def _draw_soon(self) -> None:
+        if self._may_draw and not self._due.isActive():
+            self._due.start()
+
+    @Slot()
+    def _draw_next(self) -> None:
+        """Draw one picture, of those in sight first."""
+        if not self.isVisible():
+            return
+        missing = [
+            place
+            for place, pose in enumerate(self._poses)
+            if pose.latent.tobytes() not in self._pictures
+        ]
+        if not missing:
+            return
+        seen = self.list.viewport().rect()
+        in_sight = (
+            place
+            for place in missing
+            if self.list.visualItemRect(self.list.item(place)).intersects(seen)
+        )
+        place = next(in_sight, missing[0])
+        pose = self._poses[place]
+        picture = self._picture(pose)
+        self._pictures[pose.latent.tobytes()] = picture
+        self.list.item(place).setIcon(picture)
+        self._due.start()
+
+    def _picture(self, pose: NamedPose) -> QIcon:
+        from app.rendering import PoseRenderer
+
+        model = self._document.model
+        sharpness = self.devicePixelRatioF()
+        side = round(THUMBNAIL * sharpness)
+        if self._renderer is None:
+            theme = current_theme()
+            self._renderer = PoseRenderer(model, side, side, dark=theme.is_dark, transparent=True)
+        pixels = np.ascontiguousarray(self._renderer.picture(model.decode(pose.latent, 1)))
+        image = QImage(
+            pixels.data, side, side, pixels.strides[0], QImage.Format.Format_RGBA8888
+        ).copy()
+        image.setDevicePixelRatio(sharpness)
+        drawn = QPixmap.fromImage(image)
+        picture = QIcon()
+        for mode in (QIcon.Mode.Normal, QIcon.Mode.Selected):
+            picture.addPixmap(drawn, mode)
+        return picture
+
+    @Slot(QListWidgetItem)
+    def _on_double_click(self, item: QListWidgetItem) -> None:
+        self._document.load_pose(self._poses[self.list.row(item)])
+
+    @Slot(int)
+    def _on_chosen(self, row: int) -> None:
+        chosen = 0 <= row < len(self._poses)
+        self.blend.setEnabled(chosen)
+        name = f"Blend towards {self._poses[row].name}" if chosen else "Choose a pose to blend"
+        self._target.setText(name)
+        self._target.setToolTip(name)
+
+    @Slot()
+    def _on_blend_pressed(self) -> None:
+        if self.chosen is not None:
+            self._document.begin_gesture(f"Blend towards {self.chosen.name}")
+
+    @Slot(int)
+    def _on_blend(self, value: int) -> None:
+        if self.chosen is None:
+            return
+        self._document.blend_towards(self.chosen.latent, value / _BLEND_STEPS)
+        self._share.setText(f"{value} %")
+        if not self.blend.isSliderDown():
+            self._rest_blend()
+
+    @Slot()
+    def _on_blend_released(self) -> None:
+        self._document.end_gesture()
+        self._rest_blend()
+
+    def _rest_blend(self) -> None:
+        """Back to 0: the next blend begins at the pose that this one ended in."""
+        with silent(self.blend):
+            self.blend.setValue(0)
+        self._share.setText("")

@@ -1,0 +1,282 @@
+"""Small widgets that the panels share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from PySide6.QtCore import QEvent, QObject, QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtGui import (
+    QColor,
+    QEnterEvent,
+    QKeyEvent,
+    QKeySequence,
+    QMouseEvent,
+    QPainter,
+    QPaintEvent,
+    QPen,
+    QWheelEvent,
+)
+from PySide6.QtWidgets import (
+    QDoubleSpinBox,
+    QFrame,
+    QLabel,
+    QScrollArea,
+    QSizePolicy,
+    QSlider,
+    QSpinBox,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.theme import CLOSE, NORMAL, ROW_HEIGHT, current_theme
+
+HANDLE = 7.0
+"""Radius of a slider's handle, in device-independent pixels."""
+
+_FINE = 0.1
+"""Of the pointer's way that a handle follows while Shift is held."""
+
+
+class Card(QFrame):
+    """A framed group of widgets, one below the other.
+
+    Parameters
+    ----------
+    title : above the group; "" for none
+    kind : "card", or "truth" for what is exact, not predicted
+    """
+
+    def __init__(self, title: str = "", kind: str = "card") -> None:
+        super().__init__()
+        self.setObjectName(kind)
+        self.column = QVBoxLayout(self)
+        self.column.setContentsMargins(NORMAL, NORMAL - 2, NORMAL, NORMAL - 2)
+        self.column.setSpacing(CLOSE)
+        if title:
+            self.column.addWidget(labelled(title, "title"))
+
+
+class ElidedLabel(QLabel):
+    """A label that shortens its text to the room it has, with the whole text as tool tip."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.setToolTip(text)
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+
+    def minimumSizeHint(self) -> QSize:  # noqa: N802
+        """Allow any width."""
+        return QSize(0, super().minimumSizeHint().height())
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw what fits."""
+        painter = QPainter(self)
+        painter.setPen(self.palette().color(self.foregroundRole()))
+        fitting = self.fontMetrics().elidedText(
+            self.text(), Qt.TextElideMode.ElideRight, self.width()
+        )
+        painter.drawText(self.rect(), int(self.alignment()), fitting)
+
+
+class HoverRow(QWidget):
+    """A row that tells which domain the pointer is on.
+
+    Signals
+    -------
+    hovered : int, the row's domain; None when the pointer leaves
+    """
+
+    hovered = Signal(object)
+
+    def __init__(self, domain: int | None) -> None:
+        super().__init__()
+        self.domain = domain
+
+    def enterEvent(self, event: QEnterEvent) -> None:  # noqa: N802
+        """Tell the domain."""
+        self.hovered.emit(self.domain)
+        super().enterEvent(event)
+
+    def leaveEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Tell that the pointer left."""
+        self.hovered.emit(None)
+        super().leaveEvent(event)
+
+
+class QuietSpinBox(QDoubleSpinBox):
+    """A number that the wheel changes only when it has the focus."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setKeyboardTracking(False)
+        self.setButtonSymbols(QDoubleSpinBox.ButtonSymbols.NoButtons)
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+        """Leave the wheel to the panel's scrolling unless focused."""
+        wheel_if_focused(self, event, super().wheelEvent)
+
+    def event(self, event: QEvent) -> bool:
+        """Leave Undo and Redo to the pose: what is typed is a step of it."""
+        if event.type() is QEvent.Type.ShortcutOverride and isinstance(event, QKeyEvent):
+            kinds = (QKeySequence.StandardKey.Undo, QKeySequence.StandardKey.Redo)
+            if any(event.matches(kind) for kind in kinds):
+                event.ignore()
+                return False
+        return super().event(event)
+
+
+class QuietIntegerBox(QSpinBox):
+    """A whole number that the wheel changes only when it has the focus."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setButtonSymbols(QSpinBox.ButtonSymbols.NoButtons)
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+        """Leave the wheel to the panel's scrolling unless focused."""
+        wheel_if_focused(self, event, super().wheelEvent)
+
+
+class Slider(QSlider):
+    """A horizontal slider in the window's own drawing, whose bar grows from `origin`.
+
+    The wheel moves it only when it has the focus.
+
+    Parameters
+    ----------
+    colour : "#rrggbb" of the bar, None for that of the theme
+    """
+
+    def __init__(self, colour: str | None = None) -> None:
+        super().__init__(Qt.Orientation.Horizontal)
+        self._colour = colour
+        self._grabbed = (0.0, 0)
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setMinimumWidth(60)
+
+    @property
+    def origin(self) -> float:
+        """Where the bar begins, as a share of the groove from its left end."""
+        return 0.0
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for one row's height."""
+        return QSize(110, ROW_HEIGHT - 4)
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+        """Leave the wheel to the panel's scrolling unless focused."""
+        wheel_if_focused(self, event, super().wheelEvent)
+
+    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Grab the handle: where it is, or from where the groove was pressed."""
+        if event.button() is not Qt.MouseButton.LeftButton:
+            event.ignore()
+            return
+        self.setFocus(Qt.FocusReason.MouseFocusReason)
+        x = event.position().x()
+        self.setSliderDown(True)
+        if abs(x - self._handle_x()) > HANDLE + 2:
+            self.setValue(self._value_at(x))
+        self._grabbed = (x, self.value())
+
+    def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Move the handle with the pointer; slowly while Shift is held."""
+        if not self.isSliderDown():
+            return
+        x, value = self._grabbed
+        steps = self.maximum() - self.minimum()
+        way = (event.position().x() - x) * steps / max(self.width() - 2 * HANDLE, 1.0)
+        if event.modifiers() & Qt.KeyboardModifier.ShiftModifier:
+            way *= _FINE
+        self.setValue(round(value + way))
+
+    def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: ARG002, N802
+        """Let the handle go."""
+        if self.isSliderDown():
+            self.setSliderDown(False)
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw the groove, the bar from its origin, and the handle."""
+        theme = current_theme()
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        middle = self.height() / 2
+        left, right = HANDLE, self.width() - HANDLE
+        painter.setBrush(QColor(theme.track))
+        painter.drawRoundedRect(QRectF(left, middle - 2, right - left, 4), 2, 2)
+        start = left + (right - left) * self.origin
+        if self.origin > 0.0:
+            painter.setBrush(QColor(theme.muted))
+            painter.drawRect(QRectF(start - 0.5, middle - 5, 1, 10))
+        handle = self._handle_x()
+        lively = self.isEnabled()
+        painter.setBrush(QColor((self._colour or theme.accent) if lively else theme.track))
+        painter.drawRect(QRectF(min(start, handle), middle - 2, abs(handle - start), 4))
+        if self.hasFocus():
+            halo = QColor(theme.accent)
+            halo.setAlpha(90)
+            painter.setBrush(halo)
+            painter.drawEllipse(QPointF(handle, middle), HANDLE + 3, HANDLE + 3)
+        painter.setBrush(QColor("#ffffff" if lively else theme.window))
+        bright = lively and (self.hasFocus() or self.underMouse())
+        rim = theme.accent if bright else theme.muted if lively else theme.border
+        painter.setPen(QPen(QColor(rim), 1.6))
+        painter.drawEllipse(QPointF(handle, middle), HANDLE - 1.2, HANDLE - 1.2)
+
+    def _handle_x(self) -> float:
+        share = (self.value() - self.minimum()) / max(self.maximum() - self.minimum(), 1)
+        return HANDLE + (self.width() - 2 * HANDLE) * share
+
+    def _value_at(self, x: float) -> int:
+        share = (x - HANDLE) / max(self.width() - 2 * HANDLE, 1.0)
+        return self.minimum() + round(share * (self.maximum() - self.minimum()))
+
+
+def wheel_if_focused(widget: QWidget, event: QWheelEvent, handle: object) -> None:
+    """Hand a wheel event on, or refuse it so that what is around scrolls."""
+    if widget.hasFocus() and callable(handle):
+        handle(event)
+    else:
+        event.ignore()
+
+
+@contextmanager
+def silent(*widgets: QObject) -> Iterator[None]:
+    """Change widgets without their signals, as they follow the document."""
+    before = [widget.blockSignals(True) for widget in widgets]
+    try:
+        yield
+    finally:
+        for widget, blocked in zip(widgets, before, strict=True):
+            widget.blockSignals(blocked)
+
+
+def labelled(text: str, kind: str = "") -> QLabel:
+    """Return a label of a kind that the style knows: title, caption, verdict, headline."""
+    label = QLabel(text)
+    label.setObjectName(kind)
+    return label
+
+
+def show_verdict(widget: QWidget, verdict: str) -> None:
+    """Colour a widget as "free", "colliding" or "waiting"."""
+    if widget.property("verdict") != verdict:
+        widget.setProperty("verdict", verdict)
+        widget.style().unpolish(widget)
+        widget.style().polish(widget)
+
+
+def scrolling(page: QWidget) -> QScrollArea:
+    """Return an area that scrolls a page up and down, never sideways."""
+    page.setObjectName("page")
+    area = QScrollArea()
+    area.setWidget(page)
+    area.setWidgetResizable(True)
+    area.setFrameShape(QFrame.Shape.NoFrame)
+    area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+    area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+    return area

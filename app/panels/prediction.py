@@ -1,0 +1,307 @@
+"""What the model believes of the pose: probability, verdict, and one row for each domain."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPolygonF
+from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy, QToolButton, QVBoxLayout, QWidget
+
+from app.icons import icon
+from app.panels.parts import Card, ElidedLabel, HoverRow, labelled, show_verdict, silent
+from app.panels.wording import energy_text, heading
+from app.shading import FULL_PREDICTED
+from app.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme
+
+if TYPE_CHECKING:
+    from app.document import PoseDocument
+
+EVEN_ODDS = 0.5
+"""Probability above which a pose counts as predicted to collide."""
+
+
+class ProbabilityMeter(QWidget):
+    """A bar from 0 to 1 with a line at even odds and a mark where the pose stands."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._probability: float | None = None
+        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        self.setAccessibleName("Probability of a collision")
+
+    @property
+    def probability(self) -> float | None:
+        """What is shown; None for nothing."""
+        return self._probability
+
+    def show_probability(self, probability: float | None) -> None:
+        """Move the mark."""
+        if probability != self._probability:
+            self._probability = probability
+            self.update()
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for the bar and the scale beneath it."""
+        return QSize(160, 22 + self.fontMetrics().height())
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw both halves, the line between them, the mark and the scale."""
+        theme = current_theme()
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        bar = QRectF(1, 9, self.width() - 2, 8)
+        painter.setBrush(QColor(theme.track))
+        painter.drawRoundedRect(bar, 4, 4)
+        middle = bar.left() + EVEN_ODDS * bar.width()
+        if self._probability is not None:
+            collides = self._probability > EVEN_ODDS
+            ink = QColor(theme.colliding if collides else theme.free)
+            place = bar.left() + self._probability * bar.width()
+            filled = QColor(ink)
+            filled.setAlpha(130)
+            painter.setBrush(filled)
+            painter.setClipRect(QRectF(bar.left(), 0, place - bar.left(), self.height()))
+            painter.drawRoundedRect(bar, 4, 4)
+            painter.setClipping(False)
+            painter.setBrush(ink)
+            tip = min(max(place, bar.left() + 4), bar.right() - 4)
+            corners = ((tip - 5, 1), (tip + 5, 1), (tip, 8))
+            painter.drawPolygon(QPolygonF([QPointF(x, y) for x, y in corners]))
+            painter.drawRect(QRectF(tip - 1, 7, 2, 12))
+        painter.setBrush(QColor(theme.text))
+        painter.drawRect(QRectF(middle - 0.75, 6, 1.5, 14))
+        painter.setPen(QColor(theme.muted))
+        scale = QRectF(0, 20, self.width(), self.fontMetrics().height() + 2)
+        for text, side in (
+            ("free", Qt.AlignmentFlag.AlignLeft),
+            (f"{EVEN_ODDS:g}", Qt.AlignmentFlag.AlignHCenter),
+            ("colliding", Qt.AlignmentFlag.AlignRight),
+        ):
+            painter.drawText(scale, side, text)
+
+
+class EnergyBar(QWidget):
+    """A bar as long as the predicted depth of a domain's collisions.
+
+    Parameters
+    ----------
+    colour : "#rrggbb" of the domain
+    """
+
+    def __init__(self, colour: str) -> None:
+        super().__init__()
+        self._colour = colour
+        self._share = 0.0
+        self.setMinimumWidth(48)
+
+    @property
+    def share(self) -> float:
+        """Filled, from 0 to 1."""
+        return self._share
+
+    def show_energy(self, energy: float) -> None:
+        """Fill the bar by the root of an energy in squared heights: that is a depth."""
+        share = min(math.sqrt(max(energy, 0.0)) / FULL_PREDICTED, 1.0)
+        if share != self._share:
+            self._share = share
+            self.update()
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw the track and what is filled of it."""
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        bar = QRectF(0, self.height() / 2 - 4, self.width(), 8)
+        painter.setBrush(QColor(current_theme().track))
+        painter.drawRoundedRect(bar, 4, 4)
+        if self._share > 0.0:
+            painter.setBrush(QColor(self._colour))
+            painter.setClipRect(QRectF(0, 0, self._share * self.width(), self.height()))
+            painter.drawRoundedRect(bar, 4, 4)
+
+
+class DomainRow(HoverRow):
+    """Swatch, name, predicted energy and lock of one domain.
+
+    Signals
+    -------
+    lock_toggled : int and bool, the domain and whether it is to be locked
+    """
+
+    lock_toggled = Signal(int, bool)
+
+    def __init__(self, domain: int, name: str, colour: str) -> None:
+        super().__init__(domain)
+        self._index = domain
+        self._name = heading(name)
+        self._colour = colour
+        self._lit = False
+        self.bar = EnergyBar(colour)
+        self.lock = QToolButton()
+        self.lock.setCheckable(True)
+        self.lock.setFixedSize(24, 24)
+        self.lock.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.lock.setAccessibleName(f"Lock {self._name}")
+        row = QHBoxLayout(self)
+        row.setContentsMargins(TIGHT + 12 + CLOSE, 0, 0, 0)
+        row.setSpacing(CLOSE)
+        row.addWidget(ElidedLabel(self._name), 6)
+        row.addWidget(self.bar, 5)
+        row.addWidget(self.lock)
+        self.setFixedHeight(ROW_HEIGHT)
+        self.lock.toggled.connect(self._on_lock)
+        self.show_lock(False)
+
+    def show_lock(self, locked: bool) -> None:
+        """Follow the document."""
+        with silent(self.lock):
+            self.lock.setChecked(locked)
+        theme = current_theme()
+        self.lock.setIcon(icon("lock" if locked else "unlock", None if locked else theme.muted))
+        self.lock.setToolTip(
+            f"{self._name} keeps its numbers: click to let it move again"
+            if locked
+            else f"Lock {self._name}: Resolve, Randomise and Reset all leave its numbers alone"
+        )
+
+    def show_energy(self, energy: float | None) -> None:
+        """Show a predicted energy in squared heights; None hides the bar."""
+        self.bar.setVisible(energy is not None)
+        if energy is not None:
+            self.bar.show_energy(energy)
+            self.setToolTip(f"{self._name}: predicted energy {energy_text(energy)}")
+
+    def set_lit(self, lit: bool) -> None:
+        """Show that the viewport's pointer is on this domain."""
+        if lit != self._lit:
+            self._lit = lit
+            self.update()
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw the swatch, and a wash of its colour under the pointer."""
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        if self._lit or self.underMouse():
+            wash = QColor(self._colour)
+            wash.setAlpha(60 if self._lit else 36)
+            painter.setBrush(wash)
+            painter.drawRoundedRect(self.rect(), 5, 5)
+        painter.setBrush(QColor(self._colour))
+        painter.drawRoundedRect(QRectF(TIGHT, self.height() / 2 - 6, 12, 12), 3, 3)
+
+    def _on_lock(self, locked: bool) -> None:
+        self.lock_toggled.emit(self._index, locked)
+
+
+class PredictionCard(Card):
+    """The upper half of the right panel; nothing in it is the truth.
+
+    Signals
+    -------
+    domain_hovered : int or None, the domain of the row that the pointer is on
+
+    Parameters
+    ----------
+    document : followed; its locks are changed here
+    """
+
+    domain_hovered = Signal(object)
+
+    def __init__(self, document: PoseDocument) -> None:
+        super().__init__()
+        self._document = document
+        self.rows: list[DomainRow] = []
+        title = QHBoxLayout()
+        title.addWidget(labelled("Prediction", "title"))
+        title.addStretch()
+        self._source = labelled("an instant guess", "caption")
+        title.addWidget(self._source)
+        self.verdict = labelled("", "verdict")
+        self.percent = labelled("", "headline")
+        self.meter = ProbabilityMeter()
+        self._missing = QLabel(
+            "This model has no predictor, so there is nothing to predict and Resolve is off. "
+            "“lcollision train predictor” adds one."
+        )
+        self._missing.setObjectName("caption")
+        self._missing.setWordWrap(True)
+        line = QHBoxLayout()
+        line.addWidget(self.verdict)
+        line.addStretch()
+        line.addWidget(self.percent)
+        self._rows = QVBoxLayout()
+        self._rows.setSpacing(0)
+        self.column.addLayout(title)
+        self.column.addLayout(line)
+        self.column.addWidget(self.meter)
+        self.column.addWidget(self._missing)
+        self.column.addSpacing(TIGHT)
+        self.column.addLayout(self._rows)
+        document.model_changed.connect(self._on_model)
+        document.frame_changed.connect(self._on_frame)
+        document.locks_changed.connect(self._on_locks)
+        if document.has_model:
+            self._on_model()
+        else:
+            self._missing.hide()
+
+    def light_domain(self, domain: int | None) -> None:
+        """Show which domain the viewport's pointer is on."""
+        for row in self.rows:
+            row.set_lit(row.domain == domain)
+
+    def refresh_icons(self) -> None:
+        """Draw the locks in the theme that has come."""
+        self._on_locks()
+
+    def _on_model(self) -> None:
+        for row in self.rows:
+            self._rows.removeWidget(row)
+            row.deleteLater()
+        model = self._document.model
+        self.rows = []
+        for domain, (name, colour) in enumerate(
+            zip(model.domain_names, model.domain_colours, strict=True)
+        ):
+            row = DomainRow(domain, name, colour)
+            row.hovered.connect(self.domain_hovered)
+            row.lock_toggled.connect(self._document.set_locked)
+            self._rows.addWidget(row)
+            self.rows.append(row)
+        predicts = self._document.can_resolve
+        for widget in (self.meter, self.verdict, self.percent, self._source):
+            widget.setVisible(predicts)
+        self._missing.setVisible(not predicts)
+        self._on_frame()
+        self._on_locks()
+
+    def _on_frame(self) -> None:
+        frame = self._document.frame
+        prediction = frame.prediction if frame is not None else None
+        if prediction is None:
+            self.meter.show_probability(None)
+            self.verdict.setText("…")
+            self.percent.setText("")
+            show_verdict(self.verdict, "waiting")
+            for row in self.rows:
+                row.show_energy(0.0 if self._document.can_resolve else None)
+            return
+        probability = prediction.collision_probability
+        collides = probability > EVEN_ODDS
+        kind = "colliding" if collides else "free"
+        self.meter.show_probability(probability)
+        self.verdict.setText("Probably colliding" if collides else "Probably free")
+        self.percent.setText(f"{100 * probability:.0f} %")
+        self.percent.setToolTip("How likely this pose collides with itself, as predicted")
+        show_verdict(self.verdict, kind)
+        show_verdict(self.percent, kind)
+        for row, energy in zip(self.rows, prediction.domain_energy, strict=True):
+            row.show_energy(float(energy))
+
+    def _on_locks(self) -> None:
+        for row in self.rows:
+            row.show_lock(row.domain in self._document.locked_domains)

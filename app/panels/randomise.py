@@ -1,0 +1,76 @@
+"""A pose by chance: how far to go towards it, and which one."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import Qt, Signal, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QGridLayout, QPushButton
+
+from app.icons import icon
+from app.panels.parts import Card, QuietIntegerBox, Slider, labelled
+from app.theme import CLOSE
+
+_LARGEST_SEED = 999_999
+
+
+class RandomiseCard(Card):
+    """Amount and seed; the seed counts up, so that each press draws another pose.
+
+    Signals
+    -------
+    wanted : float and int, amount from 0 to 1 and seed
+
+    Parameters
+    ----------
+    action : the menu's, which the button triggers
+    amount : from 0 to 1, at the start
+    """
+
+    wanted = Signal(float, int)
+
+    def __init__(self, action: QAction, amount: float) -> None:
+        super().__init__()
+        self._action = action
+        self.amount = Slider()
+        self.amount.setRange(1, 100)
+        self.amount.setPageStep(10)
+        self.amount.setValue(round(100 * amount))
+        self.amount.setAccessibleName("Amount")
+        self.amount.setToolTip("How far to go: 100 % forgets the present pose")
+        self._percent = labelled("", "caption")
+        self._percent.setMinimumWidth(self.fontMetrics().horizontalAdvance("100 %"))
+        self._percent.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+        self.seed = QuietIntegerBox()
+        self.seed.setRange(0, _LARGEST_SEED)
+        self.seed.setAccessibleName("Seed")
+        self.seed.setToolTip("Equal numbers draw equal poses; it counts up by itself")
+        self.button = QPushButton("Randomise")
+        self.button.setToolTip(action.toolTip())
+        grid = QGridLayout()
+        grid.setHorizontalSpacing(CLOSE)
+        grid.setVerticalSpacing(CLOSE)
+        grid.addWidget(labelled("Amount", "caption"), 0, 0)
+        grid.addWidget(self.amount, 0, 1)
+        grid.addWidget(self._percent, 0, 2)
+        grid.addWidget(labelled("Seed", "caption"), 1, 0)
+        grid.addWidget(self.seed, 1, 1)
+        grid.addWidget(self.button, 1, 2)
+        grid.setColumnStretch(1, 1)
+        self.column.addLayout(grid)
+        self.amount.valueChanged.connect(self._on_amount)
+        self.button.clicked.connect(action.trigger)
+        self._on_amount(self.amount.value())
+        self.refresh_icons()
+
+    def refresh_icons(self) -> None:
+        """Draw the die in the theme that has come."""
+        self.button.setIcon(icon("random"))
+
+    def draw(self) -> None:
+        """Ask for the next pose by chance."""
+        self.wanted.emit(self.amount.value() / 100, self.seed.value())
+        self.seed.setValue((self.seed.value() + 1) % (_LARGEST_SEED + 1))
+
+    @Slot(int)
+    def _on_amount(self, percent: int) -> None:
+        self._percent.setText(f"{percent} %")

@@ -1,0 +1,232 @@
+"""Resolve: start and cancel it, follow it, and read what came of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import Signal, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QGridLayout,
+    QHBoxLayout,
+    QLabel,
+    QProgressBar,
+    QPushButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.icons import icon, pixmap
+from app.panels.parts import Card, labelled, silent
+from app.panels.wording import energy_text, height_text, seconds_text
+from app.theme import CLOSE, TIGHT, current_theme
+
+if TYPE_CHECKING:
+    from app.document import PoseDocument
+    from lcollision_core.resolve import ResolveResult
+
+_SIGNS = {True: "check", False: "error", None: "unknown"}
+
+
+class Fact(QWidget):
+    """One of the three facts of an outcome: yes, no or not known."""
+
+    def __init__(self, sentences: dict[bool | None, str]) -> None:
+        super().__init__()
+        self._sentences = sentences
+        self._truth: bool | None = None
+        self._sign = QLabel()
+        self._sign.setFixedSize(18, 18)
+        self._text = QLabel()
+        row = QHBoxLayout(self)
+        row.setContentsMargins(0, 0, 0, 0)
+        row.setSpacing(CLOSE)
+        row.addWidget(self._sign)
+        row.addWidget(self._text, 1)
+
+    @property
+    def truth(self) -> bool | None:
+        """What is shown."""
+        return self._truth
+
+    def show_truth(self, truth: bool | None) -> None:
+        """Say yes, no, or that it is not known."""
+        self._truth = truth
+        theme = current_theme()
+        ink = {True: theme.free, False: theme.colliding, None: theme.muted}[truth]
+        self._sign.setPixmap(pixmap(_SIGNS[truth], ink, 18, self.devicePixelRatioF()))
+        self._text.setText(self._sentences[truth])
+
+
+class ResolveCard(Card):
+    """The lower end of the right panel.
+
+    Signals
+    -------
+    options_wanted : the user wants to choose how Resolve works
+
+    Parameters
+    ----------
+    document : resolved and cancelled through it
+    resolve_action : what the button triggers, with its shortcut
+    """
+
+    options_wanted = Signal()
+
+    def __init__(self, document: PoseDocument, resolve_action: QAction) -> None:
+        super().__init__()
+        self._document = document
+        self._action = resolve_action
+        self.button = QPushButton("Resolve")
+        self.button.setObjectName("primary")
+        self.options = QPushButton("Options…")
+        self.options.setToolTip("Choose how Resolve works")
+        self.cancel = QPushButton("Cancel")
+        self.cancel.setToolTip("Stop Resolve and keep the pose as it is (Escape)")
+        self.bar = QProgressBar()
+        self.bar.setTextVisible(False)
+        self._busy = labelled("Looking for the nearest free pose…", "caption")
+        self.working = QWidget()
+        working = QVBoxLayout(self.working)
+        working.setContentsMargins(0, 0, 0, 0)
+        working.setSpacing(CLOSE)
+        line = QHBoxLayout()
+        line.addWidget(self._busy, 1)
+        line.addWidget(self.cancel)
+        working.addLayout(line)
+        working.addWidget(self.bar)
+        self.outcome = QWidget()
+        self._make_outcome()
+        buttons = QHBoxLayout()
+        buttons.setSpacing(CLOSE)
+        buttons.addWidget(self.button, 1)
+        buttons.addWidget(self.options)
+        self.column.addLayout(buttons)
+        self.column.addWidget(self.working)
+        self.column.addWidget(self.outcome)
+        self.working.hide()
+        self.button.clicked.connect(resolve_action.trigger)
+        self.cancel.clicked.connect(document.cancel_resolve)
+        self.options.clicked.connect(self.options_wanted)
+        self.ghost.toggled.connect(document.show_ghost)
+        resolve_action.changed.connect(self._on_action)
+        document.solve_started.connect(self._on_started)
+        document.solve_progressed.connect(self._on_progressed)
+        document.solve_finished.connect(self._on_finished)
+        document.outcome_changed.connect(self._on_outcome)
+        document.ghost_changed.connect(self._on_ghost)
+        self._on_action()
+        self._on_outcome()
+
+    def refresh_icons(self) -> None:
+        """Draw the signs in the theme that has come."""
+        self._on_action()
+        self._on_outcome()
+
+    def _make_outcome(self) -> None:
+        self.converged = Fact(
+            {
+                True: "The solver converged",
+                False: "The solver did not converge",
+                None: "The solver was not needed",
+            }
+        )
+        self.predicted_free = Fact(
+            {True: "Predicted free", False: "Predicted colliding", None: "Not predicted"}
+        )
+        self.exactly_free = Fact(
+            {True: "Exactly free", False: "Not exactly free", None: "Not checked exactly"}
+        )
+        self._energy, self._moved, self._furthest, self._took = (QLabel() for _ in range(4))
+        self._note = labelled("", "caption")
+        self._note.setWordWrap(True)
+        self.ghost = QCheckBox("Show the pose before as a ghost")
+        self.ghost.setToolTip("Draw the old pose, see-through, behind the new one")
+        column = QVBoxLayout(self.outcome)
+        column.setContentsMargins(0, TIGHT, 0, 0)
+        column.setSpacing(TIGHT)
+        for fact in (self.converged, self.predicted_free, self.exactly_free):
+            column.addWidget(fact)
+        numbers = QGridLayout()
+        numbers.setContentsMargins(0, TIGHT, 0, TIGHT)
+        numbers.setHorizontalSpacing(CLOSE)
+        numbers.setVerticalSpacing(2)
+        for place, (name, value) in enumerate(
+            (
+                ("Energy", self._energy),
+                ("Moved on average", self._moved),
+                ("Moved at most", self._furthest),
+                ("Took", self._took),
+            )
+        ):
+            numbers.addWidget(labelled(name, "caption"), place, 0)
+            numbers.addWidget(value, place, 1)
+        numbers.setColumnStretch(1, 1)
+        column.addLayout(numbers)
+        column.addWidget(self._note)
+        column.addWidget(self.ghost)
+
+    @Slot()
+    def _on_action(self) -> None:
+        self.button.setEnabled(self._action.isEnabled())
+        self.button.setToolTip(self._action.toolTip())
+        theme = current_theme()
+        self.button.setIcon(icon("resolve", theme.on_accent))
+
+    @Slot()
+    def _on_started(self) -> None:
+        self.working.show()
+        self.outcome.hide()
+        # Until the first report there is no telling how far it is.
+        self.bar.setRange(0, 0)
+
+    @Slot(object)
+    def _on_progressed(self, status: object) -> None:
+        if isinstance(status, tuple) and len(status) == 2 and status[1] > 0 and status[0] > 0:
+            done, total = status
+            self.bar.setRange(0, int(total))
+            self.bar.setValue(int(done))
+
+    @Slot(object)
+    def _on_finished(self, result: object) -> None:  # noqa: ARG002
+        self.working.hide()
+        # An endless bar is animated even while nobody sees it.
+        self.bar.setRange(0, 1)
+        self._on_outcome()
+
+    @Slot()
+    def _on_outcome(self) -> None:
+        result = self._document.outcome if self._document.has_model else None
+        self.outcome.setVisible(result is not None and not self._document.solving)
+        if result is not None:
+            self._show(result)
+
+    @Slot()
+    def _on_ghost(self) -> None:
+        with silent(self.ghost):
+            self.ghost.setChecked(self._document.ghost_shown)
+
+    def _show(self, result: ResolveResult) -> None:
+        unmoved = result.latent_distance == 0.0
+        ran = result.solver_status != "not run"
+        self.converged.show_truth(result.converged if ran else None)
+        self.predicted_free.show_truth(result.predicted_free)
+        self.exactly_free.show_truth(result.exactly_free)
+        if result.energy_before is None or result.energy_after is None:
+            self._energy.setText("not measured")
+        else:
+            self._energy.setText(
+                f"{energy_text(result.energy_before)} → {energy_text(result.energy_after)}"
+            )
+        if unmoved:
+            self._moved.setText("nothing")
+            self._furthest.setText("nothing")
+        else:
+            self._moved.setText(f"{height_text(result.vertex_distance_mean)} of the height")
+            self._furthest.setText(f"{height_text(result.vertex_distance_max)} of the height")
+        self._took.setText(seconds_text(result.seconds))
+        self._note.setText(result.note or "")
+        self._note.setVisible(bool(result.note))
+        self.ghost.setVisible(not unmoved)
+        self._on_ghost()

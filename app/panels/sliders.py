@@ -1,0 +1,292 @@
+"""The left panel: all numbers of the pose as sliders, in groups that open and close."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PySide6.QtCore import QEvent, QRectF, QSize, Qt, Signal
+from PySide6.QtGui import QColor, QEnterEvent, QPainter, QPaintEvent, QPixmap
+from PySide6.QtWidgets import QAbstractButton, QLineEdit, QVBoxLayout, QWidget
+
+from app.icons import pixmap
+from app.panels.code_slider import CodeRow, tab_order
+from app.panels.parts import scrolling
+from app.panels.wording import heading
+from app.theme import CLOSE, NORMAL, TIGHT, current_theme
+
+if TYPE_CHECKING:
+    from app.document import PoseDocument
+    from lcollision_core.model import LatentGroup
+
+_HEADER_HEIGHT = 28
+
+
+class GroupHeader(QAbstractButton):
+    """The line above a group's sliders; a click or Space opens and closes it.
+
+    Signals
+    -------
+    hovered : int, the group's domain, or None
+
+    Parameters
+    ----------
+    name : of the group
+    colour : of its domain, None for the whole body
+    domain : index from 0, None for the whole body
+    """
+
+    hovered = Signal(object)
+
+    def __init__(self, name: str, colour: str | None, domain: int | None) -> None:
+        super().__init__()
+        self.domain = domain
+        self._colour = colour
+        self._lit = False
+        self._arrows: tuple[str, list[QPixmap]] | None = None
+        self.setText(name)
+        self.setAccessibleName(name)
+        self.setToolTip(f"Show or hide the sliders of {name.lower()}")
+        self.setCheckable(True)
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setCursor(Qt.CursorShape.PointingHandCursor)
+        self.setMinimumHeight(_HEADER_HEIGHT)
+
+    def set_lit(self, lit: bool) -> None:
+        """Show that the viewport's pointer is on this domain."""
+        if lit != self._lit:
+            self._lit = lit
+            self.update()
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for one header's height."""
+        return QSize(120, _HEADER_HEIGHT)
+
+    def enterEvent(self, event: QEnterEvent) -> None:  # noqa: N802
+        """Tell the domain."""
+        self.hovered.emit(self.domain)
+        super().enterEvent(event)
+
+    def leaveEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Tell that the pointer left."""
+        self.hovered.emit(None)
+        super().leaveEvent(event)
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw the arrow, the domain's colour and the name."""
+        theme = current_theme()
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        if self.underMouse() or self._lit:
+            wash = QColor(self._colour or theme.accent)
+            wash.setAlpha(60 if self._lit else 36)
+            painter.setBrush(wash)
+            painter.drawRoundedRect(self.rect(), 5, 5)
+        if self.hasFocus():
+            painter.setPen(QColor(theme.accent))
+            painter.setBrush(Qt.BrushStyle.NoBrush)
+            painter.drawRoundedRect(QRectF(self.rect()).adjusted(0.5, 0.5, -0.5, -0.5), 5, 5)
+            painter.setPen(Qt.PenStyle.NoPen)
+        middle = self.height() // 2
+        painter.drawPixmap(TIGHT, middle - 7, self._arrow())
+        left = TIGHT + 14 + CLOSE
+        if self._colour is not None:
+            painter.setBrush(QColor(self._colour))
+            painter.drawRoundedRect(QRectF(left, middle - 6, 12, 12), 3, 3)
+            left += 12 + CLOSE
+        font = self.font()
+        font.setBold(True)
+        painter.setFont(font)
+        painter.setPen(QColor(theme.text))
+        room = self.rect().adjusted(left, 0, -TIGHT, 0)
+        name = painter.fontMetrics().elidedText(
+            self.text(), Qt.TextElideMode.ElideRight, room.width()
+        )
+        painter.drawText(room, Qt.AlignmentFlag.AlignVCenter | Qt.AlignmentFlag.AlignLeft, name)
+
+    def _arrow(self) -> QPixmap:
+        ink = current_theme().muted
+        if self._arrows is None or self._arrows[0] != ink:
+            drawn = [pixmap(name, ink, 14, self.devicePixelRatioF()) for name in ("right", "down")]
+            self._arrows = (ink, drawn)
+        return self._arrows[1][self.isChecked()]
+
+
+class SliderGroup(QWidget):
+    """One group's header and rows; the rows are made when they are first seen."""
+
+    def __init__(self, panel: SlidersPanel, place: int, group: LatentGroup) -> None:
+        super().__init__()
+        self._panel = panel
+        self._group = group
+        self._domain = place - 1 if place else None
+        self.rows: list[CodeRow] = []
+        self.header = GroupHeader(heading(group.name), group.colour, self._domain)
+        self._body = QWidget()
+        self._column = QVBoxLayout(self._body)
+        self._column.setContentsMargins(0, 0, 0, TIGHT)
+        self._column.setSpacing(0)
+        self._body.hide()
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(0)
+        column.addWidget(self.header)
+        column.addWidget(self._body)
+        self.header.toggled.connect(self.set_open)
+        self.header.hovered.connect(panel.domain_hovered)
+
+    def set_open(self, is_open: bool) -> None:
+        """Show or hide the rows."""
+        if is_open and not self.rows:
+            self._make_rows()
+        self._body.setVisible(is_open)
+        self.header.setChecked(is_open)
+
+    def show_matching(self, words: str) -> None:
+        """Show only rows whose name holds the words; all where the group's own name does."""
+        if not words:
+            self.setVisible(True)
+            for row in self.rows:
+                row.setVisible(True)
+            return
+        in_name = words in self._group.name.casefold()
+        hits = [in_name or words in name.casefold() for name in self._group.code_names]
+        self.setVisible(any(hits))
+        if any(hits):
+            self.set_open(True)
+            for row, hit in zip(self.rows, hits, strict=True):
+                row.setVisible(hit)
+
+    def _make_rows(self) -> None:
+        from lcollision_core.labels.box import BOX_SCALE
+
+        document = self._panel.document
+        space = document.model.latent_space
+        colours = document.model.domain_colours
+        for place, name in enumerate(self._group.code_names):
+            code = self._group.codes.start + place
+            # The k-th number of the whole body moves most what the k-th domain covers.
+            domain = place if self._domain is None else self._domain
+            row = CodeRow(
+                code,
+                heading(name) if self._domain is None else f"Motion {place + 1}",
+                domain,
+                BOX_SCALE * float(space.minimum[code]),
+                BOX_SCALE * float(space.maximum[code]),
+                colours[domain],
+            )
+            row.show_number(float(document.latent[code]))
+            row.hovered.connect(self._panel.domain_hovered)
+            row.number_changed.connect(document.set_code)
+            row.reset_wanted.connect(document.reset_code)
+            row.slider.drag_started.connect(self._panel.begin_drag)
+            row.slider.drag_ended.connect(document.end_gesture)
+            row.slider.drag_abandoned.connect(document.cancel_gesture)
+            self._column.addWidget(row)
+            self.rows.append(row)
+        tab_order(self.rows, self.header)
+
+
+class SlidersPanel(QWidget):
+    """All sliders of the model, below a filter.
+
+    Signals
+    -------
+    domain_hovered : int or None, the domain of the row that the pointer is on
+
+    Parameters
+    ----------
+    document : followed, and changed by the sliders
+    """
+
+    domain_hovered = Signal(object)
+
+    def __init__(self, document: PoseDocument) -> None:
+        super().__init__()
+        self.document = document
+        self.groups: list[SliderGroup] = []
+        self._shown = np.zeros(0)
+        self.filter = QLineEdit()
+        self.filter.setPlaceholderText("Filter sliders, such as “thigh”")
+        self.filter.setToolTip("Show only the sliders whose name holds these words")
+        self.filter.setAccessibleName("Filter sliders")
+        self.filter.setClearButtonEnabled(True)
+        self._page = QWidget()
+        self._column = QVBoxLayout(self._page)
+        self._column.setContentsMargins(CLOSE, 0, CLOSE, CLOSE)
+        self._column.setSpacing(2)
+        self._column.addStretch()
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(CLOSE)
+        top = QVBoxLayout()
+        top.setContentsMargins(NORMAL, TIGHT, NORMAL, 0)
+        top.addWidget(self.filter)
+        column.addLayout(top)
+        column.addWidget(scrolling(self._page), 1)
+        self._bottom = QVBoxLayout()
+        self._bottom.setContentsMargins(NORMAL, 0, NORMAL, CLOSE)
+        column.addLayout(self._bottom)
+        self.filter.textChanged.connect(self._on_filter)
+        document.model_changed.connect(self._on_model)
+        document.latent_changed.connect(self._on_latent)
+        if document.has_model:
+            self._on_model()
+
+    def add_card(self, card: QWidget) -> None:
+        """Put something below the sliders, where it stays in sight."""
+        self._bottom.addWidget(card)
+
+    def light_domain(self, domain: int | None) -> None:
+        """Show which domain the viewport's pointer is on."""
+        for group in self.groups:
+            group.header.set_lit(domain is not None and group.header.domain == domain)
+
+    def row_of(self, code: int) -> CodeRow:
+        """Open the group of a code and return its row."""
+        for group in self.groups:
+            group.set_open(True)
+            for row in group.rows:
+                if row.code == code:
+                    return row
+        raise IndexError(code)
+
+    def begin_drag(self) -> None:
+        """Make what follows one step of undo, named after the slider that is dragged."""
+        slider = self.sender()
+        row = slider.parent() if slider is not None else None
+        name = self.document.code_name(row.code) if isinstance(row, CodeRow) else "slider"
+        self.document.begin_gesture(f"Move {name}")
+
+    def _on_model(self) -> None:
+        for group in self.groups:
+            self._column.removeWidget(group)
+            group.deleteLater()
+        space = self.document.model.latent_space
+        self.groups = [SliderGroup(self, place, group) for place, group in enumerate(space.groups)]
+        for place, group in enumerate(self.groups):
+            self._column.insertWidget(place, group)
+        self._shown = np.array(self.document.latent)
+        before: QWidget = self.filter
+        for group in self.groups:
+            QWidget.setTabOrder(before, group.header)
+            before = group.header
+        self.groups[0].set_open(True)
+        self._on_filter(self.filter.text())
+
+    def _on_latent(self) -> None:
+        latent = self.document.latent
+        if len(latent) != len(self._shown):
+            return  # the model's own signal follows
+        changed = latent != self._shown
+        self._shown = np.array(latent)
+        for group in self.groups:
+            for row in group.rows:
+                if changed[row.code]:
+                    row.show_number(float(latent[row.code]))
+
+    def _on_filter(self, text: str) -> None:
+        words = text.strip().casefold()
+        for group in self.groups:
+            group.show_matching(words)

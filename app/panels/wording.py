@@ -1,0 +1,36 @@
+"""Numbers as people read them."""
+
+from __future__ import annotations
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def energy_text(energy: float) -> str:
+    """Write an energy in squared heights: "0", or as in "1.3 · 10⁻⁵"."""
+    if energy == 0.0:
+        return "0"
+    digits, exponent = f"{energy:.1e}".split("e")
+    return f"{digits} · 10{str(int(exponent)).translate(_SUPERSCRIPTS)}"
+
+
+def height_text(distance: float) -> str:
+    """Write a distance in heights as a share of the height, as in "1.1 %"."""
+    percent = 100.0 * distance
+    if 0.0 < percent < 0.05:
+        return "below 0.1 %"
+    return f"{percent:.1f} %"
+
+
+def counted(number: int, noun: str) -> str:
+    """Write a number with its noun, "1 pair" or "2 pairs"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def heading(name: str) -> str:
+    """Give a domain's name the capital of a heading."""
+    return name[:1].upper() + name[1:]
+
+
+def seconds_text(seconds: float) -> str:
+    """Write a duration as in "90 ms" or "1.4 s"."""
+    return f"{1000 * seconds:.0f} ms" if seconds < 0.95 else f"{seconds:.1f} s"

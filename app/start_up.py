@@ -1,0 +1,158 @@
+"""What is loaded behind the window when it is on the screen already."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import signal
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, QTimer, Slot
+
+from app.dialogs.questions import Answer, ask_about_recovery
+from lcollision_core.bundled import bundled_folder
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from app.main_window import MainWindow
+    from lcollision_core.model import NamedPose, PoseModel
+
+_log = logging.getLogger(__name__)
+
+DEFAULT_MODEL = "body"
+
+_LIVELY = ("dancer", "thinking")
+"""Training poses of the built-in body that are worth looking at."""
+
+_SLOW_IMPORTS = (
+    "app.canvas",
+    "app.scene",
+    "app.rendering",
+    "app.recovery",
+    "lcollision_core.model",
+)
+_POLL_MILLISECONDS = 20
+_JOIN_SECONDS = 20.0
+
+
+class StartUp(QObject):
+    """Fills a window that is on the screen.
+
+    First a thread imports what draws and computes, so that the window stays live; then the
+    document opens the model; then the pose comes in: the given file's, or one that a crash left,
+    or one worth looking at.
+
+    Parameters
+    ----------
+    window : shown
+    path : a poses file, a mesh or a model; None for a pose of the editor's own
+    model_name : a model's file or name; the default model where None
+    """
+
+    def __init__(self, window: MainWindow, path: Path | None, model_name: str | None) -> None:
+        super().__init__(window)
+        self._window = window
+        self._document = window.document
+        self._path = path
+        self._model: str | Path = model_name or DEFAULT_MODEL
+        self._imports = threading.Thread(target=_import_slowly, name="imports", daemon=True)
+        self._poll = QTimer(self)
+        self._poll.setInterval(_POLL_MILLISECONDS)
+        self._poll.timeout.connect(self._on_poll)
+
+    def begin(self) -> None:
+        """Start loading; returns at once."""
+        signal.signal(signal.SIGINT, self._on_signal)
+        signal.signal(signal.SIGTERM, self._on_signal)
+        self._imports.start()
+        self._poll.start()
+
+    def finish(self) -> None:
+        """Wait for what is still being imported: a process that ends amid an import may crash."""
+        self._poll.stop()
+        self._imports.join(_JOIN_SECONDS)
+
+    @Slot()
+    def _on_poll(self) -> None:
+        if self._imports.is_alive():
+            return
+        # From now on it only gives Python the chance to look at signals.
+        self._poll.timeout.disconnect(self._on_poll)
+        self._poll.timeout.connect(_nothing)
+        self._poll.setInterval(1000)
+        from app.recovery import Autosave
+        from lcollision_core.model import MODEL_SUFFIX
+
+        self._window.set_autosave(Autosave(self._document))
+        if self._path is not None and self._path.suffix.lower() == MODEL_SUFFIX:
+            self._model, self._path = self._path, None
+        self._document.model_changed.connect(self._on_model)
+        self._document.open_model(self._model)
+
+    @Slot()
+    def _on_model(self) -> None:
+        self._document.model_changed.disconnect(self._on_model)
+        # The document is about to put in a pose of its own.
+        QTimer.singleShot(0, self, self._on_first_pose)
+        # Once the pose has been drawn: a question over an empty window would puzzle.
+        self._window.ready.connect(self._offer_recovery)
+
+    @Slot()
+    def _on_first_pose(self) -> None:
+        if self._path is not None:
+            path = self._path
+            self._window.attempt(lambda: self._window.files.open_path(path))
+            return
+        self._document.load_pose(opening_pose(self._document.model))
+        # What the program did is neither a change to save nor one to take back.
+        self._document.undo_stack.clear()
+
+    @Slot()
+    def _offer_recovery(self) -> None:
+        from app.recovery import find_lost_poses
+
+        lost = find_lost_poses()
+        for pose in lost:
+            answer = ask_about_recovery(self._window, pose)
+            if answer is Answer.SAVE:
+                self._window.recover(pose)
+                break
+            if answer is Answer.DISCARD:
+                pose.session.discard()
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        _log.info("signal %d: closing", number)
+        self._window.close()
+
+
+def opening_pose(model: PoseModel) -> NamedPose:
+    """Return a pose worth looking at.
+
+    The first of the bundled file of poses that is called as the model is; for a model without
+    one, a lively training pose by its name, or the last.
+    """
+    from lcollision_core.model import NamedPose, read_poses
+
+    bundled = bundled_folder("poses") / f"{model.name}.json"
+    if bundled.is_file():
+        try:
+            return read_poses(bundled, model)[0]
+        except LCollisionError as error:
+            # A user's own model may have a bundled one's name.
+            _log.info("no opening pose: %s", error)
+    names = model.pose_names
+    number = next((names.index(name) for name in _LIVELY if name in names), len(names) - 1)
+    return NamedPose(names[number], model.training_latent[number])
+
+
+def _import_slowly() -> None:
+    for module in _SLOW_IMPORTS:
+        importlib.import_module(module)
+
+
+def _nothing() -> None:
+    """Do nothing, in Python."""
