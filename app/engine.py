@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, QThread, QTimer, Signal, Slot
 
-from app.frames import LiveFrame, PoseShower
+from app.frames import LiveFrame, PoseShower, keep_torch_to_one_thread
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken, Progress
 
@@ -113,6 +113,7 @@ class LiveWorker(QObject):
 
     def _value(self, request: FrameRequest | VerdictRequest) -> object:
         if self._shower is None or self._shower.model is not request.model:
+            keep_torch_to_one_thread(request.model)
             self._shower = PoseShower(request.model)
         if isinstance(request, FrameRequest):
             return self._shower.frame(request.latent, request.request_id)

@@ -175,6 +175,18 @@ class PoseShower:
         return normals
 
 
+def keep_torch_to_one_thread(model: PoseModel) -> None:
+    """Let torch use one core in the calling thread: a single pose has nothing to spread.
+
+    On a busy machine torch's threads wait for each other: one prediction took 32 ms instead of
+    0.4. Does nothing for a model without a predictor, which needs no torch.
+    """
+    if model.predictor is not None:
+        import torch
+
+        torch.set_num_threads(1)
+
+
 def _frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     array.flags.writeable = False
     return array

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.engine import Work
-from app.frames import PoseShower
+from app.frames import PoseShower, keep_torch_to_one_thread
 from app.symmetry import mirror_vertices
 from lcollision_core.errors import ModelFileError
 from lcollision_core.jobs import CancelToken, Progress
@@ -104,6 +104,7 @@ def mirror_of(model: PoseModel) -> npt.NDArray[np.int32] | None:
 
 def warm_up(model: PoseModel) -> None:
     """Compute all that a first drag needs once, in the thread that has the time."""
+    keep_torch_to_one_thread(model)
     shower = PoseShower(model)
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
