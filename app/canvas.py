@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPointF, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import QDragEnterEvent, QDropEvent, QKeyEvent, QMouseEvent
 from pyvistaqt import QtInteractor
@@ -43,8 +45,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         super().__init__(parent, auto_update=False, multi_samples=0)
         self.setAcceptDrops(False)
         self._before_paint = before_paint
-        self._painting = False
-        self._shut = False
+        self._painting = self._settled = self._shut = False
         self.n_painted = 0
         self._rest = QTimer(self, singleShot=True, interval=_REST_MILLISECONDS)
         self._rest.timeout.connect(self._on_rest)
@@ -64,15 +65,15 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         """Ask for a rough picture soon, and a smooth one when nothing moves any more."""
         if self._shut:
             return
-        if self.ren_win.GetMultiSamples():
-            self.ren_win.SetMultiSamples(0)
+        self._settled = False
+        self.ren_win.SetMultiSamples(0)
         self._rest.start()
         self.update()
 
     @property
-    def is_smooth(self) -> bool:
-        """Whether the last picture asked for is the one at rest."""
-        return bool(self.ren_win.GetMultiSamples())
+    def is_settled(self) -> bool:
+        """Whether the smooth picture of the scene is drawn, and no other is asked for."""
+        return self._settled
 
     def pick_vertex(self, place: QPointF, actor: vtkActor) -> int | None:
         """Return the vertex that is seen at a place.
@@ -89,6 +90,23 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         if not self._picker.Pick(x, y, 0.0, self.renderer) or self._picker.GetCellId() < 0:
             return None
         return int(self._picker.GetPointId())
+
+    def place_of(self, point: npt.NDArray[Any]) -> QPointF:
+        """Return where a point of the scene is seen.
+
+        Parameters
+        ----------
+        point : (3,) array, in the data's unit
+
+        Returns
+        -------
+        place : in the widget, in device-independent pixels
+        """
+        ratio = self.devicePixelRatioF()
+        self.renderer.SetWorldPoint(*np.asarray(point, dtype=np.float64).tolist(), 1.0)
+        self.renderer.WorldToDisplay()
+        x, y, _ = self.renderer.GetDisplayPoint()
+        return QPointF(x / ratio, self.height() - 1 - y / ratio)
 
     def shut_down(self) -> None:
         """Stop the timers and free what is on the graphics card; nothing is drawn afterwards."""
@@ -116,6 +134,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         finally:
             self._vtk_interactor.EnableRenderOff()
             self._painting = False
+        self._settled = self.ren_win.GetMultiSamples() > 0
         self.n_painted += 1
         self.painted.emit(time.perf_counter() - start)
 

@@ -67,7 +67,7 @@ class PoseRenderer:
         if background is not None or transparent:
             self.scene.set_plain_background(background or "#ffffff")
         self._shower = PoseShower(model)
-        self._shader = Shader(model.attention_mask, model.domain_names, model.domain_colours, dark)
+        self._shader = Shader.of(model, dark)
         self._front = front_direction(model.reference, model.up_axis)
 
     def picture(

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PoseModel
 
 ColourArray = npt.NDArray[np.uint8]
 FloatArray = npt.NDArray[np.float64]
@@ -102,6 +105,11 @@ class Shader:
         self._dark = dark
         self._domains = mask_colours(attention_mask, domain_colours)
         self._leading = self._mask.argmax(axis=0)
+
+    @classmethod
+    def of(cls, model: PoseModel, dark: bool) -> Shader:
+        """Return the shader of a model, for a dark background or a light one."""
+        return cls(model.attention_mask, model.domain_names, model.domain_colours, dark)
 
     @property
     def skin(self) -> str:

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from app.document import PoseDocument
     from app.scene import Scene
     from app.turntable import Turntable
+    from lcollision_core.resolve import ResolveResult
 
 _ROOM = 1.15
 """How much larger than its first pose a body may grow before a limb leaves the view."""
@@ -78,7 +79,8 @@ class Viewport(QWidget):
         self._front = np.zeros(3)
         self._shown: LiveFrame | None = None
         self._pose_stale = self._colours_stale = self._crossing_stale = False
-        self._glide_next = self._place_camera = False
+        self._place_camera = False
+        self._glide_to: npt.NDArray[np.float64] | None = None
 
         self._layout = QStackedLayout(self)
         self._layout.setStackingMode(QStackedLayout.StackingMode.StackOne)
@@ -125,18 +127,24 @@ class Viewport(QWidget):
         return self._shown
 
     @property
-    def shown_vertices(self) -> Float32Array:
-        """(V, 3) float32 array that VTK draws, overwritten by each frame; for looking at."""
-        if self._scene is None:
-            return np.zeros((0, 3), dtype=np.float32)
-        return self._scene.surface.vertices
+    def canvas(self) -> Canvas | None:
+        """The widget that draws and takes the mouse; None before the first model is in."""
+        return self._canvas
 
     @property
-    def shown_colours(self) -> npt.NDArray[np.uint8]:
-        """(V, 3) uint8 array that VTK draws, likewise."""
-        if self._scene is None:
-            return np.zeros((0, 3), dtype=np.uint8)
-        return self._scene.surface.colours
+    def scene(self) -> Scene | None:
+        """What stands before the camera; likewise."""
+        return self._scene
+
+    @property
+    def hovered_domain(self) -> int | None:
+        """The domain under the pointer."""
+        return self._hovered
+
+    @property
+    def legend(self) -> Legend:
+        """What explains the colours now."""
+        return self._legend.legend
 
     @property
     def n_painted(self) -> int:
@@ -153,12 +161,11 @@ class Viewport(QWidget):
         """Whether what is on the screen is the newest pose, smooth, and nothing moves."""
         return (
             self._canvas is not None
-            and self._shown is self._document.frame
-            and not self._pose_stale
-            and not self._colours_stale
+            and self._shown is not None
+            and self._shown.latent is self._document.latent
             and not self._glide.is_running
             and not self._turn.is_running
-            and self._canvas.is_smooth
+            and self._canvas.is_settled
         )
 
     def set_shading(self, shading: Shading) -> None:
@@ -304,7 +311,7 @@ class Viewport(QWidget):
         super().changeEvent(event)
         if event.type() is QEvent.Type.PaletteChange and self._scene is not None:
             self._scene.set_dark(current_theme().is_dark)
-            self._make_shader()
+            self._shader = Shader.of(self._document.model, current_theme().is_dark)
             self._recolour()
 
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
@@ -343,7 +350,7 @@ class Viewport(QWidget):
         self._front = front_direction(model.reference, model.up_axis)
         self._tag.hide()
         self._legend.set_legend(Legend())
-        self._make_shader()
+        self._shader = Shader.of(self._document.model, current_theme().is_dark)
         self._shown = None
         self._highlight = self._hovered = None
         self._place_camera = True
@@ -378,8 +385,8 @@ class Viewport(QWidget):
         self._canvas.redraw()
 
     @Slot(object)
-    def _on_solve_finished(self, result: object) -> None:
-        self._glide_next = result is not None
+    def _on_solve_finished(self, result: ResolveResult | None) -> None:
+        self._glide_to = result.latent if result is not None else None
 
     # Drawing.
 
@@ -402,8 +409,7 @@ class Viewport(QWidget):
             self._put(scene, frame)
         if self._colours_stale:
             self._colours_stale = False
-            scene.paint(self._colours(frame))
-            self._explain(frame)
+            self._paint(scene, frame)
         if self._crossing_stale:
             self._crossing_stale = False
             exact = self._document.exact
@@ -411,7 +417,6 @@ class Viewport(QWidget):
             scene.show_crossing(exact.pairs if exact is not None and shown else None)
 
     def _put(self, scene: Scene, frame: LiveFrame) -> None:
-        before = self._shown
         self._shown = frame
         self._glide.stop()
         if self._place_camera:
@@ -419,51 +424,28 @@ class Viewport(QWidget):
             scene.show(frame.vertices, frame.normals)
             middle = frame.vertices.mean(axis=0)
             scene.view = self._preset("Three-quarter", middle + _ROOM * (frame.vertices - middle))
-        elif self._glide_next and before is not None:
-            self._glide_next = False
+        elif self._glide_to is not None and np.array_equal(self._glide_to, frame.latent):
             self._glide.begin(scene.surface.vertices.copy(), frame.vertices)
         else:
             scene.show(frame.vertices, frame.normals)
+        self._glide_to = None
         if self._shading is Shading.EXACT:
             self._crossing_stale = True
 
-    def _colours(self, frame: LiveFrame) -> npt.NDArray[np.uint8]:
+    def _paint(self, scene: Scene, frame: LiveFrame) -> None:
         assert self._shader is not None
-        return self._shader.colours(
-            self._shading, *self._energies(frame), highlight=self._highlight
-        )
-
-    def _energies(
-        self, frame: LiveFrame
-    ) -> tuple[npt.NDArray[np.float64] | None, npt.NDArray[np.float64] | None]:
         predicted, exact = frame.prediction, self._document.exact
-        return (
+        energies = (
             predicted.domain_energy if predicted is not None else None,
             exact.vertex_energy if exact is not None else None,
         )
-
-    def _explain(self, frame: LiveFrame) -> None:
-        assert self._shader is not None
-        self._legend.set_legend(
-            self._shader.legend(
-                self._shading,
-                *self._energies(frame),
-                has_predictor=self._document.model.predictor is not None,
-            )
-        )
+        scene.paint(self._shader.colours(self._shading, *energies, highlight=self._highlight))
+        has_predictor = self._document.model.predictor is not None
+        self._legend.set_legend(self._shader.legend(self._shading, *energies, has_predictor))
         self._place_legend()
 
     def _place_legend(self) -> None:
         self._legend.move(NORMAL, self.height() - self._legend.height() - NORMAL)
-
-    def _make_shader(self) -> None:
-        model = self._document.model
-        self._shader = Shader(
-            model.attention_mask,
-            model.domain_names,
-            model.domain_colours,
-            current_theme().is_dark,
-        )
 
     def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
         aspect = self.width() / max(1, self.height())

@@ -1,0 +1,159 @@
+"""Colours: what each says, that equal steps look equal, and that colour-blind eyes tell them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.shading import (
+    COLLIDING_FACE,
+    FULL_EXACT,
+    FULL_PREDICTED,
+    Shader,
+    Shading,
+    mask_colours,
+    ramp,
+    rgb,
+)
+from lcollision_core.model.colours import cielab
+
+NAMES = ("arm", "leg")
+COLOURS = ("#0077bb", "#e69f00")
+MASK = np.array([[1.0, 0.75, 0.5, 0.0], [0.0, 0.25, 0.5, 1.0]], dtype=np.float32)
+FULL_SIGHT = np.eye(3)
+RED_BLIND = np.array(
+    [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ]
+)
+GREEN_BLIND = np.array(
+    [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ]
+)
+BLUE_BLIND = np.array(
+    [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ]
+)
+"""Machado, Oliveira and Fernandes 2009, severity 1."""
+
+
+@pytest.fixture(params=[False, True], ids=["light", "dark"])
+def shader(request: pytest.FixtureRequest) -> Shader:
+    return Shader(MASK, NAMES, COLOURS, dark=request.param)
+
+
+def ramps(shader: Shader) -> list[list[str]]:
+    energy = np.zeros(2), np.zeros(4)
+    return [
+        list(shader.legend(shading, *energy).ramp) for shading in (Shading.PREDICTED, Shading.EXACT)
+    ]
+
+
+def test_a_domain_owns_white_to_its_full_colour() -> None:
+    colours = mask_colours(np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5]]), ("#000000", "#e69f00"))
+    assert colours.dtype == np.uint8
+    assert colours.tolist() == [[0, 0, 0], [0xE6, 0x9F, 0], [128, 128, 128]]
+
+
+def test_plain_is_one_colour(shader: Shader) -> None:
+    assert (shader.colours(Shading.PLAIN) == rgb(shader.skin)).all()
+
+
+def test_an_unknown_energy_is_plain_and_says_so(shader: Shader) -> None:
+    for shading in (Shading.PREDICTED, Shading.EXACT):
+        assert (shader.colours(shading) == rgb(shader.skin)).all()
+        legend = shader.legend(shading)
+        assert legend.title
+        assert legend.note
+        assert not legend.ramp
+    assert "no predictor" in shader.legend(Shading.PREDICTED, has_predictor=False).note
+
+
+def test_predicted_energy_is_spread_by_the_masks(shader: Shader) -> None:
+    ramp_colours = np.array([rgb(colour) for colour in ramps(shader)[0]])
+    energy = np.array([0.64 * FULL_PREDICTED**2, 0.0])
+    colours = shader.colours(Shading.PREDICTED, energy)
+    place = np.sqrt(0.64 * MASK[0]) * 255
+    assert (colours == ramp_colours[place.astype(int)]).all()
+    assert (colours[3] == rgb(shader.skin)).all()
+
+
+def test_exact_energy_is_each_vertex_own_and_stops_at_full(shader: Shader) -> None:
+    ramp_colours = np.array([rgb(colour) for colour in ramps(shader)[1]])
+    energy = FULL_EXACT**2 * np.array([0.0, 0.25, 1.0, 100.0])
+    colours = shader.colours(Shading.EXACT, None, energy)
+    assert (colours[[0, 2, 3]] == ramp_colours[[0, 255, 255]]).all()
+    assert (colours[1] == ramp_colours[127]).all()
+
+
+def test_a_highlight_brings_out_its_domain_and_dims_the_rest(shader: Shader) -> None:
+    plain = shader.colours(Shading.DOMAINS)
+    lit = shader.colours(Shading.DOMAINS, highlight=0)
+    assert (lit[0] == rgb(COLOURS[0])).all()
+    skin = rgb(shader.skin).astype(float)
+    before = np.abs(plain[3] - skin).sum()
+    assert 0 < np.abs(lit[3] - skin).sum() < 0.6 * before
+
+
+def test_colours_do_not_change_what_they_are_made_of(shader: Shader) -> None:
+    energy, vertex_energy = np.array([1e-4, 1e-5]), np.full(4, 1e-6)
+    for shading in Shading:
+        first = shader.colours(shading, energy, vertex_energy).copy()
+        shader.colours(shading, energy, vertex_energy, highlight=1)
+        assert (shader.colours(shading, energy, vertex_energy) == first).all()
+
+
+def test_every_step_of_a_scale_looks_alike(shader: Shader) -> None:
+    for colours in ramps(shader):
+        lab = np.array([cielab(colour) for colour in colours[::15]])
+        steps = np.linalg.norm(np.diff(lab, axis=0), axis=1)
+        # CIELAB and Oklab disagree a little about what looks alike.
+        assert steps.max() < 2.5 * steps.min()
+
+
+@pytest.mark.parametrize("sight", [FULL_SIGHT, RED_BLIND, GREEN_BLIND, BLUE_BLIND])
+def test_more_energy_is_darker_to_all_eyes(shader: Shader, sight: np.ndarray) -> None:
+    for colours in ramps(shader):
+        lightness = np.array([cielab(colour, sight)[0] for colour in colours[::5]])
+        assert (np.diff(lightness) < 0).all()
+        assert lightness[0] - lightness[-1] > 45
+
+
+@pytest.mark.parametrize("sight", [FULL_SIGHT, RED_BLIND, GREEN_BLIND, BLUE_BLIND])
+def test_intersecting_faces_stand_out_from_the_exact_scale(
+    shader: Shader, sight: np.ndarray
+) -> None:
+    red = cielab(COLLIDING_FACE, sight)
+    away = [np.linalg.norm(cielab(colour, sight) - red) for colour in ramps(shader)[1]]
+    assert min(away) > 20
+
+
+def test_a_scale_begins_and_ends_in_its_colours_and_is_not_to_be_written() -> None:
+    colours = ramp(("#ffffff", "#ff0000", "#000000"))
+    assert colours.shape == (256, 3)
+    assert colours[[0, -1]].tolist() == [[255, 255, 255], [0, 0, 0]]
+    assert np.abs(colours.astype(int) - [255, 0, 0]).sum(axis=1).min() < 12
+    with pytest.raises(ValueError, match="read-only"):
+        colours[0] = 0
+
+
+def test_legends_name_what_is_drawn(shader: Shader) -> None:
+    assert shader.legend(Shading.PLAIN).title == ""
+    domains = shader.legend(Shading.DOMAINS)
+    assert domains.swatches == (("arm", "#0077bb"), ("leg", "#e69f00"))
+    exact = shader.legend(Shading.EXACT, None, np.zeros(4))
+    assert exact.swatches == (("intersecting triangles", COLLIDING_FACE),)
+    assert [place for place, _ in exact.ticks] == [0.0, 0.5, 1.0]
+    assert exact.ticks[1][1] == "0.3"
+
+
+def test_a_vertex_belongs_to_the_domain_that_owns_most(shader: Shader) -> None:
+    assert [shader.leading_domain(vertex) for vertex in (0, 1, 3)] == [0, 0, 1]

@@ -1,0 +1,441 @@
+"""The viewport in a real window: what is drawn, what the mouse says, and what is left behind."""
+
+from __future__ import annotations
+
+import gc
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+from PySide6.QtCore import QEvent, QPoint, Qt, QTimer
+from PySide6.QtGui import QImage
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from app.camera import CAMERAS
+from app.canvas import Canvas
+from app.document import PoseDocument
+from app.shading import Shading, rgb
+from app.theme import DARK, LIGHT, apply_theme
+from app.viewport import Viewport
+from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.model import PoseModel, sample_poses
+
+SIDE = 420
+
+
+@pytest.fixture(scope="module")
+def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
+    return sample_poses(editor_model, 1, 0, colliding=True)[0]
+
+
+@pytest.fixture
+def viewport(qtbot: QtBot, document: PoseDocument) -> Iterator[Viewport]:
+    apply_theme(QApplication.instance(), LIGHT)
+    shown = Viewport(document)
+    shown.resize(SIDE, SIDE)
+    shown.show()
+    rest(qtbot, shown)
+    yield shown
+    dispose(shown)
+
+
+def dispose(shown: Viewport) -> None:
+    shown.shut_down()
+    shown.close()
+    shown.deleteLater()
+    QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
+
+
+def rest(qtbot: QtBot, viewport: Viewport) -> None:
+    """Wait until the smooth picture of the newest pose is on the screen."""
+    qtbot.waitUntil(lambda: viewport.is_at_rest, timeout=20_000)
+    # Qt hands the picture to the screen after it is drawn.
+    qtbot.wait(30)
+
+
+def pixels(viewport: Viewport) -> npt.NDArray[np.int64]:
+    """Return what the screen shows of the viewport, (SIDE, SIDE, 3)."""
+    QApplication.processEvents()
+    image = viewport.screen().grabWindow(viewport.winId()).toImage()
+    image = image.convertToFormat(QImage.Format.Format_RGB888)
+    rows = np.frombuffer(image.constBits(), dtype=np.uint8).reshape(image.height(), -1)
+    return rows[:, : 3 * image.width()].reshape(image.height(), image.width(), 3).astype(int)
+
+
+def changed(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    return np.abs(after - before).sum(axis=2) > 24
+
+
+def place_of(viewport: Viewport, vertex: int) -> QPoint:
+    assert viewport.canvas is not None
+    assert viewport.scene is not None
+    return viewport.canvas.place_of(viewport.scene.surface.vertices[vertex]).toPoint()
+
+
+def seen_vertex(viewport: Viewport, domain: int) -> int:
+    """Return a vertex of a domain that nothing hides."""
+    assert viewport.canvas is not None
+    assert viewport.scene is not None
+    mask = viewport._document.model.attention_mask
+    for vertex in np.argsort(-mask[domain]):
+        place = viewport.canvas.place_of(viewport.scene.surface.vertices[vertex])
+        if viewport.canvas.pick_vertex(place, viewport.scene.body) == vertex:
+            return int(vertex)
+    raise AssertionError("no vertex of the domain is seen")
+
+
+def test_before_the_model_there_is_a_page_that_says_so(
+    qtbot: QtBot, editor_model: PoseModel
+) -> None:
+    document = PoseDocument()
+    shown = Viewport(document)
+    shown.resize(SIDE, SIDE)
+    shown.show()
+    qtbot.waitExposed(shown)
+    document.busy_changed.emit("Opening body")
+    qtbot.wait(50)
+    first = pixels(shown)
+    qtbot.wait(150)
+    assert changed(first, pixels(shown)).any(), "nothing turns"
+    assert not shown.is_ready
+    with pytest.raises(LCollisionError, match="not on the screen yet"):
+        shown.screenshot("never.png", 10, 10, transparent=True)
+    document.set_model(editor_model)
+    rest(qtbot, shown)
+    assert shown.is_ready
+    assert document.close()
+    dispose(shown)
+    document.deleteLater()
+
+
+def test_a_pose_is_drawn_in_place(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
+) -> None:
+    assert viewport.scene is not None
+    surface = viewport.scene.surface
+    arrays = surface.vertices, surface.normals, surface.colours
+    before = pixels(viewport)
+    document.set_latent(colliding, "Jump")
+    rest(qtbot, viewport)
+    frame = document.frame
+    assert frame is not None
+    assert (surface.vertices == frame.vertices).all()
+    assert (surface.normals == frame.normals).all()
+    after = (surface.vertices, surface.normals, surface.colours)
+    assert all(a is b for a, b in zip(arrays, after, strict=True))
+    moved = changed(before, pixels(viewport))
+    assert moved.sum() > 500
+    assert not moved[:10].any(), "the sky moved"
+
+
+def test_after_many_frames_the_last_is_shown_and_few_are_drawn(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport
+) -> None:
+    painted = viewport.n_painted
+    for value in np.linspace(-1.0, 1.0, 200):
+        document.set_code(0, float(value))
+        QApplication.processEvents()
+    rest(qtbot, viewport)
+    assert viewport.scene is not None
+    expected = document.model.decode(document.latent).astype(np.float32)
+    assert document.latent[0] == 1.0
+    assert (viewport.scene.surface.vertices == expected).all()
+    assert viewport.n_painted - painted < 202
+
+
+def test_a_highlight_lights_its_domain_and_leaves_no_trace(
+    qtbot: QtBot, viewport: Viewport
+) -> None:
+    model = viewport._document.model
+    plain = pixels(viewport)
+    viewport.highlight_domain(1)
+    rest(qtbot, viewport)
+    lit = changed(plain, pixels(viewport))
+    own, other = (place_of(viewport, seen_vertex(viewport, domain)) for domain in (1, 0))
+    assert lit[own.y() - 1 : own.y() + 2, own.x() - 1 : own.x() + 2].any()
+    assert not lit[other.y(), other.x()]
+    assert viewport.scene is not None
+    strongest = int(model.attention_mask[1].argmax())
+    difference = viewport.scene.surface.colours[strongest].astype(int) - rgb(
+        model.domain_colours[1]
+    )
+    assert np.abs(difference).max() < 60
+    viewport.highlight_domain(None)
+    rest(qtbot, viewport)
+    assert not changed(plain, pixels(viewport)).any()
+
+
+def test_each_shading_looks_different_and_explains_itself(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
+) -> None:
+    document.set_latent(colliding, "Jump")
+    rest(qtbot, viewport)
+    qtbot.waitUntil(lambda: document.exact is not None)
+    seen = []
+    told: list[Shading] = []
+    viewport.shading_changed.connect(told.append)
+    for shading in (Shading.DOMAINS, Shading.PREDICTED, Shading.EXACT, Shading.PLAIN):
+        viewport.set_shading(shading)
+        rest(qtbot, viewport)
+        assert bool(viewport.legend.title) == (shading is not Shading.PLAIN)
+        seen.append(pixels(viewport))
+    assert told == [Shading.DOMAINS, Shading.PREDICTED, Shading.EXACT, Shading.PLAIN]
+    for first in range(4):
+        for second in range(first):
+            assert changed(seen[first], seen[second]).sum() > 50
+
+
+def test_intersecting_faces_are_red_while_the_truth_is_known(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
+) -> None:
+    viewport.set_shading(Shading.EXACT)
+    document.set_latent(colliding, "Jump")
+    qtbot.waitUntil(lambda: document.exact is not None)
+    rest(qtbot, viewport)
+    exact, scene = document.exact, viewport.scene
+    assert exact is not None
+    assert scene is not None
+    assert scene.n_crossing == len(np.unique(exact.pairs)) > 0
+
+    def n_red() -> int:
+        colours = pixels(viewport)
+        red, green, blue = np.moveaxis(colours, 2, 0)
+        return int(((red > 110) & (green < 0.45 * red) & (blue < 0.45 * red)).sum())
+
+    n_while_colliding = n_red()
+    document.undo_stack.undo()
+    rest(qtbot, viewport)
+    qtbot.waitUntil(lambda: document.exact is not None)
+    assert document.exact is not None
+    assert not document.exact.colliding
+    rest(qtbot, viewport)
+    assert scene.n_crossing == 0
+    assert n_red() < n_while_colliding - 20
+
+
+def test_the_pointer_names_the_domain_beneath_it(qtbot: QtBot, viewport: Viewport) -> None:
+    assert viewport.canvas is not None
+    told: list[int | None] = []
+    viewport.domain_hovered.connect(told.append)
+    for domain in (0, 1):
+        place = place_of(viewport, seen_vertex(viewport, domain))
+        QTest.mouseMove(viewport.canvas, place)
+        qtbot.waitUntil(lambda domain=domain: viewport.hovered_domain == domain)
+    QTest.mouseMove(viewport.canvas, QPoint(3, 3))
+    qtbot.waitUntil(lambda: viewport.hovered_domain is None)
+    assert told[-3:] == [0, 1, None]
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_each_camera_shows_the_whole_body(qtbot: QtBot, viewport: Viewport, name: str) -> None:
+    assert viewport.canvas is not None
+    assert viewport.scene is not None
+    viewport.set_camera(name, glide=False)
+    rest(qtbot, viewport)
+    places = [viewport.canvas.place_of(vertex) for vertex in viewport.scene.surface.vertices]
+    x = np.array([place.x() for place in places])
+    y = np.array([place.y() for place in places])
+    assert x.min() > 0
+    assert x.max() < SIDE
+    assert y.min() > 0
+    assert y.max() < SIDE
+    assert max(np.ptp(x), np.ptp(y)) > 0.4 * SIDE
+
+
+def test_a_camera_is_turned_to_by_degrees_and_arrives(qtbot: QtBot, viewport: Viewport) -> None:
+    viewport.set_camera("Back", glide=False)
+    assert viewport.view is not None
+    back = viewport.view
+    viewport.set_camera("Front")
+    assert viewport.view is not None
+    rest(qtbot, viewport)
+    arms = [view.position - view.focus for view in (back, viewport.view)]
+    directions = [arm / np.linalg.norm(arm) for arm in arms]
+    np.testing.assert_allclose(directions[0], -directions[1], atol=1e-6)
+
+
+def test_the_mouse_turns_the_camera_upright_and_keys_do_nothing(
+    qtbot: QtBot, viewport: Viewport
+) -> None:
+    canvas = viewport.canvas
+    assert canvas is not None
+    assert viewport.view is not None
+    before = viewport.view
+    QTest.mousePress(canvas, Qt.MouseButton.LeftButton, pos=QPoint(200, 200))
+    QTest.mouseMove(canvas, QPoint(240, 215))
+    QTest.mouseMove(canvas, QPoint(280, 230))
+    QTest.mouseRelease(canvas, Qt.MouseButton.LeftButton, pos=QPoint(280, 230))
+    rest(qtbot, viewport)
+    turned = viewport.view
+    assert np.linalg.norm(turned.position - before.position) > 1.0
+    np.testing.assert_allclose(turned.up, before.up)
+    up = viewport._document.model.up_axis
+    assert turned.up[up] == 1.0
+    picture = pixels(viewport)
+    canvas.setFocus()
+    for key in "wsrpfe3":
+        QTest.keyClick(canvas, key)
+    qtbot.wait(300)
+    assert not changed(picture, pixels(viewport)).any()
+
+
+def test_resolve_glides_to_the_new_pose_and_leaves_a_ghost(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
+) -> None:
+    document.set_latent(colliding, "Jump")
+    rest(qtbot, viewport)
+    scene = viewport.scene
+    assert scene is not None
+    start = scene.surface.vertices.copy()
+    between: list[npt.NDArray[np.float32]] = []
+    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
+        document.resolve()
+    viewport.painted.connect(lambda _: between.append(scene.surface.vertices.copy()))
+    rest(qtbot, viewport)
+    assert document.frame is not None
+    end = document.frame.vertices
+    assert (scene.surface.vertices == end).all()
+    assert not (start == end).all()
+    gone = [np.abs(pose - start).max() / np.abs(end - start).max() for pose in between]
+    assert sum(0.01 < share < 0.99 for share in gone) >= 2
+    assert gone == sorted(gone)
+    assert scene.ghost_shown
+    with_ghost = pixels(viewport)
+    document.show_ghost(False)
+    rest(qtbot, viewport)
+    assert not scene.ghost_shown
+    assert changed(with_ghost, pixels(viewport)).any()
+    document.undo_stack.undo()
+    rest(qtbot, viewport)
+    assert scene.surface.vertices.tobytes() == start.tobytes()
+
+
+def test_a_screenshot_has_its_size_and_is_cut_out(viewport: Viewport, tmp_path: Path) -> None:
+    path = tmp_path / "cut out.png"
+    viewport.screenshot(path, 300, 200, transparent=True)
+    alpha = np.asarray(Image.open(path))[:, :, 3]
+    assert alpha.shape == (200, 300)
+    assert alpha[0].max() == alpha[:, 0].max() == 0
+    assert 0.01 < (alpha == 255).mean() < 0.5
+    opaque = tmp_path / "opaque.png"
+    viewport.screenshot(opaque, 800, 600, transparent=False)
+    with Image.open(opaque) as image:
+        assert (image.size, image.mode) == ((800, 600), "RGB")
+    with pytest.raises(MeshFileError, match="missing"):
+        viewport.screenshot(tmp_path / "missing" / "x.png", 30, 20, transparent=True)
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_a_turntable_goes_round_once(
+    qtbot: QtBot, viewport: Viewport, tmp_path: Path, suffix: str
+) -> None:
+    path = tmp_path / f"turn{suffix}"
+    film = viewport.turntable(path, seconds=0.32, width=90, height=120)
+    with qtbot.waitSignal(film.finished, timeout=20_000) as finished:
+        assert film.is_running
+    assert finished.args == [path]
+    with Image.open(path) as image:
+        assert image.size == (90, 120)
+        assert image.n_frames == 8
+        frames = []
+        for number in range(8):
+            image.seek(number)
+            frames.append(np.asarray(image.convert("RGB"), dtype=int))
+    difference = [np.abs(frame - frames[0]).mean() for frame in frames]
+    assert min(difference[1:]) > 0
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_cancelled_turntable_leaves_no_file(
+    qtbot: QtBot, viewport: Viewport, tmp_path: Path
+) -> None:
+    film = viewport.turntable(tmp_path / "turn.gif", seconds=4.0, width=60, height=60)
+    qtbot.waitSignal(film.progressed).wait()
+    with qtbot.waitSignal(film.finished) as finished:
+        film.cancel()
+    assert finished.args == [None]
+    assert not film.is_running
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_turntable_of_another_kind_is_refused(viewport: Viewport, tmp_path: Path) -> None:
+    with pytest.raises(MeshFileError, match=r"turn\.avi .* \.gif or \.webp"):
+        viewport.turntable(tmp_path / "turn.avi")
+
+
+def test_the_theme_changes_what_is_behind_and_not_the_pose(
+    qtbot: QtBot, viewport: Viewport
+) -> None:
+    light = pixels(viewport)
+    apply_theme(QApplication.instance(), DARK)
+    rest(qtbot, viewport)
+    dark = pixels(viewport)
+    assert light[3, 3].mean() > 200
+    assert dark[3, 3].mean() < 90
+    apply_theme(QApplication.instance(), LIGHT)
+    rest(qtbot, viewport)
+    assert not changed(light, pixels(viewport)).any()
+
+
+def test_another_model_takes_the_place_of_the_first(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport
+) -> None:
+    old = viewport.canvas
+    document.set_model(document.model)
+    rest(qtbot, viewport)
+    assert viewport.canvas is not old
+    assert viewport.is_ready
+    QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
+    assert len(viewport.findChildren(Canvas)) == 1
+
+
+def test_nothing_is_drawn_at_rest(qtbot: QtBot, viewport: Viewport) -> None:
+    painted = viewport.n_painted
+    qtbot.wait(500)
+    assert viewport.n_painted == painted
+    assert [timer for timer in viewport.findChildren(QTimer) if timer.isActive()] == []
+
+
+def vtk_objects() -> list[str]:
+    gc.collect()
+    return sorted(
+        type(thing).__name__
+        for thing in gc.get_objects()
+        if str(type(thing).__module__).startswith(("vtkmodules", "pyvista")) and not callable(thing)
+    )
+
+
+def test_a_closed_viewport_leaves_no_vtk_object_no_timer_and_no_thread(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    def show_and_close() -> int:
+        shown = Viewport(document)
+        shown.resize(SIDE, SIDE)
+        shown.show()
+        rest(qtbot, shown)
+        shown.screenshot(tmp_path / "shot.png", 50, 50, transparent=True)
+        shown.turntable(tmp_path / "cut.gif", width=50, height=50)
+        shown.set_camera("Back")
+        n_alive = len(vtk_objects())
+        dispose(shown)
+        assert [timer for timer in shown_timers(shown) if timer.isActive()] == []
+        return n_alive
+
+    def shown_timers(shown: Viewport) -> list[QTimer]:
+        try:
+            return shown.findChildren(QTimer)
+        except RuntimeError:
+            return []
+
+    # The first window makes what all windows share.
+    show_and_close()
+    before = vtk_objects()
+    assert show_and_close() > len(before) + 20
+    assert vtk_objects() == before
+    assert [thread.name for thread in threading.enumerate() if thread.name == "turntable"] == []
