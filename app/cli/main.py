@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from app.cli import benchmark, check, dataset, evaluate, label, models, poses, train
+from app.cli import benchmark, check, dataset, evaluate, label, models, poses, resolve, train
 from app.cli.console import ExitStatus
 from lcollision_core.errors import CancelledError, LCollisionError
 
@@ -84,6 +84,7 @@ app.command("check")(check.check)
 app.command("encode")(poses.encode)
 app.command("decode")(poses.decode)
 app.command("sample")(poses.sample)
+app.command("resolve")(resolve.resolve)
 app.command("label")(label.label)
 app.command("evaluate")(evaluate.evaluate)
 app.add_typer(dataset.app, name="dataset")

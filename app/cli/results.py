@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lcollision_core.errors import LCollisionError, MeshFileError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    import numpy.typing as npt
 
     from lcollision_core.model import NamedPose, PoseModel
 
@@ -43,7 +45,11 @@ def require_output(path: Path, suffix: str) -> None:
 
 
 def write_result(
-    output: Path, model: PoseModel, poses: Sequence[NamedPose], mesh_format: MeshFormat
+    output: Path,
+    model: PoseModel,
+    poses: Sequence[NamedPose],
+    mesh_format: MeshFormat,
+    vertices: Sequence[npt.NDArray[Any] | None] | None = None,
 ) -> None:
     """Write poses as a .json file, one pose as a mesh, or each as a mesh of a folder.
 
@@ -53,6 +59,7 @@ def write_result(
     model : of the poses
     poses : a pose with a placement returns to it
     mesh_format : of the meshes in a folder
+    vertices : of each pose, (V, 3) to write in the place of what it decodes to, or None
 
     Raises
     ------
@@ -86,11 +93,13 @@ def write_result(
             raise MeshFileError(
                 f"the folder {output} cannot be made: {error.strerror or error}; name another"
             ) from error
-    for file, pose in zip(files, poses, strict=True):
-        vertices = model.decode(pose.latent)
-        if pose.placement is not None:
-            vertices = pose.placement.apply(vertices)
-        write_mesh(file, vertices, model.faces)
+    given = [None] * len(poses) if vertices is None else vertices
+    for file, pose, mesh in zip(files, poses, given, strict=True):
+        if mesh is None:
+            mesh = model.decode(pose.latent)
+            if pose.placement is not None:
+                mesh = pose.placement.apply(mesh)
+        write_mesh(file, mesh, model.faces)
 
 
 def _file_names(poses: Sequence[NamedPose]) -> list[str]:

@@ -22,6 +22,7 @@ from lcollision_core.resolve.ladder import Ladder
 from lcollision_core.resolve.metric import LatentMetric
 from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult
 from lcollision_core.resolve.problem import CollisionModel, ResolveProblem, Watch
+from lcollision_core.resolve.threads import single_torch_thread
 
 
 class PoseResolver:
@@ -104,7 +105,8 @@ class PoseResolver:
             progress,
             remark if outside else None,
         )
-        return ladder.climb() if chosen.verify else ladder.solve_only()
+        with single_torch_thread():
+            return ladder.climb() if chosen.verify else ladder.solve_only()
 
     def resolve_many(
         self,

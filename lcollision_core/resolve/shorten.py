@@ -9,9 +9,9 @@ from lcollision_core.resolve.contacts import Contacts
 from lcollision_core.resolve.exact import ExactCheck
 from lcollision_core.resolve.problem import ResolveProblem
 
-FIRST_HALVINGS = 4
-SLIDES = 8
-_SLIDE_HALVINGS = 2
+FIRST_HALVINGS = 3
+SLIDES = 5
+_SLIDE_HALVINGS = 1
 _SETTLED = 0.01
 """Share of the distance that a further slide must promise."""
 

@@ -1,0 +1,349 @@
+"""``lcollision resolve``: the nearest poses that are free of self-collisions, proved exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli.console import ExitStatus, counted, note, print_json, progress_bar
+from app.cli.interrupt import cancel_on_interrupt
+from app.cli.models import ModelArgument
+from app.cli.results import MeshFormat, write_result
+from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.resolve import ResolveResult
+
+_FIELDS = (
+    "solver_status",
+    "predicted_free",
+    "exactly_free",
+    "step",
+    "energy_before",
+    "energy_after",
+    "pairs_before",
+    "pairs_after",
+    "latent_distance",
+    "vertex_distance_mean",
+    "vertex_distance_max",
+    "iterations",
+    "evaluations",
+    "seconds",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """One pose to resolve: where it came from, and the mesh that it was encoded from or None."""
+
+    source: str
+    pose: NamedPose
+    mesh: npt.NDArray[np.float64] | None = None
+
+
+def resolve(
+    model_name: ModelArgument,
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="POSES|MESH...", readable=False, help="Files of poses, or meshes to encode."
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="OUT",
+            help="A .json file, a mesh file for one pose, a folder for several.",
+        ),
+    ],
+    solver: Annotated[
+        str, typer.Option(metavar="NAME", help="sqp, auglag (the paper's), slsqp or ccsaq.")
+    ] = "sqp",
+    metric: Annotated[
+        str, typer.Option(metavar="eye|latent", help="What is kept small: moves seen, or codes.")
+    ] = "eye",
+    threshold: Annotated[
+        float,
+        typer.Option(metavar="P", help="Probability up to which a pose is predicted free."),
+    ] = 0.5,
+    margin: Annotated[
+        float | None,
+        typer.Option(metavar="X", help="How far below the threshold's logit to go at first."),
+    ] = None,
+    lock: Annotated[
+        list[str] | None,
+        typer.Option(metavar="DOMAIN", help="A domain, by name or number, that keeps its codes."),
+    ] = None,
+    weight: Annotated[
+        list[str] | None,
+        typer.Option(metavar="DOMAIN=W", help="Let a move of this domain cost W times as much."),
+    ] = None,
+    sequence: Annotated[
+        bool, typer.Option("--sequence", help="The poses are frames of a motion, in order.")
+    ] = False,
+    keep_detail: Annotated[
+        bool,
+        typer.Option("--keep-detail", help="Give meshes back what encoding lost, if still free."),
+    ] = False,
+    no_verify: Annotated[
+        bool, typer.Option("--no-verify", help="Stop at the solver's answer, unchecked.")
+    ] = False,
+    time_budget: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="For each pose, then straight to the last step."),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one for each core."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the solver's starts.")] = 0,
+    mesh_format: Annotated[
+        MeshFormat, typer.Option("--format", help="Of the meshes in a folder.")
+    ] = MeshFormat.OBJ,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+) -> None:
+    """Move poses to the nearest ones that are free of self-collisions.
+
+    Exits with 0 when every pose ends free by the exact check (with --no-verify: by the
+    prediction), with 1 when one does not. A pose that is free already comes back unchanged.
+    """
+    import numpy as np
+
+    from lcollision_core.model import PoseModel
+    from lcollision_core.resolve import ResolveOptions, largest_correction_change
+
+    model = PoseModel.load(model_name)
+    options = ResolveOptions(
+        solver=solver,
+        metric=metric,
+        threshold=threshold,
+        margin=margin,
+        locked_domains=frozenset(_domain(model, name) for name in lock or ()),
+        group_weights=_group_weights(model, weight or ()),
+        time_budget=time_budget,
+        verify=not no_verify,
+        seed=seed,
+    )
+    resolver = model.resolver
+    if keep_detail and output.suffix.lower() == ".json":
+        raise LCollisionError(
+            f"{output} would hold codes, which have no room for --keep-detail; name a mesh or a "
+            f"folder"
+        )
+    _require_room(output)
+    requests, failed = _read(model, inputs)
+    if not requests:
+        raise typer.Exit(ExitStatus.BAD_INPUT)
+    if len(requests) > 1 and output.suffix.lower() not in {"", ".json"} and not output.is_dir():
+        raise LCollisionError(
+            f"{output} is one mesh, but there are {len(requests)} poses; name a folder"
+        )
+    finished: dict[int, ResolveResult] = {}
+    try:
+        with cancel_on_interrupt() as cancel, progress_bar("Resolving poses") as progress:
+            resolver.resolve_many(
+                np.array([request.pose.latent for request in requests]),
+                options,
+                workers,
+                progress,
+                cancel,
+                placements=[request.pose.placement for request in requests],
+                sequence=sequence,
+                keep=finished.__setitem__,
+            )
+    except CancelledError:
+        if finished:
+            _write(output, model, requests, finished, mesh_format, keep_detail)
+            note(f"stopped; {output} has {len(finished)} of {counted(len(requests), 'pose')}")
+        raise
+    _write(output, model, requests, finished, mesh_format, keep_detail)
+    results = [finished[place] for place in range(len(requests))]
+    _report(requests, results, as_json)
+    if sequence:
+        before = np.array([request.pose.latent for request in requests])
+        change = largest_correction_change(model.embedding, before, results)
+        note(
+            f"from frame to frame the correction changes by at most {100.0 * change:.3f} % of "
+            f"the height, in the mean over vertices"
+        )
+    if failed:
+        raise typer.Exit(ExitStatus.BAD_INPUT)
+    if not all(_ended_free(result) for result in results):
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+
+
+def _ended_free(result: ResolveResult) -> bool:
+    return result.predicted_free if result.exactly_free is None else result.exactly_free
+
+
+def _domain(model: PoseModel, name: str) -> int:
+    """Find a domain by its name, or by its number from 1."""
+    names = [known.casefold() for known in model.domain_names]
+    if name.casefold() in names:
+        return names.index(name.casefold())
+    if name.isdecimal() and 1 <= int(name) <= len(names):
+        return int(name) - 1
+    raise LCollisionError(
+        f"{model.name} has no domain {name!r}; its domains are {', '.join(model.domain_names)}, "
+        f"or 1 to {len(names)}"
+    )
+
+
+def _group_weights(model: PoseModel, wanted: Sequence[str]) -> tuple[float, ...] | None:
+    """Read DOMAIN=W options; the whole body's codes keep the weight 1."""
+    if not wanted:
+        return None
+    weights = [1.0] * (1 + len(model.domain_names))
+    for entry in wanted:
+        name, equals, number = entry.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = float("nan")
+        if not equals or not 0.0 < value < float("inf"):
+            raise LCollisionError(
+                f"--weight {entry!r} is not DOMAIN=W with a number W above 0, as in 'left arm=5'"
+            )
+        weights[1 + _domain(model, name)] = value
+    return tuple(weights)
+
+
+def _require_room(output: Path) -> None:
+    """Refuse an output that cannot be written before the work for it is done."""
+    from lcollision_core.meshes import WRITABLE_SUFFIXES, require_writable
+
+    known = (*WRITABLE_SUFFIXES, ".json")
+    if output.is_dir():
+        require_writable(output / f"pose.{MeshFormat.OBJ}")
+    elif not output.suffix or output.suffix.lower() in known:
+        require_writable(output)
+    else:
+        raise LCollisionError(
+            f"{output} cannot be written: {output.suffix} is no format known here; use one of "
+            f"{', '.join(known)} or a folder"
+        )
+
+
+def _read(model: PoseModel, inputs: Sequence[Path]) -> tuple[list[_Request], bool]:
+    """Read and encode what can be; say of each other input in a sentence why it cannot."""
+    from lcollision_core.model import unique_names
+
+    requests: list[_Request] = []
+    failed = False
+    with progress_bar("Reading poses") as progress:
+        for done, path in enumerate(inputs):
+            try:
+                requests += _requests_of(model, path)
+            except LCollisionError as error:
+                note(str(error))
+                failed = True
+            progress(done + 1, len(inputs))
+    names = unique_names(request.pose.name for request in requests)
+    named = [
+        replace(request, pose=replace(request.pose, name=name))
+        for request, name in zip(requests, names, strict=True)
+    ]
+    return named, failed
+
+
+def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
+    from lcollision_core.meshes import read_mesh
+    from lcollision_core.model import NamedPose, read_poses
+
+    if path.suffix.lower() == ".json":
+        poses = read_poses(path, model)
+        if not poses:
+            raise ModelFileError(f"{path} has no poses in it; name a file that has some")
+        for pose in poses:
+            yield _Request(f"{path}: {pose.name}", pose)
+        return
+    mesh = read_mesh(path, topology=model.topology)
+    model.require_topology(mesh.topology, str(path))
+    try:
+        encoded = model.encode(mesh.vertices)
+    except LCollisionError as error:
+        raise MeshFileError(f"{path} cannot be encoded: {error}") from error
+    pose = NamedPose.of_mesh(path.stem, encoded)
+    note(
+        f"{path} is encoded with a fit error of {100.0 * encoded.fit_error_mean:.3f} % of the "
+        f"height, at most {100.0 * encoded.fit_error_max:.2f} %"
+    )
+    yield _Request(str(path), pose, mesh.vertices)
+
+
+def _write(
+    output: Path,
+    model: PoseModel,
+    requests: Sequence[_Request],
+    finished: dict[int, ResolveResult],
+    mesh_format: MeshFormat,
+    keep_detail: bool,
+) -> None:
+    """Write what is finished, in the order of the requests."""
+    places = sorted(finished)
+    poses = [replace(requests[place].pose, latent=finished[place].latent) for place in places]
+    detailed = None
+    if keep_detail:
+        detailed = [_detailed(model, requests[place], finished[place]) for place in places]
+    write_result(output, model, poses, mesh_format, detailed)
+
+
+def _detailed(
+    model: PoseModel, request: _Request, result: ResolveResult
+) -> npt.NDArray[np.float64] | None:
+    """Return the fixed mesh with what encoding lost of it, or None where that would collide."""
+    import numpy as np
+
+    placement = request.pose.placement
+    if request.mesh is None or placement is None:
+        return None
+    before, after = model.decode(np.stack([request.pose.latent, result.latent]))
+    # Not moved by a bit where the pose did not move.
+    detailed = request.mesh + (placement.apply(after) - placement.apply(before))
+    if model.detector.are_colliding(detailed[None].astype(np.float32), workers=1)[0]:
+        note(f"{request.source}: with its detail the fixed mesh would collide, so it has none")
+        return None
+    return detailed
+
+
+def _report(requests: Sequence[_Request], results: Sequence[ResolveResult], as_json: bool) -> None:
+    rows: list[dict[str, Any]] = []
+    for request, result in zip(requests, results, strict=True):
+        if result.note:
+            note(f"{request.source}: {result.note}")
+        facts = {name: getattr(result, name) for name in _FIELDS}
+        rows.append({"source": request.source} | facts)
+        if not as_json:
+            typer.echo(f"{request.source}: {_sentence(result)}")
+    if as_json:
+        print_json(rows)
+
+
+def _sentence(result: ResolveResult) -> str:
+    from lcollision_core.resolve import Step
+
+    moved = (
+        f"moved by {100.0 * result.vertex_distance_mean:.2f} % of the height, at most "
+        f"{100.0 * result.vertex_distance_max:.1f} %"
+    )
+    spent = f"({result.seconds:.2f} s)"
+    if result.exactly_free is None:
+        verdict = "predicted free" if result.predicted_free else "still predicted to collide"
+        return f"{verdict}, not checked, {moved} {spent}"
+    if not result.exactly_free:
+        pairs = counted(result.pairs_after or 0, "pair of faces", "pairs of faces")
+        return f"still colliding, {pairs} {spent}"
+    if result.step == Step.UNCHANGED:
+        return f"free as it is, unchanged {spent}"
+    pairs = counted(result.pairs_before or 0, "pair of faces", "pairs of faces")
+    return f"exactly free of {pairs}, by the step {result.step!s}, {moved} {spent}"
