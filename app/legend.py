@@ -128,7 +128,9 @@ class LegendCard(QWidget):
         for place, words in self._legend.ticks:
             width = line.horizontalAdvance(words)
             middle = x + place * _RAMP_WIDTH
-            left = middle - (0.0 if place == 0.0 else 0.5) * width
+            # Short words end with the scale, long ones reach beyond it.
+            flush = 1.0 if place == 1.0 and len(self._legend.ticks) == 2 else 0.5
+            left = middle - (0.0 if place == 0.0 else flush) * width
             painter.drawText(
                 QRectF(left, top, width + 2, line.height()), Qt.AlignmentFlag.AlignVCenter, words
             )

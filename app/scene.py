@@ -22,8 +22,8 @@ BACKGROUND = {False: ("#e4e8ed", "#fafbfc"), True: ("#191c21", "#343a44")}
 """Bottom and top, by whether the theme is dark."""
 
 _FLOOR = {False: ("#d3d9e1", "#c2c9d3"), True: ("#2a2f37", "#1d2127")}
-_GHOST = {False: "#6b7c93", True: "#a9b8cc"}
-_GHOST_OPACITY = 0.3
+_GHOST = {False: "#6b7c93", True: "#c3d2e6"}
+_GHOST_OPACITY = 0.34
 _THROUGH_OPACITY = 0.22
 _TO_THE_FRONT = -3.0e7  # in steps of a depth buffer of 24 bits: all of its range
 _FLOOR_RADIUS = 0.62
@@ -108,6 +108,8 @@ class Scene:
         self._ghost = Surface(faces, n_vertices)
         self._ghost_actor = _actor(self._ghost.polydata)
         self._ghost_actor.GetProperty().SetOpacity(_GHOST_OPACITY)
+        self._ghost_actor.GetProperty().SetAmbient(0.4)
+        self._ghost_actor.GetProperty().SetDiffuse(0.7)
         self._ghost_actor.GetProperty().BackfaceCullingOn()
         self._ghost_actor.SetPickable(False)
         self._ghost_actor.SetVisibility(False)

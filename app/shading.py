@@ -87,7 +87,6 @@ class Shader:
     Parameters
     ----------
     attention_mask : (K, V) array, each column sums to 1
-    domain_names : K names
     domain_colours : K strings "#rrggbb"
     dark : for a dark background
     """
@@ -95,12 +94,10 @@ class Shader:
     def __init__(
         self,
         attention_mask: npt.NDArray[Any],
-        domain_names: tuple[str, ...],
         domain_colours: tuple[str, ...],
         dark: bool = False,
     ) -> None:
         self._mask = np.ascontiguousarray(attention_mask, dtype=np.float32)
-        self._names = domain_names
         self._colours = domain_colours
         self._dark = dark
         self._domains = mask_colours(attention_mask, domain_colours)
@@ -109,7 +106,7 @@ class Shader:
     @classmethod
     def of(cls, model: PoseModel, dark: bool) -> Shader:
         """Return the shader of a model, for a dark background or a light one."""
-        return cls(model.attention_mask, model.domain_names, model.domain_colours, dark)
+        return cls(model.attention_mask, model.domain_colours, dark)
 
     @property
     def skin(self) -> str:
@@ -167,8 +164,14 @@ class Shader:
         has_predictor : False where no prediction will ever come
         """
         if shading is Shading.DOMAINS:
-            swatches = tuple(zip(self._names, self._colours, strict=True))
-            return Legend("Domains", "darker: owns more of the place", swatches)
+            # Which colour is whose stands in the panels, and under the pointer.
+            greys = ramp(("#ffffff", "#565b63"))
+            return Legend(
+                "Domains",
+                "darker where one acts alone",
+                ramp=_ramp_text(greys),
+                ticks=((0.0, "shared"), (1.0, "alone")),
+            )
         if shading is Shading.PREDICTED:
             if domain_energy is None:
                 note = "computing …" if has_predictor else "this model has no predictor"
@@ -176,7 +179,7 @@ class Shader:
             return Legend(
                 "Predicted overlap",
                 "of each domain, in % of the height",
-                ramp=self._ramp_text("predicted"),
+                ramp=_ramp_text(self._ramp("predicted")),
                 ticks=_ticks(FULL_PREDICTED),
             )
         if shading is Shading.EXACT:
@@ -186,7 +189,7 @@ class Shader:
                 "Exact overlap",
                 "in % of the height",
                 (("intersecting triangles", COLLIDING_FACE),),
-                ramp=self._ramp_text("exact"),
+                ramp=_ramp_text(self._ramp("exact")),
                 ticks=_ticks(FULL_EXACT),
             )
         return Legend()
@@ -200,9 +203,6 @@ class Shader:
 
     def _ramp(self, kind: str) -> ColourArray:
         return ramp((self.skin, *_RAMPS[kind]))
-
-    def _ramp_text(self, kind: str) -> tuple[str, ...]:
-        return tuple(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in self._ramp(kind).tolist())
 
 
 def mask_colours(attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ...]) -> ColourArray:
@@ -256,6 +256,10 @@ def _on_ramp(share: npt.NDArray[Any], colours: ColourArray) -> ColourArray:
     step = np.minimum(share * (_RAMP_STEPS - 1), _RAMP_STEPS - 1)
     picked: ColourArray = colours[step.astype(np.intp)]
     return picked
+
+
+def _ramp_text(colours: ColourArray) -> tuple[str, ...]:
+    return tuple(f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in colours.tolist())
 
 
 def _ticks(full: float) -> tuple[tuple[float, str], ...]:

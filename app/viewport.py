@@ -483,7 +483,8 @@ class Viewport(QWidget):
             self._tag.hide()
         else:
             model = self._document.model
-            self._tag.point_at(place, model.domain_names[domain], model.domain_colours[domain])
+            name = model.domain_names[domain]
+            self._tag.point_at(place, name[:1].upper() + name[1:], model.domain_colours[domain])
         if domain != self._hovered:
             self._hovered = domain
             self.domain_hovered.emit(domain)

@@ -17,7 +17,6 @@ from app.shading import (
 )
 from lcollision_core.model.colours import cielab
 
-NAMES = ("arm", "leg")
 COLOURS = ("#0077bb", "#e69f00")
 MASK = np.array([[1.0, 0.75, 0.5, 0.0], [0.0, 0.25, 0.5, 1.0]], dtype=np.float32)
 FULL_SIGHT = np.eye(3)
@@ -47,7 +46,7 @@ BLUE_BLIND = np.array(
 
 @pytest.fixture(params=[False, True], ids=["light", "dark"])
 def shader(request: pytest.FixtureRequest) -> Shader:
-    return Shader(MASK, NAMES, COLOURS, dark=request.param)
+    return Shader(MASK, COLOURS, dark=request.param)
 
 
 def ramps(shader: Shader) -> list[list[str]]:
@@ -148,7 +147,8 @@ def test_a_scale_begins_and_ends_in_its_colours_and_is_not_to_be_written() -> No
 def test_legends_name_what_is_drawn(shader: Shader) -> None:
     assert shader.legend(Shading.PLAIN).title == ""
     domains = shader.legend(Shading.DOMAINS)
-    assert domains.swatches == (("arm", "#0077bb"), ("leg", "#e69f00"))
+    assert domains.ramp[0] == "#ffffff"
+    assert [text for _, text in domains.ticks] == ["shared", "alone"]
     exact = shader.legend(Shading.EXACT, None, np.zeros(4))
     assert exact.swatches == (("intersecting triangles", COLLIDING_FACE),)
     assert [place for place, _ in exact.ticks] == [0.0, 0.5, 1.0]
