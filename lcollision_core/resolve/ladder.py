@@ -95,11 +95,9 @@ class Ladder:
         if self._correction is not None:
             near = np.clip(problem.target + self._correction, problem.low, problem.high)
             yield Step.NEIGHBOUR, self._first_free([near])
-        for find in (self._by_margins, self._by_starts):
+        for find in (self._by_margins, self._by_polish, self._by_starts):
             if not problem.watch.expired:
                 yield from find()
-        if not problem.watch.expired:
-            yield Step.POLISH, self._by_polish()
         yield Step.WALK_BACK, walk_back(self._check, problem, self._free_latents)
 
     def _by_margins(self) -> Iterator[tuple[Step, FloatArray | None]]:
@@ -145,16 +143,14 @@ class Ladder:
                 return
             yield Step.START, self._first_free([self._solve(margin, start).latent])
 
-    def _by_polish(self) -> FloatArray | None:
+    def _by_polish(self) -> Iterator[tuple[Step, FloatArray | None]]:
         """Polish the poses that the steps before left in the shallowest contact."""
-        decoded = self._check.decode(np.stack([self._problem.target, *self._candidates]))
-        energies = [self._check.find(vertices).energy for vertices in decoded]
-        poses = [self._problem.target, *self._candidates]
+        poses = np.unique(np.stack([self._problem.target, *self._candidates]), axis=0)
+        energies = [self._check.find(vertices).energy for vertices in self._check.decode(poses)]
         for place in np.argsort(energies, kind="stable")[:_POLISHED]:
-            polished = polish(self._check, self._problem, poses[place])
-            if polished is not None:
-                return polished
-        return None
+            yield Step.POLISH, polish(self._check, self._problem, poses[place])
+            if self._problem.watch.expired:
+                return
 
     def _solve(self, margin: float, start: FloatArray | None = None) -> SolverOutcome:
         problem = self._problem

@@ -38,8 +38,8 @@ class Step(StrEnum):
     NEIGHBOUR = "neighbour"
     SOLVER = "solver"
     MARGIN = "margin"
-    START = "start"
     POLISH = "polish"
+    START = "start"
     WALK_BACK = "walk-back"
     NONE = "none"
 

@@ -9,7 +9,7 @@ from lcollision_core.resolve.contacts import Contacts
 from lcollision_core.resolve.exact import ExactCheck
 from lcollision_core.resolve.problem import ResolveProblem
 
-FIRST_HALVINGS = 3
+FIRST_HALVINGS, FURTHER_HALVINGS = 3, 5
 SLIDES = 5
 _SLIDE_HALVINGS = 1
 _SETTLED = 0.01
@@ -69,7 +69,11 @@ def shorten(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> Flo
     CancelledError : the problem's watch said so.
     """
     free, colliding = bisect(check, problem, free, problem.target, FIRST_HALVINGS)
-    free = _slide(check, problem, free, colliding)
+    slid = _slide(check, problem, free, colliding)
+    if slid is free:
+        free, _ = bisect(check, problem, free, colliding, FURTHER_HALVINGS)
+    else:
+        free = slid
     return _put_domains_back(check, problem, free)
 
 
