@@ -401,6 +401,8 @@ class PoseDocument(PoseHistory):
             return True
         self._closed = True
         self.cancel_all()
+        # As it is deleted it would tell widgets that look at what is gone by then.
+        self.undo_stack.blockSignals(True)
         deadline = time.monotonic() + timeout
         ended = [self._live.close(deadline), self._long.close(deadline)]
         return all(ended)

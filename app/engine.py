@@ -7,6 +7,7 @@ document keeps what is wanted next, so that the newest request wins and nothing 
 from __future__ import annotations
 
 import logging
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QObject, QThread, QTimer, Signal, Slot
+from PySide6.QtCore import QObject, Qt, QThread, QTimer, Signal, Slot
 
 from app.frames import LiveFrame, PoseShower, keep_torch_to_one_thread
 from lcollision_core.errors import CancelledError, LCollisionError
@@ -28,6 +29,11 @@ _log = logging.getLogger(__name__)
 
 Work = Callable[[Progress, CancelToken], Any]
 """Long work: called in another thread; its value is the result."""
+
+_QUICK_SECONDS = 0.005
+"""A frame that took less is waited for the next time,"""
+_PATIENCE_SECONDS = 0.008
+"""but at most this long: half of a frame at 60 per second."""
 
 _PROGRESS_SECONDS = 0.05
 """Between two reports of progress: more would only keep the window busy."""
@@ -105,11 +111,23 @@ class LiveWorker(QObject):
     def __init__(self) -> None:
         super().__init__()
         self._shower: PoseShower | None = None
+        self._answer: Answer | None = None
+        self._has_answered = threading.Event()
 
     @Slot(object)
     def answer(self, request: FrameRequest | VerdictRequest) -> None:
         """Answer one request, whatever happens."""
-        self.answered.emit(_guarded(request.request_id, "following the pose", self._value, request))
+        self._answer = _guarded(request.request_id, "following the pose", self._value, request)
+        self._has_answered.set()
+        self.answered.emit(self._answer)
+
+    def forget(self) -> None:
+        """Make `awaited` wait for the next answer; called before that is asked for."""
+        self._has_answered.clear()
+
+    def awaited(self, seconds: float) -> Answer | None:
+        """Wait in another thread for the answer; None where it takes longer."""
+        return self._answer if self._has_answered.wait(seconds) else None
 
     def _value(self, request: FrameRequest | VerdictRequest) -> object:
         if self._shower is None or self._shower.model is not request.model:
@@ -149,7 +167,9 @@ class LivePose(QObject):
     """Follows one pose: its frame as soon as can be, its verdict when it rests.
 
     Changes within one turn of the event loop are one request; while the worker is busy, only the
-    newest pose waits. A failure that repeats itself from pose to pose is told once.
+    newest pose waits. A quick frame is waited for, far shorter than a picture takes, so that the
+    slider and the mesh are drawn together: drawing the window twice would cost more than all
+    else. A failure that repeats itself from pose to pose is told once.
 
     Parameters
     ----------
@@ -161,6 +181,7 @@ class LivePose(QObject):
     failed = Signal(object)
 
     _wanted = Signal(object)
+    _due = Signal()
 
     def __init__(self, rest_milliseconds: int, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -174,7 +195,11 @@ class LivePose(QObject):
         self._shown: tuple[FrameRequest, LiveFrame] | None = None
         self._last_id = 0
         self._told = ""
-        self._due = single_shot(self, 0, self._ask)
+        self._is_quick = False
+        self._taken: Answer | None = None
+        self._is_due = False
+        # Sooner than a timer of 0 ms, which Qt fires after it has drawn the slider alone.
+        self._due.connect(self._on_due, Qt.ConnectionType.QueuedConnection)
         self._rested = single_shot(self, rest_milliseconds, self._ask)
 
     def follow(self, model: PoseModel, latent: npt.NDArray[np.float64]) -> None:
@@ -189,11 +214,12 @@ class LivePose(QObject):
         self._next = FrameRequest(self._last_id, model, latent)
         self._shown = None
         self._rested.stop()
-        self._due.start()
+        if not self._is_due:
+            self._is_due = True
+            self._due.emit()
 
     def stop(self) -> None:
         """Want nothing any more."""
-        self._due.stop()
         self._rested.stop()
         self._next = self._shown = self._model = None
 
@@ -201,6 +227,11 @@ class LivePose(QObject):
         """End the thread; see `LongWork.close`."""
         self.stop()
         return end_thread(self._thread, deadline)
+
+    @Slot()
+    def _on_due(self) -> None:
+        self._is_due = False
+        self._ask()
 
     @Slot()
     def _ask(self) -> None:
@@ -212,12 +243,23 @@ class LivePose(QObject):
             request, frame = self._shown
             self._asked = VerdictRequest(request.request_id, request.model, frame)
             self._shown = None
-        if self._asked is not None:
-            self._wanted.emit(self._asked)
+        if self._asked is None:
+            return
+        self._worker.forget()
+        self._wanted.emit(self._asked)
+        if isinstance(self._asked, FrameRequest) and self._is_quick:
+            answer = self._worker.awaited(_PATIENCE_SECONDS)
+            self._is_quick = answer is not None
+            if answer is not None:
+                self._take(answer)
 
     @Slot(object)
     def _on_answered(self, answer: Answer) -> None:
-        request, self._asked = self._asked, None
+        if answer is not self._taken:
+            self._take(answer)
+
+    def _take(self, answer: Answer) -> None:
+        request, self._asked, self._taken = self._asked, None, answer
         # What is next is handed on before the answer is drawn: the worker need not wait for that.
         self._ask()
         if request is None or request.model is not self._model:
@@ -231,6 +273,7 @@ class LivePose(QObject):
                 self._shown = (request, answer.value)
                 self._rested.start()
             self._told = ""
+            self._is_quick = answer.value.seconds < _QUICK_SECONDS
             self.frame_computed.emit(answer.value)
         elif answer.value is not None and answer.request_id == self._last_id:
             self.verdict_computed.emit(answer.value)

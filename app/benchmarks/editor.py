@@ -1,0 +1,120 @@
+"""The editor as its user feels it, model by model, each in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from app.editor import why_no_window
+from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import Progress, no_progress
+
+_STARTS = 3
+"""Runs for each model: the first fills the caches, the last is the one that is measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class EditorTiming:
+    """One row of ``lcollision benchmark editor``. Times are medians unless they say otherwise.
+
+    Attributes
+    ----------
+    model, vertices : what was open
+    decode_ms, predict_ms : one pose alone; the second is None without a predictor
+    update_ms : of an event, all until drawing begins: slider, document, thread, panels, colours
+    render_ms : drawing one picture
+    event_p50_ms, event_p95_ms : from a slider's move until the window shows it
+    burst_lag_seconds : from the last of 250 moves within two seconds to the picture that shows it
+    idle_cpu : share of one core while nothing happens, once the library's pictures are drawn
+    start_seconds : from the command to a window that shows the pose, with warm caches
+    memory_mb : the most that the process held at once
+    actions : random actions done after that
+    exceptions : among them
+    leak_mb : memory after them, less that after the first tenth
+    mesh_is_right : whether the mesh drawn at the end is, to the bit, the model's of that pose
+    """
+
+    model: str
+    vertices: int
+    decode_ms: float
+    predict_ms: float | None
+    update_ms: float
+    render_ms: float
+    event_p50_ms: float
+    event_p95_ms: float
+    burst_lag_seconds: float
+    idle_cpu: float
+    start_seconds: float
+    memory_mb: float
+    actions: int
+    exceptions: int
+    leak_mb: float
+    mesh_is_right: bool
+
+
+def time_editor(
+    models: Sequence[str], n_actions: int, progress: Progress = no_progress
+) -> list[EditorTiming]:
+    """Open the editor on each model and use it.
+
+    Parameters
+    ----------
+    models : files or names
+    n_actions : random actions to do with each
+    progress : in starts of the editor
+
+    Raises
+    ------
+    LCollisionError : no window can be opened here, or an editor ended early.
+    """
+    reason = why_no_window(os.environ, sys.platform)
+    if reason is not None:
+        raise LCollisionError(
+            f"there is no display to open a window on ({reason}); run it on a desktop, or in "
+            f'xvfb-run -a -s "-screen 0 1600x1000x24"'
+        )
+    rows = []
+    for place, model in enumerate(models):
+        for start in range(_STARTS):
+            is_last = start == _STARTS - 1
+            answer = _run(model, n_actions if is_last else -1)
+            progress(place * _STARTS + start + 1, len(models) * _STARTS)
+        rows.append(EditorTiming(**answer))
+    return rows
+
+
+def _run(model: str, n_actions: int) -> dict[str, Any]:
+    """Run one editor with settings, log and sessions of its own; -1 only starts it."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {
+            **os.environ,
+            "XDG_CONFIG_HOME": str(Path(folder, "config")),
+            "XDG_STATE_HOME": str(Path(folder, "state")),
+        }
+        started = time.time()
+        ended = subprocess.run(
+            [sys.executable, "-m", "app.benchmarks.editor_session", model, str(n_actions)]
+            + [repr(started)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    try:
+        answer = json.loads(ended.stdout.splitlines()[-1])
+    except (IndexError, ValueError) as error:
+        last = (ended.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        raise LCollisionError(
+            f"the editor ended early on {model} with status {ended.returncode} ({last}); start it "
+            f"with `lcollision edit --model {model}` to see why"
+        ) from error
+    assert isinstance(answer, dict)
+    return answer

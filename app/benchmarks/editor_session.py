@@ -1,0 +1,305 @@
+"""One editor that uses itself and prints what that cost: ``MODEL ACTIONS STARTED``.
+
+Started by `app.benchmarks.editor`, so that starting and memory are those of a fresh process.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
+from PySide6.QtWidgets import QApplication
+
+from app.cli import main  # noqa: F401 - what the command would have loaded by then
+from app.document import PoseDocument
+from app.main_window import MainWindow
+from app.settings import Settings
+from app.shading import Shading
+from app.start_up import StartUp
+from app.theme import apply_theme, wanted_theme
+
+_EVENTS = 60
+_BURST_EVENTS, _BURST_SECONDS = 250, 2.0
+_IDLE_SECONDS = 5.0
+_IDLE_SHARE = 0.02
+_MOST_PICTURE_SECONDS = 60
+_TIMEOUT_SECONDS = 60.0
+_REPEATS = 30
+
+
+class Session(QObject):
+    """Uses a window as a hand would, and takes the time.
+
+    Parameters
+    ----------
+    window : that shows its first pose
+    """
+
+    _looked = Signal()
+
+    def __init__(self, window: MainWindow) -> None:
+        super().__init__()
+        self._window = window
+        self._document = window.document
+        self._code = self._document.model.latent_space.groups[1].codes.start
+        self._slider = window.sliders.row_of(self._code).slider
+        self._last_paint = (0.0, 0.0)
+        self._n_failures = 0
+        window.viewport.painted.connect(self._on_painted)
+        self._document.failed.connect(self._on_failed)
+        sys.excepthook = self._on_exception
+
+    def measure(self, n_actions: int) -> dict[str, Any]:
+        """Return all but the first and the last columns of `EditorTiming`."""
+        self.settle()
+        idle_cpu = self.idle_cpu()
+        updates, renders, events = zip(*self.events(), strict=True)
+        lag = self.burst()
+        exceptions, leak = self.act(n_actions)
+        self.settle()
+        return {
+            **self._core_times(),
+            "update_ms": 1e3 * statistics.median(updates),
+            "render_ms": 1e3 * statistics.median(renders),
+            "event_p50_ms": 1e3 * statistics.median(events),
+            "event_p95_ms": 1e3 * float(np.percentile(events, 95)),
+            "burst_lag_seconds": lag,
+            "idle_cpu": idle_cpu,
+            "actions": n_actions,
+            "exceptions": exceptions,
+            "leak_mb": leak,
+            "mesh_is_right": self.mesh_is_right(),
+        }
+
+    def events(self) -> list[tuple[float, float, float]]:
+        """Move a slider time after time.
+
+        Returns
+        -------
+        seconds : of each move, until its picture is begun, that the picture takes, and until the
+            window with it is on the screen
+        """
+        seconds = []
+        for place in random.Random(0).sample(range(self._slider.maximum()), _EVENTS):
+            start = time.perf_counter()
+            self._slider.setValue(place)
+            self.wait_for(self.is_shown)
+            seen = time.perf_counter()
+            ended, render = self._last_paint
+            seconds.append((ended - render - start, render, seen - start))
+            self.settle()
+        return seconds
+
+    def burst(self) -> float:
+        """Drag as fast as a hand can; return how long the last picture took to come."""
+        start = time.monotonic()
+        done = 0
+        self._window.sliders.begin_drag()
+        while done < _BURST_EVENTS:
+            due = int(_BURST_EVENTS * (time.monotonic() - start) / _BURST_SECONDS) + 1
+            for event in range(done, min(due, _BURST_EVENTS)):
+                self._slider.setValue(round((event + 1) / _BURST_EVENTS * self._slider.maximum()))
+            done = max(done, min(due, _BURST_EVENTS))
+            self.turn()
+        last = time.monotonic()
+        self.wait_for(self.is_shown)
+        lag = time.monotonic() - last
+        self._document.end_gesture()
+        return lag
+
+    def idle_cpu(self) -> float:
+        """Do nothing for a while and return the share of a core that this took.
+
+        Once the library's pictures are drawn: they come one by one while nothing else is to do.
+        """
+        for _ in range(_MOST_PICTURE_SECONDS):
+            cpu = time.process_time()
+            self.pause(1.0)
+            if time.process_time() - cpu < 0.5 * _IDLE_SHARE:
+                break
+        wall, cpu = time.monotonic(), time.process_time()
+        self.pause(_IDLE_SECONDS)
+        return (time.process_time() - cpu) / (time.monotonic() - wall)
+
+    def act(self, n_actions: int) -> tuple[int, float]:
+        """Do random actions; return the number of failures, and the memory that grew in MB."""
+        self._n_failures = 0
+        chance = random.Random(1)
+        acts = self._actions(chance)
+        before = memory_mb()
+        for action in range(n_actions):
+            chance.choices(list(acts), weights=list(acts.values()))[0]()
+            self.turn()
+            if action == n_actions // 10:
+                self.settle()
+                before = memory_mb()
+        self.settle()
+        return self._n_failures, memory_mb() - before
+
+    def _actions(self, chance: random.Random) -> dict[Callable[[], object], float]:
+        """Return what to do with how much weight."""
+        document, window = self._document, self._window
+        size = document.model.latent_size
+
+        def slide() -> None:
+            row = window.sliders.row_of(chance.randrange(size))
+            row.slider.setValue(chance.randrange(row.slider.maximum() + 1))
+
+        def load() -> None:
+            n_poses = len(document.model.pose_names)
+            document.load_pose(document.training_pose(chance.randrange(n_poses)))
+
+        def resolve() -> None:
+            if document.can_resolve:
+                document.resolve()
+
+        def shade() -> None:
+            window.viewport.set_shading(chance.choice(list(Shading)))
+
+        def resize() -> None:
+            window.resize(chance.randrange(1100, 1500), chance.randrange(700, 950))
+
+        return {
+            slide: 60.0,
+            document.undo: 10.0,
+            document.redo: 8.0,
+            load: 4.0,
+            resolve: 3.0,
+            document.cancel_resolve: 2.0,
+            shade: 3.0,
+            resize: 1.0,
+            lambda: document.randomise(chance.random(), chance.randrange(1000)): 3.0,
+            lambda: self.wait_for(self.is_settled): 2.0,
+        }
+
+    def mesh_is_right(self) -> bool:
+        """Compare the drawn mesh with what the model says of the pose, bit by bit."""
+        scene = self._window.viewport.scene
+        decoded = self._document.model.decode(self._document.latent).astype(np.float32)
+        return scene is not None and scene.surface.vertices.tobytes() == decoded.tobytes()
+
+    def _core_times(self) -> dict[str, Any]:
+        model, latent = self._document.model, self._document.latent
+        predict = None
+        if model.predictor is not None:
+            predict = 1e3 * _median_seconds(lambda: model.predict(latent))
+        return {
+            "model": model.name,
+            "vertices": model.n_vertices,
+            "decode_ms": 1e3 * _median_seconds(lambda: model.decode(latent, n_threads=1)),
+            "predict_ms": predict,
+        }
+
+    # Waiting, with the window alive.
+
+    def is_shown(self) -> bool:
+        """Whether the picture on the screen is of the pose."""
+        frame = self._window.viewport.shown_frame
+        return frame is not None and frame.latent is self._document.latent
+
+    def is_settled(self) -> bool:
+        """Whether nothing is to be expected any more."""
+        document = self._document
+        return (
+            self.is_shown()
+            and document.exact is not None
+            and not document.busy
+            and self._window.viewport.is_at_rest
+        )
+
+    def settle(self) -> None:
+        """Wait until nothing moves, computes or waits for a picture."""
+        self.wait_for(self.is_settled)
+
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        """Let the window live until something is so."""
+        deadline = time.monotonic() + _TIMEOUT_SECONDS
+        while not condition():
+            if time.monotonic() > deadline:
+                raise TimeoutError("the window does not come to rest")
+            self.turn(wait=True)
+
+    def turn(self, wait: bool = False) -> None:
+        """Run one turn of the event loop, that of deferred deletions included."""
+        loop = QEventLoop()
+        QTimer.singleShot(1 if wait else 0, loop.quit)
+        loop.exec()
+
+    def pause(self, seconds: float) -> None:
+        """Let the window live for a while."""
+        loop = QEventLoop()
+        QTimer.singleShot(int(1000 * seconds), loop.quit)
+        loop.exec()
+
+    @Slot(float)
+    def _on_painted(self, seconds: float) -> None:
+        self._last_paint = (time.perf_counter(), seconds)
+
+    @Slot(object)
+    def _on_failed(self, _: object) -> None:
+        self._n_failures += 1
+
+    def _on_exception(self, kind: type[BaseException], error: BaseException, trace: Any) -> None:
+        self._n_failures += 1
+        sys.__excepthook__(kind, error, trace)
+
+
+def memory_mb(peak: bool = False) -> float:
+    """Return the memory that this process holds, or held at most."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+    except OSError:
+        # Elsewhere than on Linux only the peak is to be had without a library.
+        import resource
+
+        unit = 1e6 if sys.platform == "darwin" else 1e3
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    lines = dict(line.split(":", 1) for line in status.splitlines())
+    return int(lines["VmHWM" if peak else "VmRSS"].split()[0]) / 1e3
+
+
+def _median_seconds(work: Callable[[], object]) -> float:
+    seconds = []
+    for _ in range(_REPEATS):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds)
+
+
+def run(model: str, n_actions: int, started: float) -> None:
+    """Open the editor, measure unless `n_actions` is below 0, and print one line of JSON.
+
+    Parameters
+    ----------
+    started : when the command was given, in seconds since 1970
+    """
+    application = QApplication(sys.argv[:1])
+    settings = Settings()
+    apply_theme(application, wanted_theme(settings["theme"]))
+    window = MainWindow(PoseDocument(), settings)
+    loop = QEventLoop()
+    window.ready.connect(loop.quit)
+    window.show()
+    StartUp(window, None, model).begin()
+    loop.exec()
+    answer: dict[str, Any] = {"start_seconds": time.time() - started}
+    if n_actions >= 0:
+        answer = Session(window).measure(n_actions) | answer
+        answer["memory_mb"] = memory_mb(peak=True)
+    # Nothing is to be asked about, nor kept.
+    window.document.undo_stack.setClean()
+    window.close()
+    sys.stdout.write(json.dumps(answer) + "\n")
+
+
+if __name__ == "__main__":
+    run(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]))
