@@ -164,6 +164,6 @@ def _with_shortcuts(menu: QMenu) -> list[QAction]:
         submenu = action.menu()
         if isinstance(submenu, QMenu):
             found.extend(_with_shortcuts(submenu))
-        elif action.shortcut():
+        elif not action.shortcut().isEmpty():
             found.append(action)
     return found

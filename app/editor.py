@@ -120,8 +120,5 @@ def _run(path: Path | None, model_name: str | None) -> int:
     window = MainWindow(PoseDocument(), settings)
     start_logging(window.show_failure)
     window.show()
-    start = StartUp(window, path, model_name)
-    start.begin()
-    status = application.exec()
-    start.finish()
-    return status
+    StartUp(window, path, model_name).begin()
+    return application.exec()

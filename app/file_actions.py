@@ -20,13 +20,16 @@ if TYPE_CHECKING:
     from app.viewport import Viewport
 
 POSES_SUFFIX = ".json"
+MODEL_SUFFIX = ".safetensors"
+"""As in `lcollision_core.model`, which takes too long to import before the window is there."""
+
 _EXPORTS = {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
-_FILMS = {"GIF": ".gif", "MP4": ".mp4"}
+_FILMS = {"GIF": ".gif", "WebP": ".webp"}
 
 
 def _kinds(*wanted: str) -> str:
     """Return the filter of a file dialog for "poses", "meshes" and "models"."""
-    suffixes = {"poses": (POSES_SUFFIX,), "meshes": _mesh_suffixes(), "models": (_model_suffix(),)}
+    suffixes = {"poses": (POSES_SUFFIX,), "meshes": _mesh_suffixes(), "models": (MODEL_SUFFIX,)}
     masks = {kind: " ".join(f"*{suffix}" for suffix in found) for kind, found in suffixes.items()}
     filters = [f"{kind.capitalize()} ({masks[kind]})" for kind in wanted]
     if len(wanted) > 1:
@@ -39,12 +42,6 @@ def _mesh_suffixes() -> tuple[str, ...]:
     from lcollision_core.meshes import READABLE_SUFFIXES
 
     return READABLE_SUFFIXES
-
-
-def _model_suffix() -> str:
-    from lcollision_core.model import MODEL_SUFFIX
-
-    return MODEL_SUFFIX
 
 
 class FileActions(QObject):
@@ -109,7 +106,7 @@ class FileActions(QObject):
             if not self.may_lose_changes():
                 return
             self._document.open_poses(path)
-        elif suffix == _model_suffix():
+        elif suffix == MODEL_SUFFIX:
             if not self.may_lose_changes():
                 return
             self._document.open_model(path)
@@ -118,7 +115,7 @@ class FileActions(QObject):
         else:
             raise LCollisionError(
                 f"{path.name} is nothing that the editor knows; open poses ({POSES_SUFFIX}), a "
-                f"mesh ({', '.join(_mesh_suffixes())}) or a model ({_model_suffix()})"
+                f"mesh ({', '.join(_mesh_suffixes())}) or a model ({MODEL_SUFFIX})"
             )
         self._remember(path)
 
@@ -182,7 +179,6 @@ class FileActions(QObject):
             path = self._ask_save("Save the turntable", proposed, _FILMS)
             if path is not None:
                 viewport.turntable(path, seconds=self._settings["turntable_seconds"])
-                self._document.message.emit(f"Saved {path.name}")
 
         self._after(turntable_form(self._settings, self._window), shoot)
 

@@ -52,7 +52,7 @@ from app.panels.randomise import RandomiseCard
 from app.panels.sliders import SlidersPanel
 from app.settings import Settings
 from app.shading import Shading
-from app.theme import apply_theme, wanted_theme
+from app.theme import NORMAL, apply_theme, wanted_theme
 from app.viewport import Viewport
 from lcollision_core.errors import LCollisionError
 
@@ -297,6 +297,7 @@ class MainWindow(QMainWindow):
         for widget in (self._busy_text, self._busy_bar, self._facts):
             self.statusBar().addPermanentWidget(widget)
         self.statusBar().setSizeGripEnabled(False)
+        self.statusBar().setContentsMargins(NORMAL, 0, NORMAL, 0)
         self._on_busy("")
 
     def _connect(self) -> None:

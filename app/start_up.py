@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import signal
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, QTimer, Slot
 
 from app.dialogs.questions import Answer, ask_about_recovery
+from app.file_actions import MODEL_SUFFIX
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 
@@ -28,23 +27,17 @@ DEFAULT_MODEL = "body"
 _LIVELY = ("dancer", "thinking")
 """Training poses of the built-in body that are worth looking at."""
 
-_SLOW_IMPORTS = (
-    "app.canvas",
-    "app.scene",
-    "app.rendering",
-    "app.recovery",
-    "lcollision_core.model",
-)
-_POLL_MILLISECONDS = 20
-_JOIN_SECONDS = 20.0
+_POLL_MILLISECONDS = 500
+"""Between two chances for Python to look at signals, which Qt's loop would keep from it."""
+
+_LATER_MILLISECONDS = 300
 
 
 class StartUp(QObject):
     """Fills a window that is on the screen.
 
-    First a thread imports what draws and computes, so that the window stays live; then the
-    document opens the model; then the pose comes in: the given file's, or one that a crash left,
-    or one worth looking at.
+    The document opens the model in its long worker, which imports what that takes; then the pose
+    comes in: the given file's, or one worth looking at, and what a crash left is offered.
 
     Parameters
     ----------
@@ -59,35 +52,15 @@ class StartUp(QObject):
         self._document = window.document
         self._path = path
         self._model: str | Path = model_name or DEFAULT_MODEL
-        self._imports = threading.Thread(target=_import_slowly, name="imports", daemon=True)
         self._poll = QTimer(self)
         self._poll.setInterval(_POLL_MILLISECONDS)
-        self._poll.timeout.connect(self._on_poll)
+        self._poll.timeout.connect(_nothing)
 
     def begin(self) -> None:
         """Start loading; returns at once."""
         signal.signal(signal.SIGINT, self._on_signal)
         signal.signal(signal.SIGTERM, self._on_signal)
-        self._imports.start()
         self._poll.start()
-
-    def finish(self) -> None:
-        """Wait for what is still being imported: a process that ends amid an import may crash."""
-        self._poll.stop()
-        self._imports.join(_JOIN_SECONDS)
-
-    @Slot()
-    def _on_poll(self) -> None:
-        if self._imports.is_alive():
-            return
-        # From now on it only gives Python the chance to look at signals.
-        self._poll.timeout.disconnect(self._on_poll)
-        self._poll.timeout.connect(_nothing)
-        self._poll.setInterval(1000)
-        from app.recovery import Autosave
-        from lcollision_core.model import MODEL_SUFFIX
-
-        self._window.set_autosave(Autosave(self._document))
         if self._path is not None and self._path.suffix.lower() == MODEL_SUFFIX:
             self._model, self._path = self._path, None
         self._document.model_changed.connect(self._on_model)
@@ -95,11 +68,13 @@ class StartUp(QObject):
 
     @Slot()
     def _on_model(self) -> None:
+        from app.recovery import Autosave
+
         self._document.model_changed.disconnect(self._on_model)
+        self._window.set_autosave(Autosave(self._document))
         # The document is about to put in a pose of its own.
         QTimer.singleShot(0, self, self._on_first_pose)
-        # Once the pose has been drawn: a question over an empty window would puzzle.
-        self._window.ready.connect(self._offer_recovery)
+        self._window.ready.connect(self._on_ready)
 
     @Slot()
     def _on_first_pose(self) -> None:
@@ -110,6 +85,11 @@ class StartUp(QObject):
         self._document.load_pose(opening_pose(self._document.model))
         # What the program did is neither a change to save nor one to take back.
         self._document.undo_stack.clear()
+
+    @Slot()
+    def _on_ready(self) -> None:
+        # Once the pose has been drawn: a question over an empty window would puzzle.
+        QTimer.singleShot(_LATER_MILLISECONDS, self, self._offer_recovery)
 
     @Slot()
     def _offer_recovery(self) -> None:
@@ -147,11 +127,6 @@ def opening_pose(model: PoseModel) -> NamedPose:
     names = model.pose_names
     number = next((names.index(name) for name in _LIVELY if name in names), len(names) - 1)
     return NamedPose(names[number], model.training_latent[number])
-
-
-def _import_slowly() -> None:
-    for module in _SLOW_IMPORTS:
-        importlib.import_module(module)
 
 
 def _nothing() -> None:

@@ -263,16 +263,17 @@ QPushButton#primary:focus {{ border: 2px solid {theme.text}; }}
 QPushButton#primary:disabled {{
     background: {theme.track}; color: {faded}; border-color: {theme.border};
 }}
-QLineEdit, QDoubleSpinBox, QSpinBox, QPlainTextEdit {{
+QLineEdit, QPlainTextEdit {{
     background: {theme.field}; border: 1px solid {theme.border}; border-radius: {RADIUS - 2}px;
     padding: 3px 6px; selection-background-color: {theme.accent};
     selection-color: {theme.on_accent};
 }}
-QLineEdit:focus, QDoubleSpinBox:focus, QSpinBox:focus, QPlainTextEdit:focus {{
+QLineEdit:focus, QPlainTextEdit:focus {{
     border-color: {theme.accent};
 }}
-QDoubleSpinBox#code {{ padding: 1px 4px; }}
-QAbstractSpinBox::up-button, QAbstractSpinBox::down-button {{ width: 0; border: none; }}
+QAbstractSpinBox QLineEdit {{ border: none; padding: 0 2px; background: transparent; }}
+QDialogButtonBox {{ dialogbuttonbox-buttons-have-icons: 0; }}
+QMessageBox QLabel#qt_msgbox_label {{ font-weight: 600; }}
 QProgressBar {{
     background: {theme.track}; border: none; border-radius: 3px; max-height: 6px;
 }}

@@ -61,6 +61,8 @@ class FailureDialog(QDialog):
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         buttons.addButton(self.unfold, QDialogButtonBox.ButtonRole.ActionRole)
         buttons.addButton(log, QDialogButtonBox.ButtonRole.ActionRole)
+        for button in (self.unfold, log):
+            button.setAutoDefault(False)
         buttons.button(QDialogButtonBox.StandardButton.Close).setDefault(True)
         column = QVBoxLayout(self)
         column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
@@ -83,8 +85,14 @@ def split_sentence(sentence: str) -> tuple[str, str]:
     what, _, advice = sentence.rpartition("; ")
     if not what:
         what, advice = advice, ""
-    what, advice = (part[:1].upper() + part[1:] for part in (what, advice))
+    what, advice = (_with_capital(part) for part in (what, advice))
     return what, advice + "." * bool(advice and not advice.endswith((".", "?", "!")))
+
+
+def _with_capital(text: str) -> str:
+    """Begin with a capital, unless the first word is a file's name or a number."""
+    word = text.partition(" ")[0]
+    return text[:1].upper() + text[1:] if word.isalpha() else text
 
 
 def open_log_file() -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtWidgets import QMessageBox, QPushButton, QWidget
 
 from app.icons import pixmap
-from app.theme import current_theme
+from app.theme import WIDE, current_theme
 
 if TYPE_CHECKING:
     from app.recovery import LostPose
@@ -60,7 +60,10 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Answer:
 def _box(parent: QWidget, title: str) -> QMessageBox:
     box = QMessageBox(parent)
     box.setWindowTitle(title)
-    box.setIconPixmap(pixmap("unknown", current_theme().accent, 36, parent.devicePixelRatioF()))
+    box.setIconPixmap(pixmap("question", current_theme().accent, 36, parent.devicePixelRatioF()))
+    layout = box.layout()
+    if layout is not None:
+        layout.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
     return box
 
 

@@ -32,7 +32,7 @@ class ExactCard(Card):
         title = QHBoxLayout()
         title.addWidget(labelled("Exact check", "title"))
         title.addStretch()
-        title.addWidget(labelled("the truth", "caption"))
+        title.addWidget(labelled("computed on the mesh", "caption"))
         self._sign = QLabel()
         self._sign.setFixedSize(22, 22)
         self.verdict = labelled("", "verdict")

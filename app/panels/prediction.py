@@ -142,16 +142,16 @@ class DomainRow(HoverRow):
         self.bar = EnergyBar(colour)
         self.lock = QToolButton()
         self.lock.setCheckable(True)
-        self.lock.setFixedSize(24, 24)
+        self.lock.setFixedSize(24, 22)
         self.lock.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.lock.setAccessibleName(f"Lock {self._name}")
         row = QHBoxLayout(self)
         row.setContentsMargins(TIGHT + 12 + CLOSE, 0, 0, 0)
         row.setSpacing(CLOSE)
-        row.addWidget(ElidedLabel(self._name), 6)
-        row.addWidget(self.bar, 5)
+        row.addWidget(ElidedLabel(self._name), 3)
+        row.addWidget(self.bar, 2)
         row.addWidget(self.lock)
-        self.setFixedHeight(ROW_HEIGHT)
+        self.setFixedHeight(ROW_HEIGHT - 3)
         self.lock.toggled.connect(self._on_lock)
         self.show_lock(False)
 
@@ -173,6 +173,11 @@ class DomainRow(HoverRow):
         if energy is not None:
             self.bar.show_energy(energy)
             self.setToolTip(f"{self._name}: predicted energy {energy_text(energy)}")
+
+    @property
+    def is_lit(self) -> bool:
+        """Whether the viewport's pointer is on this domain."""
+        return self._lit
 
     def set_lit(self, lit: bool) -> None:
         """Show that the viewport's pointer is on this domain."""
@@ -218,7 +223,7 @@ class PredictionCard(Card):
         title = QHBoxLayout()
         title.addWidget(labelled("Prediction", "title"))
         title.addStretch()
-        self._source = labelled("an instant guess", "caption")
+        self._source = labelled("by the model, at once", "caption")
         title.addWidget(self._source)
         self.verdict = labelled("", "verdict")
         self.percent = labelled("", "headline")

@@ -7,20 +7,21 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import (
-    QCheckBox,
     QGridLayout,
     QHBoxLayout,
     QLabel,
     QProgressBar,
     QPushButton,
+    QSizePolicy,
+    QStackedWidget,
     QVBoxLayout,
     QWidget,
 )
 
 from app.icons import icon, pixmap
-from app.panels.parts import Card, labelled, silent
+from app.panels.parts import Card, ElidedLabel, labelled
 from app.panels.wording import energy_text, height_text, seconds_text
-from app.theme import CLOSE, TIGHT, current_theme
+from app.theme import CLOSE, NORMAL, TIGHT, current_theme
 
 if TYPE_CHECKING:
     from app.document import PoseDocument
@@ -86,36 +87,38 @@ class ResolveCard(Card):
         self.cancel.setToolTip("Stop Resolve and keep the pose as it is (Escape)")
         self.bar = QProgressBar()
         self.bar.setTextVisible(False)
-        self._busy = labelled("Looking for the nearest free pose…", "caption")
         self.working = QWidget()
-        working = QVBoxLayout(self.working)
+        working = QGridLayout(self.working)
         working.setContentsMargins(0, 0, 0, 0)
-        working.setSpacing(CLOSE)
-        line = QHBoxLayout()
-        line.addWidget(self._busy, 1)
-        line.addWidget(self.cancel)
-        working.addLayout(line)
-        working.addWidget(self.bar)
+        working.setHorizontalSpacing(NORMAL)
+        working.setVerticalSpacing(TIGHT)
+        working.addWidget(ElidedLabel("Looking for a free pose…"), 0, 0)
+        working.addWidget(self.bar, 1, 0)
+        working.addWidget(self.cancel, 0, 1, 2, 1)
+        working.setColumnStretch(0, 1)
         self.outcome = QWidget()
         self._make_outcome()
-        buttons = QHBoxLayout()
-        buttons.setSpacing(CLOSE)
-        buttons.addWidget(self.button, 1)
-        buttons.addWidget(self.options)
-        self.column.addLayout(buttons)
-        self.column.addWidget(self.working)
+        self.resting = QWidget()
+        resting = QHBoxLayout(self.resting)
+        resting.setContentsMargins(0, 0, 0, 0)
+        resting.setSpacing(CLOSE)
+        resting.addWidget(self.button, 1)
+        resting.addWidget(self.options)
+        # One takes the other's place, so that nothing jumps.
+        self.stack = QStackedWidget()
+        self.stack.addWidget(self.resting)
+        self.stack.addWidget(self.working)
+        self.stack.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
+        self.column.addWidget(self.stack)
         self.column.addWidget(self.outcome)
-        self.working.hide()
         self.button.clicked.connect(resolve_action.trigger)
         self.cancel.clicked.connect(document.cancel_resolve)
         self.options.clicked.connect(self.options_wanted)
-        self.ghost.toggled.connect(document.show_ghost)
         resolve_action.changed.connect(self._on_action)
         document.solve_started.connect(self._on_started)
         document.solve_progressed.connect(self._on_progressed)
         document.solve_finished.connect(self._on_finished)
         document.outcome_changed.connect(self._on_outcome)
-        document.ghost_changed.connect(self._on_ghost)
         self._on_action()
         self._on_outcome()
 
@@ -138,11 +141,9 @@ class ResolveCard(Card):
         self.exactly_free = Fact(
             {True: "Exactly free", False: "Not exactly free", None: "Not checked exactly"}
         )
-        self._energy, self._moved, self._furthest, self._took = (QLabel() for _ in range(4))
+        self._energy, self._moved, self._took = (QLabel() for _ in range(3))
         self._note = labelled("", "caption")
         self._note.setWordWrap(True)
-        self.ghost = QCheckBox("Show the pose before as a ghost")
-        self.ghost.setToolTip("Draw the old pose, see-through, behind the new one")
         column = QVBoxLayout(self.outcome)
         column.setContentsMargins(0, TIGHT, 0, 0)
         column.setSpacing(TIGHT)
@@ -155,8 +156,7 @@ class ResolveCard(Card):
         for place, (name, value) in enumerate(
             (
                 ("Energy", self._energy),
-                ("Moved on average", self._moved),
-                ("Moved at most", self._furthest),
+                ("Moved", self._moved),
                 ("Took", self._took),
             )
         ):
@@ -165,7 +165,6 @@ class ResolveCard(Card):
         numbers.setColumnStretch(1, 1)
         column.addLayout(numbers)
         column.addWidget(self._note)
-        column.addWidget(self.ghost)
 
     @Slot()
     def _on_action(self) -> None:
@@ -176,7 +175,7 @@ class ResolveCard(Card):
 
     @Slot()
     def _on_started(self) -> None:
-        self.working.show()
+        self.stack.setCurrentWidget(self.working)
         self.outcome.hide()
         # Until the first report there is no telling how far it is.
         self.bar.setRange(0, 0)
@@ -190,7 +189,7 @@ class ResolveCard(Card):
 
     @Slot(object)
     def _on_finished(self, result: object) -> None:  # noqa: ARG002
-        self.working.hide()
+        self.stack.setCurrentWidget(self.resting)
         # An endless bar is animated even while nobody sees it.
         self.bar.setRange(0, 1)
         self._on_outcome()
@@ -202,13 +201,7 @@ class ResolveCard(Card):
         if result is not None:
             self._show(result)
 
-    @Slot()
-    def _on_ghost(self) -> None:
-        with silent(self.ghost):
-            self.ghost.setChecked(self._document.ghost_shown)
-
     def _show(self, result: ResolveResult) -> None:
-        unmoved = result.latent_distance == 0.0
         ran = result.solver_status != "not run"
         self.converged.show_truth(result.converged if ran else None)
         self.predicted_free.show_truth(result.predicted_free)
@@ -219,14 +212,10 @@ class ResolveCard(Card):
             self._energy.setText(
                 f"{energy_text(result.energy_before)} → {energy_text(result.energy_after)}"
             )
-        if unmoved:
-            self._moved.setText("nothing")
-            self._furthest.setText("nothing")
-        else:
-            self._moved.setText(f"{height_text(result.vertex_distance_mean)} of the height")
-            self._furthest.setText(f"{height_text(result.vertex_distance_max)} of the height")
+        mean, largest = result.vertex_distance_mean, result.vertex_distance_max
+        moved = f"{height_text(mean)}, at most {height_text(largest)}"
+        self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
+        self._moved.setToolTip("Of the body's height: on average, and where it moved furthest")
         self._took.setText(seconds_text(result.seconds))
         self._note.setText(result.note or "")
         self._note.setVisible(bool(result.note))
-        self.ghost.setVisible(not unmoved)
-        self._on_ghost()

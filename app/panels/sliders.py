@@ -52,6 +52,11 @@ class GroupHeader(QAbstractButton):
         self.setCursor(Qt.CursorShape.PointingHandCursor)
         self.setMinimumHeight(_HEADER_HEIGHT)
 
+    @property
+    def is_lit(self) -> bool:
+        """Whether the viewport's pointer is on this domain."""
+        return self._lit
+
     def set_lit(self, lit: bool) -> None:
         """Show that the viewport's pointer is on this domain."""
         if lit != self._lit:
