@@ -11,10 +11,12 @@ import typer
 
 from app.cli.benchmark_editor import editor
 from app.cli.benchmark_predictor import predictor
+from app.cli.benchmark_resolve import resolve
 from app.cli.console import note, print_json, progress_bar
 
 app = typer.Typer(help="Measure what the README quotes.", no_args_is_help=True)
 app.command("predictor")(predictor)
+app.command("resolve")(resolve)
 app.command("editor")(editor)
 
 

@@ -31,6 +31,9 @@ _STATUS = {
     nlopt.MAXEVAL_REACHED: "out of evaluations",
     nlopt.MAXTIME_REACHED: "out of time",
 }
+_FAILURES = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
+"""What NLopt raises where it cannot go on; from 2.10 its failures are no more `RuntimeError`."""
+
 _CONVERGED = {nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED}
 
 
@@ -99,7 +102,7 @@ class _Run:
             status = _STATUS.get(code, "stopped")
         except nlopt.ForcedStop:
             code, status = None, "out of time"
-        except (nlopt.RoundoffLimited, RuntimeError):
+        except _FAILURES:
             # An inner failure ends the outer loop; what the callbacks saw is as good as ever.
             code, status = None, "halted by rounding"
         if self._cancelled is not None:

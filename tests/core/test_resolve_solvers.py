@@ -164,6 +164,22 @@ def test_a_model_that_breaks_leaves_the_best_pose_so_far(solver: Solver) -> None
     assert NORMAL @ outcome.latent <= NORMAL @ TARGET
 
 
+@pytest.mark.parametrize("solver", Solver)
+def test_slopes_that_mislead_end_with_the_best_pose_so_far(solver: Solver) -> None:
+    """AUGLAG's inner LBFGS fails on these, and NLopt raises."""
+
+    class Misleading:
+        def logit_and_gradient(self, latent: npt.NDArray) -> tuple[FloatArray, FloatArray]:
+            logit, gradient = HalfSpace(NORMAL, 0.5).logit_and_gradient(latent)
+            return logit, -1e3 * gradient * np.sign(np.sin(1e4 * latent))
+
+    problem = toy_problem(Misleading(), TARGET)
+    outcome = solve(solver, problem)
+    assert problem.evaluations > 1
+    assert (np.abs(outcome.latent) <= 10.0).all()
+    assert NORMAL @ outcome.latent <= NORMAL @ TARGET
+
+
 def test_rows_of_a_batch_do_not_know_of_each_other() -> None:
     problem = toy_problem(Ball(CENTRE, 1.0), TARGET)
     starts = np.stack([TARGET, TARGET + 0.2, TARGET])

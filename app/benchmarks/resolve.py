@@ -1,0 +1,245 @@
+"""Resolve on colliding poses, solver by solver, beside bisection that has learnt nothing.
+
+Each solver runs twice on each pose, on one core: alone, for the paper's figures of merit (whether
+the point that it returns is feasible for the classifier, and how much of the exact energy is
+gone), and with the whole ladder, for time, distances and the exact verdict.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes import PoseSet, RigidTransform
+from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.resolve import ResolveOptions, ResolveResult, Solver, Step
+
+FloatArray = npt.NDArray[np.float64]
+
+BASELINE = "bisection"
+"""Halving the segment to the first pose that the model knows as free: no learning."""
+
+HALVINGS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class ResolveScore:
+    """One row of ``lcollision benchmark resolve``: means over the poses.
+
+    Attributes
+    ----------
+    solver : the name of a `Solver`, or "bisection"
+    poses : colliding ones that were resolved
+    median_ms, p95_ms : of a whole resolve, on one core
+    feasible_rate : of the poses that the predictor calls colliding, how many the solver alone
+        brings to a point that it calls free; None for the baseline
+    exactly_free_rate : at the end, by the exact check
+    free_before_walk_back : exactly free without the ladder's last step; None for the baseline
+    energy_decrease : mean share of the exact energy that is gone at the solver's feasible points
+    latent_distance : mean ||Z - Z*|| / ||Z*||
+    vertex_distance : mean distance over vertices, in heights
+    """
+
+    solver: str
+    poses: int
+    median_ms: float
+    p95_ms: float
+    feasible_rate: float | None
+    exactly_free_rate: float
+    free_before_walk_back: float | None
+    energy_decrease: float | None
+    latent_distance: float
+    vertex_distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class SolverRuns:
+    """What the paper's histograms are drawn of: one solver alone, its feasible poses.
+
+    Attributes
+    ----------
+    solver : name
+    iterations : (n,) of all poses
+    seconds : (n,) of all poses
+    energy_change : (m,) relative change of the exact energy of the feasible ones, -1 all gone
+    """
+
+    solver: str
+    iterations: npt.NDArray[np.int64]
+    seconds: FloatArray
+    energy_change: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class CollidingPoses:
+    """What is resolved: (n, D) latent poses, and for encoded meshes where each belongs."""
+
+    latents: FloatArray
+    placements: Sequence[RigidTransform | None]
+
+
+def sampled_poses(
+    model: PoseModel, n_poses: int, seed: int, progress: Progress = no_progress
+) -> CollidingPoses:
+    """Draw colliding poses from the latent box."""
+    latents = sample_poses(model, n_poses, seed, colliding=True, progress=progress)
+    return CollidingPoses(latents, [None] * n_poses)
+
+
+def real_poses(
+    model: PoseModel, pose_set: PoseSet, n_poses: int, progress: Progress = no_progress
+) -> CollidingPoses:
+    """Encode those poses of a set that intersect themselves, the first `n_poses` of them.
+
+    Raises
+    ------
+    LCollisionError : another topology, or none collides.
+    """
+    model.require_topology(pose_set.topology, "the pose set")
+    colliding = model.detector.are_colliding(pose_set.vertices.astype(np.float32))
+    chosen = np.flatnonzero(colliding)[:n_poses]
+    if len(chosen) == 0:
+        raise LCollisionError("no pose of the set intersects itself; name another set")
+    encoded = []
+    for pose in chosen:
+        encoded.append(model.encode(pose_set.vertices[pose]))
+        progress(len(encoded), len(chosen))
+    return CollidingPoses(
+        np.stack([one.latent for one in encoded]), [one.placement for one in encoded]
+    )
+
+
+def score_baseline(model: PoseModel, poses: CollidingPoses) -> ResolveScore:
+    """Bisect towards the first known free pose.
+
+    Raises
+    ------
+    LCollisionError : the model knows no free pose.
+    """
+    if len(model.free_latent) == 0:
+        raise LCollisionError(
+            f"the model {model.name!r} knows no free pose to bisect to; train its predictor again"
+        )
+    seconds, latents = [], []
+    for target in poses.latents:
+        start = time.perf_counter()
+        free, colliding = model.free_latent[0], target
+        for _ in range(HALVINGS):
+            middle = 0.5 * (free + colliding)
+            if _are_colliding(model, middle[None])[0]:
+                colliding = middle
+            else:
+                free = middle
+        seconds.append(time.perf_counter() - start)
+        latents.append(free)
+    moved = np.stack(latents) - poses.latents
+    distances = [
+        np.linalg.norm(model.decode(free, 1) - model.decode(target, 1), axis=1).mean()
+        for free, target in zip(latents, poses.latents, strict=True)
+    ]
+    return ResolveScore(
+        solver=BASELINE,
+        poses=len(latents),
+        median_ms=_milliseconds(seconds, 0.5),
+        p95_ms=_milliseconds(seconds, 0.95),
+        feasible_rate=None,
+        exactly_free_rate=1.0 - float(_are_colliding(model, np.stack(latents)).mean()),
+        free_before_walk_back=None,
+        energy_decrease=None,
+        latent_distance=float(
+            (np.linalg.norm(moved, axis=1) / np.linalg.norm(poses.latents, axis=1)).mean()
+        ),
+        vertex_distance=float(np.mean(distances)) / model.height,
+    )
+
+
+def score_solver(
+    model: PoseModel,
+    poses: CollidingPoses,
+    solver: Solver,
+    metric: str,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> tuple[ResolveScore, SolverRuns]:
+    """Run one solver alone and with its ladder on all poses, on the calling thread.
+
+    Parameters
+    ----------
+    model : with a predictor
+    poses : colliding
+    solver, metric : as in `ResolveOptions`
+    progress : in poses
+    cancel : polled at every evaluation
+
+    Raises
+    ------
+    CancelledError : `cancel` was set.
+    """
+    resolver = model.resolver
+    # What is built once for all poses is not a pose's time.
+    resolver.resolve(poses.latents[0], ResolveOptions(solver=solver, metric=metric))
+    alone, whole = [], []
+    for target, placement in zip(poses.latents, poses.placements, strict=True):
+        solved = ResolveOptions(solver=solver, metric=metric, verify=False)
+        alone.append(resolver.resolve(target, solved, cancel=cancel, placement=placement))
+        climbed = ResolveOptions(solver=solver, metric=metric)
+        whole.append(resolver.resolve(target, climbed, cancel=cancel, placement=placement))
+        progress(len(whole), len(poses.latents))
+    called = model.predict(poses.latents).collision_logit > 0.0
+    feasible = np.array([result.predicted_free for result in alone]) & called
+    change = _energy_change(model, poses, alone, feasible)
+    seconds = [result.seconds for result in whole]
+    before_walk = [bool(result.exactly_free) and result.step != Step.WALK_BACK for result in whole]
+    score = ResolveScore(
+        solver=str(solver),
+        poses=len(whole),
+        median_ms=_milliseconds(seconds, 0.5),
+        p95_ms=_milliseconds(seconds, 0.95),
+        feasible_rate=float(feasible.sum() / called.sum()) if called.any() else None,
+        exactly_free_rate=float(np.mean([bool(result.exactly_free) for result in whole])),
+        free_before_walk_back=float(np.mean(before_walk)),
+        energy_decrease=-float(change.mean()) if len(change) else None,
+        latent_distance=float(np.mean([result.latent_distance for result in whole])),
+        vertex_distance=float(np.mean([result.vertex_distance_mean for result in whole])),
+    )
+    runs = SolverRuns(
+        solver=str(solver),
+        iterations=np.array([result.iterations for result in alone]),
+        seconds=np.array([result.seconds for result in alone]),
+        energy_change=change,
+    )
+    return score, runs
+
+
+def _energy_change(
+    model: PoseModel,
+    poses: CollidingPoses,
+    alone: Sequence[ResolveResult],
+    feasible: npt.NDArray[np.bool_],
+) -> FloatArray:
+    """Return by how much the exact energy changed, relative to what it was, where feasible."""
+    changes = []
+    for place in np.flatnonzero(feasible).tolist():
+        before, after = (
+            model.detector.detect(model.decode(latent, 1).astype(np.float32)).energy
+            for latent in (poses.latents[place], alone[place].latent)
+        )
+        # An encoded mesh that collides may decode to one that does not.
+        if before > 0.0:
+            changes.append(after / before - 1.0)
+    return np.array(changes)
+
+
+def _are_colliding(model: PoseModel, latents: FloatArray) -> npt.NDArray[np.bool_]:
+    vertices = model.decode(latents, 1).astype(np.float32)
+    return model.detector.are_colliding(vertices, workers=1)
+
+
+def _milliseconds(seconds: Sequence[float], quantile: float) -> float:
+    return 1e3 * float(np.quantile(seconds, quantile))
