@@ -30,10 +30,10 @@ _log = logging.getLogger(__name__)
 Work = Callable[[Progress, CancelToken], Any]
 """Long work: called in another thread; its value is the result."""
 
-_QUICK_SECONDS = 0.005
+_QUICK_SECONDS = 0.012
 """A frame that took less is waited for the next time,"""
-_PATIENCE_SECONDS = 0.008
-"""but at most this long: half of a frame at 60 per second."""
+_PATIENCE_SECONDS = 0.016
+"""but at most this long, a picture of a screen that draws 60 in a second."""
 
 _PROGRESS_SECONDS = 0.05
 """Between two reports of progress: more would only keep the window busy."""

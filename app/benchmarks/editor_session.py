@@ -100,16 +100,16 @@ class Session(QObject):
 
     def burst(self) -> float:
         """Drag as fast as a hand can; return how long the last picture took to come."""
-        start = time.monotonic()
+        start = last = time.monotonic()
         done = 0
         self._window.sliders.begin_drag()
         while done < _BURST_EVENTS:
             due = int(_BURST_EVENTS * (time.monotonic() - start) / _BURST_SECONDS) + 1
             for event in range(done, min(due, _BURST_EVENTS)):
                 self._slider.setValue(round((event + 1) / _BURST_EVENTS * self._slider.maximum()))
+            last = time.monotonic()
             done = max(done, min(due, _BURST_EVENTS))
             self.turn()
-        last = time.monotonic()
         self.wait_for(self.is_shown)
         lag = time.monotonic() - last
         self._document.end_gesture()
