@@ -1,0 +1,397 @@
+"""``lcollision resolve`` and ``benchmark resolve``, on a small body."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lcollision_core.contact import DEPTH_TOLERANCE
+from lcollision_core.meshes import read_mesh, write_mesh, write_pose_set
+from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
+from lcollision_core.resolve import find_free_poses
+from tests.app.support import Lcollision
+from tests.bending_tube import bending_tube
+from tests.core.brute_force import all_pairs
+from tests.core.shapes import random_rotation
+
+FIELDS = [
+    "source",
+    "solver_status",
+    "predicted_free",
+    "exactly_free",
+    "step",
+    "energy_before",
+    "energy_after",
+    "pairs_before",
+    "pairs_after",
+    "latent_distance",
+    "vertex_distance_mean",
+    "vertex_distance_max",
+    "iterations",
+    "evaluations",
+    "seconds",
+]
+
+
+@pytest.fixture(scope="module")
+def model(editor_model: PoseModel) -> PoseModel:
+    free = find_free_poses(editor_model.embedding, editor_model.detector, editor_model.height)
+    return editor_model.with_free_poses(free)
+
+
+@pytest.fixture(scope="module")
+def model_file(model: PoseModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "tube.safetensors"
+    model.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def helpless_file(editor_model: PoseModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a model that knows no free pose."""
+    path = tmp_path_factory.mktemp("model") / "helpless.safetensors"
+    editor_model.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def colliding(model: PoseModel) -> np.ndarray:
+    return sample_poses(model, 4, seed=5, colliding=True)
+
+
+@pytest.fixture
+def poses(model: PoseModel, colliding: np.ndarray, tmp_path: Path) -> Path:
+    """Return a file of four colliding poses and a free one."""
+    path = tmp_path / "poses.json"
+    named = [NamedPose(f"pose {place}", row) for place, row in enumerate(colliding)]
+    write_poses(path, model, [*named, NamedPose("mean", np.zeros(model.latent_size))])
+    return path
+
+
+def colliding_mesh(model: PoseModel, latent: np.ndarray, path: Path) -> np.ndarray:
+    """Write a mesh that lies somewhere else and is not quite what the model decodes."""
+    generator = np.random.default_rng(1)
+    detail = 2e-3 * model.height * np.sin(np.arange(model.n_vertices))[:, None]
+    turned = (model.decode(latent) + detail) @ random_rotation(generator).T
+    vertices = turned + 50.0
+    write_mesh(path, vertices, model.faces)
+    return vertices
+
+
+def n_pairs(model: PoseModel, vertices: np.ndarray) -> int:
+    """Count colliding pairs by brute force."""
+    return len(all_pairs(vertices, model.faces, DEPTH_TOLERANCE * model.height).pairs)
+
+
+def test_poses_come_back_free_in_their_order(
+    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "free.json"
+    result = lcollision("resolve", model_file, poses, "-o", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    rows = json.loads(result.stdout)
+    assert [list(row) for row in rows] == [FIELDS] * 5
+    assert [row["source"] for row in rows] == [
+        *(f"{poses}: pose {place}" for place in range(4)),
+        f"{poses}: mean",
+    ]
+    assert [row["exactly_free"] for row in rows] == [True] * 5
+    assert [row["step"] == "unchanged" for row in rows] == [False] * 4 + [True]
+    before, after = read_poses(poses, model), read_poses(out, model)
+    assert [pose.name for pose in after] == [pose.name for pose in before]
+    assert after[4].latent.tolist() == [0.0] * model.latent_size
+    for row, was, pose in zip(rows, before, after, strict=True):
+        exported = model.decode(pose.latent).astype(np.float32).astype(np.float64)
+        assert n_pairs(model, exported) == 0
+        moved = np.linalg.norm(pose.latent - was.latent)
+        assert row["latent_distance"] * np.linalg.norm(was.latent) == pytest.approx(moved)
+
+
+@pytest.mark.parametrize("solver", ["auglag", "slsqp", "ccsaq"])
+def test_every_solver_by_its_name(
+    lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path, solver: str
+) -> None:
+    out = tmp_path / "free.json"
+    options = ("--solver", solver, "--metric", "latent", "--margin", "1", "--threshold", "0.4")
+    result = lcollision("resolve", model_file, poses, "-o", out, *options)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.count("exactly free of") == 4
+    assert "mean: free as it is, unchanged" in result.stdout
+
+
+def test_a_mesh_comes_back_in_its_place(
+    lcollision: Lcollision,
+    model: PoseModel,
+    model_file: Path,
+    colliding: np.ndarray,
+    tmp_path: Path,
+) -> None:
+    source, out = tmp_path / "bent.obj", tmp_path / "free.ply"
+    vertices = colliding_mesh(model, colliding[1], source)
+    result = lcollision("resolve", model_file, source, "-o", out)
+    assert result.exit_code == 0, result.stderr
+    assert "bent.obj is encoded with a fit error of " in result.stderr
+    fixed = read_mesh(out)
+    assert np.array_equal(fixed.topology.faces, model.faces)
+    assert n_pairs(model, fixed.vertices) == 0
+    assert n_pairs(model, vertices) > 0
+    # Nearer than a wrong place or another order of vertices would be.
+    assert np.linalg.norm(fixed.vertices - vertices, axis=1).mean() < 0.1 * model.height
+
+
+def test_detail_is_kept_where_it_stays_free(
+    lcollision: Lcollision,
+    model: PoseModel,
+    model_file: Path,
+    colliding: np.ndarray,
+    tmp_path: Path,
+) -> None:
+    n_kept = 0
+    for place, latent in enumerate(colliding):
+        source = tmp_path / f"bent{place}.obj"
+        vertices = colliding_mesh(model, latent, source)
+        plain, detailed = tmp_path / "plain.obj", tmp_path / "detailed.obj"
+        assert lcollision("resolve", model_file, source, "-o", plain).exit_code == 0
+        result = lcollision("resolve", model_file, source, "-o", detailed, "--keep-detail")
+        assert result.exit_code == 0
+        fixed, bare = read_mesh(detailed).vertices, read_mesh(plain).vertices
+        assert n_pairs(model, fixed) == 0
+        if "with its detail the fixed mesh would collide" in result.stderr:
+            assert np.array_equal(fixed, bare)
+            continue
+        n_kept += 1
+        encoded = model.encode(read_mesh(source).vertices)
+        residual = vertices - encoded.placement.apply(model.decode(encoded.latent))
+        np.testing.assert_allclose(fixed - bare, residual, atol=2e-4 * model.height)
+        assert np.abs(residual).max() > 1e-3 * model.height
+    assert n_kept > 0
+
+
+def test_a_free_mesh_with_detail_comes_back_as_it_was(
+    lcollision: Lcollision, model: PoseModel, model_file: Path, tmp_path: Path
+) -> None:
+    source, out = tmp_path / "straight.obj", tmp_path / "same.obj"
+    colliding_mesh(model, np.zeros(model.latent_size), source)
+    result = lcollision("resolve", model_file, source, "-o", out, "--keep-detail")
+    assert result.exit_code == 0
+    assert np.array_equal(read_mesh(out).vertices, read_mesh(source).vertices)
+
+
+def test_a_folder_takes_several(
+    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    result = lcollision("resolve", model_file, poses, "-o", out, "--format", "off")
+    assert result.exit_code == 0
+    assert sorted(file.name for file in out.iterdir()) == [
+        "mean.off",
+        *(f"pose {place}.off" for place in range(4)),
+    ]
+    for file in out.iterdir():
+        assert n_pairs(model, read_mesh(file).vertices) == 0
+
+
+def test_locks_and_weights_by_name(
+    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "free.json"
+    name = model.domain_names[0]
+    result = lcollision("resolve", model_file, poses, "-o", out, "--lock", name, "--json")
+    assert result.exit_code in (0, 1)
+    for before, after in zip(read_poses(poses, model), read_poses(out, model), strict=True):
+        assert after.latent[2:5].tolist() == before.latent[2:5].tolist()
+    result = lcollision("resolve", model_file, poses, "-o", out, "--weight", "2=50")
+    assert result.exit_code == 0
+
+
+def test_all_domains_locked_leaves_poses_colliding(
+    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "same.json"
+    result = lcollision("resolve", model_file, poses, "-o", out, "--lock", "1", "--lock", "2")
+    assert result.exit_code == 1
+    assert result.stderr.count("every domain is locked") == 4
+    assert result.stdout.count("still colliding") == 4
+    for before, after in zip(read_poses(poses, model), read_poses(out, model), strict=True):
+        assert after.latent.tolist() == before.latent.tolist()
+
+
+def test_unverified_answers_say_so(
+    lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "free.json"
+    result = lcollision("resolve", model_file, poses, "-o", out, "--no-verify", "--json")
+    rows = json.loads(result.stdout)
+    assert {row["exactly_free"] for row in rows} == {None}
+    assert {row["pairs_before"] for row in rows} == {None}
+    assert result.exit_code == (0 if all(row["predicted_free"] for row in rows) else 1)
+
+
+def test_a_sequence_reports_its_largest_change(
+    lcollision: Lcollision,
+    model: PoseModel,
+    model_file: Path,
+    colliding: np.ndarray,
+    tmp_path: Path,
+) -> None:
+    path, out = tmp_path / "motion.json", tmp_path / "free.json"
+    ways = np.linspace(0.0, 1.0, 12)
+    frames = [NamedPose(f"frame {i}", way * colliding[0]) for i, way in enumerate(ways)]
+    write_poses(path, model, frames)
+    result = lcollision("resolve", model_file, path, "-o", out, "--sequence")
+    assert result.exit_code == 0
+    assert "from frame to frame the correction changes by at most " in result.stderr
+    assert len(read_poses(out, model)) == 12
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--threshold", "0"), "the threshold must be a probability between 0 and 1, got 0"),
+        (("--threshold", "1.5"), "the threshold must be a probability between 0 and 1, got 1.5"),
+        (("--solver", "magic"), "there is no solver 'magic'; choose one of sqp, auglag"),
+        (("--metric", "near"), "there is no metric 'near'; choose one of eye, latent"),
+        (("--margin", "-2"), "the margin must be 0 or more, got -2"),
+        (("--lock", "tail"), "has no domain 'tail'; its domains are"),
+        (("--lock", "0"), "has no domain '0'; its domains are"),
+        (("--weight", "1"), "--weight '1' is not DOMAIN=W"),
+        (("--weight", "1=-3"), "--weight '1=-3' is not DOMAIN=W"),
+        (("--time-budget", "0"), "the time budget must be more than 0 seconds, got 0"),
+        (("--keep-detail",), "no room for --keep-detail"),
+    ],
+)
+def test_bad_options_are_one_sentence(
+    lcollision: Lcollision,
+    model_file: Path,
+    poses: Path,
+    tmp_path: Path,
+    options: tuple[str, ...],
+    sentence: str,
+) -> None:
+    result = lcollision("resolve", model_file, poses, "-o", tmp_path / "free.json", *options)
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+    assert not (tmp_path / "free.json").exists()
+
+
+def test_bad_inputs_are_one_sentence_each_and_the_rest_is_done(
+    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    empty, alien, broken = (tmp_path / name for name in ("empty.json", "alien.json", "nan.json"))
+    empty.write_text("")
+    text = poses.read_text()
+    alien.write_text(text.replace(model.fingerprint, "0" * 16))
+    document = json.loads(text)
+    document["poses"][1]["latent"][3] = float("nan")
+    broken.write_text(json.dumps(document))
+    none = tmp_path / "none.json"
+    none.write_text(json.dumps(json.loads(text) | {"poses": []}))
+    out = tmp_path / "free.json"
+    inputs = (empty, alien, broken, none, tmp_path / "gone.obj", poses)
+    result = lcollision("resolve", model_file, *inputs, "-o", out)
+    assert result.exit_code == 2
+    sentences = result.stderr.splitlines()
+    assert len(sentences) == 5
+    for path, sentence in zip(inputs, sentences, strict=False):
+        assert str(path) in sentence
+    assert "is no JSON" in sentences[0]
+    assert "which is not" in sentences[1]
+    assert "has no poses in it" in sentences[3]
+    assert len(read_poses(out, model)) == 5
+    alone = lcollision("resolve", model_file, empty, "-o", tmp_path / "other.json")
+    assert alone.exit_code == 2
+    assert not (tmp_path / "other.json").exists()
+
+
+def test_an_output_that_cannot_be_is_refused_first(
+    lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    for out, sentence in (
+        (tmp_path / "no" / "free.json", "there is no folder"),
+        (tmp_path / "free.docx", ".docx is no format known here"),
+        (tmp_path / "free.obj", "is one mesh, but there are 5 poses"),
+    ):
+        result = lcollision("resolve", model_file, poses, "-o", out)
+        assert result.exit_code == 2
+        assert sentence in result.stderr
+        assert result.stderr.count("\n") == 1
+
+
+def test_a_model_without_a_predictor_is_refused(
+    lcollision: Lcollision, model: PoseModel, poses: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "bare.safetensors"
+    PoseModel(model.name, model.embedding, model.card).save(path)
+    result = lcollision("resolve", path, poses, "-o", tmp_path / "free.json")
+    assert result.exit_code == 2
+    assert "has no predictor" in result.stderr
+
+
+def test_an_interrupted_batch_keeps_what_is_finished(
+    lcollision: Lcollision,
+    model: PoseModel,
+    model_file: Path,
+    colliding: np.ndarray,
+    tmp_path: Path,
+) -> None:
+    path, out = tmp_path / "many.json", tmp_path / "free.json"
+    many = [NamedPose(f"pose {i}", colliding[i % 4] * (1.0 - 1e-5 * i)) for i in range(2000)]
+    write_poses(path, model, many)
+    interrupt = threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT))
+    interrupt.start()
+    result = lcollision("resolve", model_file, path, "-o", out)
+    interrupt.cancel()
+    assert result.exit_code == 130
+    kept = read_poses(out, model)
+    assert f"stopped; {out} has {len(kept)} of 2000 poses" in result.stderr
+    assert 0 < len(kept) < 2000
+    vertices = model.decode(np.stack([pose.latent for pose in kept[:50]])).astype(np.float32)
+    assert not model.detector.are_colliding(vertices).any()
+
+
+def test_benchmark_compares_the_solvers_with_bisection(
+    lcollision: Lcollision, model_file: Path, tmp_path: Path
+) -> None:
+    figures = tmp_path / "figures"
+    result = lcollision(
+        *("benchmark", "resolve", "--model", model_file, "-n", "6", "--json"),
+        *("--figure", figures, "--solver", "sqp", "--solver", "auglag"),
+    )
+    assert result.exit_code == 0, result.stderr
+    rows = json.loads(result.stdout)
+    assert [row["solver"] for row in rows] == ["bisection", "sqp", "auglag"]
+    assert list(rows[0]) == [
+        *("solver", "poses", "median_ms", "p95_ms", "feasible_rate", "exactly_free_rate"),
+        *("free_before_walk_back", "energy_decrease", "latent_distance", "vertex_distance"),
+    ]
+    for row in rows:
+        assert row["poses"] == 6
+        assert row["exactly_free_rate"] == 1.0
+        assert 0.0 < row["median_ms"] <= row["p95_ms"]
+        assert 0.0 < row["vertex_distance"] < 0.5
+    for name in ("convergence-sqp", "energy-sqp", "convergence-auglag", "energy-auglag"):
+        with Image.open(figures / f"{name}.png") as picture:
+            assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 3
+
+
+def test_benchmark_resolves_the_colliding_poses_of_a_set(
+    lcollision: Lcollision, model_file: Path, helpless_file: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "bends.npz"
+    write_pose_set(path, bending_tube(most=4.0))
+    options = ("--data", path, "-n", "3", "--json", "--solver", "sqp")
+    result = lcollision("benchmark", "resolve", "--model", model_file, *options)
+    assert result.exit_code == 0, result.stderr
+    assert [row["exactly_free_rate"] for row in json.loads(result.stdout)][1:] == [1.0]
+    helpless = lcollision("benchmark", "resolve", "--model", helpless_file, *options)
+    assert helpless.exit_code == 2
+    assert "knows no free pose to bisect to" in helpless.stderr
