@@ -15,7 +15,7 @@ from app.benchmarks.resolve import SolverRuns
 from lcollision_core.meshes import atomic_write
 
 _WIDTH, _HEIGHT = 900, 620
-_LEFT, _RIGHT, _TOP, _BOTTOM = 110, 40, 70, 90
+_LEFT, _RIGHT, _TOP, _BOTTOM = 110, 40, 100, 90
 _INK, _GRID = (40, 44, 52), (222, 224, 230)
 _PALE, _FULL = np.array([236, 242, 250.0]), np.array([18, 64, 133.0])
 _TIME_BINS, _ITERATION_BINS, _CHANGE_BINS = 24, 16, 40
@@ -27,7 +27,7 @@ def draw_convergence(runs: SolverRuns, path: str | os.PathLike[str]) -> None:
 
     Parameters
     ----------
-    runs : of one solver
+    runs : of one solver, one pose at least
     path : the .png file to write, whole or not at all
 
     Notes
@@ -37,9 +37,10 @@ def draw_convergence(runs: SolverRuns, path: str | os.PathLike[str]) -> None:
     """
     milliseconds = 1e3 * runs.seconds
     most_time = max(float(np.quantile(milliseconds, _MOST_SHOWN)), 1e-3)
-    most_steps = max(float(np.quantile(runs.iterations, _MOST_SHOWN)), 1.0)
+    per_bin = max(1, round(float(np.quantile(runs.iterations, _MOST_SHOWN)) / _ITERATION_BINS))
+    most_steps = float(per_bin * _ITERATION_BINS)
     counts, _, _ = np.histogram2d(
-        np.minimum(runs.iterations, most_steps),
+        np.minimum(runs.iterations, most_steps - 1),
         np.minimum(milliseconds, most_time),
         bins=(_ITERATION_BINS, _TIME_BINS),
         range=((0.0, most_steps), (0.0, most_time)),
@@ -90,7 +91,7 @@ def draw_energy_change(runs: SolverRuns, path: str | os.PathLike[str]) -> None:
 def _canvas(title: str) -> tuple[Image.Image, ImageDraw.ImageDraw]:
     picture = Image.new("RGB", (_WIDTH, _HEIGHT), "white")
     draw = ImageDraw.Draw(picture)
-    draw.text((_LEFT, 24), title, fill=_INK, font=_font(20))
+    draw.text((_LEFT, 20), title, fill=_INK, font=_font(20))
     return picture, draw
 
 
@@ -118,7 +119,7 @@ def _label_axes(
             value = low + share * (high - low)
             draw.text(place, f"{value:.3g}", fill=_INK, font=_font(16), anchor=anchor)
     draw.text(((_LEFT + right) // 2, _HEIGHT - 34), across, fill=_INK, font=_font(18), anchor="mm")
-    draw.text((_LEFT - 60, _TOP - 18), up, fill=_INK, font=_font(18), anchor="lm")
+    draw.text((_LEFT - 60, _TOP - 22), up, fill=_INK, font=_font(18), anchor="lm")
 
 
 def _edges(n_bins: int, start: int, stop: int) -> Sequence[int]:

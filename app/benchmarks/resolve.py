@@ -60,13 +60,13 @@ class ResolveScore:
 
 @dataclass(frozen=True, eq=False)
 class SolverRuns:
-    """What the paper's histograms are drawn of: one solver alone, its feasible poses.
+    """What the paper's histograms are drawn of: one solver alone.
 
     Attributes
     ----------
     solver : name
-    iterations : (n,) of all poses
-    seconds : (n,) of all poses
+    iterations, seconds : (n,) of the poses that the predictor calls colliding, or of all where
+        it calls none so
     energy_change : (m,) relative change of the exact energy of the feasible ones, -1 all gone
     """
 
@@ -208,10 +208,11 @@ def score_solver(
         latent_distance=float(np.mean([result.latent_distance for result in whole])),
         vertex_distance=float(np.mean([result.vertex_distance_mean for result in whole])),
     )
+    shown = called if called.any() else ~called
     runs = SolverRuns(
         solver=str(solver),
-        iterations=np.array([result.iterations for result in alone]),
-        seconds=np.array([result.seconds for result in alone]),
+        iterations=np.array([result.iterations for result in alone])[shown],
+        seconds=np.array([result.seconds for result in alone])[shown],
         energy_change=change,
     )
     return score, runs
