@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPointF, Qt, QTimer, Signal, Slot
-from PySide6.QtGui import QDragEnterEvent, QDropEvent, QKeyEvent, QMouseEvent
+from PySide6.QtGui import QDragEnterEvent, QDropEvent, QKeyEvent, QMouseEvent, QResizeEvent
 from pyvistaqt import QtInteractor
 from vtkmodules.vtkRenderingCore import vtkActor, vtkCellPicker
 
@@ -142,6 +142,11 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._fast = self._settled and seconds < _FAST_SECONDS
         self.n_painted += 1
         self.painted.emit(seconds)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Draw rough pictures while the window is pulled."""
+        super().resizeEvent(event)
+        self.redraw()
 
     def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
         """Leave keys to the window: VTK has shortcuts of its own."""

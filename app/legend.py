@@ -53,7 +53,8 @@ class LegendCard(QWidget):
         if legend.note:
             height += line.height()
         if legend.ramp:
-            width = max(width, _RAMP_WIDTH + line.horizontalAdvance(legend.ticks[-1][1]) * 0.5)
+            beyond = 0.5 * line.horizontalAdvance(legend.ticks[-1][1])
+            width = max(width, _RAMP_WIDTH + (beyond if len(legend.ticks) > 2 else 0.0))
             height += CLOSE + _RAMP_HEIGHT + TIGHT + line.height()
         if legend.swatches:
             height += CLOSE + len(legend.swatches) * self._row(line)

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 ImageArray = npt.NDArray[np.uint8]
 
+_NOTHING = "#000000"
+"""Behind a cut-out picture: adds nothing to the pixels that a rim covers in part."""
+
 _FINEST = 512 * 512
 """Pixels up to which a picture is drawn 16 times as large and shrunk."""
 
@@ -31,7 +34,6 @@ class PoseRenderer:
     width, height : in pixels
     dark : for a dark theme
     transparent : nothing but the mesh, without a background
-    background : "#rrggbb" instead of the theme's gradient
     """
 
     def __init__(
@@ -41,7 +43,6 @@ class PoseRenderer:
         height: int,
         dark: bool = False,
         transparent: bool = False,
-        background: str | None = None,
     ) -> None:
         import pyvista as pv
         from vtkmodules.vtkCommonCore import vtkLogger
@@ -64,8 +65,8 @@ class PoseRenderer:
             self._plotter, model.faces, model.n_vertices, model.up_axis, model.height, dark
         )
         self.scene.show_floor(not transparent)
-        if background is not None or transparent:
-            self.scene.set_plain_background(background or "#ffffff")
+        if transparent:
+            self.scene.set_plain_background(_NOTHING)
         self._shower = PoseShower(model)
         self._shader = Shader.of(model, dark)
         self._front = front_direction(model.reference, model.up_axis)
@@ -102,8 +103,8 @@ class PoseRenderer:
         pixels = np.asarray(
             self._plotter.screenshot(return_img=True, transparent_background=self._transparent)
         )
-        if pixels.shape[2] == 4:
-            return pixels
+        if self._transparent:
+            return _uncovered(pixels)
         opaque = np.full((*pixels.shape[:2], 1), 255, dtype=np.uint8)
         return np.concatenate([pixels, opaque], axis=2)
 
@@ -135,10 +136,24 @@ class PoseRenderer:
         pixels = self.drawn()
         picture = Image.fromarray(pixels if self._transparent else pixels[:, :, :3].copy())
         encoded = io.BytesIO()
-        picture.save(encoded, format="PNG")
+        # Level 6, the default, takes seconds for a large picture and saves little.
+        picture.save(encoded, format="PNG", compress_level=3)
         with atomic_write(path) as file:
             file.write(encoded.getbuffer())
 
     def close(self) -> None:
         """Free the picture's memory on the graphics card."""
         self._plotter.close()
+
+
+def _uncovered(pixels: ImageArray) -> ImageArray:
+    """Give pixels of a rim, darkened by the black behind, the colour of what covers them.
+
+    Parameters
+    ----------
+    pixels : (height, width, 4) uint8 array, drawn on black; alpha is the share that is covered
+    """
+    alpha = np.maximum(pixels[:, :, 3:], 1).astype(np.float32)
+    straight = pixels.copy()
+    straight[:, :, :3] = np.minimum(pixels[:, :, :3] * (255.0 / alpha), 255.0).astype(np.uint8)
+    return straight

@@ -147,18 +147,23 @@ class Scene:
         for actor in (self._floor_actor, self._shadow_actor):
             actor.GetProperty().LightingOff()
             actor.SetPickable(False)
-        for actor in (
+        self._actors = (
             self._floor_actor,
             self._shadow_actor,
             self.body,
             self._crossing_actor,
             self._ghost_actor,
             self._through_actor,
-        ):
+        )
+        for actor in self._actors:
             self._renderer.AddActor(actor)
-        self._plotter = plotter
         self._floor_shown = True
         self.set_dark(dark)
+
+    def remove(self) -> None:
+        """Take everything out of the renderer, for another scene."""
+        for actor in self._actors:
+            self._renderer.RemoveActor(actor)
 
     def set_dark(self, dark: bool) -> None:
         """Take the colours of the light or the dark theme."""
@@ -178,7 +183,7 @@ class Scene:
         self._shadow_actor.SetVisibility(shown)
 
     def set_plain_background(self, colour: str) -> None:
-        """Put one colour behind everything, as pictures that are cut out or packed need it."""
+        """Put one colour, "#rrggbb", behind everything, as pictures to be cut out need it."""
         self._renderer.SetGradientBackground(False)
         self._renderer.SetBackground(*_share(colour))
 

@@ -185,6 +185,8 @@ class Shader:
         if shading is Shading.EXACT:
             if vertex_energy is None:
                 return Legend("Exact overlap", "computed when the pose rests")
+            if not vertex_energy.any():
+                return Legend("Exact overlap", "none: nothing intersects")
             return Legend(
                 "Exact overlap",
                 "in % of the height",

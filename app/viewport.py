@@ -330,14 +330,13 @@ class Viewport(QWidget):
         self._glide.stop()
         self._turn.stop()
         model = self._document.model
-        if self._canvas is not None:
-            self._canvas.shut_down()
-            self._layout.removeWidget(self._canvas)
-            self._canvas.deleteLater()
-        self._canvas = Canvas(self._bring_up_to_date, self)
-        self._canvas.hovered.connect(self._on_hovered)
-        self._canvas.painted.connect(self.painted)
-        self._canvas.camera_moved.connect(self._turn.stop)
+        if self._canvas is None:
+            self._canvas = Canvas(self._bring_up_to_date, self)
+            self._canvas.hovered.connect(self._on_hovered)
+            self._canvas.painted.connect(self.painted)
+            self._canvas.camera_moved.connect(self._turn.stop)
+        if self._scene is not None:
+            self._scene.remove()
         self._scene = Scene(
             self._canvas,
             model.faces,

@@ -50,7 +50,7 @@ def shader(request: pytest.FixtureRequest) -> Shader:
 
 
 def ramps(shader: Shader) -> list[list[str]]:
-    energy = np.zeros(2), np.zeros(4)
+    energy = np.zeros(2), np.full(4, 1e-6)
     return [
         list(shader.legend(shading, *energy).ramp) for shading in (Shading.PREDICTED, Shading.EXACT)
     ]
@@ -149,7 +149,10 @@ def test_legends_name_what_is_drawn(shader: Shader) -> None:
     domains = shader.legend(Shading.DOMAINS)
     assert domains.ramp[0] == "#ffffff"
     assert [text for _, text in domains.ticks] == ["shared", "alone"]
-    exact = shader.legend(Shading.EXACT, None, np.zeros(4))
+    free = shader.legend(Shading.EXACT, None, np.zeros(4))
+    assert free.note == "none: nothing intersects"
+    assert not free.ramp
+    exact = shader.legend(Shading.EXACT, None, np.full(4, 1e-6))
     assert exact.swatches == (("intersecting triangles", COLLIDING_FACE),)
     assert [place for place, _ in exact.ticks] == [0.0, 0.5, 1.0]
     assert exact.ticks[1][1] == "0.3"
