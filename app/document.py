@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from PySide6.QtCore import QObject, Signal, Slot
 
 from app import tasks
 from app.commands import ChangeState, DocumentState
-from app.engine import Failure, LivePose, LongWork
+from app.engine import Failure, LivePose, LongWork, Work
 from app.frames import ExactVerdict, LiveFrame, PosePrediction
 from app.history import UNNAMED, PoseHistory, read_only
 from lcollision_core.errors import LCollisionError, ModelFileError
@@ -80,7 +81,7 @@ class PoseDocument(PoseHistory):
         self._exact: ExactVerdict | None = None
 
         self._solve: int | None = None
-        self._mirroring = 0
+        self._mirroring = self._incoming = 0
         self._closed = False
         self._live = LivePose(REST_MILLISECONDS, self)
         self._live.frame_computed.connect(self._on_frame_computed)
@@ -164,13 +165,7 @@ class PoseDocument(PoseHistory):
         self._edit(f"Move {self.code_name(index)}", latent, run=index)
 
     def set_latent(self, latent: npt.ArrayLike, label: str) -> None:
-        """Set the whole pose, in one step.
-
-        Parameters
-        ----------
-        latent : (D,) finite array
-        label : what the menu calls the step
-        """
+        """Set the whole pose, a (D,) finite array, in one step with this name in the menu."""
         self._edit(label, np.array(latent, dtype=np.float64))
 
     def reset_code(self, index: int) -> None:
@@ -250,8 +245,7 @@ class PoseDocument(PoseHistory):
 
     def _put_in(self, opened: tasks.OpenedModel) -> None:
         self._model = opened.model
-        self._model_file = opened.file
-        self._mirror = opened.mirror
+        self._model_file, self._mirror = opened.file, opened.mirror
         self._locked = frozenset()
         self.cancel_all()
         self._frame = self._exact = self._gesture = self._file = None
@@ -276,19 +270,17 @@ class PoseDocument(PoseHistory):
 
     def open_model(self, name_or_path: str | Path) -> None:
         """Read a model in the long worker and put it in."""
-        self._long.start(
-            f"Opening {name_or_path}", tasks.opened_model(name_or_path), self._on_model
-        )
+        self._bring(f"Opening {name_or_path}", tasks.opened_model(name_or_path), self._on_model)
 
     def new_pose(self) -> None:
         """Start anew: an unnamed pose, no library, no file, no history."""
+        self._long.cancel(self._incoming)
         self._begin(self._blank(), None)
 
     def open_poses(self, path: str | Path) -> None:
         """Read a poses file in the long worker; its poses are the library, its first is edited."""
-        self._long.start(
-            f"Opening {Path(path).name}", tasks.read(self.model, Path(path)), self._on_poses
-        )
+        work = tasks.read(self.model, Path(path))
+        self._bring(f"Opening {Path(path).name}", work, self._on_poses)
 
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
         """Read what a crash left, in the long worker, and make it the pose, unsaved.
@@ -300,12 +292,10 @@ class PoseDocument(PoseHistory):
         name : of the pose that was edited
         file : that it came from
         """
-        if model_file == self._model_file:
-            opened = tasks.OpenedModel(self.model, model_file, self._mirror)
-        else:
-            opened = None
+        is_open = model_file == self._model_file
+        opened = tasks.OpenedModel(self.model, model_file, self._mirror) if is_open else None
         work = tasks.recovered(opened, model_file, poses_file, name, file)
-        self._long.start(f"Recovering {name}", work, self._on_recovered)
+        self._bring(f"Recovering {name}", work, self._on_recovered)
 
     def save(self, path: str | Path | None = None) -> None:
         """Write the library and the edited pose, under its name, and clear the modified mark.
@@ -335,9 +325,8 @@ class PoseDocument(PoseHistory):
 
     def import_mesh(self, path: str | Path) -> None:
         """Encode a mesh of the model's topology in the long worker and make it the pose."""
-        self._long.start(
-            f"Importing {Path(path).name}", tasks.encoded(self.model, Path(path)), self._on_encoded
-        )
+        work = tasks.encoded(self.model, Path(path))
+        self._bring(f"Importing {Path(path).name}", work, self._on_encoded)
 
     def export_mesh(self, path: str | Path) -> None:
         """Write the mesh on the screen in the long worker, bit by bit, but back in its place.
@@ -430,8 +419,8 @@ class PoseDocument(PoseHistory):
 
     def _on_poses(self, read: tasks.ReadPoses) -> None:
         first = read.poses[0]
-        state = DocumentState(read_only(first.latent), first.name, first.placement, read.poses)
-        self._begin(state, read.path)
+        latent = read_only(first.latent)
+        self._begin(DocumentState(latent, first.name, first.placement, read.poses), read.path)
         n_poses = len(read.poses)
         self.message.emit(f"Opened {read.path.name}: {n_poses} pose{'s' * (n_poses != 1)}")
 
@@ -480,6 +469,12 @@ class PoseDocument(PoseHistory):
 
     def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
         self._push(label, replace(self._state, latent=read_only(latent), outcome=None), run)
+
+    def _bring(self, label: str, work: Work, done: Callable[[Any], None]) -> None:
+        """Start what will replace the pose; the newest such wish wins, also over Resolve."""
+        self.cancel_resolve()
+        self._long.cancel(self._incoming)
+        self._incoming = self._long.start(label, work, done)
 
     def _blank(self) -> DocumentState:
         return DocumentState(read_only(np.zeros(self.model.latent_size)), UNNAMED)

@@ -104,9 +104,9 @@ def _nothing() -> None:
 
 
 class LiveWorker(QObject):
-    """Computes frames and verdicts, in its own thread."""
+    """Computes frames and verdicts, in its own thread; `answered` tells what was asked too."""
 
-    answered = Signal(object)
+    answered = Signal(object, object)
 
     def __init__(self) -> None:
         super().__init__()
@@ -119,7 +119,7 @@ class LiveWorker(QObject):
         """Answer one request, whatever happens."""
         self._answer = _guarded(request.request_id, "following the pose", self._value, request)
         self._has_answered.set()
-        self.answered.emit(self._answer)
+        self.answered.emit(request, self._answer)
 
     def forget(self) -> None:
         """Make `awaited` wait for the next answer; called before that is asked for."""
@@ -196,7 +196,6 @@ class LivePose(QObject):
         self._last_id = 0
         self._told = ""
         self._is_quick = False
-        self._taken: Answer | None = None
         self._is_due = False
         # Sooner than a timer of 0 ms, which Qt fires after it has drawn the slider alone.
         self._due.connect(self._on_due, Qt.ConnectionType.QueuedConnection)
@@ -253,13 +252,14 @@ class LivePose(QObject):
             if answer is not None:
                 self._take(answer)
 
-    @Slot(object)
-    def _on_answered(self, answer: Answer) -> None:
-        if answer is not self._taken:
+    @Slot(object, object)
+    def _on_answered(self, request: FrameRequest | VerdictRequest, answer: Answer) -> None:
+        # One that was waited for comes a second time this way, maybe amid a later request.
+        if request is self._asked:
             self._take(answer)
 
     def _take(self, answer: Answer) -> None:
-        request, self._asked, self._taken = self._asked, None, answer
+        request, self._asked = self._asked, None
         # What is next is handed on before the answer is drawn: the worker need not wait for that.
         self._ask()
         if request is None or request.model is not self._model:

@@ -224,7 +224,11 @@ class Session(QObject):
         deadline = time.monotonic() + _TIMEOUT_SECONDS
         while not condition():
             if time.monotonic() > deadline:
-                raise TimeoutError("the window does not come to rest")
+                raise TimeoutError(
+                    f"the window does not come to rest: shown {self.is_shown()}, busy with "
+                    f"{self._document.busy!r}, checked {self._document.exact is not None}, at rest "
+                    f"{self._window.viewport.is_at_rest}"
+                )
             self.turn(wait=True)
 
     def turn(self, wait: bool = False) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from app.document import PoseDocument
 from app.engine import Failure, LongWork
 from app.frames import LiveFrame, PoseShower
 from lcollision_core.jobs import CancelToken, Progress
-from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.model import NamedPose, PoseModel, sample_poses, write_poses
 
 
 def settle(qtbot: QtBot, document: PoseDocument) -> None:
@@ -275,3 +276,68 @@ def test_jobs_run_in_turn_and_a_cancelled_one_is_not_heard_of(qtbot: QtBot) -> N
     assert work.busy == ""
     assert labels == ["first", "first", "second", ""]
     assert work.close(time.monotonic() + 5)
+
+
+def test_the_newest_file_wins_and_no_file_waits_for_a_solve(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name, number in (("first", 1), ("second", 2)):
+        pose = NamedPose(name, document.model.training_latent[number])
+        write_poses(tmp_path / f"{name}.json", document.model, [pose])
+    told: list[str] = []
+    document.message.connect(told.append)
+    working, ended = endless_resolve(monkeypatch)
+    document.resolve()
+    qtbot.waitUntil(working.is_set)
+    document.open_poses(tmp_path / "first.json")
+    assert not document.solving
+    document.open_poses(tmp_path / "second.json")
+    qtbot.waitUntil(lambda: bool(told) and not document.busy)
+    assert ended.is_set()
+    assert told == ["Opened second.json: 1 pose"]
+    assert document.pose_name == "second"
+    document.open_poses(tmp_path / "first.json")
+    document.new_pose()
+    settle(qtbot, document)
+    assert document.pose_name == "pose"
+    assert not document.latent.any()
+
+
+def test_slider_and_mesh_are_drawn_in_one_turn(qtbot: QtBot, document: PoseDocument) -> None:
+    """A quick frame is there before anything else that waits for its turn, such as painting."""
+    order: list[str] = []
+    for value in (0.1, 0.2, 0.3):
+        document.set_code(0, value)
+        settle(qtbot, document)
+    document.frame_changed.connect(lambda: order.append("frame"))
+    document.set_code(0, 0.4)
+    QTimer.singleShot(0, lambda: order.append("what waits"))
+    qtbot.waitUntil(lambda: len(order) == 2)
+    assert order == ["frame", "what waits"]
+
+
+def test_an_answer_that_comes_twice_is_not_taken_for_that_of_a_later_request(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, go_on = threading.Event(), threading.Event()
+    compute = PoseShower.frame
+
+    def slow(shower: PoseShower, latent: np.ndarray, request_id: int) -> LiveFrame:
+        started.set()
+        go_on.wait(10)
+        return compute(shower, latent, request_id)
+
+    worker = document._live._worker
+    with qtbot.waitSignal(worker.answered) as earlier:
+        document.set_code(0, 0.1)
+    settle(qtbot, document)
+    with monkeypatch.context() as patched:
+        patched.setattr(PoseShower, "frame", slow)
+        document.set_code(0, 0.2)
+        qtbot.waitUntil(started.is_set)
+        assert earlier.args is not None
+        worker.answered.emit(*earlier.args)
+        go_on.set()
+        settle(qtbot, document)
+    assert document.frame is not None
+    assert document.frame.latent[0] == 0.2
