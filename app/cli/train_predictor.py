@@ -149,6 +149,11 @@ def _training_bar(leads: bool) -> Iterator[StatusCallback]:
         bar = bars.add_task("reading rows", total=None, facts="")
 
         def show(status: PredictorStatus) -> None:
+            if status.preparing is not None:
+                bars.update(
+                    bar, description="labelling patches", completed=status.preparing, total=1
+                )
+                return
             facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
             if status.held_out_accuracy is not None:
                 facts.append(f"{100.0 * status.held_out_accuracy:.1f} % right")

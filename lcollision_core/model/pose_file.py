@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.meshes import RigidTransform, atomic_write
-from lcollision_core.model.pose_model import EncodedPose, PoseModel
+from lcollision_core.model.encoded_pose import EncodedPose
+from lcollision_core.model.pose_model import PoseModel
 
 POSES_FORMAT = "lcollision-poses"
 POSES_VERSION = 1

@@ -20,7 +20,7 @@ class PredictorConfig:
 
     Attributes
     ----------
-    preset : names the network, see `networks.NETWORKS`
+    preset : names the network, see `presets.NETWORKS`
     by_domain : whether there is a predictor for each domain; False is the paper's baseline ND
     depth_weight, rank_weight, entropy_weight : of L_PD, L_rank, L_entropy; the entropy's is over 0
     rate : Adam's step size; the largest one with the schedule "one-cycle"
@@ -67,7 +67,16 @@ class PredictorConfig:
 
 
 PRESETS = {
-    "default": PredictorConfig("default", schedule="one-cycle", batch_rows=256, epochs=10),
+    "default": PredictorConfig(
+        "default",
+        depth_weight=1.0,
+        rank_weight=0.0,
+        entropy_weight=1.0,
+        rate=2e-3,
+        schedule="one-cycle",
+        batch_rows=128,
+        epochs=10,
+    ),
     "paper": PredictorConfig("paper"),
 }
 """The presets by name: what measures best, and Tan et al. 2021, section Evaluation."""

@@ -20,8 +20,10 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.predictor.config import PredictorConfig
-from lcollision_core.predictor.networks import NETWORKS, PredictorNetwork, Targets
+from lcollision_core.predictor.networks import PredictorNetwork, Targets
+from lcollision_core.predictor.patch_labels import patch_roots
 from lcollision_core.predictor.predictor import TrainingFacts, taken
+from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.processes import Processes, joined_processes
 from lcollision_core.predictor.training import PredictorStatus, StatusCallback
 
@@ -81,6 +83,7 @@ class TrainingLoop:
         self._losses: list[float] = []
         self._accuracy: float | None = None
         self._reported = -math.inf
+        self._preparing: float | None = None
 
     def run(self) -> PredictorNetwork:
         """Train, or go on from the checkpoint; returns the network on the training device.
@@ -107,7 +110,15 @@ class TrainingLoop:
         shared: torch.nn.Module = network
         if processes.count > 1:
             shared = DistributedDataParallel(network)
-        batches = _Batches(self._rows, self._training_index, config, self._facts, processes.device)
+        batches = _Batches(
+            self._rows,
+            self._training_index,
+            config,
+            self._facts,
+            processes.device,
+            self._patch_roots(network),
+        )
+        self._preparing = None
         network.train()
         self._report(step)
         while step < self._total:
@@ -132,6 +143,26 @@ class TrainingLoop:
                 )
             self._after_step(step, network, optimiser, checkpoint, processes)
         return network
+
+    def _patch_roots(self, network: PredictorNetwork) -> npt.NDArray[np.float16]:
+        if network.patch is None:
+            return np.empty((len(self._training_index), 0), dtype=np.float16)
+        store = self._facts.store
+
+        def report(done: int, total: int) -> None:
+            self._preparing = done / total
+            self._report(0)
+
+        return patch_roots(
+            self._embedding,
+            self._rows.latent,
+            self._training_index,
+            network.patch,
+            0.0 if store is None else store.near_exclusion,
+            self._facts.energy_scale,
+            progress=report,
+            cancel=self._cancel,
+        )
 
     def _after_step(
         self,
@@ -168,6 +199,7 @@ class TrainingLoop:
                 total=self._total,
                 loss=math.fsum(self._losses) / len(self._losses) if self._losses else None,
                 held_out_accuracy=self._accuracy,
+                preparing=self._preparing,
             )
         )
 
@@ -241,25 +273,28 @@ class _Batches:
         config: PredictorConfig,
         facts: TrainingFacts,
         device: torch.device,
+        patch_root: npt.NDArray[np.float16],
     ) -> None:
-        self._rows, self._training_index = rows, training_index
+        self._rows, self._training_index, self._patch_root = rows, training_index, patch_root
         self._batch_rows, self._facts, self._device = config.batch_rows, facts, device
         self._epoch = -1
-        self._order = training_index
+        self._order = np.arange(len(training_index))
 
     def at(self, epoch: int, number: int) -> tuple[torch.Tensor, Targets]:
         """Return batch `number` of an epoch: codes and targets."""
         if epoch != self._epoch:
             self._epoch = epoch
             rng = np.random.default_rng([self._facts.seed, epoch])
-            self._order = rng.permutation(self._training_index)
+            self._order = rng.permutation(len(self._training_index))
         start = number * self._batch_rows
-        index = self._order[start : start + self._batch_rows]
+        place = self._order[start : start + self._batch_rows]
+        index = self._training_index[place]
         rows, scale = self._rows, self._facts.energy_scale
         targets = (
             rows.domain_energy[index] / scale,
             rows.energy[index] / scale,
             rows.n_pairs[index] > 0,
+            self._patch_root[place],
         )
         return self._tensor(rows.latent[index]), Targets(*map(self._tensor, targets))
 

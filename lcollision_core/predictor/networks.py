@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import nn
 
@@ -37,11 +39,20 @@ class NetworkOutput(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """The truth of B poses: scaled energies (B, K) and (B,), and (B,) 1 where they collide."""
+    """The truth of B poses.
+
+    Attributes
+    ----------
+    domain_energy : (B, K) scaled
+    energy : (B,) scaled
+    colliding : (B,) 1 where they collide, else 0
+    patch_root : (B, P) see `patch_labels`; (B, 0) for a network without patches
+    """
 
     domain_energy: torch.Tensor
     energy: torch.Tensor
     colliding: torch.Tensor
+    patch_root: torch.Tensor
 
     def part(self, start: int, stop: int) -> Targets:
         """Return rows `start` to `stop` - 1."""
@@ -88,6 +99,11 @@ class PredictorNetwork(nn.Module, ABC):
         network = cls.build(embedding, config)
         network.load_state_dict(state)
         return network
+
+    @property
+    def patch(self) -> npt.NDArray[np.int64] | None:
+        """(V,) the patch of skin of each vertex, for a network that learns patch by patch."""
+        return None
 
     @abstractmethod
     def forward(self, latent: torch.Tensor) -> NetworkOutput:
@@ -267,13 +283,3 @@ def _padded_codes(group_sizes: Sequence[int]) -> torch.Tensor:
         index[domain, :size] = torch.arange(start, start + size)
         start += size
     return index
-
-
-class SmoothNetwork(PaperNetwork):
-    """The paper's sizes with a smooth activation, which leaves solvers a curvature."""
-
-    activation = nn.SiLU
-
-
-NETWORKS: dict[str, type[PredictorNetwork]] = {"default": SmoothNetwork, "paper": PaperNetwork}
-"""The network of each preset."""

@@ -245,7 +245,7 @@ class CollisionPredictor:
         """
         import torch
 
-        from lcollision_core.predictor.networks import NETWORKS
+        from lcollision_core.predictor.presets import NETWORKS
 
         preset = section.metadata.get("preset")
         if preset not in PRESETS:
