@@ -91,6 +91,7 @@ def predictor(
     from lcollision_core.meshes import require_writable
     from lcollision_core.model import PoseModel, model_destination
     from lcollision_core.predictor import PRESETS, train_predictor
+    from lcollision_core.resolve import find_free_poses
 
     destination = model_destination(output)
     require_writable(destination)
@@ -121,7 +122,13 @@ def predictor(
             note(f"stopped; run the same command again to go on from {checkpoint}")
         raise
     if leads:
-        model.with_predictor(trained).save(destination)
+        free_latent = find_free_poses(model.embedding, model.detector, model.height)
+        if not len(free_latent):
+            note(
+                "no pose of this body that was tried is free of collision; Resolve has nowhere "
+                "to walk back to and may leave poses colliding"
+            )
+        model.with_predictor(trained).with_free_poses(free_latent).save(destination)
         checkpoint.unlink(missing_ok=True)
         if trained.metrics is not None:
             note(f"wrote {destination}: {scores_sentence(trained.metrics)}")
