@@ -75,6 +75,7 @@ class PoseDocument(PoseHistory):
         super().__init__(parent)
         self._model: PoseModel | None = None
         self._model_file = ""
+        self._predicts = False
         self._mirror: npt.NDArray[np.int32] | None = None
         self._locked: frozenset[int] = frozenset()
         self._frame: LiveFrame | None = None
@@ -141,7 +142,7 @@ class PoseDocument(PoseHistory):
     @property
     def can_resolve(self) -> bool:
         """Whether Resolve can be asked for: the model has a predictor."""
-        return self._model is not None and self._model.predictor is not None
+        return self._model is not None and self._model.has_predictor
 
     @property
     def can_mirror(self) -> bool:
@@ -192,13 +193,7 @@ class PoseDocument(PoseHistory):
         self._edit("Randomise", self._with_locked(latent))
 
     def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
-        """Blend between the pose at the gesture's begin and another one.
-
-        Parameters
-        ----------
-        latent : (D,) finite array, the other pose
-        share : 0 for the one at the begin, 1 for the other
-        """
+        """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1."""
         start = self._gesture[1].latent if self._gesture else self.latent
         target = np.asarray(latent, dtype=np.float64)
         self._edit("Blend", target.copy() if share == 1.0 else start + share * (target - start))
@@ -247,10 +242,13 @@ class PoseDocument(PoseHistory):
         self._model = opened.model
         self._model_file, self._mirror = opened.file, opened.mirror
         self._locked = frozenset()
-        self.cancel_all()
+        self.cancel_resolve()
+        self._long.cancel_all()
         self._frame = self._exact = self._gesture = self._file = None
         self._state = self._blank()
-        self._live.follow(self.model, self.latent)
+        self._predicts = False
+        self._live.follow(self.model, self.latent, self._predicts)
+        self._load_predictor()
         self.undo_stack.clear()
         # All of it is in before anyone is told: who looks finds poses of that model only, and
         # may edit at once.
@@ -283,15 +281,7 @@ class PoseDocument(PoseHistory):
         self._bring(f"Opening {Path(path).name}", work, self._on_poses)
 
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
-        """Read what a crash left, in the long worker, and make it the pose, unsaved.
-
-        Parameters
-        ----------
-        poses_file : what was left
-        model_file : of the model that was open
-        name : of the pose that was edited
-        file : that it came from
-        """
+        """Read what a crash left, as `LostPose` tells of it, and make it the pose, unsaved."""
         is_open = model_file == self._model_file
         opened = tasks.OpenedModel(self.model, model_file, self._mirror) if is_open else None
         work = tasks.recovered(opened, model_file, poses_file, name, file)
@@ -329,12 +319,7 @@ class PoseDocument(PoseHistory):
         self._bring(f"Importing {Path(path).name}", work, self._on_encoded)
 
     def export_mesh(self, path: str | Path) -> None:
-        """Write the mesh on the screen in the long worker, bit by bit, but back in its place.
-
-        Parameters
-        ----------
-        path : its extension says the format
-        """
+        """Write the mesh on the screen, back in its place, in the format that `path` says."""
         self._long.start(
             f"Exporting {Path(path).name}",
             tasks.exported(self.model, self.latent, self.placement, Path(path)),
@@ -375,9 +360,10 @@ class PoseDocument(PoseHistory):
             self.solve_finished.emit(None)
 
     def cancel_all(self) -> None:
-        """Stop all long work."""
+        """Stop all long work but the loading of the predictor."""
         self.cancel_resolve()
         self._long.cancel_all()
+        self._load_predictor()
 
     def close(self, timeout: float = 5.0) -> bool:
         """Stop all work and end the threads, before any window closes.
@@ -470,6 +456,17 @@ class PoseDocument(PoseHistory):
     def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
         self._push(label, replace(self._state, latent=read_only(latent), outcome=None), run)
 
+    def _load_predictor(self) -> None:
+        """Have predictions soon: the pose is shown, and can be edited, before."""
+        if self.can_resolve and not self._predicts and not self._closed:
+            work = tasks.loaded_predictor(self.model)
+            self._long.start("Loading predictions", work, self._on_predictor)
+
+    def _on_predictor(self, model: PoseModel) -> None:
+        if model is self._model:
+            self._predicts = True
+            self._live.follow(self.model, self.latent, self._predicts)
+
     def _bring(self, label: str, work: Work, done: Callable[[Any], None]) -> None:
         """Start what will replace the pose; the newest such wish wins, also over Resolve."""
         self.cancel_resolve()
@@ -482,7 +479,7 @@ class PoseDocument(PoseHistory):
     def _follow_latent(self) -> None:
         self.cancel_resolve()
         self._long.cancel(self._mirroring)
-        self._live.follow(self.model, self.latent)
+        self._live.follow(self.model, self.latent, self._predicts)
         if self._exact is not None:
             self._exact = None
             self.exact_changed.emit()

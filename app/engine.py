@@ -55,11 +55,18 @@ class Failure:
 
 @dataclass(frozen=True, eq=False)
 class FrameRequest:
-    """Ask for the frame of a pose. `latent` is a (D,) float64 array, read-only."""
+    """Ask for the frame of a pose.
+
+    Attributes
+    ----------
+    latent : (D,) float64 array, read-only
+    predicts : whether it is to have a prediction
+    """
 
     request_id: int
     model: PoseModel
     latent: npt.NDArray[np.float64]
+    predicts: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +138,12 @@ class LiveWorker(QObject):
 
     def _value(self, request: FrameRequest | VerdictRequest) -> object:
         if self._shower is None or self._shower.model is not request.model:
-            keep_torch_to_one_thread(request.model)
             self._shower = PoseShower(request.model)
+            self._shower.predicts = False
         if isinstance(request, FrameRequest):
+            if request.predicts and not self._shower.predicts:
+                keep_torch_to_one_thread(request.model)
+                self._shower.predicts = True
             return self._shower.frame(request.latent, request.request_id)
         return self._shower.verdict(request.frame)
 
@@ -201,16 +211,17 @@ class LivePose(QObject):
         self._due.connect(self._on_due, Qt.ConnectionType.QueuedConnection)
         self._rested = single_shot(self, rest_milliseconds, self._ask)
 
-    def follow(self, model: PoseModel, latent: npt.NDArray[np.float64]) -> None:
+    def follow(self, model: PoseModel, latent: npt.NDArray[np.float64], predicts: bool) -> None:
         """Want the frame, and later the verdict, of another pose.
 
         Parameters
         ----------
         latent : (D,) float64 array, read-only, as the worker reads it too
+        predicts : whether predictions can be had without loading anything
         """
         self._last_id += 1
         self._model = model
-        self._next = FrameRequest(self._last_id, model, latent)
+        self._next = FrameRequest(self._last_id, model, latent, predicts)
         self._shown = None
         self._rested.stop()
         if not self._is_due:

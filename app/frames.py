@@ -87,12 +87,17 @@ class PoseShower:
     Parameters
     ----------
     model : of all poses
+
+    Attributes
+    ----------
+    predicts : whether frames get predictions, as far as the model has a predictor
     """
 
     def __init__(self, model: PoseModel) -> None:
         from scipy.sparse import csr_matrix
 
         self.model = model
+        self.predicts = True
         self._corners = tuple(np.ascontiguousarray(corner) for corner in model.faces.T)
         n_faces = len(model.faces)
         # Sums the faces' normals into their vertices: one product instead of a scattered sum.
@@ -116,7 +121,7 @@ class PoseShower:
         vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
         normals = self.normals(vertices)
         prediction = None
-        if self.model.predictor is not None:
+        if self.predicts and self.model.has_predictor:
             predicted = self.model.predict(latent[None])
             prediction = PosePrediction(
                 domain_energy=_frozen(predicted.domain_energy[0]),
@@ -181,7 +186,7 @@ def keep_torch_to_one_thread(model: PoseModel) -> None:
     On a busy machine torch's threads wait for each other: one prediction took 32 ms instead of
     0.4. Does nothing for a model without a predictor, which needs no torch.
     """
-    if model.predictor is not None:
+    if model.has_predictor:
         import torch
 
         torch.set_num_threads(1)

@@ -103,13 +103,24 @@ def mirror_of(model: PoseModel) -> npt.NDArray[np.int32] | None:
 
 
 def warm_up(model: PoseModel) -> None:
-    """Compute all that a first drag needs once, in the thread that has the time."""
-    keep_torch_to_one_thread(model)
+    """Compute once, in the thread that has the time, what a first drag needs but predictions."""
     shower = PoseShower(model)
+    shower.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
     shower.verdict(shower.frame(latent, 0))
     _ = model.fingerprint, model.latent_space
+
+
+def loaded_predictor(model: PoseModel) -> Work:
+    """Load what predicts: torch takes longer than all else that the window needs."""
+
+    def work(_: Progress, __: CancelToken) -> PoseModel:
+        keep_torch_to_one_thread(model)
+        model.predict(np.zeros(model.latent_size))
+        return model
+
+    return work
 
 
 def read(model: PoseModel, path: Path) -> Work:

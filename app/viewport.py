@@ -439,7 +439,7 @@ class Viewport(QWidget):
             exact.vertex_energy if exact is not None else None,
         )
         scene.paint(self._shader.colours(self._shading, *energies, highlight=self._highlight))
-        has_predictor = self._document.model.predictor is not None
+        has_predictor = self._document.model.has_predictor
         self._legend.set_legend(self._shader.legend(self._shading, *energies, has_predictor))
         self._place_legend()
 

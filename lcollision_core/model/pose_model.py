@@ -334,6 +334,11 @@ class PoseModel:
         sections = {**self._other_sections, name: section}
         return PoseModel(self.name, self.embedding, self.card, sections)
 
+    @property
+    def has_predictor(self) -> bool:
+        """Whether a predictor was trained; unlike `predictor`, it loads nothing."""
+        return _PREDICTOR in self._other_sections
+
     @cached_property
     def predictor(self) -> CollisionPredictor | None:
         """What predicts collisions; None where none was trained yet.
