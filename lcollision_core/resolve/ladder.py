@@ -20,13 +20,16 @@ from lcollision_core.resolve.walk_back import walk_back
 MARGINS = (0.0, 2.0, 4.0, 8.0, 16.0)
 """In the logit, above the user's own. Those that no pose reaches still push in the right way."""
 
-FIRST_ITERATIONS, FURTHER_ITERATIONS = 6, 24
+ITERATIONS = (1, 1, 2, 2, 24)
+"""After each of these the poses are checked exactly, and the first that is free ends the search:
+what it lacks in nearness, shortening makes up for better than further iterations do."""
+
 START_MARGIN, START_ITERATIONS = 6.0, 15
 _KNOWN_STARTS, _RANDOM_STARTS = 4, 4
 _SPREAD = 0.1
-_POLISHED = 3
+_REMEMBERED, _POLISHED = 8, 3
 
-N_STEPS = 6
+N_STEPS = 8
 
 
 class Ladder:
@@ -59,6 +62,11 @@ class Ladder:
 
     def climb(self) -> ResolveResult:
         """Try the steps until one frees the pose, then shorten."""
+        result = self._climb()
+        self._progress(N_STEPS, N_STEPS)
+        return result
+
+    def _climb(self) -> ResolveResult:
         problem, check = self._problem, self._check
         problem.watch.poll()
         before = check.find(check.decode(problem.target)[0])
@@ -74,10 +82,7 @@ class Ladder:
         for done, (step, latent) in enumerate(self._steps()):
             self._progress(min(done, N_STEPS - 1), N_STEPS)
             if latent is not None:
-                shortened = shorten(check, problem, latent)
-                self._progress(N_STEPS, N_STEPS)
-                return self._result(shortened, step, before)
-        self._progress(N_STEPS, N_STEPS)
+                return self._result(shorten(check, problem, latent), step, before)
         return self._result(problem.target, Step.NONE, before, self._why_not())
 
     def solve_only(self) -> ResolveResult:
@@ -116,12 +121,14 @@ class Ladder:
                     return
             return
         batch = SqpBatch(problem, np.tile(problem.target, (len(margins), 1)), margins)
-        for n_iterations in (FIRST_ITERATIONS, FURTHER_ITERATIONS):
+        for n_iterations in ITERATIONS:
             outcomes = batch.run(n_iterations)
             self._keep(outcomes[0])
             latent = self._first_free([outcome.latent for outcome in outcomes])
             is_first = latent is not None and np.array_equal(latent, outcomes[0].latent)
             yield Step.SOLVER if is_first else Step.MARGIN, latent
+            if problem.watch.expired:
+                return
 
     def _by_starts(self) -> Iterator[tuple[Step, FloatArray | None]]:
         """Start between Z* and known free poses, and about Z* by chance."""
@@ -157,7 +164,7 @@ class Ladder:
         begin = problem.target if start is None else start
         if self._options.solver == Solver.SQP:
             batch = SqpBatch(problem, begin[None], np.array([margin]))
-            return batch.run(FIRST_ITERATIONS + FURTHER_ITERATIONS)[0]
+            return batch.run(sum(ITERATIONS))[0]
         from lcollision_core.resolve.nlopt_solvers import solve_nlopt
 
         return solve_nlopt(problem, Solver(self._options.solver), begin, margin)
@@ -172,7 +179,7 @@ class Ladder:
             self._problem.watch.poll()
             if self._check.is_free(latent):
                 return latent
-            self._candidates.append(latent)
+            self._candidates = [*self._candidates[1 - _REMEMBERED :], latent]
         return None
 
     def _why_not(self) -> str:

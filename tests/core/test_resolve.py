@@ -141,7 +141,8 @@ def test_the_solver_alone(
     resolver = resolver_of(tube_model, around_the_mean(latent, 0.3), np.empty((0, 8)))
     result = resolver.resolve(latent, ResolveOptions(solver=solver, metric=metric))
     assert result.step == Step.SOLVER
-    assert result.converged
+    # The first free pose of the default solver ends its search.
+    assert result.converged or solver == Solver.SQP
     assert result.iterations > 0
     assert result.note is None
     assert_free_by_brute_force(tube_model, result)
@@ -422,7 +423,7 @@ class _Cancelling:
 
 
 @pytest.mark.parametrize("solver", Solver)
-@pytest.mark.parametrize("at_call", [1, 4])
+@pytest.mark.parametrize("at_call", [1, 2])
 def test_cancel_within_one_evaluation(
     tube_model: PoseModel, deep: FloatArray, solver: Solver, at_call: int
 ) -> None:
