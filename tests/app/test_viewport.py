@@ -54,7 +54,18 @@ def dispose(shown: Viewport) -> None:
 
 def rest(qtbot: QtBot, viewport: Viewport) -> None:
     """Wait until the smooth picture of the newest pose is on the screen."""
-    qtbot.waitUntil(lambda: viewport.is_at_rest, timeout=20_000)
+
+    def settle() -> None:
+        frame, document = viewport.shown_frame, viewport._document
+        assert frame is not None, "no pose has been shown"
+        newest = document.frame is not None and document.frame.latent is document.latent
+        assert newest, "the frame of the newest pose has not come"
+        assert frame is document.frame, "the newest frame is not shown"
+        assert viewport.canvas is not None
+        assert viewport.canvas.is_settled, "the smooth picture has not been drawn"
+        assert viewport.is_at_rest, "something glides"
+
+    qtbot.waitUntil(settle, timeout=20_000)
     # Qt hands the picture to the screen after it is drawn.
     qtbot.wait(30)
 
