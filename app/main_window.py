@@ -231,7 +231,8 @@ class MainWindow(QMainWindow):
             self._autosave.close()
         if not self.document.close():
             _log.warning("a thread was still busy when the window closed")
-        self.library.close_renderer()
+        self.statusBar().clearMessage()
+        self.library.stop()
         self.viewport.shut_down()
         super().closeEvent(event)
 

@@ -19,12 +19,14 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from app.camera import front_direction, preset_view
 from app.panels.parts import ElidedLabel, Slider, labelled, silent
+from app.panels.thumbnail import draw_pose
 from app.theme import CLOSE, NORMAL, TIGHT, current_theme
 
 if TYPE_CHECKING:
     from app.document import PoseDocument
-    from app.rendering import PoseRenderer
+    from app.frames import PoseShower
     from lcollision_core.model import NamedPose
 
 THUMBNAIL = 88
@@ -34,6 +36,8 @@ _PAUSE = 25
 """Milliseconds between two pictures, so that the window stays live while they are drawn."""
 
 _BLEND_STEPS = 100
+_SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
+"""By whether the theme is dark."""
 
 
 class PoseList(QListWidget):
@@ -80,7 +84,8 @@ class LibraryPanel(QWidget):
         self._document = document
         self._poses: list[NamedPose] = []
         self._pictures: dict[bytes, QIcon] = {}
-        self._renderer: PoseRenderer | None = None
+        self._shower: PoseShower | None = None
+        self._front = np.zeros(3)
         self._may_draw = False
         self._due = QTimer(self)
         self._due.setSingleShot(True)
@@ -160,16 +165,13 @@ class LibraryPanel(QWidget):
 
     def redraw(self) -> None:
         """Draw all pictures again, as for another theme."""
-        self._forget_pictures()
+        self._pictures.clear()
         self.refresh()
 
-    def close_renderer(self) -> None:
-        """Give back what drawing holds, before the window goes."""
+    def stop(self) -> None:
+        """Draw no more pictures, as the window goes."""
         self._due.stop()
         self._may_draw = False
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
 
     def load_chosen(self) -> None:
         """Edit the selected pose."""
@@ -228,14 +230,8 @@ class LibraryPanel(QWidget):
 
     @Slot()
     def _on_model(self) -> None:
-        self._forget_pictures()
-        self.refresh()
-
-    def _forget_pictures(self) -> None:
         self._pictures.clear()
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self.refresh()
 
     @Slot()
     def _draw_soon(self) -> None:
@@ -268,15 +264,23 @@ class LibraryPanel(QWidget):
         self._due.start()
 
     def _picture(self, pose: NamedPose) -> QIcon:
-        from app.rendering import PoseRenderer
+        from app.frames import PoseShower
 
         model = self._document.model
+        if self._shower is None or self._shower.model is not model:
+            self._shower = PoseShower(model)
+            self._front = front_direction(model.reference, model.up_axis)
         sharpness = self.devicePixelRatioF()
         side = round(THUMBNAIL * sharpness)
-        if self._renderer is None:
-            theme = current_theme()
-            self._renderer = PoseRenderer(model, side, side, dark=theme.is_dark, transparent=True)
-        pixels = np.ascontiguousarray(self._renderer.picture(model.decode(pose.latent, 1)))
+        vertices = model.decode(pose.latent, 1).astype(np.float32)
+        pixels = draw_pose(
+            vertices,
+            self._shower.normals(vertices),
+            model.faces,
+            preset_view("Three-quarter", vertices, model.up_axis, self._front, 1.0),
+            side,
+            _SKIN[current_theme().is_dark],
+        )
         image = QImage(
             pixels.data, side, side, pixels.strides[0], QImage.Format.Format_RGBA8888
         ).copy()
