@@ -13,7 +13,7 @@ from app.cli.console import ExitStatus, counted, note, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import MeshFormat, write_result
-from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -161,7 +161,7 @@ def resolve(
                 sequence=sequence,
                 keep=finished.__setitem__,
             )
-    except CancelledError:
+    except LCollisionError:
         if finished:
             _write(output, model, requests, finished, mesh_format, keep_detail)
             note(f"stopped; {output} has {len(finished)} of {counted(len(requests), 'pose')}")

@@ -146,6 +146,8 @@ class PoseResolver:
         """
         rows = [self._checked(row) for row in np.atleast_2d(np.asarray(latents, np.float64))]
         placed = [None] * len(rows) if placements is None else placements
+        # Built once, before several threads would each begin to.
+        _ = self._eye, self._embedding.codec, self._embedding.decoder
         results: dict[int, ResolveResult] = {}
         guard = Lock()
 
