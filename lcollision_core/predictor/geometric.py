@@ -20,6 +20,7 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, silu, smooth_l1_loss
 
 from lcollision_core.predictor.body_points import FAR_PARTNERS, NEAR_PARTNERS, BodyPoints
+from lcollision_core.predictor.look import look
 from lcollision_core.predictor.losses import rank_loss
 from lcollision_core.predictor.networks import (
     NetworkOutput,
@@ -28,7 +29,7 @@ from lcollision_core.predictor.networks import (
     StackedLinear,
     Targets,
 )
-from lcollision_core.predictor.reduced_body import ReducedBody, product3
+from lcollision_core.predictor.reduced_body import ReducedBody
 
 if TYPE_CHECKING:
     from lcollision_core.embedding import Embedding
@@ -39,9 +40,6 @@ PATCH_WIDTH = 32
 HEAD_SIZES = (256, 64)
 
 _N_INPUTS = 4 * FAR_PARTNERS + 3 * NEAR_PARTNERS
-_REACH = 0.1
-"""Heights over which a far partner's influence falls to 1/e."""
-
 _PATCH_WEIGHT, _DEPTH_WEIGHT = 20.0, 5.0
 """Of the patches' cross entropy and depth, which are means over hundreds of mostly free patches."""
 
@@ -79,18 +77,13 @@ class GeometricNetwork(PredictorNetwork):
     partners: torch.Tensor
     input_mean: torch.Tensor
     input_deviation: torch.Tensor
-    frame: torch.Tensor
 
     def __init__(self, embedding: Embedding, seed: int) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
         self._points = BodyPoints.of(embedding)
         n_points, n_domains = len(self._points.vertex), embedding.n_domains
-        self.body = ReducedBody(embedding, self._points.vertex)
-        frame = torch.tensor(self._points.frame, dtype=torch.float32)
-        # Entries first, and room for the batch: (3, 3, 1, P), see `product3`.
-        frame = frame.permute(1, 2, 0)[:, :, None]
-        self.register_buffer("frame", frame, persistent=False)
+        self.body = ReducedBody(embedding, self._points.vertex, self._points.frame)
         self.register_buffer("partners", torch.zeros(n_points, FAR_PARTNERS + NEAR_PARTNERS).int())
         self.register_buffer("input_mean", torch.zeros(n_points, 1, _N_INPUTS))
         self.register_buffer("input_deviation", torch.ones(n_points, 1, _N_INPUTS))
@@ -152,32 +145,8 @@ class GeometricNetwork(PredictorNetwork):
 
     def _raw_inputs(self, latent: torch.Tensor) -> torch.Tensor:
         """Return (P, B, n) places of the partners in each point's frame."""
-        rotation, places = self.body(latent)
-        frame = product3(rotation, self.frame)
-        partners = self.partners.long().flatten()
-        x, y, z = (
-            axis[:, partners].unflatten(1, self.partners.shape) - axis[:, :, None]
-            for axis in places
-        )
-        local = [
-            x * frame[0, axis, :, :, None]
-            + y * frame[1, axis, :, :, None]
-            + z * frame[2, axis, :, :, None]
-            for axis in range(3)
-        ]
-        far = [axis[:, :, :FAR_PARTNERS] for axis in local]
-        distance = (far[0].square() + far[1].square() + far[2].square() + 1e-8).sqrt()
-        closeness = torch.exp(distance * (-1.0 / _REACH))
-        factor = closeness / distance
-        inputs = torch.cat(
-            [
-                *(axis * factor for axis in far),
-                closeness,
-                *(axis[:, :, FAR_PARTNERS:] for axis in local),
-            ],
-            dim=2,
-        )
-        return inputs.transpose(0, 1)
+        frame, places = self.body(latent)
+        return look(frame, places, self.partners, FAR_PARTNERS)
 
     def forward(self, latent: torch.Tensor) -> NetworkOutput:
         """Predict from (B, D) latent codes."""

@@ -9,15 +9,13 @@ from torch import nn
 
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
-
-_SYMMETRIC = [3, 4, 5, 4, 6, 7, 5, 7, 8]
-"""Where the features hold the nine entries of S."""
+from lcollision_core.predictor.look import deform
 
 _DAMPING = 1e-8
 
 
 class ReducedBody(nn.Module):
-    """Latent codes to some points of the body and their deformation gradients.
+    """Latent codes to some points of the body and their frames.
 
     The gradients are those of the embedding at the points. The points are a linear map of them,
     as the body's vertices are of all gradients, fitted to decoded poses.
@@ -26,15 +24,22 @@ class ReducedBody(nn.Module):
     ----------
     embedding : of the body
     vertex : (P,) integer array, the points
+    rest_frame : (P, 3, 3) array, their frames on the reference, as columns
     """
 
     offset: torch.Tensor
+    rest_frame: torch.Tensor
     scale: torch.Tensor
     points: torch.Tensor
     origin: torch.Tensor
     identity: torch.Tensor
 
-    def __init__(self, embedding: Embedding, vertex: npt.NDArray[np.int64]) -> None:
+    def __init__(
+        self,
+        embedding: Embedding,
+        vertex: npt.NDArray[np.int64],
+        rest_frame: npt.NDArray[np.float64],
+    ) -> None:
         super().__init__()
         decoder = embedding.decoder
         self.n_points = len(vertex)
@@ -50,6 +55,7 @@ class ReducedBody(nn.Module):
             start += n_codes
         self._keep("offset", decoder.offset[vertex])
         self._keep("scale", decoder.scale)
+        self._keep("rest_frame", rest_frame)
         # Of the model file: fitted, not a function of the embedding.
         self.register_buffer("points", torch.zeros(3 * self.n_points, self.n_points))
         self.register_buffer("origin", torch.zeros(3, self.n_points))
@@ -72,8 +78,9 @@ class ReducedBody(nn.Module):
         for start in range(0, len(latent), 256):
             part = slice(start, start + 256)
             with torch.no_grad():
-                _, gradients = self.gradients(torch.tensor(latent[part], dtype=torch.float32))
-            rows = gradients.permute(2, 0, 3, 1).reshape(-1, width - 3).double().numpy()
+                codes = torch.tensor(latent[part], dtype=torch.float32)
+                _, gradients = deform(self.features(codes), self.rest_frame)
+            rows = gradients.reshape(-1, width - 3).double().numpy()
             rows = np.concatenate([rows, np.tile(np.eye(3), (len(rows) // 3, 1))], axis=1)
             square += rows.T @ rows
             product += rows.T @ positions[part].transpose(0, 2, 1).reshape(-1, self.n_points)
@@ -82,48 +89,16 @@ class ReducedBody(nn.Module):
         self.points.copy_(solution[:-3])
         self.origin.copy_(solution[-3:])
 
-    def gradients(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return rotations R and gradients T = R S of (B, D) codes.
-
-        Returns
-        -------
-        rotation, gradient : (3, 3, B, P) tensors: entries first, so that products of 3 x 3
-            matrices are a few passes over long rows, not a call for each point
-        """
+    def features(self, latent: torch.Tensor) -> torch.Tensor:
+        """Return the (B, P, 9) deformation features at the points, of (B, D) codes."""
         features = self.offset.expand(len(latent), -1, -1)
         for number, codes in enumerate(self._codes):
             output = torch.tanh(latent[:, codes] @ getattr(self, f"table_{number}"))
             part = output.reshape(len(latent), -1, N_FEATURES) * self.scale
             features = features.index_add(1, getattr(self, f"place_{number}"), part)
-        entries = features.permute(2, 0, 1).contiguous()
-        rotation = _rotation(entries[:3])
-        return rotation, product3(rotation, entries[_SYMMETRIC, ...].reshape(3, 3, *entries.shape[1:]))
+        return features
 
     def forward(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the points' rotations (3, 3, B, P) and places (3, B, P), in heights."""
-        rotation, gradient = self.gradients(latent)
-        rows = gradient.permute(0, 2, 3, 1).flatten(2)
-        return rotation, rows @ self.points + self.origin[:, None]
-
-
-def product3(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """Multiply 3 x 3 matrices whose entries come first: (3, 3, ...) by (3, 3, ...)."""
-    return (left[:, :, None] * right[None]).sum(dim=1)
-
-
-def _rotation(log: torch.Tensor) -> torch.Tensor:
-    """Return exp of (3, B, P) rotation vectors by Rodrigues' formula, smooth at 0: (3, 3, B, P)."""
-    squared_angle = log.square().sum(dim=0) + 1e-12
-    angle = squared_angle.sqrt()
-    sine, cosine = angle.sin() / angle, angle.cos()
-    versine = (1.0 - cosine) / squared_angle
-    x, y, z = log
-    sx, sy, sz = sine * log
-    vx, vy, vz = versine * log
-    xy, yz, zx = vx * y, vy * z, vz * x
-    rows = (
-        (cosine + vx * x, xy - sz, zx + sy),
-        (xy + sz, cosine + vy * y, yz - sx),
-        (zx - sy, yz + sx, cosine + vz * z),
-    )
-    return torch.stack([torch.stack(row) for row in rows])
+        """Return the points' frames (B, P, 3, 3) and places (B, 3, P), in heights."""
+        frame, rows = deform(self.features(latent), self.rest_frame)
+        return frame, rows @ self.points + self.origin
