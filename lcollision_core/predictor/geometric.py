@@ -19,6 +19,7 @@ import torch
 from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, silu, smooth_l1_loss
 
+from lcollision_core.errors import LCollisionError
 from lcollision_core.predictor.body_points import FAR_PARTNERS, NEAR_PARTNERS, BodyPoints
 from lcollision_core.predictor.look import look
 from lcollision_core.predictor.losses import rank_loss
@@ -103,11 +104,20 @@ class GeometricNetwork(PredictorNetwork):
     def build(
         cls,
         embedding: Embedding,
-        config: PredictorConfig,  # noqa: ARG003
+        config: PredictorConfig,
         rows: LabelRows | None = None,
         seed: int = 0,
     ) -> PredictorNetwork:
-        """Make the network of an embedding, its points and inputs fitted to the rows' poses."""
+        """Make the network of an embedding, its points and inputs fitted to the rows' poses.
+
+        Raises
+        ------
+        LCollisionError : a network without domains is asked for.
+        """
+        if not config.by_domain:
+            raise LCollisionError(
+                "only the preset paper has a network without domains; add --preset paper"
+            )
         network = cls(embedding, seed)
         if rows is not None:
             network._fit(embedding, rows.latent)
