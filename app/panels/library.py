@@ -281,9 +281,8 @@ class LibraryPanel(QWidget):
             side,
             _SKIN[current_theme().is_dark],
         )
-        image = QImage(
-            pixels.data, side, side, pixels.strides[0], QImage.Format.Format_RGBA8888
-        ).copy()
+        image = QImage(side, side, QImage.Format.Format_RGBA8888)
+        np.frombuffer(image.bits(), dtype=np.uint8)[:] = pixels.ravel()
         image.setDevicePixelRatio(sharpness)
         drawn = QPixmap.fromImage(image)
         picture = QIcon()

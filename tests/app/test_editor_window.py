@@ -1,0 +1,357 @@
+"""The main story in a real window: drag, see, resolve, undo, export."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PySide6.QtCore import QPoint, Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QMessageBox
+from pytestqt.qtbot import QtBot
+
+from app.dialogs.failure import FailureDialog
+from app.document import PoseDocument
+from app.main_window import MainWindow
+from app.shading import Shading
+from lcollision_core.meshes import read_mesh, write_mesh
+from lcollision_core.model import PoseModel, read_poses, sample_poses
+from tests.app.windows import (
+    PATIENCE,
+    answer,
+    close_window,
+    colours,
+    decoded,
+    drag,
+    drop,
+    is_open,
+    open_window,
+    rest,
+    settings_in,
+    shown,
+)
+
+
+@pytest.fixture(scope="module")
+def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
+    return sample_poses(editor_model, 1, 0, colliding=True)[0]
+
+
+@pytest.fixture
+def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[MainWindow]:
+    held = open_window(qtbot, document, settings_in(tmp_path))
+    yield held
+    if is_open(held):
+        close_window(held)
+
+
+def failures(window: MainWindow) -> list[FailureDialog]:
+    return [dialog for dialog in window.findChildren(FailureDialog) if dialog.isVisible()]
+
+
+def test_a_dragged_slider_changes_the_mesh_as_the_model_says(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    document = window.document
+    before, mesh_before = document.latent, shown(window)
+    row = window.sliders.row_of(1)
+    drag(qtbot, row, by=24)
+    rest(qtbot, window)
+    assert document.latent[1] > before[1]
+    assert np.array_equal(np.delete(document.latent, 1), np.delete(before, 1))
+    assert row.field.value() == pytest.approx(document.latent[1], abs=5.1e-4)
+    assert np.array_equal(shown(window), decoded(document))
+    assert not np.array_equal(shown(window), mesh_before)
+    assert document.undo_stack.count() == 1
+    assert document.undo_stack.undoText() == f"Move {document.code_name(1)}"
+    QTest.keyClick(row.slider, Qt.Key.Key_Z, Qt.KeyboardModifier.ControlModifier)
+    rest(qtbot, window)
+    assert document.latent.tobytes() == before.tobytes()
+    assert np.array_equal(shown(window), mesh_before)
+    assert row.slider.number == pytest.approx(before[1], abs=0.01)
+
+
+def test_prediction_and_exact_check_follow_the_pose(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
+) -> None:
+    document, model = window.document, window.document.model
+    for latent in (colliding, np.zeros_like(colliding)):
+        document.set_latent(latent, "Test")
+        rest(qtbot, window)
+        card = window.collision.prediction
+        predicted = model.predict(latent[None])
+        probability = float(predicted.collision_probability[0])
+        assert card.meter.probability == pytest.approx(probability, abs=1e-6)
+        assert card.percent.text() == f"{100 * probability:.0f} %"
+        assert ("colliding" in card.verdict.text()) == (probability > 0.5)
+        shares = [row.bar.share for row in card.rows]
+        assert np.argmax(shares) == predicted.domain_energy[0].argmax() or max(shares) == 0.0
+        found = model.detector.detect(decoded(document))
+        words = window.collision.exact.verdict.text()
+        if found.colliding:
+            assert words.startswith(f"{len(found.pairs)} pair")
+        else:
+            assert words == "Exactly collision-free"
+    assert document.exact is not None
+    assert not document.exact.colliding
+
+
+def test_hovering_a_row_lights_its_domain_and_the_mesh_lights_its_row(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    window.viewport.set_shading(Shading.DOMAINS)
+    rest(qtbot, window)
+    plain = colours(window)
+    row = window.collision.prediction.rows[1]
+    QTest.mouseMove(window.statusBar(), QPoint(3, 3))
+    QTest.mouseMove(row, QPoint(30, 8))
+    qtbot.waitUntil(lambda: not np.array_equal(colours(window), plain))
+    leading = window.document.model.attention_mask.argmax(axis=0)
+    dimmed = (colours(window) != plain).any(axis=1)
+    assert dimmed[leading == 0].mean() > dimmed[leading == 1].mean()
+    QTest.mouseMove(window.statusBar(), QPoint(3, 3))
+    qtbot.waitUntil(lambda: np.array_equal(colours(window), plain))
+    slider_row = window.sliders.row_of(0)
+    QTest.mouseMove(slider_row, QPoint(5, 5))
+    qtbot.waitUntil(lambda: not np.array_equal(colours(window), plain))
+    QTest.mouseMove(window.statusBar(), QPoint(3, 3))
+    canvas, scene = window.viewport.canvas, window.viewport.scene
+    assert canvas is not None
+    assert scene is not None
+    rest(qtbot, window)
+    front = [
+        vertex
+        for vertex in np.flatnonzero(leading == 1)
+        if canvas.pick_vertex(canvas.place_of(scene.surface.vertices[vertex]), scene.body) == vertex
+    ]
+    place = canvas.place_of(scene.surface.vertices[front[len(front) // 2]]).toPoint()
+    with qtbot.waitSignal(window.viewport.domain_hovered) as told:
+        QTest.mouseMove(canvas, place)
+    lit = [header.is_lit for header in (group.header for group in window.sliders.groups)]
+    assert told.args is not None
+    assert lit == [group.header.domain == told.args[0] for group in window.sliders.groups]
+    assert window.collision.prediction.rows[told.args[0]].is_lit
+
+
+def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
+) -> None:
+    document, card = window.document, window.collision.resolve
+    document.set_latent(colliding, "Test")
+    rest(qtbot, window)
+    before = shown(window)
+    assert document.model.detector.detect(before).colliding
+    steps = document.undo_stack.count()
+    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+        QTest.mouseClick(card.button, Qt.MouseButton.LeftButton)
+        assert document.solving
+        assert card.working.isVisible()
+        assert not card.resting.isVisible()
+    rest(qtbot, window)
+    after = shown(window)
+    assert np.array_equal(after, decoded(document))
+    assert not document.model.detector.detect(after).colliding
+    assert window.collision.exact.verdict.text() == "Exactly collision-free"
+    assert document.outcome is not None
+    assert card.outcome.isVisible()
+    assert card.exactly_free.truth is True
+    assert card.predicted_free.truth == document.outcome.predicted_free
+    assert document.undo_stack.count() == steps + 1
+    assert np.array_equal(document.ghost, before)
+    QTest.keyClick(window, Qt.Key.Key_Z, Qt.KeyboardModifier.ControlModifier)
+    rest(qtbot, window)
+    assert document.latent.tobytes() == colliding.tobytes()
+    assert shown(window).tobytes() == before.tobytes()
+    assert not card.outcome.isVisible()
+    QTest.keyClick(
+        window,
+        Qt.Key.Key_Z,
+        Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier,
+    )
+    rest(qtbot, window)
+    assert shown(window).tobytes() == after.tobytes()
+    assert card.exactly_free.truth is True
+
+
+def test_cancelled_in_the_middle_resolve_leaves_everything_as_it_was(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
+) -> None:
+    document, card = window.document, window.collision.resolve
+    document.set_latent(colliding, "Test")
+    rest(qtbot, window)
+    before = shown(window)
+    QTest.mouseClick(card.button, Qt.MouseButton.LeftButton)
+    assert document.solving
+    QTest.mouseClick(card.cancel, Qt.MouseButton.LeftButton)
+    assert not document.solving
+    assert card.resting.isVisible()
+    qtbot.wait(200)
+    assert document.latent.tobytes() == colliding.tobytes()
+    assert shown(window).tobytes() == before.tobytes()
+    assert document.outcome is None
+    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE) as told:
+        window.actions_by_key["resolve"].trigger()
+    assert told.args is not None
+    assert told.args[0].exactly_free
+
+
+def test_an_edit_cancels_resolve(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
+) -> None:
+    document = window.document
+    document.set_latent(colliding, "Test")
+    rest(qtbot, window)
+    window.actions_by_key["resolve"].trigger()
+    assert document.solving
+    QTest.keyClick(window.sliders.row_of(0).slider, Qt.Key.Key_Right)
+    assert not document.solving
+    rest(qtbot, window)
+    qtbot.wait(200)
+    assert np.array_equal(np.delete(document.latent, 0), np.delete(colliding, 0))
+    assert np.array_equal(shown(window), decoded(document))
+
+
+def test_the_window_closes_in_the_middle_of_resolve(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
+) -> None:
+    document = window.document
+    document.set_latent(colliding, "Test")
+    rest(qtbot, window)
+    window.actions_by_key["resolve"].trigger()
+    assert document.solving
+    close_window(window)
+    assert document.close()
+    assert not document.solving
+
+
+def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
+    document, model = window.document, window.document.model
+    latent = 0.6 * model.latent_space.maximum
+    vertices = model.decode(latent) + np.array([3.0, -2.0, 1.0]) * model.height
+    write_mesh(tmp_path / "bent.obj", vertices, model.faces)
+    with qtbot.waitSignal(document.latent_changed, timeout=PATIENCE):
+        drop(window, tmp_path / "bent.obj")
+    rest(qtbot, window)
+    assert document.pose_name == "bent"
+    assert document.undo_stack.undoText() == "Import bent"
+    assert document.placement is not None
+    back = document.placement.apply(shown(window).astype(np.float64))
+    assert np.abs(back - vertices).max() < 2e-3 * model.height
+    assert "of the height" in window.statusBar().currentMessage()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("broken.obj", "v 1 2\nf 1 2 3\n", "broken.obj"),
+        ("other.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "3 vertices"),
+        ("empty.ply", "", "empty"),
+        ("notes.txt", "hello", "nothing that the editor knows"),
+        ("poses.json", "[1, 2", "no JSON"),
+        ("model.safetensors", "garbage", "model.safetensors"),
+    ],
+)
+def test_dropped_garbage_is_refused_with_one_sentence(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, name: str, content: str, sentence: str
+) -> None:
+    (tmp_path / name).write_text(content)
+    before, model = window.document.latent, window.document.model
+    drop(window, tmp_path / name)
+    qtbot.waitUntil(lambda: bool(failures(window)), timeout=PATIENCE)
+    (dialog,) = failures(window)
+    words = f"{dialog.what.text()} {dialog.advice.text()}"
+    assert sentence in words
+    assert "Traceback" not in words
+    assert "\n" not in words
+    assert dialog.advice.text()
+    assert not dialog.details.isVisible()
+    QTest.mouseClick(dialog.unfold, Qt.MouseButton.LeftButton)
+    assert dialog.details.isVisible()
+    assert "Error" in dialog.details.toPlainText()
+    QTest.keyClick(dialog, Qt.Key.Key_Escape)
+    qtbot.waitUntil(lambda: not failures(window))
+    assert window.document.model is model
+    assert window.document.latent.tobytes() == before.tobytes()
+    drag(qtbot, window.sliders.row_of(0), by=12)
+    rest(qtbot, window)
+    assert np.array_equal(shown(window), decoded(window.document))
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".glb"])
+def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
+) -> None:
+    document, model = window.document, window.document.model
+    document.set_latent(0.5 * model.latent_space.minimum, "Test")
+    rest(qtbot, window)
+    on_screen = shown(window)
+    path = tmp_path / f"pose{suffix}"
+
+    def choose(dialog: QDialog) -> None:
+        assert isinstance(dialog, QFileDialog)
+        dialog.selectFile(str(path))
+        dialog.accept()
+
+    asked = answer(choose)
+    with qtbot.waitSignal(document.message, timeout=PATIENCE):
+        window.actions_by_key["export"].trigger()
+    assert not asked.isActive()
+    mesh = read_mesh(path, topology=model.topology)
+    assert np.array_equal(mesh.vertices.astype(np.float32), on_screen)
+    assert np.array_equal(mesh.faces, model.faces)
+    with qtbot.waitSignal(document.latent_changed, timeout=PATIENCE):
+        drop(window, path)
+    rest(qtbot, window)
+    assert document.placement is not None
+    back = document.placement.apply(shown(window).astype(np.float64))
+    assert np.abs(back - on_screen).max() < 2e-3 * model.height
+
+
+def test_changes_are_saved_kept_or_given_up_as_the_user_says(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document = window.document
+    drag(qtbot, window.sliders.row_of(0), by=15)
+    assert window.isWindowModified()
+    asked = answer(lambda dialog: dialog.reject())
+    assert not window.close()
+    assert not asked.isActive()
+    assert window.isVisible()
+    path = tmp_path / "mine.json"
+    document.save(path)
+    assert not window.isWindowModified()
+    drag(qtbot, window.sliders.row_of(1), by=15)
+    assert window.isWindowModified()
+
+    def save(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        dialog.buttons()[0].click()
+
+    latent = document.latent
+    asked = answer(save)
+    assert window.close()
+    assert not asked.isActive()
+    assert read_poses(path, document.model)[0].latent.tobytes() == latent.tobytes()
+
+
+def test_a_failing_worker_leaves_the_editor_usable(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    window.document.export_mesh(tmp_path / "no such folder" / "pose.obj")
+    qtbot.waitUntil(lambda: bool(failures(window)), timeout=PATIENCE)
+    assert "no folder" in failures(window)[0].what.text()
+    QTest.keyClick(failures(window)[0], Qt.Key.Key_Escape)
+    drag(qtbot, window.sliders.row_of(0), by=12)
+    rest(qtbot, window)
+    assert np.array_equal(shown(window), decoded(window.document))
+
+
+def test_nothing_is_left_open(window: MainWindow) -> None:
+    """Closing by the menu, with nothing to save, asks nothing."""
+    window.actions_by_key["quit"].trigger()
+    assert not window.isVisible()
+    assert window.document.close()
+    assert QApplication.activeModalWidget() is None

@@ -1,0 +1,161 @@
+"""An editor's window for tests: made, waited for, looked at, and taken away without a trace."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QEvent, QMimeData, QPoint, QPointF, QSettings, Qt, QTimer, QUrl
+from PySide6.QtGui import QDragEnterEvent, QDropEvent
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QDialog, QWidget
+from pytestqt.qtbot import QtBot
+from shiboken6 import isValid
+
+from app.document import PoseDocument
+from app.main_window import MainWindow
+from app.panels.code_slider import CodeRow
+from app.panels.parts import HANDLE
+from app.settings import Settings
+from app.theme import apply_theme, wanted_theme
+
+SHOTS = Path(__file__).parents[2] / "out" / "screenshots"
+"""Where tests leave pictures of the window, for people to look at."""
+
+PATIENCE = 30_000
+"""Milliseconds to wait for a machine that does other things too."""
+
+
+def settings_in(folder: Path) -> Settings:
+    """Return settings that nobody else reads."""
+    return Settings(QSettings(str(folder / "editor.ini"), QSettings.Format.IniFormat))
+
+
+def open_window(
+    qtbot: QtBot, document: PoseDocument, settings: Settings, size: tuple[int, int] = (1280, 800)
+) -> MainWindow:
+    """Show a window of a document that has a model, and wait until it has drawn the pose."""
+    apply_theme(application(), wanted_theme(settings["theme"]))
+    window = MainWindow(document, settings)
+    window.resize(*size)
+    window.show()
+    # Shortcuts reach only the active window.
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow, timeout=PATIENCE)
+    rest(qtbot, window)
+    return window
+
+
+def application() -> QApplication:
+    """Return the application of all tests."""
+    held = QApplication.instance()
+    assert isinstance(held, QApplication)
+    return held
+
+
+def close_window(window: MainWindow) -> None:
+    """Close a window whose changes may be lost, and see that nothing of it runs on."""
+    window.document.end_gesture()
+    window.document.undo_stack.setClean()
+    assert window.close()
+    dispose(window)
+
+
+def dispose(window: MainWindow) -> None:
+    """Delete a window that is closed, and see that it leaves neither thread nor timer."""
+    assert not window.isVisible()
+    running = [timer for timer in window.findChildren(QTimer) if timer.isActive()]
+    assert running == []
+    window.deleteLater()
+    QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
+    assert [t.name for t in threading.enumerate() if t.name == "import VTK"] == []
+
+
+def rest(qtbot: QtBot, window: MainWindow) -> None:
+    """Wait until the newest pose is on the screen, checked exactly."""
+    document = window.document
+    qtbot.waitUntil(
+        lambda: document.exact is not None and window.viewport.is_at_rest, timeout=PATIENCE
+    )
+
+
+def is_open(window: MainWindow) -> bool:
+    """Return whether a window has not been closed and deleted."""
+    return isValid(window) and window.isVisible()
+
+
+def shown(window: MainWindow) -> npt.NDArray[np.float32]:
+    """Return a copy of the vertices that are on the screen."""
+    assert window.viewport.scene is not None
+    return window.viewport.scene.surface.vertices.copy()
+
+
+def colours(window: MainWindow) -> npt.NDArray[np.uint8]:
+    """Return a copy of the vertices' colours that are on the screen."""
+    assert window.viewport.scene is not None
+    return window.viewport.scene.surface.colours.copy()
+
+
+def decoded(document: PoseDocument) -> npt.NDArray[np.float32]:
+    """Return the vertices that ought to be on the screen."""
+    return document.model.decode(document.latent).astype(np.float32)
+
+
+def handle(row: CodeRow) -> QPoint:
+    """Return where a row's handle is, in its slider."""
+    slider = row.slider
+    share = slider.value() / slider.maximum()
+    return QPoint(round(HANDLE + share * (slider.width() - 2 * HANDLE)), slider.height() // 2)
+
+
+def drag(qtbot: QtBot, row: CodeRow, by: int, steps: int = 6) -> None:
+    """Drag a row's handle with the left button, by some pixels."""
+    start = handle(row)
+    QTest.mousePress(row.slider, Qt.MouseButton.LeftButton, pos=start)
+    for step in range(1, steps + 1):
+        QTest.mouseMove(row.slider, start + QPoint(by * step // steps, 0))
+        qtbot.wait(5)
+    QTest.mouseRelease(row.slider, Qt.MouseButton.LeftButton, pos=start + QPoint(by, 0))
+
+
+def drop(window: QWidget, *paths: Path) -> None:
+    """Drop files on a window, as from a file manager."""
+    dropped = QMimeData()
+    dropped.setUrls([QUrl.fromLocalFile(str(path)) for path in paths])
+    buttons, keys = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
+    place, action = QPoint(400, 300), Qt.DropAction.CopyAction
+    entering = QDragEnterEvent(place, action, dropped, buttons, keys)
+    QApplication.sendEvent(window, entering)
+    assert entering.isAccepted()
+    QApplication.sendEvent(window, QDropEvent(QPointF(place), action, dropped, buttons, keys))
+
+
+def answer(act: Callable[[QDialog], None]) -> QTimer:
+    """Answer the next dialog that blocks its caller.
+
+    The timer asks every few milliseconds, as long as it is kept by the caller.
+    """
+    timer = QTimer()
+
+    def look() -> None:
+        dialog = QApplication.activeModalWidget()
+        if isinstance(dialog, QDialog) and dialog.isVisible():
+            timer.stop()
+            act(dialog)
+
+    timer.timeout.connect(look)
+    timer.start(10)
+    return timer
+
+
+def take_picture(window: QWidget, name: str) -> None:
+    """Save what the screen shows of a window."""
+    QApplication.processEvents()
+    SHOTS.mkdir(parents=True, exist_ok=True)
+    corner = window.mapToGlobal(QPoint(0, 0))
+    picture = window.screen().grabWindow(0, corner.x(), corner.y(), window.width(), window.height())
+    assert not picture.isNull()
+    assert picture.save(str(SHOTS / f"{name}.png"))
