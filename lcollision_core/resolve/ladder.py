@@ -29,6 +29,8 @@ _KNOWN_STARTS, _RANDOM_STARTS = 4, 4
 _SPREAD = 0.1
 _REMEMBERED, _POLISHED = 8, 3
 
+_ITERATIONS_ALONE = 60
+
 N_STEPS = 8
 
 
@@ -164,7 +166,7 @@ class Ladder:
         begin = problem.target if start is None else start
         if self._options.solver == Solver.SQP:
             batch = SqpBatch(problem, begin[None], np.array([margin]))
-            return batch.run(sum(ITERATIONS))[0]
+            return batch.run(_ITERATIONS_ALONE)[0]
         from lcollision_core.resolve.nlopt_solvers import solve_nlopt
 
         return solve_nlopt(problem, Solver(self._options.solver), begin, margin)

@@ -16,6 +16,7 @@ _SETTLED = 0.02
 """A row has converged when its step is this share of its distance from Z*; the exact check and
 shortening follow, so more digits would be lost."""
 
+_PATIENCE = 20
 _SHORTEST = 0.1
 _PENALTY = 1.5
 _BOUND_ROUNDS = 6
@@ -99,14 +100,19 @@ class SqpBatch:
         """Choose a row's next step, or find that it has converged."""
         problem, here = self._problem, self._here[row]
         violation = float(self._violation[row])
-        goal, multiplier = _minimiser(problem, here, self._slope[row], violation)
-        self._step[row] = goal - here
-        self._length[row] = 1.0
-        self._penalty[row] = max(self._penalty[row], _PENALTY * multiplier)
-        length_squared = float(problem.code_weights @ self._step[row] ** 2)
+        slope = self._slope[row]
+        goal, multiplier = _minimiser(problem, problem.target, here, slope, violation)
+        length_squared = float(problem.code_weights @ (goal - here) ** 2)
         settled = length_squared <= _SETTLED**2 * float(problem.search_distance(goal))
         if settled and violation <= FEASIBLE:
             self._running[row] = False
+        elif violation > FEASIBLE and (settled or self._iterations[row] >= _PATIENCE):
+            # Along a curved border steps gain on the constraint by a few percent each, or swing
+            # about it; straight to it is nearly as near.
+            goal, _ = _minimiser(problem, here, here, slope, violation)
+        self._step[row] = goal - here
+        self._length[row] = 1.0
+        self._penalty[row] = max(self._penalty[row], _PENALTY * multiplier)
 
     def _judge(self, row: int, trial: FloatArray, violation: float, slope: FloatArray) -> None:
         """Take a trial step, or halve it."""
@@ -126,14 +132,18 @@ class SqpBatch:
 
 
 def _minimiser(
-    problem: ResolveProblem, here: FloatArray, slope: FloatArray, violation: float
+    problem: ResolveProblem,
+    centre: FloatArray,
+    here: FloatArray,
+    slope: FloatArray,
+    violation: float,
 ) -> tuple[FloatArray, float]:
-    """Minimise the search distance where slope . (Z - here) + violation <= 0, within the bounds.
+    """Go least far from a centre to slope . (Z - here) + violation <= 0, within the bounds.
 
     Codes that would leave the bounds stop there, and the others make up for it. Also returns the
     constraint's multiplier.
     """
-    goal, share = problem.target, 0.0
+    goal, share = centre, 0.0
     direction = np.where(problem.movable, slope / problem.code_weights, 0.0)
     inside = np.ones(len(here), dtype=np.bool_)
     for _ in range(_BOUND_ROUNDS):
@@ -141,9 +151,9 @@ def _minimiser(
         if fall <= 0.0:
             break
         settled = float(slope[~inside] @ (goal - here)[~inside])
-        missing = violation + settled + float(slope[inside] @ (problem.target - here)[inside])
+        missing = violation + settled + float(slope[inside] @ (centre - here)[inside])
         share = max(0.0, missing / fall)
-        unbounded = problem.target - share * direction
+        unbounded = centre - share * direction
         goal = np.clip(unbounded, problem.low, problem.high)
         stopped = inside & (goal != unbounded)
         if not stopped.any():
