@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QMessageBox
+from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QLineEdit, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.dialogs.failure import FailureDialog
@@ -292,13 +292,15 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
 
     def choose(dialog: QDialog) -> None:
         assert isinstance(dialog, QFileDialog)
-        dialog.selectFile(str(path))
+        name = dialog.findChild(QLineEdit, "fileNameEdit")
+        assert isinstance(name, QLineEdit)
+        name.setText(str(path))
         dialog.accept()
 
     asked = answer(choose)
-    with qtbot.waitSignal(document.message, timeout=PATIENCE):
-        window.actions_by_key["export"].trigger()
+    window.actions_by_key["export"].trigger()
     assert not asked.isActive()
+    qtbot.waitUntil(path.is_file, timeout=PATIENCE)
     mesh = read_mesh(path, topology=model.topology)
     assert np.array_equal(mesh.vertices.astype(np.float32), on_screen)
     assert np.array_equal(mesh.faces, model.faces)
