@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.compiled import compiled
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
@@ -108,16 +109,68 @@ def pull_to_latent(
     The transpose of the decoder's Jacobian, by one more back-substitution.
     """
     decoder, codec = embedding.decoder, embedding.codec
-    features = decoder.features(latent[None])
+    codes = latent.astype(np.float32)
+    features = decoder.features(codes[None])
     at = np.broadcast_to(features, (len(by_vertices), *features.shape[1:]))
     by_features = codec.decode_vjp(at, by_vertices, n_threads=1)
     by_features *= decoder.scale
-    result = np.empty((len(by_vertices), len(latent)))
+    scaled = by_features.astype(np.float32)
+    result = np.zeros((len(by_vertices), len(latent)))
     start = 0
     for group in decoder.groups:
         stop = start + len(group.weights)
-        slope = 1.0 - np.tanh(latent[start:stop].astype(np.float32) @ group.weights) ** 2
-        by_output = by_features[:, group.support].reshape(len(by_vertices), -1) * slope
-        result[:, start:stop] = by_output.astype(np.float32) @ group.weights.T
+        total = np.empty((len(group.blocks), group.blocks.shape[2]), dtype=np.float32)
+        _weigh(codes[start:stop], group.blocks, total)
+        slope = np.float32(1.0) - np.tanh(total) ** 2
+        _pull_group(group.blocks, group.support, slope, scaled, result[:, start:stop])
         start = stop
     return result
+
+
+@compiled
+def _weigh(
+    codes: npt.NDArray[np.float32],
+    blocks: npt.NDArray[np.float32],
+    total: npt.NDArray[np.float32],
+) -> None:
+    """Write codes @ weights, block by block."""
+    for block in range(len(blocks)):
+        weights, sums = blocks[block], total[block]
+        sums[:] = np.float32(0.0)
+        for k in range(len(codes)):
+            code = codes[k]
+            for i in range(len(sums)):
+                sums[i] += code * weights[k, i]
+
+
+@compiled
+def _pull_group(
+    blocks: npt.NDArray[np.float32],
+    support: npt.NDArray[np.int32],
+    slope: npt.NDArray[np.float32],
+    by_output: npt.NDArray[np.float32],
+    by_codes: FloatArray,
+) -> None:
+    """Add the derivative by one group's codes, given the one by its output and its slope there.
+
+    Parameters
+    ----------
+    blocks, support : of a `DecoderGroup`
+    slope : (n_blocks, 9 n) float32 array, of tanh
+    by_output : (n, V, 9) float32 array
+    by_codes : (n, m) float64 array, added to
+    """
+    width = slope.shape[1]
+    # A product for each block, small enough for the library to keep to this thread.
+    weighted = np.zeros((len(by_output), width), dtype=np.float32)
+    for block in range(len(blocks)):
+        first = block * width // 9
+        last = min(first + width // 9, len(support))
+        for row in range(len(by_output)):
+            out = weighted[row]
+            for n in range(last - first):
+                given = by_output[row, support[first + n]]
+                for j in range(9):
+                    out[9 * n + j] = given[j] * slope[block, 9 * n + j]
+            out[9 * (last - first) :] = np.float32(0.0)
+        by_codes += np.dot(weighted, blocks[block].T)

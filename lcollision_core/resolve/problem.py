@@ -97,10 +97,9 @@ class ResolveProblem:
     @cached_property
     def whitening(self) -> FloatArray:
         """(M, M) array R of the M movable codes, with ||y||^2 = d for a move of R y."""
-        kept = np.flatnonzero(self.movable)
-        lower = np.linalg.cholesky(self.metric.gram[np.ix_(kept, kept)])
-        root: FloatArray = np.linalg.inv(lower).T
-        return root
+        if self.movable.all():
+            return self.metric.whitening  # the same for all poses of a model
+        return self.metric.whitening_of(np.flatnonzero(self.movable))
 
     def distance(self, latent: FloatArray) -> FloatArray:
         """Measure d of (..., D) poses from Z*: (...)."""

@@ -187,6 +187,10 @@ class PoseResolver:
         return LatentMetric.eye(self._embedding)
 
     @cached_property
+    def _plain(self) -> LatentMetric:
+        return LatentMetric.latent(self._embedding.latent_size)
+
+    @cached_property
     def _group_of_code(self) -> npt.NDArray[np.int64]:
         sizes = self._embedding.group_sizes
         return np.repeat(np.arange(len(sizes)), sizes)
@@ -203,7 +207,7 @@ class PoseResolver:
     def _problem(
         self, target: FloatArray, options: ResolveOptions, cancel: CancelToken | None
     ) -> ResolveProblem:
-        metric = self._eye if options.metric == Metric.EYE else LatentMetric.latent(len(target))
+        metric = self._eye if options.metric == Metric.EYE else self._plain
         code_weights = np.ones(len(target))
         if options.group_weights is not None:
             n_groups = len(self._embedding.group_sizes)
