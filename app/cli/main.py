@@ -14,7 +14,18 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from app.cli import benchmark, check, dataset, evaluate, label, models, poses, resolve, train
+from app.cli import (
+    benchmark,
+    check,
+    dataset,
+    edit,
+    evaluate,
+    label,
+    models,
+    poses,
+    resolve,
+    train,
+)
 from app.cli.console import ExitStatus
 from lcollision_core.errors import CancelledError, LCollisionError
 
@@ -71,12 +82,12 @@ def _refuse_usage(error: Any) -> NoReturn:
 app = typer.Typer(
     cls=_Commands,
     name="lcollision",
-    help="Find where a body runs into itself, and move it free.",
-    no_args_is_help=True,
+    help="Find where a body runs into itself, and move it free. Without a command: the editor.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+app.command("edit")(edit.edit)
 app.command("models")(models.models)
 app.command("info")(models.info)
 app.command("domains")(models.domains)
@@ -100,14 +111,15 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _global_options(
-    version: Annotated[
+    context: typer.Context,
+    version: Annotated[  # noqa: ARG001 - its eager callback acts
         bool,
         typer.Option("--version", callback=_print_version, is_eager=True, help="Say the version."),
     ] = False,
 ) -> None:
-    pass
+    edit.edit_without_command(context)
 
 
 def main() -> None:

@@ -42,6 +42,7 @@ def models(
             origin = "bundled" if report["bundled"] else "your own"
             typer.echo(f"{report['name']}: {_size_sentence(report)} ({origin})")
             typer.echo(f"  {error_sentence(report)}")
+            typer.echo(f"  {_predictor_sentence(report)}")
         if not reports and not failed:
             typer.echo(
                 f"there are no models yet; `lcollision train embedding` makes one, and those in "
@@ -77,6 +78,7 @@ def info(
     typer.echo(f"{report['name']}: {_size_sentence(report)}")
     typer.echo(f"  trained on {report['source']}, licence {report['licence']}")
     typer.echo(f"  {error_sentence(report)}")
+    typer.echo(f"  {_predictor_sentence(report)}")
     if report["near_exclusion"]:
         typer.echo(f"  pairs of faces within {report['near_exclusion']} heights count apart")
     _print_domains(report)
@@ -156,7 +158,7 @@ def describe(model: PoseModel) -> dict[str, Any]:
             "connected_share": metrics.connected_share,
             "domains_per_vertex": metrics.domains_per_vertex,
         },
-        "predictor": None,
+        "predictor": _describe_predictor(model),
         "near_exclusion": model.near_exclusion,
         "up_axis": "xyz"[model.up_axis],
         "height": model.height,
@@ -164,6 +166,39 @@ def describe(model: PoseModel) -> dict[str, Any]:
         "source": model.card.source,
         "provenance": dict(model.card.provenance),
     }
+
+
+def _describe_predictor(model: PoseModel) -> dict[str, Any] | None:
+    from dataclasses import asdict
+
+    predictor = model.predictor
+    if predictor is None:
+        return None
+    facts = predictor.facts
+    metrics = None if predictor.metrics is None else asdict(predictor.metrics)
+    return {
+        "preset": predictor.preset,
+        "rows": facts.rows,
+        "colliding_share": facts.colliding_share,
+        "seed": facts.seed,
+        "metrics": metrics,
+        "free_poses": len(model.free_latent),
+    }
+
+
+def _predictor_sentence(report: dict[str, Any]) -> str:
+    """Put what `describe` says of the predictor into words."""
+    predictor = report["predictor"]
+    if predictor is None:
+        return "no predictor yet; `lcollision label` and `lcollision train predictor` make one"
+    metrics = predictor["metrics"]
+    if metrics is None:
+        return f"predictor {predictor['preset']}, not measured"
+    return (
+        f"predictor {predictor['preset']}: {100.0 * metrics['accuracy']:.1f} % of unseen samples "
+        f"right (always saying the commoner: {100.0 * metrics['majority_rate']:.1f} %), of "
+        f"{predictor['rows']} labelled"
+    )
 
 
 def _size_sentence(report: dict[str, Any]) -> str:
