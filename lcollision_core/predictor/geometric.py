@@ -7,6 +7,21 @@ others lie in its frame: points of other parts that come near, and the skin abou
 fold. It says whether the patch of skin round its point is hit, and how deeply, and is taught that
 by the exact energies of the patch, which are worth hundreds of labels a pose. What follows joins
 the patches to the domains' energies and the logit.
+
+What was tried, on SCAPE (110 codes, 66.2 % of the box collides) at M = 50 000, CLASSIFY in per cent
+of the 15 000 samples held out, one seed each:
+
+===============================================================  ========
+the paper's preset                                               79.2
+300 points, 24 far partners and no near ones                     89.0
+the same with 10 near partners: folds of skin show               91.3
+the same with the exact places of the points, not the reduced    91.0
+the same with a head of 64, dropout 0.25 and weight decay 0.5    89.9
+200 points, 16 far and 8 near partners: half the time; the one   90.2
+===============================================================  ========
+
+The rows set the limit, not the points: the built-in body has 94.6 at M = 50 000 and 96.0 at
+300 000.
 """
 
 from __future__ import annotations
