@@ -107,10 +107,12 @@ def _run(path: Path | None, model_name: str | None) -> int:
     from app.document import PoseDocument
     from app.log import start_logging
     from app.main_window import MainWindow
+    from app.memory import keep_memory_small
     from app.settings import Settings
     from app.start_up import StartUp
     from app.theme import apply_theme, wanted_theme
 
+    keep_memory_small()
     application = QApplication(sys.argv[:1])
     application.setApplicationName("lcollision")
     application.setApplicationDisplayName("LCollision")

@@ -21,6 +21,7 @@ from PySide6.QtWidgets import QApplication
 from app.cli import main  # noqa: F401 - what the command would have loaded by then
 from app.document import PoseDocument
 from app.main_window import MainWindow
+from app.memory import keep_memory_small
 from app.settings import Settings
 from app.shading import Shading
 from app.start_up import StartUp
@@ -286,6 +287,7 @@ def run(model: str, n_actions: int, started: float) -> None:
     ----------
     started : when the command was given, in seconds since 1970
     """
+    keep_memory_small()
     application = QApplication(sys.argv[:1])
     settings = Settings()
     apply_theme(application, wanted_theme(settings["theme"]))
