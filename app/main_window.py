@@ -65,7 +65,7 @@ _log = logging.getLogger(__name__)
 _LAYOUT_VERSION = 1
 _MESSAGE_MILLISECONDS = 8000
 _SIZE = QSize(1440, 900)
-_SIDE_WIDTHS = {"sliders": 330, "collision": 296}
+_SIDE_WIDTHS = {"sliders": 330, "collision": 312}
 _AREAS = {
     "sliders": Qt.DockWidgetArea.LeftDockWidgetArea,
     "collision": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -209,6 +209,9 @@ class MainWindow(QMainWindow):
     def showEvent(self, event: QShowEvent) -> None:  # noqa: N802 - Qt's name
         """Give the panels their widths, which only a shown window keeps."""
         super().showEvent(event)
+        if not event.spontaneous():
+            # Or else the first button of the tool bar would look chosen.
+            self.viewport.setFocus()
         if self.settings["window_layout"].isEmpty():
             QTimer.singleShot(0, self, self._size_docks)
 

@@ -23,7 +23,10 @@ BACKGROUND = {False: ("#e4e8ed", "#fafbfc"), True: ("#191c21", "#343a44")}
 
 _FLOOR = {False: ("#d3d9e1", "#c2c9d3"), True: ("#2a2f37", "#1d2127")}
 _GHOST = {False: "#6b7c93", True: "#c3d2e6"}
-_GHOST_OPACITY = 0.34
+_GHOST_OPACITY = 0.4
+_GHOST_NEAR, _GHOST_FAR = 0.004, 0.015
+"""Distances from the body, in its height, at which the ghost begins to show and shows in full."""
+
 _THROUGH_OPACITY = 0.22
 _TO_THE_FRONT = -3.0e7  # in steps of a depth buffer of 24 bits: all of its range
 _FLOOR_RADIUS = 0.62
@@ -39,17 +42,18 @@ class Surface:
     ----------
     faces : (F, 3) integer array
     n_vertices : V
+    n_channels : C, 3 for opaque colours or 4 with how opaque each vertex is
 
     Attributes
     ----------
     vertices, normals : (V, 3) float32 arrays that VTK reads; write into them, then `touch`
-    colours : (V, 3) uint8 array, likewise
+    colours : (V, C) uint8 array, likewise
     """
 
-    def __init__(self, faces: npt.NDArray[Any], n_vertices: int) -> None:
+    def __init__(self, faces: npt.NDArray[Any], n_vertices: int, n_channels: int = 3) -> None:
         self.vertices = np.zeros((n_vertices, 3), dtype=np.float32)
         self.normals = np.zeros((n_vertices, 3), dtype=np.float32)
-        self.colours = np.full((n_vertices, 3), 200, dtype=np.uint8)
+        self.colours = np.full((n_vertices, n_channels), 200, dtype=np.uint8)
         points = vtkPoints()
         points.SetData(numpy_to_vtk(self.vertices))
         self.polydata = vtkPolyData()
@@ -96,6 +100,7 @@ class Scene:
         self._renderer = plotter.renderer
         self._faces = faces
         self._up_axis = up_axis
+        self._height = height
         self.surface = Surface(faces, n_vertices)
         self.body = _actor(self.surface.polydata)
         self.body.GetMapper().SetScalarVisibility(True)
@@ -105,9 +110,10 @@ class Scene:
         shine.SetSpecular(0.1)
         shine.SetSpecularPower(18.0)
 
-        self._ghost = Surface(faces, n_vertices)
+        self._ghost = Surface(faces, n_vertices, n_channels=4)
         self._ghost_actor = _actor(self._ghost.polydata)
-        self._ghost_actor.GetProperty().SetOpacity(_GHOST_OPACITY)
+        self._ghost_actor.GetMapper().SetScalarVisibility(True)
+        self._ghost_actor.ForceTranslucentOn()
         self._ghost_actor.GetProperty().SetAmbient(0.4)
         self._ghost_actor.GetProperty().SetDiffuse(0.7)
         self._ghost_actor.GetProperty().BackfaceCullingOn()
@@ -174,7 +180,8 @@ class Scene:
         floor, shadow = _FLOOR[dark]
         self._floor_actor.GetProperty().SetColor(*_share(floor))
         self._shadow_actor.GetProperty().SetColor(*_share(shadow))
-        self._ghost_actor.GetProperty().SetColor(*_share(_GHOST[dark]))
+        self._ghost.colours[:, :3] = rgb(_GHOST[dark])
+        self._ghost.touch()
 
     def show_floor(self, shown: bool) -> None:
         """Draw or hide the floor and the shadow upon it."""
@@ -205,6 +212,8 @@ class Scene:
         if colours is not None:
             self.surface.colours[:] = colours
         self.surface.touch(colours is not None)
+        if self.ghost_shown:
+            self._fade_ghost()
         if self._floor_shown:
             self._lay_floor(float(self.surface.vertices[:, self._up_axis].min()))
 
@@ -220,7 +229,7 @@ class Scene:
         if vertices is not None:
             self._ghost.vertices[:] = vertices
             self._ghost.normals[:] = normals
-            self._ghost.touch(colours=False)
+            self._fade_ghost()
         self._ghost_actor.SetVisibility(vertices is not None)
 
     def show_crossing(self, pairs: npt.NDArray[np.int32] | None) -> None:
@@ -281,6 +290,16 @@ class Scene:
         self._renderer.ResetCameraClippingRange()
         # Or else pyvista turns the camera to a view of its own at the first frame.
         self._renderer.camera_set = True
+
+    def _fade_ghost(self) -> None:
+        """Leave of the ghost what the body has moved away from.
+
+        Where both lie upon each other they would be seen in patches, by which is a hair nearer.
+        """
+        away = np.linalg.norm(self._ghost.vertices - self.surface.vertices, axis=1) / self._height
+        share = np.clip((away - _GHOST_NEAR) / (_GHOST_FAR - _GHOST_NEAR), 0.0, 1.0)
+        self._ghost.colours[:, 3] = np.rint(255.0 * _GHOST_OPACITY * share)
+        self._ghost.touch()
 
     def _lay_floor(self, level: float) -> None:
         place = [0.0, 0.0, 0.0]

@@ -91,6 +91,11 @@ DARK = Theme(
     waiting="#a0a9b5",
 )
 
+_SEEN = 1.7
+"""Contrast of a bar with its groove: shape and place say the rest, and hues are to stay apart."""
+
+_LIGHTENING = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+
 _current = LIGHT
 
 
@@ -164,6 +169,28 @@ def mixed(colour: str, other: str, share: float) -> QColor:
     one, two = QColor(colour), QColor(other)
     parts = ((one.red(), two.red()), (one.green(), two.green()), (one.blue(), two.blue()))
     return QColor(*(round((1.0 - share) * a + share * b) for a, b in parts))
+
+
+def contrast(colour: QColor, other: QColor) -> float:
+    """Return the contrast ratio of two colours, from 1 to 21, as WCAG 2.1 defines it."""
+    light, dark = sorted((_luminance(colour), _luminance(other)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+def visible_colour(colour: str) -> QColor:
+    """Return a domain's colour, lightened where it would not be seen on the dark theme's bars."""
+    shade = QColor(colour)
+    for share in _LIGHTENING:
+        if not _current.is_dark or contrast(shade, QColor(_current.track)) >= _SEEN:
+            break
+        shade = mixed(colour, "#ffffff", share)
+    return shade
+
+
+def _luminance(colour: QColor) -> float:
+    parts = (colour.redF(), colour.greenF(), colour.blueF())
+    red, green, blue = (p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 def _style_sheet(theme: Theme) -> str:

@@ -29,7 +29,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from app.theme import CLOSE, NORMAL, ROW_HEIGHT, current_theme
+from app.theme import CLOSE, NORMAL, ROW_HEIGHT, current_theme, visible_colour
 
 HANDLE = 7.0
 """Radius of a slider's handle, in device-independent pixels."""
@@ -214,7 +214,8 @@ class Slider(QSlider):
             painter.drawRect(QRectF(start - 0.5, middle - 5, 1, 10))
         handle = self._handle_x()
         lively = self.isEnabled()
-        painter.setBrush(QColor((self._colour or theme.accent) if lively else theme.track))
+        filled = visible_colour(self._colour or theme.accent) if lively else QColor(theme.track)
+        painter.setBrush(filled)
         painter.drawRect(QRectF(min(start, handle), middle - 2, abs(handle - start), 4))
         if self.hasFocus():
             halo = QColor(theme.accent)

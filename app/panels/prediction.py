@@ -13,13 +13,15 @@ from app.icons import icon
 from app.panels.parts import Card, ElidedLabel, HoverRow, labelled, show_verdict, silent
 from app.panels.wording import energy_text, heading
 from app.shading import FULL_PREDICTED
-from app.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme
+from app.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme, visible_colour
 
 if TYPE_CHECKING:
     from app.document import PoseDocument
 
 EVEN_ODDS = 0.5
 """Probability above which a pose counts as predicted to collide."""
+
+_BAR_WIDTH = 54
 
 
 class ProbabilityMeter(QWidget):
@@ -95,7 +97,7 @@ class EnergyBar(QWidget):
         super().__init__()
         self._colour = colour
         self._share = 0.0
-        self.setMinimumWidth(48)
+        self.setFixedWidth(_BAR_WIDTH)
 
     @property
     def share(self) -> float:
@@ -118,7 +120,7 @@ class EnergyBar(QWidget):
         painter.setBrush(QColor(current_theme().track))
         painter.drawRoundedRect(bar, 4, 4)
         if self._share > 0.0:
-            painter.setBrush(QColor(self._colour))
+            painter.setBrush(visible_colour(self._colour))
             painter.setClipRect(QRectF(0, 0, self._share * self.width(), self.height()))
             painter.drawRoundedRect(bar, 4, 4)
 
@@ -148,8 +150,8 @@ class DomainRow(HoverRow):
         row = QHBoxLayout(self)
         row.setContentsMargins(TIGHT + 12 + CLOSE, 0, 0, 0)
         row.setSpacing(CLOSE)
-        row.addWidget(ElidedLabel(self._name), 3)
-        row.addWidget(self.bar, 2)
+        row.addWidget(ElidedLabel(self._name), 1)
+        row.addWidget(self.bar)
         row.addWidget(self.lock)
         self.setFixedHeight(ROW_HEIGHT - 3)
         self.lock.toggled.connect(self._on_lock)
@@ -195,7 +197,7 @@ class DomainRow(HoverRow):
             wash.setAlpha(60 if self._lit else 36)
             painter.setBrush(wash)
             painter.drawRoundedRect(self.rect(), 5, 5)
-        painter.setBrush(QColor(self._colour))
+        painter.setBrush(visible_colour(self._colour))
         painter.drawRoundedRect(QRectF(TIGHT, self.height() / 2 - 6, 12, 12), 3, 3)
 
     def _on_lock(self, locked: bool) -> None:

@@ -13,7 +13,7 @@ from app.icons import pixmap
 from app.panels.code_slider import CodeRow, tab_order
 from app.panels.parts import scrolling
 from app.panels.wording import heading
-from app.theme import CLOSE, NORMAL, TIGHT, current_theme
+from app.theme import CLOSE, NORMAL, TIGHT, current_theme, visible_colour
 
 if TYPE_CHECKING:
     from app.document import PoseDocument
@@ -97,7 +97,7 @@ class GroupHeader(QAbstractButton):
         painter.drawPixmap(TIGHT, middle - 7, self._arrow())
         left = TIGHT + 14 + CLOSE
         if self._colour is not None:
-            painter.setBrush(QColor(self._colour))
+            painter.setBrush(visible_colour(self._colour))
             painter.drawRoundedRect(QRectF(left, middle - 6, 12, 12), 3, 3)
             left += 12 + CLOSE
         font = self.font()
