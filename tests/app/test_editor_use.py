@@ -1,0 +1,443 @@
+"""The editor around its main story: crashes, themes, the keyboard, no display, and long use."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint, QPointF, Qt
+from PySide6.QtGui import QAction, QColor, QPalette, QWheelEvent
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QDialog, QMenu, QMessageBox, QWidget
+from pytestqt.qtbot import QtBot
+
+from app.benchmarks.editor_session import Session
+from app.dialogs.failure import FailureDialog
+from app.document import PoseDocument
+from app.editor import why_no_window
+from app.engine import Failure
+from app.main_window import MainWindow
+from app.recovery import sessions_folder
+from app.shading import Shading
+from app.start_up import StartUp, opening_pose
+from app.theme import DARK, LIGHT, Theme, visible_colour
+from lcollision_core.meshes import write_mesh
+from lcollision_core.model import PoseModel
+from tests.app.windows import (
+    PATIENCE,
+    answer,
+    application,
+    close_window,
+    decoded,
+    dispose,
+    is_open,
+    open_window,
+    rest,
+    settings_in,
+    shown,
+    take_picture,
+)
+
+ROOT = Path(__file__).parents[2]
+N_ACTIONS = int(os.environ.get("LCOLLISION_RANDOM_ACTIONS", "300"))
+THEMES = pytest.mark.parametrize("theme", [LIGHT, DARK], ids=lambda theme: theme.name)
+
+
+@pytest.fixture
+def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[MainWindow]:
+    held = open_window(qtbot, document, settings_in(tmp_path))
+    yield held
+    if is_open(held):
+        close_window(held)
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keep settings, log and sessions of this process and of those that it starts in a folder."""
+    for name in ("XDG_CONFIG_HOME", "XDG_STATE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / name))
+    return tmp_path
+
+
+@pytest.fixture
+def signals() -> Iterator[None]:
+    """Give the signals that an editor takes back to those who had them."""
+    held = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in held.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start a real editor; one that still runs after the test is killed."""
+    started = []
+
+    def run(*arguments: object) -> subprocess.Popen[str]:
+        words = [sys.executable, "-m", "app", "edit", *map(str, arguments)]
+        editor = subprocess.Popen(words, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        started.append(editor)
+        return editor
+
+    yield run
+    for editor in started:
+        editor.kill()
+        editor.communicate()
+
+
+def wait_for_file(editor: subprocess.Popen[str], pattern: str) -> Path:
+    """Wait until an editor has written a file into its session."""
+    deadline = time.monotonic() + PATIENCE / 1000
+    while time.monotonic() < deadline and editor.poll() is None:
+        found = list(sessions_folder().glob(pattern))
+        if found:
+            return found[0]
+        time.sleep(0.05)
+    editor.kill()
+    raise AssertionError(f"no {pattern}: {editor.communicate()[1]}")
+
+
+# Crashes and a clean end.
+
+
+@pytest.mark.usefixtures("signals")
+def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
+    qtbot: QtBot,
+    home: Path,
+    start: Callable[..., subprocess.Popen[str]],
+    editor_model: PoseModel,
+) -> None:
+    model_file, mesh = home / "tube.safetensors", home / "bent.obj"
+    editor_model.save(model_file)
+    bent = editor_model.decode(0.5 * editor_model.latent_space.maximum)
+    write_mesh(mesh, bent, editor_model.faces)
+    editor = start(mesh, "--model", model_file)
+    # An imported mesh is a change that nobody has saved.
+    wait_for_file(editor, "*/session.json")
+    editor.send_signal(signal.SIGKILL)
+    assert editor.wait() == -signal.SIGKILL
+
+    offers = []
+
+    def recover(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        offers.append(dialog.text())
+        (button,) = [held for held in dialog.buttons() if held.text() == "Recover"]
+        button.click()
+
+    document = PoseDocument()
+    window = MainWindow(document, settings_in(home))
+    window.show()
+    start_up = StartUp(window, None, str(model_file))
+    timer = answer(recover)
+    with qtbot.waitSignal(document.recovered, timeout=PATIENCE):
+        start_up.begin()
+    timer.stop()
+    # It looks out for signals until the process ends.
+    start_up.setParent(None)
+    rest(qtbot, window)
+    assert offers == ["The editor closed unexpectedly while “bent” was not saved."]
+    assert document.pose_name == "bent"
+    assert document.modified
+    assert np.array_equal(shown(window), decoded(document))
+    assert np.abs(shown(window) - bent).max() < 2e-3 * editor_model.height
+    close_window(window)
+    assert list(sessions_folder().iterdir()) == []
+
+
+def test_it_opens_on_the_built_in_body_and_ends_when_told_to(
+    home: Path, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    editor = start()
+    wait_for_file(editor, "*/lock")
+    time.sleep(2.0)
+    editor.send_signal(signal.SIGTERM)
+    _, errors = editor.communicate(timeout=PATIENCE / 1000)
+    assert editor.returncode == 0, errors
+    assert "Error" not in errors
+    (log,) = home.rglob("editor.log")
+    assert "ERROR" not in log.read_text()
+    assert list(sessions_folder().iterdir()) == []
+
+
+# No display.
+
+
+@pytest.mark.parametrize(
+    ("environment", "platform", "reason"),
+    [
+        ({}, "linux", "neither DISPLAY nor WAYLAND_DISPLAY is set"),
+        ({"DISPLAY": ":6543"}, "linux", "nothing answers at the display :6543"),
+        (
+            {"WAYLAND_DISPLAY": "none", "XDG_RUNTIME_DIR": "/nowhere"},
+            "linux",
+            "nothing answers at the Wayland display none",
+        ),
+        ({"QT_QPA_PLATFORM": "offscreen"}, "linux", None),
+        ({}, "win32", None),
+        ({}, "darwin", None),
+    ],
+)
+def test_it_says_why_no_window_can_be_opened(
+    environment: dict[str, str], platform: str, reason: str | None
+) -> None:
+    assert why_no_window(environment, platform) == reason
+
+
+@pytest.mark.parametrize("words", [(), ("edit",)], ids=["alone", "edit"])
+def test_without_a_display_one_sentence_names_what_works_there(words: tuple[str, ...]) -> None:
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")
+    environment = {key: value for key, value in os.environ.items() if key not in hidden}
+    ended = subprocess.run(
+        [sys.executable, "-m", "app", *words],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    (sentence,) = ended.stderr.splitlines()
+    assert "no display" in sentence
+    assert "`lcollision resolve`" in sentence
+
+
+# Themes.
+
+
+def luminance(colour: QColor) -> float:
+    """Return the relative luminance of WCAG 2.1."""
+    channels = np.array(colour.getRgbF()[:3])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+def contrast(colour: QColor, other: QColor) -> float:
+    light, dark = sorted((luminance(colour), luminance(other)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+@THEMES
+def test_what_is_read_stands_out_from_what_is_behind_it(theme: Theme) -> None:
+    for behind in (theme.window, theme.card, theme.field):
+        for ink in (theme.text, theme.muted, theme.free, theme.colliding, theme.waiting):
+            assert contrast(QColor(ink), QColor(behind)) >= 4.5, (ink, behind)
+    assert contrast(QColor(theme.on_accent), QColor(theme.accent)) >= 4.5
+    # The signs and bars beside the words need less.
+    assert contrast(QColor(theme.accent), QColor(theme.card)) >= 3.0
+
+
+def test_the_window_takes_on_both_themes(window: MainWindow) -> None:
+    for theme in (LIGHT, DARK):
+        window.set_theme(theme.name)
+        QApplication.processEvents()
+        role = QPalette.ColorRole
+        palette = window.palette()
+        assert palette.color(role.Window) == QColor(theme.window)
+        assert contrast(palette.color(role.WindowText), palette.color(role.Window)) >= 7.0
+        picture = window.grab().toImage()
+        ratio = picture.devicePixelRatio()
+        places = [(3, window.height() - 4), (window.width() // 3, 6)]
+        for x, y in places:
+            seen = picture.pixelColor(int(x * ratio), int(y * ratio))
+            assert contrast(seen, QColor(theme.window)) < 1.1
+        lit = [luminance(visible_colour(c)) for c in window.document.model.domain_colours]
+        if theme.is_dark:
+            assert min(lit) > luminance(QColor(theme.track))
+    assert window.settings["theme"] == "dark"
+
+
+# The keyboard.
+
+
+def menu_actions(menu: QMenu) -> Iterator[QAction]:
+    for action in menu.actions():
+        held = action.menu()
+        if isinstance(held, QMenu):
+            yield from menu_actions(held)
+        elif not action.isSeparator():
+            yield action
+
+
+def test_every_action_is_in_a_menu_and_has_a_shortcut_of_its_own(window: MainWindow) -> None:
+    entries = [action for menu in window.menus.values() for action in menu_actions(menu)]
+    assert [action.text() for action in entries if not action.shortcuts()] == ["No files yet"]
+    named = [action for action in entries if action.shortcuts()]
+    assert set(window.actions_by_key.values()) <= set(named)
+    assert len(named) == len(set(named))
+    keys = [key.toString() for action in named for key in action.shortcuts()]
+    assert len(keys) > len(window.actions_by_key)
+    assert sorted(keys) == sorted(set(keys))
+    assert all(action.toolTip() and action.toolTip() != action.text() for action in named)
+
+
+@pytest.mark.parametrize(
+    ("key", "share"),
+    [
+        (Qt.Key.Key_Right, 0.01),
+        (Qt.Key.Key_Up, 0.01),
+        (Qt.Key.Key_Left, -0.01),
+        (Qt.Key.Key_PageUp, 0.1),
+        (Qt.Key.Key_PageDown, -0.1),
+    ],
+)
+def test_keys_move_a_focused_slider(
+    qtbot: QtBot, window: MainWindow, key: Qt.Key, share: float
+) -> None:
+    row, space = window.sliders.row_of(1), window.document.model.latent_space
+    row.slider.setFocus()
+    before = row.slider.number
+    QTest.keyClick(row.slider, key)
+    width = 1.2 * float(space.maximum[1] - space.minimum[1])
+    assert window.document.latent[1] - before == pytest.approx(share * width)
+    rest(qtbot, window)
+    assert np.array_equal(shown(window), decoded(window.document))
+
+
+def turn_wheel(widget: QWidget) -> None:
+    place = QPointF(widget.rect().center())
+    event = QWheelEvent(
+        place,
+        widget.mapToGlobal(place),
+        QPoint(),
+        QPoint(0, 120),
+        Qt.MouseButton.NoButton,
+        Qt.KeyboardModifier.NoModifier,
+        Qt.ScrollPhase.NoScrollPhase,
+        False,
+    )
+    QApplication.sendEvent(widget, event)
+
+
+def test_the_wheel_moves_only_what_has_the_focus(window: MainWindow) -> None:
+    row, before = window.sliders.row_of(0), window.document.latent
+    for widget in (row.slider, row.field):
+        window.viewport.setFocus()
+        turn_wheel(widget)
+        assert np.array_equal(window.document.latent, before)
+    row.slider.setFocus()
+    turn_wheel(row.slider)
+    assert window.document.latent[0] > before[0]
+
+
+def test_tab_goes_through_everything_once_and_row_by_row(window: MainWindow) -> None:
+    filter_field = window.sliders.filter
+    filter_field.setFocus()
+    visited: list[QWidget] = []
+    for _ in range(300):
+        focused = QApplication.focusWidget()
+        assert focused is not None
+        if focused in visited:
+            break
+        visited.append(focused)
+        QTest.keyClick(focused, Qt.Key.Key_Tab)
+    assert QApplication.focusWidget() is filter_field
+    assert all(widget.isVisible() and widget.isEnabled() for widget in visited)
+    opened = window.sliders.groups[0]
+    expected: list[QWidget] = [filter_field, opened.header]
+    for row in opened.rows:
+        expected += [row.slider, row.field]
+    expected += [group.header for group in window.sliders.groups[1:]]
+    assert visited[: len(expected)] == expected
+    assert window.collision.resolve.button in visited
+    locks = [row.lock for row in window.collision.prediction.rows]
+    assert [widget for widget in visited if widget in locks] == locks
+
+
+def test_the_layout_is_remembered(
+    qtbot: QtBot, document: PoseDocument, editor_model: PoseModel, tmp_path: Path
+) -> None:
+    first = open_window(qtbot, document, settings_in(tmp_path))
+    first.docks["library"].hide()
+    first.resize(1190, 760)
+    first.viewport.set_shading(Shading.PREDICTED)
+    first.set_theme("dark")
+    rest(qtbot, first)
+    close_window(first)
+    again = PoseDocument()
+    again.set_model(editor_model)
+    second = open_window(qtbot, again, settings_in(tmp_path), size=(1440, 900))
+    # As the constructor restored it, before the helper above resized it.
+    third = MainWindow(PoseDocument(), settings_in(tmp_path))
+    assert (third.width(), third.height()) == (1190, 760)
+    third.close()
+    dispose(third)
+    assert not second.docks["library"].isVisible()
+    assert second.docks["sliders"].isVisible()
+    assert second.viewport.shading is Shading.PREDICTED
+    assert second.palette().color(QPalette.ColorRole.Window) == QColor(DARK.window)
+    second.reset_layout()
+    assert second.docks["library"].isVisible()
+    close_window(second)
+
+
+# Long use, and how it looks.
+
+
+def test_random_actions_end_with_the_right_mesh(
+    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    n_failures, grown = Session(window).act(N_ACTIONS)
+    rest(qtbot, window)
+    assert n_failures == 0
+    assert shown(window).tobytes() == decoded(window.document).tobytes()
+    assert grown < 50.0
+    assert window.document.undo_stack.count() > 0
+
+
+@pytest.fixture(scope="module")
+def body() -> PoseModel:
+    return PoseModel.load("body")
+
+
+@THEMES
+def test_the_built_in_body_from_colliding_to_free(
+    qtbot: QtBot, body: PoseModel, tmp_path: Path, theme: Theme
+) -> None:
+    document, settings = PoseDocument(), settings_in(tmp_path)
+    settings["theme"] = theme.name
+    with qtbot.waitSignal(
+        document.exact_changed,
+        timeout=PATIENCE,
+        check_params_cb=lambda: document.exact is not None,
+    ):
+        document.set_model(body)
+    document.load_pose(opening_pose(body))
+    document.undo_stack.clear()
+    window = open_window(qtbot, document, settings)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    window.viewport.set_shading(Shading.DOMAINS)
+    rest(qtbot, window)
+    take_picture(window, f"{theme.name}-start")
+    assert document.exact is not None
+    assert document.exact.colliding
+    assert document.frame is not None
+    assert document.frame.prediction is not None
+    assert document.frame.prediction.collision_probability > 0.5
+    window.viewport.set_shading(Shading.EXACT)
+    rest(qtbot, window)
+    take_picture(window, f"{theme.name}-colliding")
+    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+        window.actions_by_key["resolve"].trigger()
+    rest(qtbot, window)
+    take_picture(window, f"{theme.name}-resolved")
+    assert document.outcome is not None
+    assert document.outcome.exactly_free
+    assert not document.exact.colliding
+    assert document.ghost is not None
+    window.show_failure(Failure("bent.obj has 3 vertices; import a mesh of this model", "details"))
+    (dialog,) = window.findChildren(FailureDialog)
+    qtbot.waitUntil(dialog.isVisible)
+    take_picture(window, f"{theme.name}-error")
+    dialog.reject()
+    close_window(window)
+    assert application().activeModalWidget() is None
