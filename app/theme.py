@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor, QGuiApplication, QPalette
-from PySide6.QtWidgets import QApplication, QStyleFactory
+from PySide6.QtWidgets import QApplication
 
 TIGHT, CLOSE, NORMAL, WIDE = 4, 8, 12, 16
 """All distances in the window, in device-independent pixels."""
@@ -122,7 +122,8 @@ def apply_theme(application: QApplication, theme: Theme) -> None:
     """Give the whole application a theme; widgets learn of it by ``changeEvent``."""
     global _current
     _current = theme
-    application.setStyle(QStyleFactory.create("Fusion"))
+    # By name: a style made here, which Qt deletes, would leave its address to be taken for it.
+    application.setStyle("Fusion")
     application.setPalette(_palette(theme))
     application.setStyleSheet(_style_sheet(theme))
 
