@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +16,46 @@ from app.document import PoseDocument
 from lcollision_core.model import PoseModel
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
+
+_WINDOW_TESTS = {"test_viewport", "test_editor_window", "test_editor_use"}
+_PREPARED_MODEL = "LCOLLISION_PREPARED_MODEL"
+"""Names the model that the process which started this one has trained."""
+
+
+def pytest_runtest_protocol(item: pytest.Item) -> bool | None:
+    """Give each test that opens real windows a process of its own, as the program has.
+
+    Dozens of windows opened and closed in one process corrupt the heap inside the software OpenGL
+    driver sooner or later.
+    """
+    if item.path.stem not in _WINDOW_TESTS or _PREPARED_MODEL in os.environ:
+        return None
+    folder = Path(item.config.cache.mkdir(f"window-tests-{os.getpid()}"))
+    model = folder / "tube.safetensors"
+    if not model.exists():
+        trained_tube().save(model)
+        item.config.add_cleanup(lambda: shutil.rmtree(folder))
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    ended = subprocess.run(
+        [sys.executable, "-X", "faulthandler", "-m", "pytest", "-q", item.nodeid],
+        cwd=item.config.rootpath,
+        env={**os.environ, _PREPARED_MODEL: str(model)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    passed = ended.returncode == 0 and "1 passed" in ended.stdout
+    report = pytest.TestReport(
+        nodeid=item.nodeid,
+        location=item.location,
+        keywords={},
+        outcome="passed" if passed else "failed",
+        longrepr=None if passed else f"exit {ended.returncode}\n{ended.stdout}{ended.stderr}",
+        when="call",
+    )
+    item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
 
 
 @pytest.fixture
@@ -33,7 +77,8 @@ def apart(tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def editor_model() -> PoseModel:
     """Return a small model with a predictor."""
-    return trained_tube()
+    prepared = os.environ.get(_PREPARED_MODEL)
+    return PoseModel.load(prepared) if prepared else trained_tube()
 
 
 @pytest.fixture
