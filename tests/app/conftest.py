@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
@@ -21,6 +22,10 @@ _WINDOW_TESTS = {"test_viewport", "test_editor_window", "test_editor_use"}
 _PREPARED_MODEL = "LCOLLISION_PREPARED_MODEL"
 """Names the model that the process which started this one has trained."""
 
+if _PREPARED_MODEL in os.environ:
+    # Collecting what a closed window leaves behind can crash in the driver too.
+    gc.disable()
+
 
 def pytest_runtest_protocol(item: pytest.Item) -> bool | None:
     """Give each test that opens real windows a process of its own, as the program has.
@@ -37,7 +42,10 @@ def pytest_runtest_protocol(item: pytest.Item) -> bool | None:
         item.config.add_cleanup(lambda: shutil.rmtree(folder))
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
     ended = subprocess.run(
-        [sys.executable, "-X", "faulthandler", "-m", "pytest", "-q", item.nodeid],
+        [
+            *(sys.executable, "-X", "faulthandler", "-m", "pytest"),
+            *("-q", "-p", "no:hypothesispytest", item.nodeid),
+        ],
         cwd=item.config.rootpath,
         env={**os.environ, _PREPARED_MODEL: str(model)},
         capture_output=True,
@@ -56,6 +64,16 @@ def pytest_runtest_protocol(item: pytest.Item) -> bool | None:
     item.ihook.pytest_runtest_logreport(report=report)
     item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
     return True
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """End a process of one test as it stands: the report is out, and only collecting is left."""
+    if _PREPARED_MODEL in os.environ:
+        failed = config.pluginmanager.get_plugin("terminalreporter").stats.get("failed", [])
+        errors = config.pluginmanager.get_plugin("terminalreporter").stats.get("error", [])
+        sys.stdout.flush()
+        os._exit(1 if failed or errors else 0)
 
 
 @pytest.fixture
