@@ -1,7 +1,7 @@
 """The compiled loops of `look`: forward and backward passes over every point and its partners.
 
-Written out, they take a tenth of the time of the same in array operations, which spend it on
-passing temporary arrays through memory. Sums over points run in a fixed order.
+Array operations spend most of their time on passing temporary arrays through memory; these keep
+a point's few numbers at hand. Sums over points run in a fixed order.
 """
 
 from __future__ import annotations
