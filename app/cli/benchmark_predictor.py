@@ -9,7 +9,6 @@ import typer
 
 from app.cli.console import note, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
-from lcollision_core.errors import ModelFileError
 
 if TYPE_CHECKING:
     from app.benchmarks.predictor import PredictorTiming
@@ -37,11 +36,7 @@ def predictor(
     from lcollision_core.model import PoseModel
 
     model = PoseModel.load(model_name)
-    trained = model.predictor
-    if trained is None:
-        raise ModelFileError(
-            f"the model {model.name!r} has no predictor; run `lcollision train predictor` first"
-        )
+    trained = model.require_predictor()
     with cancel_on_interrupt() as cancel, progress_bar("Timing exact verdicts") as progress:
         rows = time_predictor(model, trained, n_poses, progress, cancel)
     if as_json:

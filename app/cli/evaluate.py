@@ -10,7 +10,7 @@ import typer
 from app.cli.console import counted, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
-from lcollision_core.errors import LabelStoreError, ModelFileError
+from lcollision_core.errors import LabelStoreError
 
 if TYPE_CHECKING:
     from lcollision_core.labels import LabelRows, LabelStore
@@ -40,11 +40,7 @@ def evaluate(
     from lcollision_core.predictor import evaluate_predictor
 
     model = PoseModel.load(model_name)
-    trained = model.predictor
-    if trained is None:
-        raise ModelFileError(
-            f"the model {model.name!r} has no predictor; run `lcollision train predictor` first"
-        )
+    trained = model.require_predictor()
     store = LabelStore.open(store_path)
     require_store_of(store, model)
     rows = _unseen(store, store.load(n_rows), trained)

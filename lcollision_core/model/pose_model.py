@@ -217,7 +217,7 @@ class PoseModel:
         ShapeError : another shape, or a number that is not finite.
         ModelFileError : the model has no predictor, or a damaged one.
         """
-        return self._needed_predictor().predict(np.atleast_2d(np.asarray(latent, np.float64)))
+        return self.require_predictor().predict(np.atleast_2d(np.asarray(latent, np.float64)))
 
     def resolve(
         self,
@@ -354,7 +354,8 @@ class PoseModel:
 
         return CollisionPredictor.from_section(section, self.embedding)
 
-    def _needed_predictor(self) -> CollisionPredictor:
+    def require_predictor(self) -> CollisionPredictor:
+        """Return the predictor, or raise ModelFileError where there is none or a damaged one."""
         predictor = self.predictor
         if predictor is None:
             raise ModelFileError(
@@ -386,7 +387,7 @@ class PoseModel:
         box = LatentBox.of(self.embedding)
         return PoseResolver(
             self.embedding,
-            self._needed_predictor(),
+            self.require_predictor(),
             self.detector,
             self.height,
             self.free_latent,
