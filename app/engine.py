@@ -241,12 +241,17 @@ class LivePose(QObject):
     @Slot()
     def _on_due(self) -> None:
         self._is_due = False
-        self._ask()
+        if self._ask() and isinstance(self._asked, FrameRequest) and self._is_quick:
+            answer = self._worker.awaited(_PATIENCE_SECONDS)
+            self._is_quick = answer is not None
+            if answer is not None:
+                self._take(answer)
 
     @Slot()
-    def _ask(self) -> None:
+    def _ask(self) -> bool:
+        """Hand on what is wanted next, unless the worker is busy; tell whether it was."""
         if self._asked is not None:
-            return
+            return False
         if self._next is not None:
             self._asked, self._next = self._next, None
         elif self._shown is not None and not self._rested.isActive():
@@ -254,14 +259,10 @@ class LivePose(QObject):
             self._asked = VerdictRequest(request.request_id, request.model, frame)
             self._shown = None
         if self._asked is None:
-            return
+            return False
         self._worker.forget()
         self._wanted.emit(self._asked)
-        if isinstance(self._asked, FrameRequest) and self._is_quick:
-            answer = self._worker.awaited(_PATIENCE_SECONDS)
-            self._is_quick = answer is not None
-            if answer is not None:
-                self._take(answer)
+        return True
 
     @Slot(object, object)
     def _on_answered(self, request: FrameRequest | VerdictRequest, answer: Answer) -> None:
@@ -272,6 +273,7 @@ class LivePose(QObject):
     def _take(self, answer: Answer) -> None:
         request, self._asked = self._asked, None
         # What is next is handed on before the answer is drawn: the worker need not wait for that.
+        # Nor is it waited for here: it would be told before this answer.
         self._ask()
         if request is None or request.model is not self._model:
             return
@@ -405,7 +407,7 @@ def end_thread(thread: QThread, deadline: float) -> bool:
     return thread.wait(max(1, int(1000 * (deadline - time.monotonic()))))
 
 
-def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], None]) -> QTimer:
+def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], object]) -> QTimer:
     """Make a timer that calls a slot once each time it is started."""
     timer = QTimer(parent)
     timer.setSingleShot(True)

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from PySide6.QtCore import QTimer
 from pytestqt.qtbot import QtBot
@@ -69,6 +70,37 @@ def test_the_mesh_follows_250_events_in_two_seconds_and_ends_right(
     assert document.frame is not None
     expected = document.model.decode(document.latent).astype(np.float32)
     assert document.frame.vertices.tobytes() == expected.tobytes()
+
+
+def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compute = PoseShower.frame
+    held = {0.1: threading.Event(), 0.2: threading.Event()}
+
+    def starved(shower: PoseShower, latent: npt.NDArray[np.float64], request_id: int) -> LiveFrame:
+        """Be quick, but late, as a thread is that gets no core."""
+        frame = compute(shower, latent, request_id)
+        if latent[0] in held:
+            held[latent[0]].wait(10)
+        return frame
+
+    monkeypatch.setattr(PoseShower, "frame", starved)
+    told: list[float] = []
+    document.frame_changed.connect(lambda: told.append(document.frame.latent[0]))
+    document.set_code(0, 0.1)
+    qtbot.wait(50)
+    document.set_code(0, 0.2)
+    qtbot.wait(50)
+    held[0.1].set()
+    qtbot.waitUntil(lambda: told == [0.1])
+    document.set_code(0, 0.3)
+    qtbot.wait(50)
+    held[0.2].set()
+    settle(qtbot, document)
+    assert told == [0.1, 0.2, 0.3]
+    assert document.frame is not None
+    assert document.frame.latent is document.latent
 
 
 def test_a_verdict_of_a_pose_that_has_moved_on_is_not_told(
