@@ -37,8 +37,9 @@ class EditorTiming:
     start_seconds : from the command to a window that shows the pose, with warm caches
     memory_mb : the most that the process held at once
     actions : random actions done after that
-    exceptions : among them
-    leak_mb : memory after them, less that after the first tenth
+    exceptions : that they raised, in the window or in a thread behind it
+    errors : what the first of them said
+    leak_mb : memory after them, less that after each kind once and the first tenth
     mesh_is_right : whether the mesh drawn at the end is, to the bit, the model's of that pose
     """
 
@@ -56,6 +57,7 @@ class EditorTiming:
     memory_mb: float
     actions: int
     exceptions: int
+    errors: list[str]
     leak_mb: float
     mesh_is_right: bool
 

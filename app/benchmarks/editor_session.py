@@ -18,8 +18,10 @@ import numpy as np
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
 from PySide6.QtWidgets import QApplication
 
+from app.camera import CAMERAS
 from app.cli import main  # noqa: F401 - what the command would have loaded by then
 from app.document import PoseDocument
+from app.engine import Failure
 from app.main_window import MainWindow
 from app.memory import keep_memory_small
 from app.settings import Settings
@@ -34,6 +36,8 @@ _IDLE_SHARE = 0.02
 _MOST_PICTURE_SECONDS = 60
 _TIMEOUT_SECONDS = 60.0
 _REPEATS = 30
+_MOST_ERRORS = 10
+_MOST_KEPT = 20
 
 
 class Session(QObject):
@@ -53,7 +57,7 @@ class Session(QObject):
         self._code = self._document.model.latent_space.groups[1].codes.start
         self._slider = window.sliders.row_of(self._code).slider
         self._last_paint = (0.0, 0.0)
-        self._n_failures = 0
+        self._errors: list[str] = []
         window.viewport.painted.connect(self._on_painted)
         self._document.failed.connect(self._on_failed)
         sys.excepthook = self._on_exception
@@ -64,7 +68,7 @@ class Session(QObject):
         idle_cpu = self.idle_cpu()
         updates, renders, events = zip(*self.events(), strict=True)
         lag = self.burst()
-        exceptions, leak = self.act(n_actions)
+        errors, leak = self.act(n_actions)
         self.settle()
         return {
             **self._core_times(),
@@ -75,7 +79,8 @@ class Session(QObject):
             "burst_lag_seconds": lag,
             "idle_cpu": idle_cpu,
             "actions": n_actions,
-            "exceptions": exceptions,
+            "exceptions": len(errors),
+            "errors": errors[:_MOST_ERRORS],
             "leak_mb": leak,
             "mesh_is_right": self.mesh_is_right(),
         }
@@ -130,25 +135,42 @@ class Session(QObject):
         self.pause(_IDLE_SECONDS)
         return (time.process_time() - cpu) / (time.monotonic() - wall)
 
-    def act(self, n_actions: int) -> tuple[int, float]:
-        """Do random actions; return the number of failures, and the memory that grew in MB."""
-        self._n_failures = 0
+    def act(self, n_actions: int) -> tuple[list[str], float]:
+        """Do random actions, each whatever came of the one before.
+
+        Returns
+        -------
+        errors : what went wrong, one sentence for each time
+        grown : memory in MB, less that after each kind once and the first tenth: what is loaded
+            for an action stays
+        """
+        self._errors.clear()
         chance = random.Random(1)
         acts = self._actions(chance)
+        if n_actions:
+            for act in acts:
+                self._try(act)
+                self.settle()
         before = memory_mb()
         for action in range(n_actions):
-            chance.choices(list(acts), weights=list(acts.values()))[0]()
-            self.turn()
+            self._try(chance.choices(list(acts), weights=list(acts.values()))[0])
             if action == n_actions // 10:
                 self.settle()
                 before = memory_mb()
         self.settle()
-        return self._n_failures, memory_mb() - before
+        return list(self._errors), memory_mb() - before
+
+    def _try(self, act: Callable[[], object]) -> None:
+        try:
+            act()
+        except Exception as error:
+            self._on_exception(type(error), error, error.__traceback__)
+        self.turn()
 
     def _actions(self, chance: random.Random) -> dict[Callable[[], object], float]:
         """Return what to do with how much weight."""
         document, window = self._document, self._window
-        size = document.model.latent_size
+        size, n_domains = document.model.latent_size, len(document.model.domain_names)
 
         def slide() -> None:
             row = window.sliders.row_of(chance.randrange(size))
@@ -168,6 +190,22 @@ class Session(QObject):
         def resize() -> None:
             window.resize(chance.randrange(1100, 1500), chance.randrange(700, 950))
 
+        def hover() -> None:
+            window.viewport.highlight_domain(chance.choice([None, *range(n_domains)]))
+
+        def lock() -> None:
+            document.set_locked(chance.randrange(n_domains), chance.random() < 0.5)
+
+        def keep() -> None:
+            if len(document.poses) < _MOST_KEPT:
+                document.add_pose_to_library("kept")
+            else:
+                document.remove_pose_from_library(document.poses[0].name)
+
+        def mirror() -> None:
+            if document.can_mirror:
+                document.mirror()
+
         return {
             slide: 60.0,
             document.undo: 10.0,
@@ -177,6 +215,13 @@ class Session(QObject):
             document.cancel_resolve: 2.0,
             shade: 3.0,
             resize: 1.0,
+            hover: 3.0,
+            lock: 2.0,
+            keep: 1.0,
+            mirror: 1.0,
+            document.reset_all: 1.0,
+            lambda: window.viewport.set_camera(chance.choice(CAMERAS)): 1.0,
+            lambda: window.set_theme(chance.choice(["light", "dark"])): 0.5,
             lambda: document.randomise(chance.random(), chance.randrange(1000)): 3.0,
             lambda: self.wait_for(self.is_settled): 2.0,
         }
@@ -249,11 +294,11 @@ class Session(QObject):
         self._last_paint = (time.perf_counter(), seconds)
 
     @Slot(object)
-    def _on_failed(self, _: object) -> None:
-        self._n_failures += 1
+    def _on_failed(self, failure: Failure) -> None:
+        self._errors.append(failure.sentence)
 
     def _on_exception(self, kind: type[BaseException], error: BaseException, trace: Any) -> None:
-        self._n_failures += 1
+        self._errors.append(f"{kind.__name__}: {error}")
         sys.__excepthook__(kind, error, trace)
 
 

@@ -45,3 +45,5 @@ def editor(
                 f"{row.actions} random actions: {row.exceptions} exceptions, "
                 f"{row.leak_mb:+.0f} MB, the mesh at the end is {right}"
             )
+            for error in row.errors:
+                typer.echo(f"  {error}")

@@ -386,12 +386,31 @@ def test_random_actions_end_with_the_right_mesh(
     qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
-    n_failures, grown = Session(window).act(N_ACTIONS)
+    errors, grown = Session(window).act(N_ACTIONS)
     rest(qtbot, window)
-    assert n_failures == 0
+    assert errors == []
     assert shown(window).tobytes() == decoded(window.document).tobytes()
     assert grown < 50.0
     assert window.document.undo_stack.count() > 0
+
+
+def test_random_actions_tell_what_goes_wrong_and_go_on(
+    window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise ValueError("not today")
+
+    def fail_in_a_thread(*_: object) -> None:
+        window.document.export_mesh(tmp_path / "no such folder" / "pose.obj")
+
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    monkeypatch.setattr(window.document, "reset_all", fail)
+    monkeypatch.setattr(window.document, "randomise", fail_in_a_thread)
+    errors, _ = Session(window).act(1)
+    raised, told = errors
+    assert raised == "ValueError: not today"
+    assert "no folder" in told
+    window.findChild(FailureDialog).reject()
 
 
 @pytest.fixture(scope="module")
