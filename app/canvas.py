@@ -27,12 +27,15 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
 
     Parameters
     ----------
-    before_paint : is called before each picture, to bring the scene up to date
+    before_paint : is called before each picture, to bring the scene up to date; must leave widgets
+        alone: showing or resizing one lays out the window, which may resize this canvas, and Qt
+        then frees the framebuffer and the texture that are being drawn into
     parent : of the widget
 
     Signals
     -------
-    painted : float, the seconds that drawing one picture took
+    painted : float, the seconds that drawing one picture took; what it calls must leave widgets
+        alone too, or be connected queued
     hovered : QPointF in the widget, or None as the pointer leaves; while no button is pressed
     camera_moved : the user has turned, shifted or zoomed
     """

@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import (
-    QEvent,
-    QPointF,
-    QSize,
-    QTimer,
-    Signal,
-    Slot,
-)
+from PySide6.QtCore import QEvent, QPointF, QSize, QTimer, Signal, Slot
 from PySide6.QtGui import QCloseEvent, QResizeEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QStackedLayout, QWidget
@@ -42,6 +35,7 @@ _ROOM = 1.15
 """How much larger than its first pose a body may grow before a limb leaves the view."""
 
 Float32Array = npt.NDArray[np.float32]
+FloatArray = npt.NDArray[np.float64]
 
 
 class Viewport(QWidget):
@@ -59,7 +53,7 @@ class Viewport(QWidget):
     -------
     domain_hovered : int, the domain under the pointer, or None
     shading_changed : Shading
-    painted : float, the seconds that drawing one picture took
+    painted : float, the seconds that drawing one picture took; see `Canvas.painted`
     """
 
     domain_hovered = Signal(object)
@@ -393,6 +387,7 @@ class Viewport(QWidget):
         self._colours_stale = True
         self._crossing_stale = self._crossing_stale or crossing
         if self._canvas is not None:
+            self._explain_colours()
             self._canvas.redraw()
 
     def _bring_up_to_date(self) -> None:
@@ -433,14 +428,25 @@ class Viewport(QWidget):
 
     def _paint(self, scene: Scene, frame: LiveFrame) -> None:
         assert self._shader is not None
+        energies = self._energies(frame)
+        scene.paint(self._shader.colours(self._shading, *energies, highlight=self._highlight))
+
+    def _energies(self, frame: LiveFrame) -> tuple[FloatArray | None, FloatArray | None]:
         predicted, exact = frame.prediction, self._document.exact
-        energies = (
+        return (
             predicted.domain_energy if predicted is not None else None,
             exact.vertex_energy if exact is not None else None,
         )
-        scene.paint(self._shader.colours(self._shading, *energies, highlight=self._highlight))
+
+    def _explain_colours(self) -> None:
+        """Bring the legend up to date; never before a picture, see `Canvas`."""
+        frame = self._document.frame
+        if self._shader is None or frame is None:
+            return
         has_predictor = self._document.model.has_predictor
-        self._legend.set_legend(self._shader.legend(self._shading, *energies, has_predictor))
+        self._legend.set_legend(
+            self._shader.legend(self._shading, *self._energies(frame), has_predictor)
+        )
         self._place_legend()
 
     def _place_legend(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from PIL import Image
-from PySide6.QtCore import QEvent, QPoint, Qt, QTimer
+from PySide6.QtCore import QEvent, QObject, QPoint, Qt, QTimer
 from PySide6.QtGui import QImage
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
@@ -20,6 +20,7 @@ from pytestqt.qtbot import QtBot
 from app.camera import CAMERAS
 from app.canvas import Canvas
 from app.document import PoseDocument
+from app.legend import LegendCard
 from app.shading import Shading, rgb
 from app.theme import DARK, LIGHT, apply_theme
 from app.viewport import Viewport
@@ -200,6 +201,43 @@ def test_each_shading_looks_different_and_explains_itself(
     for first in range(4):
         for second in range(first):
             assert changed(seen[first], seen[second]).sum() > 50
+
+
+class LegendWatch(QObject):
+    """Notes what happens to a legend while its canvas paints, and at other times."""
+
+    def __init__(self, viewport: Viewport) -> None:
+        super().__init__(viewport)
+        self.painting = False
+        self.meanwhile: list[str] = []
+        self.otherwise: list[str] = []
+        self.legend = viewport.findChild(LegendCard)
+        self.legend.installEventFilter(self)
+        assert viewport.canvas is not None
+        viewport.canvas.installEventFilter(self)
+        viewport.canvas.painted.connect(self.on_painted)
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
+        layout = (QEvent.Type.Show, QEvent.Type.Hide, QEvent.Type.Resize, QEvent.Type.Move)
+        if watched is not self.legend:
+            self.painting = self.painting or event.type() is QEvent.Type.Paint
+        elif event.type() in layout:
+            (self.meanwhile if self.painting else self.otherwise).append(event.type().name)
+        return False
+
+    def on_painted(self) -> None:
+        self.painting = False
+
+
+def test_the_legend_is_laid_out_while_nothing_is_painted(qtbot: QtBot, viewport: Viewport) -> None:
+    """A widget that is shown while the canvas paints may resize it: Qt frees what is drawn into."""
+    watch = LegendWatch(viewport)
+    for shading in (Shading.DOMAINS, Shading.PLAIN, Shading.PREDICTED):
+        viewport.set_shading(shading)
+        rest(qtbot, viewport)
+    assert watch.otherwise.count("Show") == 2
+    assert watch.otherwise.count("Hide") == 1
+    assert watch.meanwhile == []
 
 
 def test_intersecting_faces_are_red_while_the_truth_is_known(
