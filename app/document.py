@@ -49,6 +49,7 @@ class PoseDocument(PoseHistory):
     latent_changed, locks_changed, ghost_changed, library_changed, file_changed : look again;
         `file_changed` covers `file` and `pose_name`
     frame_changed, exact_changed : `frame`, `exact` are new, or None as they are not yet known
+    pose_loaded : the pose has come in whole, from the library or a file, not by sliders
     modified_changed : bool
     outcome_changed : `outcome` is new, or None as the pose has been changed since
     solve_started, solve_progressed(object), solve_finished(object) : around a Resolve; the last

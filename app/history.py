@@ -42,6 +42,7 @@ class PoseHistory(QObject):
     modified_changed = Signal(bool)
     file_changed = Signal()
     library_changed = Signal()
+    pose_loaded = Signal()
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -186,6 +187,7 @@ class PoseHistory(QObject):
     def _load(self, label: str, pose: NamedPose) -> None:
         latent = read_only(np.array(pose.latent, dtype=np.float64))
         self._push(label, DocumentState(latent, pose.name, pose.placement, self.poses))
+        self.pose_loaded.emit()
 
     def _push(self, label: str, state: DocumentState, run: int | None = None) -> None:
         """Go to another state, as a step of its own or as part of the gesture."""
@@ -212,6 +214,7 @@ class PoseHistory(QObject):
         self._apply(state)
         self.undo_stack.clear()
         self.file_changed.emit()
+        self.pose_loaded.emit()
 
     def _apply(self, state: DocumentState) -> None:
         """Put in a state and tell what has changed: the one place where the pose changes."""

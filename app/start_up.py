@@ -74,6 +74,8 @@ class StartUp(QObject):
         self._window.set_autosave(Autosave(self._document))
         # The document is about to put in a pose of its own.
         QTimer.singleShot(0, self, self._on_first_pose)
+        self._document.pose_loaded.connect(self._on_pose_loaded)
+        self._document.recovered.connect(self._window.viewport.frame_pose)
         self._window.ready.connect(self._on_ready)
 
     @Slot()
@@ -85,6 +87,12 @@ class StartUp(QObject):
         self._document.load_pose(opening_pose(self._document.model))
         # What the program did is neither a change to save nor one to take back.
         self._document.undo_stack.clear()
+
+    @Slot()
+    def _on_pose_loaded(self) -> None:
+        # Later ones are seen as the user chose to look.
+        self._document.pose_loaded.disconnect(self._on_pose_loaded)
+        self._window.viewport.frame_pose()
 
     @Slot()
     def _on_ready(self) -> None:

@@ -74,6 +74,7 @@ class Viewport(QWidget):
         self._shown: LiveFrame | None = None
         self._pose_stale = self._colours_stale = self._crossing_stale = False
         self._place_camera = False
+        self._framed: npt.NDArray[np.float64] | None = None
         self._glide_to: npt.NDArray[np.float64] | None = None
 
         self._layout = QStackedLayout(self)
@@ -204,6 +205,14 @@ class Viewport(QWidget):
             self._canvas.redraw()
             return
         self._turn.begin(self._scene.view, end)
+
+    @Slot()
+    def frame_pose(self) -> None:
+        """Look at the document's pose as at a model's first, as soon as it is drawn."""
+        self._framed = self._document.latent
+        if self._shown is not None and self._shown.latent is self._framed:
+            self._pose_stale = True
+            self._recolour()
 
     def reset_camera(self) -> None:
         """Look at the whole pose as at the start."""
@@ -413,8 +422,12 @@ class Viewport(QWidget):
     def _put(self, scene: Scene, frame: LiveFrame) -> None:
         self._shown = frame
         self._glide.stop()
-        if self._place_camera:
+        is_framed = frame.latent is self._framed
+        if self._place_camera or is_framed:
             self._place_camera = False
+            if is_framed:
+                self._framed = None
+            self._turn.stop()
             scene.show(frame.vertices, frame.normals)
             middle = frame.vertices.mean(axis=0)
             scene.view = self._preset("Three-quarter", middle + _ROOM * (frame.vertices - middle))

@@ -92,6 +92,11 @@ def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
         editor.communicate()
 
 
+@pytest.fixture(scope="module")
+def body() -> PoseModel:
+    return PoseModel.load("body")
+
+
 def wait_for_file(editor: subprocess.Popen[str], pattern: str) -> Path:
     """Wait until an editor has written a file into its session."""
     deadline = time.monotonic() + PATIENCE / 1000
@@ -165,6 +170,50 @@ def test_it_opens_on_the_built_in_body_and_ends_when_told_to(
     (log,) = home.rglob("editor.log")
     assert "ERROR" not in log.read_text()
     assert list(sessions_folder().iterdir()) == []
+
+
+def share_of_height(window: MainWindow) -> float:
+    """Return how much of the view's height the pose on the screen takes."""
+    canvas = window.viewport.canvas
+    assert canvas is not None
+    places = [canvas.place_of(vertex).y() for vertex in shown(window)]
+    assert 0.0 < min(places) < max(places) < canvas.height()
+    return (max(places) - min(places)) / canvas.height()
+
+
+@pytest.mark.usefixtures("signals")
+@pytest.mark.parametrize("opens_a_mesh", [False, True], ids=["pose", "mesh"])
+def test_it_opens_with_the_camera_on_its_first_pose_and_leaves_it_there(
+    qtbot: QtBot, home: Path, body: PoseModel, opens_a_mesh: bool
+) -> None:
+    document = PoseDocument()
+    window = MainWindow(document, settings_in(home))
+    window.resize(1280, 800)
+    window.show()
+    mesh = home / "kneeling.obj"
+    kneeling = opening_pose(body)
+    if opens_a_mesh:
+        write_mesh(mesh, body.decode(kneeling.latent), body.faces)
+    start_up = StartUp(window, mesh if opens_a_mesh else None, "body")
+    with qtbot.waitSignal(document.pose_loaded, timeout=4 * PATIENCE):
+        start_up.begin()
+    start_up.setParent(None)
+    rest(qtbot, window)
+    assert document.pose_name == ("kneeling" if opens_a_mesh else kneeling.name)
+    # It was half before, framed as the standing body.
+    assert 0.62 < share_of_height(window) < 0.85
+    view = window.viewport.view
+    document.begin_gesture("Drag")
+    document.set_code(0, 0.0)
+    document.end_gesture()
+    document.load_pose(document.training_pose(0))
+    rest(qtbot, window)
+    after = window.viewport.view
+    assert view is not None
+    assert after is not None
+    assert after.position == pytest.approx(view.position)
+    assert after.focus == pytest.approx(view.focus)
+    close_window(window)
 
 
 # No display.
@@ -411,11 +460,6 @@ def test_random_actions_tell_what_goes_wrong_and_go_on(
     assert raised == "ValueError: not today"
     assert "no folder" in told
     window.findChild(FailureDialog).reject()
-
-
-@pytest.fixture(scope="module")
-def body() -> PoseModel:
-    return PoseModel.load("body")
 
 
 @THEMES
