@@ -171,13 +171,13 @@ def describe(model: PoseModel) -> dict[str, Any]:
 def _describe_predictor(model: PoseModel) -> dict[str, Any] | None:
     from dataclasses import asdict
 
-    predictor = model.predictor
-    if predictor is None:
+    record = model.predictor_record
+    if record is None:
         return None
-    facts = predictor.facts
-    metrics = None if predictor.metrics is None else asdict(predictor.metrics)
+    facts = record.facts
+    metrics = None if record.metrics is None else asdict(record.metrics)
     return {
-        "preset": predictor.preset,
+        "preset": record.config.preset,
         "rows": facts.rows,
         "colliding_share": facts.colliding_share,
         "seed": facts.seed,

@@ -1,12 +1,15 @@
-"""Whether a mesh is of a model's topology."""
+"""Whether a mesh is of a model's topology, and fit to be encoded."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import PoseSetError
-from lcollision_core.meshes import Topology
+from lcollision_core.errors import PoseSetError, ShapeError
+from lcollision_core.meshes import Topology, height
+from lcollision_core.meshes.topology import FloatArray
+
+_LARGEST_SIZE = 20.0
 
 
 def require_same_faces(topology: Topology, needed: Topology, source: str, model: str) -> None:
@@ -45,3 +48,32 @@ def _sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     turned = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
     rows = np.take_along_axis(faces, turned, axis=1)
     return rows[np.lexsort(rows.T)]
+
+
+def checked_mesh(vertices: npt.ArrayLike, reference: FloatArray, model: str) -> FloatArray:
+    """Return a mesh that a model can encode as a float64 array.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array, in the data's unit
+    reference : (V, 3) array, the model's
+    model : its name
+
+    Raises
+    ------
+    ShapeError : another shape, or a coordinate that is not finite.
+    PoseSetError : 20 times larger or smaller than the reference.
+    """
+    mesh = np.asarray(vertices, dtype=np.float64)
+    if mesh.shape != reference.shape:
+        raise ShapeError(f"a mesh of {model} has shape {reference.shape}, got {mesh.shape}")
+    if not np.isfinite(mesh).all():
+        vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
+        raise ShapeError(f"vertex {vertex} (from 0) is not finite")
+    size = height(mesh) / height(reference)
+    if not 1.0 / _LARGEST_SIZE < size < _LARGEST_SIZE:
+        raise PoseSetError(
+            f"the mesh is {size:.3g} times as large as the reference of {model!r}; export it in "
+            f"the unit of the model's data"
+        )
+    return mesh

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.metrics import EmbeddingMetrics
-from lcollision_core.errors import ModelFileError, PoseSetError, ShapeError
+from lcollision_core.errors import ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, RigidTransform, Topology, height, up_axis
 from lcollision_core.model.card import ModelCard
@@ -24,12 +24,12 @@ from lcollision_core.model.colours import domain_colours
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_space import WHOLE_BODY, LatentGroup, LatentSpace
 from lcollision_core.model.library import find_model
-from lcollision_core.model.matching import require_same_faces
+from lcollision_core.model.matching import checked_mesh, require_same_faces
 from lcollision_core.model.naming import checked_name, names_from_labels, numbered_names
 from lcollision_core.model_file import Section, read_model_file, write_model_file
 
 if TYPE_CHECKING:
-    from lcollision_core.predictor import CollisionPredictor, Prediction
+    from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
@@ -38,8 +38,6 @@ _EMBEDDING = "embedding"
 _CARD = "model"
 _PREDICTOR = "predictor"
 _FREE_POSES = "free_poses"
-
-_LARGEST_SIZE = 20.0
 
 
 class PoseModel:
@@ -260,20 +258,7 @@ class PoseModel:
         PoseSetError : 20 times larger or smaller than the reference.
         CancelledError : `cancel` was set.
         """
-        mesh = np.asarray(vertices, dtype=np.float64)
-        if mesh.shape != self.reference.shape:
-            raise ShapeError(
-                f"a mesh of {self.name} has shape {self.reference.shape}, got {mesh.shape}"
-            )
-        if not np.isfinite(mesh).all():
-            vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
-            raise ShapeError(f"vertex {vertex} (from 0) is not finite")
-        size = height(mesh) / self.height
-        if not 1.0 / _LARGEST_SIZE < size < _LARGEST_SIZE:
-            raise PoseSetError(
-                f"the mesh is {size:.3g} times as large as the reference of {self.name!r}; export "
-                f"it in the unit of the model's data"
-            )
+        mesh = checked_mesh(vertices, self.reference, self.name)
         fit = self.embedding.encode(mesh[None] / self.card.height, cancel=cancel)
         aligning = RigidTransform(fit.rotations[0], fit.translations[0] * self.card.height)
         return EncodedPose(
@@ -353,6 +338,21 @@ class PoseModel:
         from lcollision_core.predictor import CollisionPredictor
 
         return CollisionPredictor.from_section(section, self.embedding)
+
+    @property
+    def predictor_record(self) -> PredictorRecord | None:
+        """How the predictor was trained and measured, without torch; None where there is none.
+
+        Raises
+        ------
+        ModelFileError : the record is damaged.
+        """
+        section = self._other_sections.get(_PREDICTOR)
+        if section is None:
+            return None
+        from lcollision_core.predictor import PredictorRecord
+
+        return PredictorRecord.from_metadata(section.metadata)
 
     def require_predictor(self) -> CollisionPredictor:
         """Return the predictor, or raise ModelFileError where there is none or a damaged one."""

@@ -5,6 +5,7 @@ from lcollision_core.predictor.metrics import CalibrationBin, PredictorMetrics
 from lcollision_core.predictor.predictor import (
     CollisionPredictor,
     Prediction,
+    PredictorRecord,
     TrainingFacts,
     evaluate_predictor,
     held_out_rows,
@@ -25,6 +26,7 @@ __all__ = [
     "Prediction",
     "PredictorConfig",
     "PredictorMetrics",
+    "PredictorRecord",
     "PredictorStatus",
     "StatusCallback",
     "TrainingFacts",

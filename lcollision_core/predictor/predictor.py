@@ -29,6 +29,8 @@ BATCH_ROWS = 500
 
 _ROWS_A_REPORT = 50 * BATCH_ROWS
 
+_MISFIT = "the model's predictor does not fit its latent space; train the predictor again"
+
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
@@ -83,6 +85,46 @@ class TrainingFacts:
         if not facts.energy_scale > 0.0:
             raise ValueError("no energy scale")
         return facts
+
+
+@dataclass(frozen=True)
+class PredictorRecord:
+    """What a model file says of its predictor beside the weights.
+
+    Attributes
+    ----------
+    config : how it was trained
+    facts : what it was trained upon
+    metrics : measured on held-out rows, None before they are
+    """
+
+    config: PredictorConfig
+    facts: TrainingFacts
+    metrics: PredictorMetrics | None
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, Any]) -> PredictorRecord:
+        """Read the record of a section, without torch.
+
+        Raises
+        ------
+        ModelFileError : the preset is unknown, or a value is missing or wrong.
+        """
+        preset = metadata.get("preset")
+        if preset not in PRESETS:
+            raise ModelFileError(
+                f"the model's predictor has the preset {preset!r}, this program knows "
+                f"{', '.join(PRESETS)}; update the program or train the predictor again"
+            )
+        try:
+            measured = metadata["metrics"]
+            return cls(
+                PredictorConfig(**metadata["config"]),
+                TrainingFacts.from_metadata(metadata["facts"]),
+                None if measured is None else PredictorMetrics.from_metadata(measured),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelFileError(_MISFIT) from error
 
 
 class CollisionPredictor:
@@ -247,24 +289,20 @@ class CollisionPredictor:
 
         from lcollision_core.predictor.presets import NETWORKS
 
-        preset = section.metadata.get("preset")
-        if preset not in PRESETS:
-            raise ModelFileError(
-                f"the model's predictor has the preset {preset!r}, this program knows "
-                f"{', '.join(PRESETS)}; update the program or train the predictor again"
-            )
+        record = PredictorRecord.from_metadata(section.metadata)
         try:
-            config = PredictorConfig(**section.metadata["config"])
-            facts = TrainingFacts.from_metadata(section.metadata["facts"])
-            measured = section.metadata["metrics"]
-            metrics = None if measured is None else PredictorMetrics.from_metadata(measured)
             state = {name: torch.tensor(array) for name, array in section.arrays.items()}
-            network = NETWORKS[config.preset].restore(embedding, config, state)
+            network = NETWORKS[record.config.preset].restore(embedding, record.config, state)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise ModelFileError(
-                "the model's predictor does not fit its latent space; train the predictor again"
-            ) from error
-        return cls(network, config, facts, embedding.n_domains, embedding.latent_size, metrics)
+            raise ModelFileError(_MISFIT) from error
+        return cls(
+            network,
+            record.config,
+            record.facts,
+            embedding.n_domains,
+            embedding.latent_size,
+            record.metrics,
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "_exact_network"}

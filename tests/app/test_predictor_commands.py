@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -256,3 +257,28 @@ def test_floating_point_operations_are_those_of_the_layers(trained: Path) -> Non
     encoder = size * 512 + 512 * 256 + 256 * 256
     each = (256 + codes) * 512 + 512 * 256 + 256 * 256 + 256 * 128 + 128
     assert predictor.flops(7) == 7 * 2 * (encoder + 2 * each + 2 * 64 + 64)
+
+
+@pytest.mark.parametrize("command", ["info", "models"])
+def test_describing_a_predictor_loads_no_torch(trained: Path, tmp_path: Path, command: str) -> None:
+    """Torch takes longer to import than all else that these commands do."""
+    users = tmp_path / "lcollision" / "models"
+    users.mkdir(parents=True)
+    shutil.copy(trained, users / "tube.safetensors")
+    words = ["info", "tube"] if command == "info" else ["models"]
+    code = (
+        "import sys\n"
+        "from app.cli.main import app\n"
+        f"app({words!r}, standalone_mode=False)\n"
+        "print('torch' in sys.modules)"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "XDG_DATA_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    *lines, torch_is_loaded = ended.stdout.splitlines()
+    assert any("predictor paper:" in line for line in lines)
+    assert torch_is_loaded == "False"
