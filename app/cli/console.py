@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol
 
 import typer
 
@@ -22,6 +22,15 @@ class ExitStatus(IntEnum):
     BAD_INPUT = 2
     BUG = 3
     INTERRUPTED = 130
+
+
+class ShowStatus(Protocol):
+    """Draws how far long work is."""
+
+    def __call__(
+        self, done: float, total: float, facts: Iterable[str] = (), description: str | None = None
+    ) -> None:
+        """Draw what is done of all, facts beside it, and what is done now."""
 
 
 def print_json(document: Any) -> None:
@@ -60,5 +69,49 @@ def progress_bar(task: str) -> Iterator[Progress]:
 
         def show(done: int, total: int) -> None:
             bars.update(bar, completed=done, total=total)
+
+        yield show
+
+
+@contextmanager
+def status_bar(task: str, *, rows: bool = False) -> Iterator[ShowStatus | None]:
+    """Give a `ShowStatus` that draws a bar on a terminal, and None in a pipe.
+
+    Parameters
+    ----------
+    task : what is done, until a status says otherwise
+    rows : show how many of how many are done, not the share and the time left
+    """
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    amount: tuple[rich_progress.ProgressColumn, ...] = (
+        rich_progress.TaskProgressColumn(),
+        rich_progress.TimeRemainingColumn(),
+    )
+    if rows:
+        amount = (rich_progress.MofNCompleteColumn(),)
+    columns = (
+        rich_progress.TextColumn("{task.description}"),
+        rich_progress.BarColumn(),
+        *amount,
+        rich_progress.TextColumn("{task.fields[facts]}"),
+    )
+    with rich_progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        bar = bars.add_task(task, total=None, facts="")
+
+        def show(
+            done: float, total: float, facts: Iterable[str] = (), description: str | None = None
+        ) -> None:
+            bars.update(
+                bar,
+                completed=done,
+                total=total,
+                facts=", ".join(facts),
+                description=description or task,
+            )
 
         yield show

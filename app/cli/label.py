@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import counted, note, print_json
+from app.cli.console import counted, note, print_json, status_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
@@ -119,24 +118,14 @@ class _Watched:
 @contextmanager
 def _labelling_bar() -> Iterator[StatusCallback]:
     """Give a callback that draws rows, rate, time left and share colliding on a terminal."""
-    from lcollision_core.labels import no_status
-
-    if not sys.stderr.isatty():
-        yield no_status
-        return
     from datetime import timedelta
 
-    from rich import progress as rich_progress
-    from rich.console import Console
+    from lcollision_core.labels import no_status
 
-    columns = (
-        rich_progress.TextColumn("Labelling"),
-        rich_progress.BarColumn(),
-        rich_progress.MofNCompleteColumn(),
-        rich_progress.TextColumn("{task.fields[facts]}"),
-    )
-    with rich_progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        bar = bars.add_task("", total=None, facts="")
+    with status_bar("Labelling", rows=True) as draw:
+        if draw is None:
+            yield no_status
+            return
 
         def show(status: LabelStatus) -> None:
             facts = []
@@ -145,6 +134,6 @@ def _labelling_bar() -> Iterator[StatusCallback]:
                 facts += [f"{status.rows_per_second:.0f}/s", f"{left} left"]
             if status.colliding_share is not None:
                 facts.append(f"{100.0 * status.colliding_share:.1f} % collide")
-            bars.update(bar, completed=status.done, total=status.total, facts=", ".join(facts))
+            draw(status.done, status.total, facts)
 
         yield show

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import note
+from app.cli.console import note, status_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import describe, error_sentence
 from app.cli.train_predictor import predictor
@@ -123,21 +122,10 @@ def _training_bar() -> Iterator[StatusCallback]:
     """Give a callback that draws the stage and both levels' errors on a terminal."""
     from lcollision_core.embedding.training import no_status
 
-    if not sys.stderr.isatty():
-        yield no_status
-        return
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    columns = (
-        rich_progress.TextColumn("{task.description}"),
-        rich_progress.BarColumn(),
-        rich_progress.TaskProgressColumn(),
-        rich_progress.TimeRemainingColumn(),
-        rich_progress.TextColumn("{task.fields[errors]}"),
-    )
-    with rich_progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        bar = bars.add_task("reading features", total=None, errors="")
+    with status_bar("reading features") as draw:
+        if draw is None:
+            yield no_status
+            return
 
         def show(status: TrainingStatus) -> None:
             errors = [
@@ -148,12 +136,7 @@ def _training_bar() -> Iterator[StatusCallback]:
                 )
                 if error is not None
             ]
-            bars.update(
-                bar,
-                description=f"{status.model}: learning {status.stage}",
-                completed=status.done,
-                total=status.total,
-                errors=f"error {', '.join(errors)}" if errors else "",
-            )
+            facts = [f"error {', '.join(errors)}"] if errors else []
+            draw(status.done, status.total, facts, f"{status.model}: learning {status.stage}")
 
         yield show

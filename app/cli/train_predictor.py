@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.console import note
+from app.cli.console import note, status_bar
 from app.cli.evaluate import require_store_of, scores_sentence
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -139,37 +138,22 @@ def _training_bar(leads: bool) -> Iterator[StatusCallback]:
     """Give a callback that draws steps, loss and held-out accuracy on a terminal."""
     from lcollision_core.predictor import no_status
 
-    if not leads or not sys.stderr.isatty():
+    if not leads:
         yield no_status
         return
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    columns = (
-        rich_progress.TextColumn("{task.description}"),
-        rich_progress.BarColumn(),
-        rich_progress.TaskProgressColumn(),
-        rich_progress.TimeRemainingColumn(),
-        rich_progress.TextColumn("{task.fields[facts]}"),
-    )
-    with rich_progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        bar = bars.add_task("reading rows", total=None, facts="")
+    with status_bar("reading rows") as draw:
+        if draw is None:
+            yield no_status
+            return
 
         def show(status: PredictorStatus) -> None:
             if status.preparing is not None:
-                bars.update(
-                    bar, description="labelling patches", completed=status.preparing, total=1
-                )
+                draw(status.preparing, 1.0, description="labelling patches")
                 return
             facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
             if status.held_out_accuracy is not None:
                 facts.append(f"{100.0 * status.held_out_accuracy:.1f} % right")
-            bars.update(
-                bar,
-                description=f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}",
-                completed=status.done,
-                total=status.total,
-                facts=", ".join(facts),
-            )
+            epoch = f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}"
+            draw(status.done, status.total, facts, epoch)
 
         yield show

@@ -1,0 +1,76 @@
+"""The bars of long commands: drawn on a real terminal, silent in a pipe."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+if sys.platform == "win32":
+    pytest.skip("there are no pseudo-terminals", allow_module_level=True)
+
+import pty
+
+BARS = {
+    "label": (
+        "from app.cli.label import _labelling_bar as bar\n"
+        "from lcollision_core.labels import LabelStatus\n"
+        "status = LabelStatus(30, 200, 15, 7.0, 61.0)\n"
+        "made = bar()",
+        ("Labelling", "30/200", "7/s, 0:01:01 left, 50.0 % collide"),
+    ),
+    "embedding": (
+        "from app.cli.train import _training_bar as bar\n"
+        "from lcollision_core.embedding.training import TrainingStatus\n"
+        "status = TrainingStatus('held out', 'level 2', 1, 4, 40, 100, 0.04, 0.01)\n"
+        "made = bar()",
+        ("held out: learning level 2", "40%", "error level 1 4.00 %, both levels 1.00 %"),
+    ),
+    "predictor": (
+        "from app.cli.train_predictor import _training_bar as bar\n"
+        "from lcollision_core.predictor import PredictorStatus\n"
+        "status = PredictorStatus(1, 30, 20, 100, 0.5, 0.875, None)\n"
+        "made = bar(True)",
+        ("epoch 2 of 30", "20%", "loss 0.500, 87.5 % right"),
+    ),
+    "patches": (
+        "from app.cli.train_predictor import _training_bar as bar\n"
+        "from lcollision_core.predictor import PredictorStatus\n"
+        "status = PredictorStatus(0, 30, 0, 100, None, None, 0.25)\n"
+        "made = bar(True)",
+        ("labelling patches", "25%"),
+    ),
+}
+
+
+def draw(code: str, error: int) -> None:
+    """Draw one status in another process, whose standard error is `error`."""
+    held = f"{code}\nwith made as progress:\n    progress(status)\n    import time; time.sleep(0.3)"
+    environment = {**os.environ, "COLUMNS": "160", "TERM": "xterm"}
+    subprocess.run([sys.executable, "-c", held], env=environment, stderr=error, check=True)
+
+
+@pytest.mark.parametrize("name", BARS)
+def test_on_a_terminal_a_bar_tells_how_far_the_work_is(name: str) -> None:
+    code, told = BARS[name]
+    ours, theirs = pty.openpty()
+    try:
+        draw(code, theirs)
+        drawn = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", os.read(ours, 100_000).decode())
+    finally:
+        os.close(theirs)
+        os.close(ours)
+    for words in told:
+        assert words in drawn
+
+
+@pytest.mark.parametrize("name", BARS)
+def test_in_a_pipe_there_is_no_bar(name: str) -> None:
+    ours, theirs = os.pipe()
+    draw(BARS[name][0], theirs)
+    os.close(theirs)
+    with os.fdopen(ours) as reader:
+        assert reader.read() == ""
