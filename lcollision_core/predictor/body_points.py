@@ -1,4 +1,4 @@
-"""Points all over the body, and which of them tell whether the skin round a point collides."""
+"""Points all over the body, and the patch of skin round each."""
 
 from __future__ import annotations
 
@@ -10,23 +10,11 @@ from scipy.sparse import csgraph
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.embedding.seeding import edge_graph
-from lcollision_core.meshes.topology import FloatArray, IntArray
+from lcollision_core.meshes.topology import FloatArray
 
 N_POINTS = 200
 """Of a mesh that has as many vertices; see the table in `geometric`."""
 
-FAR_PARTNERS = 16
-NEAR_PARTNERS = 8
-
-_FAR_DISTANCE = 0.12
-"""Heights along the surface beyond which two points collide like parts, not like folding skin."""
-
-_NEAR_REACH = 0.16
-_FAR_SCALE = 0.05
-_FAR_SPREAD, _NEAR_SPREAD = 0.04, 0.03
-"""Heights within which a chosen partner makes its neighbours redundant."""
-
-_REDUNDANCE = 0.8
 _LEAST_LENGTH = 1e-9
 
 
@@ -67,12 +55,8 @@ class BodyPoints:
             nearest = np.minimum(nearest, to_best) if chosen else to_best
             chosen.append(int(used[best]))
         vertex = np.sort(np.array(chosen))
-        edges = topology.edges
-        # SciPy would drop edges of length 0.
-        lengths = np.maximum(topology.edge_lengths(rest), _LEAST_LENGTH)
-        graph = edge_graph(edges, len(rest), lengths)
-        distance: FloatArray = csgraph.dijkstra(graph, directed=False, indices=vertex)
-        return cls(vertex, distance, _tangent_frames(embedding, vertex))
+        distance = skin_distances(embedding, vertex)
+        return cls(vertex, distance, tangent_frames(embedding, vertex))
 
     @property
     def patch(self) -> npt.NDArray[np.int64]:
@@ -80,51 +64,21 @@ class BodyPoints:
         nearest: npt.NDArray[np.int64] = self.distance.argmin(axis=0)
         return nearest
 
-    def partners(self, positions: npt.NDArray[np.floating]) -> npt.NDArray[np.int64]:
-        """Choose for each point those whose places tell most about collisions round it.
 
-        First `FAR_PARTNERS` points of other parts, that come near often; then `NEAR_PARTNERS` of
-        the skin about it, that tell how it folds. A choice makes its neighbours less wanted.
+def skin_distances(embedding: Embedding, vertex: npt.NDArray[np.integer]) -> FloatArray:
+    """Return (n, V) lengths of the shortest edge paths from some vertices, in heights.
 
-        Parameters
-        ----------
-        positions : (n, P, 3) array, the points in sampled poses, in heights
-
-        Returns
-        -------
-        partners : (P, FAR_PARTNERS + NEAR_PARTNERS) int64 array; small bodies repeat points
-        """
-        between = self.distance[:, self.vertex]
-        closeness = np.zeros_like(between)
-        for pose in positions:
-            offset = np.linalg.norm(pose[:, None] - pose[None], axis=2)
-            closeness += np.exp(-offset / _FAR_SCALE)
-        far = np.where(between < _FAR_DISTANCE, 0.0, closeness)
-        near = np.where((between > 0.0) & (between < _NEAR_REACH), np.exp(-between / 0.1), 0.0)
-        return np.concatenate(
-            [
-                _chosen(far, between, FAR_PARTNERS, _FAR_SPREAD),
-                _chosen(near, between, NEAR_PARTNERS, _NEAR_SPREAD),
-            ],
-            axis=1,
-        )
+    They are infinite between components.
+    """
+    rest, topology = embedding.rest_vertices, embedding.topology
+    # SciPy would drop edges of length 0.
+    lengths = np.maximum(topology.edge_lengths(rest), _LEAST_LENGTH)
+    graph = edge_graph(topology.edges, len(rest), lengths)
+    distance: FloatArray = csgraph.dijkstra(graph, directed=False, indices=vertex)
+    return distance
 
 
-def _chosen(
-    score: FloatArray, between: FloatArray, n_chosen: int, spread: float
-) -> npt.NDArray[np.int64]:
-    """Take the best of every row again and again, each time lowering its neighbours' scores."""
-    left = score.copy()
-    rows = np.arange(len(score))
-    chosen = np.empty((len(score), n_chosen), dtype=np.int64)
-    for number in range(n_chosen):
-        chosen[:, number] = best = left.argmax(axis=1)
-        left *= 1.0 - _REDUNDANCE * np.exp(-((between[best] / spread) ** 2))
-        left[rows, best] = -1.0
-    return chosen
-
-
-def _tangent_frames(embedding: Embedding, vertex: IntArray) -> FloatArray:
+def tangent_frames(embedding: Embedding, vertex: npt.NDArray[np.integer]) -> FloatArray:
     """Return (P, 3, 3): columns normal and two tangents of the reference at some vertices."""
     rest, faces = embedding.rest_vertices, embedding.topology.faces
     corner = rest[faces]

@@ -14,6 +14,10 @@ LOSSES: tuple[Loss, ...] = ("full", "no-rank", "no-depth", "entropy")
 """Table 1 of Tan et al. 2021: Ours, entropy+PD, entropy+rank, entropy."""
 
 
+LEAST_PASSES = 4
+"""Over any number of rows, where `shown_rows` shortens a training."""
+
+
 @dataclass(frozen=True)
 class PredictorConfig:
     """How a collision predictor is trained.
@@ -27,7 +31,8 @@ class PredictorConfig:
     schedule : "constant", or "one-cycle": up to `rate` in the first fifth of the steps, then down
         to 0, along cosines
     batch_rows : rows per step, of all processes together; even, for the ranking loss's pairs
-    epochs : passes over the training rows
+    epochs : passes over the training rows, see `passes`
+    shown_rows : where not None, passes over many rows end when so many have been shown
 
     Raises
     ------
@@ -43,6 +48,7 @@ class PredictorConfig:
     schedule: Schedule = "constant"
     batch_rows: int = 32
     epochs: int = 30
+    shown_rows: int | None = None
 
     def __post_init__(self) -> None:
         for name, low in (("batch_rows", 2), ("epochs", 1)):
@@ -56,6 +62,15 @@ class PredictorConfig:
         for name in ("entropy_weight", "rate"):
             if not getattr(self, name) > 0.0:
                 raise LCollisionError(f"{name} must be over 0, got {getattr(self, name)}")
+
+    def passes(self, n_rows: int) -> int:
+        """Return how often `n_rows` training rows are gone through: at most `epochs`.
+
+        Many rows need fewer passes, but no fewer than `LEAST_PASSES`.
+        """
+        if self.shown_rows is None:
+            return self.epochs
+        return min(self.epochs, max(LEAST_PASSES, -(-self.shown_rows // n_rows)))
 
     def with_loss(self, loss: Loss) -> PredictorConfig:
         """Return the same choices with some of the loss's terms left out."""
@@ -76,6 +91,7 @@ PRESETS = {
         schedule="one-cycle",
         batch_rows=128,
         epochs=10,
+        shown_rows=1_500_000,
     ),
     "paper": PredictorConfig("paper"),
 }

@@ -27,7 +27,7 @@ from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.processes import Processes, joined_processes
 from lcollision_core.predictor.training import PredictorStatus, StatusCallback
 
-_RUN_VERSION = 1
+_RUN_VERSION = 2
 """Goes up when training changes, so that no checkpoint is continued by other rules."""
 
 _WATCHED_ROWS = 4000
@@ -75,11 +75,13 @@ class TrainingLoop:
         self._config, self._facts = config, facts
         self._device_name, self._path = device, checkpoint
         self._progress, self._cancel = progress, cancel
+        self._near_exclusion = 0.0 if facts.store is None else facts.store.near_exclusion
         held_out = is_held_out(np.arange(len(rows)))
         self._training_index = np.flatnonzero(~held_out)
         self._watched = taken(rows, np.flatnonzero(held_out)[:_WATCHED_ROWS])
         self._steps_an_epoch = -(-len(self._training_index) // config.batch_rows)
-        self._total = config.epochs * self._steps_an_epoch
+        self._epochs = config.passes(len(self._training_index))
+        self._total = self._epochs * self._steps_an_epoch
         self._losses: list[float] = []
         self._accuracy: float | None = None
         self._reported = -math.inf
@@ -101,7 +103,9 @@ class TrainingLoop:
         config = self._config
         checkpoint = Checkpoint(self._path, self._key())
         some = taken(self._rows, self._training_index[:_BUILDING_ROWS])
-        network = NETWORKS[config.preset].build(self._embedding, config, some, self._facts.seed)
+        network = NETWORKS[config.preset].build(
+            self._embedding, config, some, self._facts.seed, self._near_exclusion
+        )
         network = network.to(processes.device)
         learnt = [values for values in network.parameters() if values.requires_grad]
         optimiser = torch.optim.Adam(learnt, lr=config.rate, fused=True)
@@ -145,9 +149,8 @@ class TrainingLoop:
         return network
 
     def _patch_roots(self, network: PredictorNetwork) -> npt.NDArray[np.float16]:
-        if network.patch is None:
+        if network.cells is None:
             return np.empty((len(self._training_index), 0), dtype=np.float16)
-        store = self._facts.store
 
         def report(done: int, total: int) -> None:
             self._preparing = done / total
@@ -157,8 +160,8 @@ class TrainingLoop:
             self._embedding,
             self._rows.latent,
             self._training_index,
-            network.patch,
-            0.0 if store is None else store.near_exclusion,
+            network.cells,
+            self._near_exclusion,
             self._facts.energy_scale,
             progress=report,
             cancel=self._cancel,
@@ -194,7 +197,7 @@ class TrainingLoop:
         self._progress(
             PredictorStatus(
                 epoch=step // self._steps_an_epoch,
-                epochs=self._config.epochs,
+                epochs=self._epochs,
                 done=step,
                 total=self._total,
                 loss=math.fsum(self._losses) / len(self._losses) if self._losses else None,

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import nn
 
@@ -16,6 +14,7 @@ from lcollision_core.embedding import Embedding
 from lcollision_core.labels import LabelRows
 from lcollision_core.predictor.config import PredictorConfig
 from lcollision_core.predictor.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
+from lcollision_core.predictor.patch_labels import SkinCells
 
 ENCODER_SIZES = (512, 256, 256)
 PREDICTOR_SIZES = (512, 256, 256, 128)
@@ -46,7 +45,7 @@ class Targets(NamedTuple):
     domain_energy : (B, K) scaled
     energy : (B,) scaled
     colliding : (B,) 1 where they collide, else 0
-    patch_root : (B, P) see `patch_labels`; (B, 0) for a network without patches
+    patch_root : (B, P + S) see `patch_labels`; (B, 0) for a network without patches
     """
 
     domain_energy: torch.Tensor
@@ -74,6 +73,7 @@ class PredictorNetwork(nn.Module, ABC):
         config: PredictorConfig,
         rows: LabelRows | None = None,
         seed: int = 0,
+        near_exclusion: float = 0.0,
     ) -> PredictorNetwork:
         """Make the network of an embedding.
 
@@ -84,6 +84,7 @@ class PredictorNetwork(nn.Module, ABC):
         rows : some of those to train on, as they are in the store; None where a state dict will be
             loaded
         seed : of the initial weights
+        near_exclusion : of the rows, in heights
         """
 
     @classmethod
@@ -101,8 +102,8 @@ class PredictorNetwork(nn.Module, ABC):
         return network
 
     @property
-    def patch(self) -> npt.NDArray[np.int64] | None:
-        """(V,) the patch of skin of each vertex, for a network that learns patch by patch."""
+    def cells(self) -> SkinCells | None:
+        """How the skin is divided, for a network that learns patch by patch."""
         return None
 
     @abstractmethod
@@ -253,6 +254,7 @@ class PaperNetwork(PredictorNetwork):
         config: PredictorConfig,
         rows: LabelRows | None = None,  # noqa: ARG003
         seed: int = 0,
+        near_exclusion: float = 0.0,  # noqa: ARG003
     ) -> PredictorNetwork:
         """Make the network of an embedding; the rows do not matter."""
         return cls(embedding.group_sizes, config.by_domain, seed)

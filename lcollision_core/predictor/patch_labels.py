@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -10,65 +11,96 @@ import numpy.typing as npt
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.predictor.folds import FOLD_REACH
 
 _ROWS_A_BLOCK = 256
-_PATCH_SHARE = 0.05
-"""A patch that is hit has about this share of its pose's energy."""
+_PATCH_SHARE, _FOLD_SHARE = 0.05, 0.005
+"""A patch that is hit has about this share of its pose's energy; so has a fold."""
 
 _LEAST_ROOT = 1e-3
 """So that the shallowest touch is still told from none in half precision."""
+
+
+@dataclass(frozen=True, eq=False)
+class SkinCells:
+    """How the skin is divided, twice.
+
+    Attributes
+    ----------
+    patch : (V,) the patch of each vertex, 0 to P - 1, for contact between parts
+    fold : (V,) the site of each vertex, 0 to S - 1, for folds; all -1 where folds count as contact
+    """
+
+    patch: npt.NDArray[np.int64]
+    fold: npt.NDArray[np.int64]
+
+    @property
+    def n_patches(self) -> int:
+        """P."""
+        return int(self.patch.max()) + 1
+
+    @property
+    def n_folds(self) -> int:
+        """S."""
+        return int(self.fold.max()) + 1
 
 
 def patch_roots(
     embedding: Embedding,
     latent: npt.NDArray[np.float32],
     index: npt.NDArray[np.int64],
-    patch: npt.NDArray[np.int64],
+    cells: SkinCells,
     near_exclusion: float,
     energy_scale: float,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> npt.NDArray[np.float16]:
-    """Find the exact energy of each patch of skin in some poses.
+    """Find the exact energy of each patch of skin in some poses, and of each fold.
 
     Parameters
     ----------
     embedding : decodes
     latent : (M, D) codes
     index : (n,) the rows wanted
-    patch : (V,) the patch of each vertex, 0 to P - 1
-    near_exclusion : in heights
+    cells : pairs within `FOLD_REACH` of each other along the surface go to the folds
+    near_exclusion : in heights; 0 where there are folds
     energy_scale : the mean energy of a colliding pose, in squared heights
     progress : in rows
     cancel : polled for every block of rows
 
     Returns
     -------
-    roots : (n, P) float16 array: square roots of the patches' sums of PDe, in units that make them
-        about 1 where a patch is hit; 0 where it is not
+    roots : (n, P + S) float16 array: square roots of the sums of PDe, in units that make them
+        about 1 where a patch or a fold is hit; 0 where it is not
 
     Raises
     ------
     CancelledError : `cancel` was set.
     """
+    n_patches, n_folds = cells.n_patches, cells.n_folds
     detector = CollisionDetector(
-        embedding.topology, embedding.rest_vertices, near_exclusion=near_exclusion
+        embedding.topology,
+        embedding.rest_vertices,
+        near_exclusion=FOLD_REACH if n_folds else near_exclusion,
     )
-    n_patches = int(patch.max()) + 1
-    roots = np.zeros((len(index), n_patches), dtype=np.float16)
-    unit = _PATCH_SHARE * energy_scale
+    faces = embedding.topology.faces
+    roots = np.zeros((len(index), n_patches + n_folds), dtype=np.float16)
+    unit = np.repeat([_PATCH_SHARE, _FOLD_SHARE], [n_patches, n_folds]) * energy_scale
 
     def label(start: int) -> None:
         if cancel is not None:
             cancel.raise_if_cancelled()
         part = slice(start, start + _ROWS_A_BLOCK)
-        vertices = embedding.decode(latent[index[part]], n_threads=1)
-        found = detector.detect_batch(vertices.astype(np.float32), workers=1)
-        for row, vertex_energy in enumerate(found.vertex_energy, start):
-            touched = np.flatnonzero(vertex_energy)
-            energy = np.bincount(patch[touched], vertex_energy[touched], n_patches)
+        poses = embedding.decode(latent[index[part]], n_threads=1).astype(np.float32)
+        for row, vertices in enumerate(poses, start):
+            found = detector.detect(vertices)
+            energy = np.bincount(cells.patch, found.vertex_energy, n_patches)
+            if n_folds:
+                corners = cells.fold[faces[found.near_pairs]].reshape(-1, 6)
+                shares = np.repeat(found.near_penetration_depth**2 / 6.0, 6)
+                energy = np.append(energy, np.bincount(corners.ravel(), shares, n_folds))
             hit = energy > 0.0
-            roots[row, hit] = np.maximum(np.sqrt(energy[hit] / unit), _LEAST_ROOT)
+            roots[row, hit] = np.maximum(np.sqrt(energy[hit] / unit[hit]), _LEAST_ROOT)
 
     starts = range(0, len(index), _ROWS_A_BLOCK)
     _ = embedding.codec, embedding.decoder

@@ -9,96 +9,103 @@ from torch import nn
 
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
-from lcollision_core.predictor.look import deform
+from lcollision_core.predictor.field import Decoding, decode_features, deform
 
 _DAMPING = 1e-8
 
 
 class ReducedBody(nn.Module):
-    """Latent codes to some points of the body and their frames.
+    """Latent codes to the deformation of some points of the body, and to where most of them are.
 
-    The gradients are those of the embedding at the points. The points are a linear map of them,
-    as the body's vertices are of all gradients, fitted to decoded poses.
+    The gradients are those of the embedding at the points. Places are a linear map of them, as the
+    body's vertices are of all gradients, fitted to decoded poses.
 
     Parameters
     ----------
     embedding : of the body
-    vertex : (P,) integer array, the points
-    rest_frame : (P, 3, 3) array, their frames on the reference, as columns
+    vertex : (Q,) integer array, the points, none twice
+    rest_frame : (Q, 3, 3) array, their frames on the reference, as columns
+    n_placed : P, how many of them, the first, have places
     """
 
     offset: torch.Tensor
     rest_frame: torch.Tensor
     scale: torch.Tensor
+    tables: torch.Tensor
+    target: torch.Tensor
     points: torch.Tensor
     origin: torch.Tensor
-    identity: torch.Tensor
 
     def __init__(
         self,
         embedding: Embedding,
         vertex: npt.NDArray[np.int64],
         rest_frame: npt.NDArray[np.float64],
+        n_placed: int,
     ) -> None:
         super().__init__()
         decoder = embedding.decoder
-        self.n_points = len(vertex)
-        self._codes: list[slice] = []
-        start = 0
-        for number, group in enumerate(decoder.groups):
+        self.n_placed = n_placed
+        self._blocks: list[tuple[slice, slice]] = []
+        tables, targets = [], []
+        code = column = 0
+        for group in decoder.groups:
             n_codes = len(group.weights)
             _, place, own = np.intersect1d(vertex, group.support, return_indices=True)
             weights = group.weights.reshape(n_codes, -1, N_FEATURES)[:, own]
-            self._keep(f"table_{number}", weights.reshape(n_codes, -1))
-            self.register_buffer(f"place_{number}", torch.tensor(place), persistent=False)
-            self._codes.append(slice(start, start + n_codes))
-            start += n_codes
+            codes = slice(code, code + n_codes)
+            columns = slice(column, column + N_FEATURES * len(own))
+            self._blocks.append((codes, columns))
+            tables.append(weights.reshape(-1))
+            targets.append(place)
+            code, column = codes.stop, columns.stop
+        self._keep("tables", np.concatenate(tables))
         self._keep("offset", decoder.offset[vertex])
         self._keep("scale", decoder.scale)
         self._keep("rest_frame", rest_frame)
+        target = torch.tensor(np.concatenate(targets), dtype=torch.int32)
+        self.register_buffer("target", target, persistent=False)
         # Of the model file: fitted, not a function of the embedding.
-        self.register_buffer("points", torch.zeros(3 * self.n_points, self.n_points))
-        self.register_buffer("origin", torch.zeros(3, self.n_points))
+        self.register_buffer("points", torch.zeros(3 * n_placed, n_placed))
+        self.register_buffer("origin", torch.zeros(3, n_placed))
 
     def _keep(self, name: str, values: npt.NDArray[np.floating]) -> None:
         kept = torch.tensor(np.asarray(values, dtype=np.float32))
         self.register_buffer(name, kept, persistent=False)
 
     def fit(self, latent: npt.NDArray[np.floating], positions: npt.NDArray[np.floating]) -> None:
-        """Fit the points' linear map by ridge regression.
+        """Fit the places' linear map by ridge regression.
 
         Parameters
         ----------
         latent : (n, D) array, n of some thousands
-        positions : (n, P, 3) array, the points of the decoded poses, in heights
+        positions : (n, P, 3) array, the places of the decoded poses, in heights
         """
-        width = 3 * self.n_points + 3
+        width = 3 * self.n_placed + 3
         square = np.zeros((width, width))
-        product = np.zeros((width, self.n_points))
+        product = np.zeros((width, self.n_placed))
         for start in range(0, len(latent), 256):
             part = slice(start, start + 256)
             with torch.no_grad():
-                codes = torch.tensor(latent[part], dtype=torch.float32)
-                _, gradients = deform(self.features(codes), self.rest_frame)
-            rows = gradients.reshape(-1, width - 3).double().numpy()
+                _, gradients, _ = self(torch.tensor(latent[part], dtype=torch.float32))
+            rows = gradients[:, :, : width - 3].reshape(-1, width - 3).double().numpy()
             rows = np.concatenate([rows, np.tile(np.eye(3), (len(rows) // 3, 1))], axis=1)
             square += rows.T @ rows
-            product += rows.T @ positions[part].transpose(0, 2, 1).reshape(-1, self.n_points)
+            product += rows.T @ positions[part].transpose(0, 2, 1).reshape(-1, self.n_placed)
         square += _DAMPING * np.trace(square) / width * np.eye(width)
         solution = torch.tensor(np.linalg.solve(square, product), dtype=torch.float32)
         self.points.copy_(solution[:-3])
         self.origin.copy_(solution[-3:])
 
     def features(self, latent: torch.Tensor) -> torch.Tensor:
-        """Return the (B, P, 9) deformation features at the points, of (B, D) codes."""
-        features = self.offset.expand(len(latent), -1, -1)
-        for number, codes in enumerate(self._codes):
-            output = torch.tanh(latent[:, codes] @ getattr(self, f"table_{number}"))
-            part = output.reshape(len(latent), -1, N_FEATURES) * self.scale
-            features = features.index_add(1, getattr(self, f"place_{number}"), part)
-        return features
+        """Return the (B, Q, 9) deformation features at the points, of (B, D) codes."""
+        decoding = Decoding(self._blocks, self.tables, self.target, self.offset, self.scale)
+        return decode_features(latent, decoding)
 
-    def forward(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the points' frames (B, P, 3, 3) and places (B, 3, P), in heights."""
+    def forward(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return frames (B, Q, 3, 3), rows (B, 3, 3 Q) of gradients, and places (B, 3, P).
+
+        Places are in heights.
+        """
         frame, rows = deform(self.features(latent), self.rest_frame)
-        return frame, rows @ self.points + self.origin
+        return frame, rows, rows[:, :, : 3 * self.n_placed] @ self.points + self.origin

@@ -13,10 +13,18 @@ from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS
-from lcollision_core.predictor.body_points import FAR_PARTNERS, NEAR_PARTNERS, BodyPoints
-from lcollision_core.predictor.geometric import GeometricNetwork
-from lcollision_core.predictor.look import deform, look
-from lcollision_core.predictor.patch_labels import patch_roots
+from lcollision_core.predictor.body_points import BodyPoints, skin_distances
+from lcollision_core.predictor.field import (
+    Decoding,
+    contact_field,
+    decode_features,
+    deform,
+    fold_view,
+    normalised,
+)
+from lcollision_core.predictor.folds import FOLD_REACH, N_MEMBERS, FoldSites
+from lcollision_core.predictor.geometric import REACHES, GeometricNetwork
+from lcollision_core.predictor.patch_labels import SkinCells, patch_roots
 from tests.core.predictor_rows import made_up_rows
 
 
@@ -56,23 +64,12 @@ def test_frames_are_rotations_whose_first_axis_points_out(tube_model: PoseModel)
     assert (outward > 0.0).mean() > 0.9
 
 
-def test_far_partners_are_far_along_the_skin_and_near_ones_near(
-    tube_model: PoseModel, network: GeometricNetwork
-) -> None:
-    between = BodyPoints.of(tube_model.embedding).distance[:, network._points.vertex]
-    partners = network.partners.numpy()
-    assert partners.shape[1] == FAR_PARTNERS + NEAR_PARTNERS
-    rows = np.arange(len(partners))[:, None]
-    assert between[rows, partners[:, :4]].min() >= 0.12
-    assert between[rows, partners[:, FAR_PARTNERS : FAR_PARTNERS + 2]].max() < 0.16
-
-
 def test_reduced_body_lies_where_the_decoder_puts_it(
     tube_model: PoseModel, network: GeometricNetwork
 ) -> None:
     latent = _some_latent(tube_model, 20)
     with torch.no_grad():
-        _, places = network.body(torch.tensor(latent, dtype=torch.float32))
+        _, _, places = network.body(torch.tensor(latent, dtype=torch.float32))
     truth = tube_model.embedding.decode(latent)[:, network._points.vertex]
     errors = np.linalg.norm(places.numpy().transpose(0, 2, 1) - truth, axis=2)
     assert errors.mean() < 2e-3
@@ -80,83 +77,177 @@ def test_reduced_body_lies_where_the_decoder_puts_it(
     assert np.abs(moved).max() > 0.05
 
 
-def test_points_see_partners_where_the_mesh_has_them(
+def test_frames_and_gradients_are_those_of_the_embedding(
     tube_model: PoseModel, network: GeometricNetwork
 ) -> None:
-    """By hand for one point: offset in its turned frame, shortened to its closeness."""
-    latent = torch.tensor(_some_latent(tube_model, 1), dtype=torch.float64)
-    exact = GeometricNetwork(tube_model.embedding, 0)
-    exact.load_state_dict(network.state_dict())
-    exact = exact.double()
+    """Each point's S is symmetric, R turns its frame, and both follow from its features alone."""
+    embedding = tube_model.embedding
+    latent = _some_latent(tube_model, 3)
+    exact = embedding.decoder.features(latent)[:, network._points.vertex]
     with torch.no_grad():
-        frame, places = exact.body(latent)
-        inputs = look(frame, places, exact.partners, FAR_PARTNERS)[5, 0].numpy()
-    place = places[0].numpy()
-    partner = int(network.partners[5, 2])
-    local = frame[0, 5].numpy().T @ (place[:, partner] - place[:, 5])
-    distance = np.linalg.norm(local)
-    closeness = np.exp(-distance / 0.1)
-    assert inputs[[2, FAR_PARTNERS + 2, 2 * FAR_PARTNERS + 2]] == pytest.approx(
-        local / distance * closeness, rel=1e-4
-    )
-    assert inputs[3 * FAR_PARTNERS + 2] == pytest.approx(closeness, rel=1e-4)
-    near = int(network.partners[5, FAR_PARTNERS])
-    local = frame[0, 5].numpy().T @ (place[:, near] - place[:, 5])
-    assert inputs[4 * FAR_PARTNERS] == pytest.approx(local[0], rel=1e-9)
+        found = network.body.features(torch.tensor(latent, dtype=torch.float32))
+    assert found[:, : len(network._points.vertex)].numpy() == pytest.approx(exact, abs=1e-5)
 
 
 @pytest.fixture
 def made_up() -> tuple[torch.Tensor, ...]:
+    """Features, rest frames, places, which pairs are apart, and reaches, in double precision."""
     generator = torch.Generator().manual_seed(1)
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64)
 
-    features = normal(2, 5, 9)
+    features = normal(2, 7, 9)
     features[0, 0, :3] = 0.0
-    partners = torch.tensor([[(p + q + 1) % 5 for q in range(4)] for p in range(5)])
-    return features, torch.linalg.qr(normal(5, 3, 3))[0], 0.1 * normal(2, 3, 5), partners.int()
+    apart = torch.eye(7, dtype=torch.float64)
+    apart[0, 1] = apart[1, 0] = 1.0
+    reach = torch.tensor(REACHES, dtype=torch.float64)
+    return features, torch.linalg.qr(normal(7, 3, 3))[0], 0.05 * normal(2, 3, 7), apart, reach
+
+
+def test_field_by_hand() -> None:
+    """Two points face each other across 0.05; a third behind the first one's skin is not seen."""
+    frame = torch.eye(3, dtype=torch.float64).repeat(1, 3, 1, 1)
+    frame[0, 1] = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
+    places = torch.zeros((1, 3, 3), dtype=torch.float64)
+    places[0, :, 1] = torch.tensor([0.05, 0.01, 0.0], dtype=torch.float64)
+    places[0, 0, 2] = -0.08
+    apart = torch.eye(3, dtype=torch.float64)
+    reach = torch.tensor([0.1], dtype=torch.float64)
+    (first, second, _) = contact_field(frame, places, apart, reach)[:, 0, 0].numpy()
+    weight = (1.0 - (0.05**2 + 0.01**2) / 0.1**2) ** 3
+    # The first is 0.05 above the second's plane, whose normal points back at it.
+    assert first == pytest.approx(
+        weight * np.array([1.0, 0.05, 0.05, 0.01, 0.0, -1.0, 0.0, 0.0]), abs=1e-12
+    )
+    # The second's own frame turns what it sees: ahead is -x of the world.
+    assert second == pytest.approx(
+        weight * np.array([1.0, 0.05, 0.05, -0.01, 0.0, -1.0, 0.0, 0.0]), abs=1e-12
+    )
+
+
+def test_pairs_that_are_apart_do_not_feel_each_other(made_up: tuple[torch.Tensor, ...]) -> None:
+    features, rest_frame, places, apart, reach = made_up
+    frame, _ = deform(features, rest_frame)
+    blind = torch.ones_like(apart)
+    assert contact_field(frame, places, blind, reach).abs().max() == 0.0
+    one = blind.clone()
+    one[2, 3] = one[3, 2] = 0.0
+    felt = contact_field(frame, 0.3 * places, one, reach)
+    assert felt[[0, 1, 4, 5, 6]].abs().max() == 0.0
+    assert felt[[2, 3]].abs().max() > 0.0
 
 
 def test_compiled_and_torch_paths_agree(made_up: tuple[torch.Tensor, ...]) -> None:
     """On a GPU torch does what the compiled loops do on the CPU; `meta` hides where it runs."""
-    features, rest_frame, places, partners = made_up
+    features, rest_frame, places, apart, reach = made_up
     frame, rows = deform(features, rest_frame)
-    hidden = _Elsewhere(features)
-    frame_torch, rows_torch = deform(hidden, rest_frame)  # type: ignore[arg-type]
+    frame_torch, rows_torch = deform(_elsewhere(features), rest_frame)
     assert torch.allclose(frame, frame_torch, atol=1e-12)
     assert torch.allclose(rows, rows_torch, atol=1e-12)
-    inputs = look(frame, places, partners, 3)
-    inputs_torch = look(_Elsewhere(frame), places, partners, 3)  # type: ignore[arg-type]
-    assert torch.allclose(inputs, inputs_torch, atol=1e-12)
-    assert inputs.abs().max() > 0.1
+    sums = contact_field(frame, places, apart, reach)
+    sums_torch = contact_field(_elsewhere(frame), places, apart, reach)
+    assert torch.allclose(sums, sums_torch, atol=1e-12)
+    assert sums.abs().max() > 0.1
+    inputs = normalised(sums, reach, 0.3, 0.05)
+    assert torch.allclose(inputs, normalised(_elsewhere(sums), reach, 0.3, 0.05), atol=1e-12)
+    members = torch.tensor([[0, 1, 2], [6, 0, 3]], dtype=torch.int32)
+    view = fold_view(frame, rows, members)
+    assert torch.allclose(view, fold_view(_elsewhere(frame), rows, members), atol=1e-12)
+
+
+def _elsewhere(values: torch.Tensor) -> torch.Tensor:
+    """Return a tensor that says it is on another device, so that the torch path is taken."""
+    return torch.Tensor._make_subclass(_Elsewhere, values)
 
 
 class _Elsewhere(torch.Tensor):
-    """A tensor that says it is on another device, so that the torch path is taken."""
-
-    @staticmethod
-    def __new__(cls, values: torch.Tensor) -> _Elsewhere:
-        return torch.Tensor._make_subclass(cls, values)
-
     @property
     def device(self) -> torch.device:  # type: ignore[override]
         return torch.device("meta")
 
     @classmethod
     def __torch_function__(cls, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
-        return super().__torch_function__(func, types, args, kwargs or {})
+        return super().__torch_function__(func, types, args, kwargs or {})  # type: ignore[no-untyped-call]
 
 
 def test_derivatives_are_those_of_finite_differences(made_up: tuple[torch.Tensor, ...]) -> None:
-    features, rest_frame, places, partners = made_up
+    features, rest_frame, places, apart, reach = made_up
     moving = features.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda values: deform(values, rest_frame), moving)
-    frame = deform(features, rest_frame)[0].requires_grad_()
+    frame, rows = (values.requires_grad_() for values in deform(features, rest_frame))
+    places.requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda turned, placed: look(turned, placed, partners, 3),
-        (frame, places.requires_grad_()),
+        lambda turned, placed: contact_field(turned, placed, apart, reach), (frame, places)
     )
+    sums = contact_field(frame, places, apart, reach).detach().requires_grad_()
+    assert torch.autograd.gradcheck(lambda values: normalised(values, reach, 0.3, 0.05), sums)
+    members = torch.tensor([[0, 1, 2], [6, 0, 3]], dtype=torch.int32)
+    assert torch.autograd.gradcheck(
+        lambda turned, given: fold_view(turned, given, members), (frame, rows)
+    )
+
+
+def test_features_are_differentiable() -> None:
+    generator = torch.Generator().manual_seed(2)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    # Two groups of 3 and 2 codes; both move point 1.
+    blocks = [(slice(0, 3), slice(0, 18)), (slice(3, 5), slice(18, 27))]
+    tables = torch.cat([normal(54), normal(18)])
+    target = torch.tensor([0, 1, 1], dtype=torch.int32)
+    decoding = Decoding(blocks, tables, target, normal(2, 9), normal(9).abs())
+    latent = normal(4, 5).requires_grad_()
+    assert torch.autograd.gradcheck(lambda codes: decode_features(codes, decoding), latent)
+    (features,) = decode_features(latent[:1], decoding).detach()
+    own = torch.tanh(latent[0, :3].detach() @ tables[:54].reshape(3, 18)).reshape(2, 9)
+    other = torch.tanh(latent[0, 3:].detach() @ tables[54:].reshape(2, 9))
+    assert torch.allclose(features[0], decoding.offset[0] + own[0] * decoding.scale)
+    both = own[1] + other
+    assert torch.allclose(features[1], decoding.offset[1] + both * decoding.scale)
+
+
+def test_folds_are_looked_for_where_the_skin_folds(
+    tube_model: PoseModel, tube_folds: FoldSites
+) -> None:
+    """Sites lie where near pairs collide, and their members about them."""
+    embedding = tube_model.embedding
+    assert tube_folds.members.shape[1] == N_MEMBERS
+    assert 1 <= len(tube_folds.members) <= 48
+    centres = tube_folds.members[:, 0]
+    assert len(np.unique(centres)) == len(centres)
+    detector = CollisionDetector(
+        embedding.topology, embedding.rest_vertices, near_exclusion=FOLD_REACH
+    )
+    folded = [
+        detector.detect(pose.astype(np.float32)).near_pairs
+        for pose in embedding.decode(_colliding_latent(tube_model))
+    ]
+    touched = np.unique(embedding.topology.faces[np.concatenate(folded)])
+    assert len(touched)
+    assert np.isin(centres, touched).all()
+    distance = skin_distances(embedding, centres)
+    assert (tube_folds.cell == distance.argmin(axis=0)).all()
+
+
+def test_a_body_without_folds_has_no_sites(tube_model: PoseModel) -> None:
+    embedding = tube_model.embedding
+    sites = FoldSites.find(embedding, np.zeros((3, embedding.latent_size), dtype=np.float32))
+    assert sites.members.shape == (0, N_MEMBERS)
+    assert (sites.cell == -1).all()
+    network = GeometricNetwork(embedding, 0, sites)
+    assert torch.isfinite(network(torch.zeros((2, embedding.latent_size))).logit).all()
+
+
+def _colliding_latent(model: PoseModel) -> np.ndarray:
+    return (2.5 * _some_latent(model, 60)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def tube_folds(tube_model: PoseModel) -> FoldSites:
+    return FoldSites.find(tube_model.embedding, _colliding_latent(tube_model))
 
 
 def test_a_batch_is_its_poses(tube_model: PoseModel, network: GeometricNetwork) -> None:
@@ -169,35 +260,73 @@ def test_a_batch_is_its_poses(tube_model: PoseModel, network: GeometricNetwork) 
     assert (together.domain_energy >= 0.0).all()
 
 
-def test_patches_share_out_the_exact_energy(tube_model: PoseModel) -> None:
+def test_patches_and_folds_share_out_the_exact_energy(
+    tube_model: PoseModel, tube_folds: FoldSites
+) -> None:
     embedding = tube_model.embedding
-    latent = (2.5 * _some_latent(tube_model, 60)).astype(np.float32)
-    patch = BodyPoints.of(embedding, 25).patch
+    latent = _colliding_latent(tube_model)
+    cells = SkinCells(BodyPoints.of(embedding, 25).patch, tube_folds.cell)
     index = np.arange(0, 60, 2)
-    roots = patch_roots(embedding, latent, index, patch, 0.0, energy_scale=1e-4)
+    roots = patch_roots(embedding, latent, index, cells, 0.0, energy_scale=1e-4)
+    assert roots.shape == (30, cells.n_patches + cells.n_folds)
     detector = CollisionDetector(embedding.topology, embedding.rest_vertices)
     vertices = embedding.decode(latent[index]).astype(np.float32)
     energy = detector.detect_batch(vertices).vertex_energy.sum(axis=1)
     assert (energy > 0.0).sum() >= 5
     assert ((roots > 0.0).any(axis=1) == (energy > 0.0)).all()
-    shared = (roots.astype(np.float64) ** 2).sum(axis=1) * 0.05 * 1e-4
-    assert shared == pytest.approx(energy, rel=5e-3, abs=1e-9)
+    squares = roots.astype(np.float64) ** 2
+    shares = np.repeat([0.05, 0.005], [cells.n_patches, cells.n_folds])
+    assert (squares * shares).sum(axis=1) * 1e-4 == pytest.approx(energy, rel=5e-3, abs=1e-9)
+    assert squares[:, : cells.n_patches].any()
+    assert squares[:, cells.n_patches :].any()
+
+
+def test_folds_count_as_contact_where_there_are_no_sites(tube_model: PoseModel) -> None:
+    embedding = tube_model.embedding
+    cells = SkinCells(
+        BodyPoints.of(embedding, 25).patch, np.full(tube_model.n_vertices, -1, dtype=np.int64)
+    )
+    latent = _colliding_latent(tube_model)
+    for near_exclusion in (0.0, 0.1):
+        roots = patch_roots(
+            embedding, latent, np.arange(60), cells, near_exclusion, energy_scale=1e-4
+        )
+        detector = CollisionDetector(
+            embedding.topology, embedding.rest_vertices, near_exclusion=near_exclusion
+        )
+        poses = embedding.decode(latent).astype(np.float32)
+        assert ((roots > 0.0).any(axis=1) == detector.detect_batch(poses).colliding).all()
 
 
 def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
     cancel = CancelToken()
     cancel.cancel()
-    patch = np.zeros(tube_model.n_vertices, dtype=np.int64)
+    zeros = np.zeros(tube_model.n_vertices, dtype=np.int64)
     with pytest.raises(CancelledError):
         patch_roots(
             tube_model.embedding,
             _some_latent(tube_model, 4).astype(np.float32),
             np.arange(4),
-            patch,
+            SkinCells(zeros, zeros - 1),
             0.0,
             1.0,
             cancel=cancel,
         )
+
+
+def test_a_stored_network_predicts_the_same(
+    tube_model: PoseModel, tube_folds: FoldSites, network: GeometricNetwork
+) -> None:
+    embedding, config = tube_model.embedding, PRESETS["default"]
+    folding = GeometricNetwork(embedding, 3, tube_folds)
+    latent = torch.tensor(_some_latent(tube_model, 5), dtype=torch.float32)
+    for given in (network, folding):
+        restored = GeometricNetwork.restore(embedding, config, given.state_dict())
+        with torch.no_grad():
+            assert torch.equal(restored(latent).logit, given(latent).logit)
+    state = folding.state_dict() | {"site_vertices": torch.tensor([[10**6] * N_MEMBERS])}
+    with pytest.raises(RuntimeError, match="fold sites"):
+        GeometricNetwork.restore(embedding, config, state)
 
 
 def test_a_network_without_domains_is_the_paper_s_alone(tube_model: PoseModel) -> None:

@@ -1,0 +1,381 @@
+"""The compiled loops of `field`: forward and backward passes over every point of the body.
+
+Array operations spend most of their time on passing temporary arrays through memory; these keep
+a point's few numbers at hand. Sums over points run in a fixed order.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.compiled import compiled
+
+Array = npt.NDArray[np.floating[Any]]
+
+BEHIND, FADE = 0.07, 0.04
+"""Heights behind a point's tangent plane at which others are not seen any more, so that the far
+side of a limb is not, and over which they fade in."""
+
+SMALLEST_SQUARED_ANGLE = 1e-12
+
+
+@compiled
+def add_features(
+    outputs: Array, target: npt.NDArray[np.int32], offset: Array, scale: Array, features: Array
+) -> None:
+    """Sum up each point's scaled outputs (B, n, 9) over the groups that move it: (B, P, 9)."""
+    for b in range(outputs.shape[0]):
+        features[b] = offset
+        for n in range(outputs.shape[1]):
+            for c in range(outputs.shape[2]):
+                features[b, target[n], c] += outputs[b, n, c] * scale[c]
+
+
+@compiled
+def add_features_backward(
+    outputs: Array,
+    target: npt.NDArray[np.int32],
+    scale: Array,
+    by_features: Array,
+    by_inputs: Array,
+) -> None:
+    """Pull derivatives by `add_features`' features back to what the tanh was taken of."""
+    one = outputs.dtype.type(1.0)
+    for b in range(outputs.shape[0]):
+        for n in range(outputs.shape[1]):
+            for c in range(outputs.shape[2]):
+                slope = one - outputs[b, n, c] * outputs[b, n, c]
+                by_inputs[b, n, c] = by_features[b, target[n], c] * scale[c] * slope
+
+
+@compiled
+def deform(features: Array, rest_frame: Array, frame: Array, rows: Array) -> None:
+    """Fill in frames R F (B, P, 3, 3) and gradients R S as rows (B, 3, P, 3)."""
+    rotation = np.empty((3, 3), dtype=features.dtype)
+    stretch = np.empty((3, 3), dtype=features.dtype)
+    for b in range(features.shape[0]):
+        for p in range(features.shape[1]):
+            _unpack(features[b, p], rotation, stretch)
+            for i in range(3):
+                for j in range(3):
+                    turned = features.dtype.type(0.0)
+                    stretched = features.dtype.type(0.0)
+                    for k in range(3):
+                        turned += rotation[i, k] * rest_frame[p, k, j]
+                        stretched += rotation[i, k] * stretch[k, j]
+                    frame[b, p, i, j] = turned
+                    rows[b, i, p, j] = stretched
+
+
+@compiled
+def deform_backward(
+    features: Array, rest_frame: Array, by_frame: Array, by_rows: Array, by_features: Array
+) -> None:
+    """Pull derivatives by `deform`'s results back to its (B, P, 9) features."""
+    rotation = np.empty((3, 3), dtype=features.dtype)
+    stretch = np.empty((3, 3), dtype=features.dtype)
+    by_rotation = np.empty((3, 3), dtype=features.dtype)
+    by_stretch = np.empty((3, 3), dtype=features.dtype)
+    for b in range(features.shape[0]):
+        for p in range(features.shape[1]):
+            _unpack(features[b, p], rotation, stretch)
+            for i in range(3):
+                for j in range(3):
+                    turned = features.dtype.type(0.0)
+                    stretched = features.dtype.type(0.0)
+                    for k in range(3):
+                        turned += by_frame[b, p, i, k] * rest_frame[p, j, k]
+                        turned += by_rows[b, i, p, k] * stretch[j, k]
+                        stretched += rotation[k, i] * by_rows[b, k, p, j]
+                    by_rotation[i, j] = turned
+                    by_stretch[i, j] = stretched
+            _pull_rotation(features[b, p], by_rotation, by_features[b, p])
+            by_features[b, p, 3] = by_stretch[0, 0]
+            by_features[b, p, 4] = by_stretch[0, 1] + by_stretch[1, 0]
+            by_features[b, p, 5] = by_stretch[0, 2] + by_stretch[2, 0]
+            by_features[b, p, 6] = by_stretch[1, 1]
+            by_features[b, p, 7] = by_stretch[1, 2] + by_stretch[2, 1]
+            by_features[b, p, 8] = by_stretch[2, 2]
+
+
+@compiled
+def _unpack(features: Array, rotation: Array, stretch: Array) -> None:
+    """Write exp of the rotation vector, by Rodrigues' formula, and S of nine features."""
+    x, y, z = features[0], features[1], features[2]
+    squared = x * x + y * y + z * z + SMALLEST_SQUARED_ANGLE
+    angle = math.sqrt(squared)
+    half = math.sin(0.5 * angle)
+    s = math.sin(angle) / angle
+    v = 2.0 * half * half / squared
+    c = 1.0 - 2.0 * half * half
+    rotation[0, 0], rotation[1, 1], rotation[2, 2] = c + v * x * x, c + v * y * y, c + v * z * z
+    rotation[0, 1], rotation[1, 0] = v * x * y - s * z, v * x * y + s * z
+    rotation[0, 2], rotation[2, 0] = v * z * x + s * y, v * z * x - s * y
+    rotation[1, 2], rotation[2, 1] = v * y * z - s * x, v * y * z + s * x
+    stretch[0, 0], stretch[0, 1], stretch[0, 2] = features[3], features[4], features[5]
+    stretch[1, 0], stretch[1, 1], stretch[1, 2] = features[4], features[6], features[7]
+    stretch[2, 0], stretch[2, 1], stretch[2, 2] = features[5], features[7], features[8]
+
+
+@compiled
+def _pull_rotation(w: Array, by_rotation: Array, by_w: Array) -> None:
+    """Pull a derivative by R = cos I + s [w] + v w w^T back to the rotation vector w."""
+    squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2] + SMALLEST_SQUARED_ANGLE
+    angle = math.sqrt(squared)
+    sine, half = math.sin(angle), math.sin(0.5 * angle)
+    versine = 2.0 * half * half
+    s, v = sine / angle, versine / squared
+    # Derivatives of s and v by the angle.
+    by_s = ((1.0 - versine) - s) / angle
+    by_v = (sine - 2.0 * versine / angle) / squared
+    trace, along, twice = 0.0, 0.0, 0.0
+    for i in range(3):
+        trace += by_rotation[i, i]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        along += (by_rotation[k, j] - by_rotation[j, k]) * w[i]
+        for m in range(3):
+            twice += w[i] * by_rotation[i, m] * w[m]
+    radial = (by_s * along + by_v * twice - sine * trace) / angle
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        total = radial * w[i] + s * (by_rotation[k, j] - by_rotation[j, k])
+        for m in range(3):
+            total += v * (by_rotation[i, m] + by_rotation[m, i]) * w[m]
+        by_w[i] = total
+
+
+@compiled
+def contact_field(frame: Array, places: Array, apart: Array, reach: Array, sums: Array) -> None:
+    """Fill in the sums (P, B, R, 8) of `field.contact_field`."""
+    n_points, n_reaches = places.shape[2], len(reach)
+    kind = frame.dtype.type
+    one = kind(1.0)
+    largest, inverse = reach[-1] * reach[-1], one / (reach * reach)
+    squared = np.empty(n_points, dtype=frame.dtype)
+    near = np.empty(n_points, dtype=np.int32)
+    normal = np.empty((3, n_points), dtype=frame.dtype)
+    total = np.empty((n_points, n_reaches, 8), dtype=frame.dtype)
+    for b in range(frame.shape[0]):
+        x, y, z = places[b, 0], places[b, 1], places[b, 2]
+        nx, ny, nz = normal[0], normal[1], normal[2]
+        total[:] = 0.0
+        for p in range(n_points):
+            nx[p], ny[p], nz[p] = frame[b, p, 0, 0], frame[b, p, 1, 0], frame[b, p, 2, 0]
+        for p in range(n_points):
+            n_near = 0
+            for q in range(p + 1, n_points):
+                dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
+                squared[q] = dx * dx + dy * dy + dz * dz + apart[p, q]
+            for q in range(p + 1, n_points):
+                # Without a branch, which would be mispredicted.
+                near[n_near] = q
+                n_near += squared[q] < largest
+            for place in range(n_near):
+                q = near[place]
+                dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
+                # How far q is ahead of p, and p of q: each also how far the other is above its
+                # own tangent plane.
+                ahead = dx * nx[p] + dy * ny[p] + dz * nz[p]
+                back = -(dx * nx[q] + dy * ny[q] + dz * nz[q])
+                p_sees, q_sees = kind(_facing(ahead)), kind(_facing(back))
+                if p_sees + q_sees == 0.0:
+                    continue
+                for k in range(n_reaches):
+                    t = one - squared[q] * inverse[k]
+                    if t <= 0.0:
+                        continue
+                    cube = t * t * t
+                    if p_sees > 0.0:
+                        weight = p_sees * cube
+                        total[p, k, 0] += weight
+                        total[p, k, 1] += weight * back
+                        total[p, k, 2] += weight * dx
+                        total[p, k, 3] += weight * dy
+                        total[p, k, 4] += weight * dz
+                        total[p, k, 5] += weight * nx[q]
+                        total[p, k, 6] += weight * ny[q]
+                        total[p, k, 7] += weight * nz[q]
+                    if q_sees > 0.0:
+                        weight = q_sees * cube
+                        total[q, k, 0] += weight
+                        total[q, k, 1] += weight * ahead
+                        total[q, k, 2] -= weight * dx
+                        total[q, k, 3] -= weight * dy
+                        total[q, k, 4] -= weight * dz
+                        total[q, k, 5] += weight * nx[p]
+                        total[q, k, 6] += weight * ny[p]
+                        total[q, k, 7] += weight * nz[p]
+        for p in range(n_points):
+            f = frame[b, p]
+            for k in range(n_reaches):
+                own, out = total[p, k], sums[p, b, k]
+                out[0], out[1] = own[0], own[1]
+                for c in range(3):
+                    out[2 + c] = f[0, c] * own[2] + f[1, c] * own[3] + f[2, c] * own[4]
+                    out[5 + c] = f[0, c] * own[5] + f[1, c] * own[6] + f[2, c] * own[7]
+
+
+@compiled
+def normalised(sums: Array, reach: Array, full: float, some: float, inputs: Array) -> None:
+    """Fill in `field.normalised` of the sums (P, B, R, 8)."""
+    kind = sums.dtype.type
+    one = kind(1.0)
+    for p in range(sums.shape[0]):
+        for b in range(sums.shape[1]):
+            for k in range(sums.shape[2]):
+                own, out = sums[p, b, k], inputs[p, b, k]
+                share = one / (own[0] + kind(some))
+                out[0] = own[0] / (own[0] + kind(full))
+                for c in range(1, 5):
+                    out[c] = own[c] * share / reach[k]
+                for c in range(5, 8):
+                    out[c] = own[c] * share
+
+
+@compiled
+def normalised_backward(
+    sums: Array, reach: Array, by_inputs: Array, full: float, some: float, by_sums: Array
+) -> None:
+    """Pull derivatives by `normalised`'s inputs back to the sums."""
+    for p in range(sums.shape[0]):
+        for b in range(sums.shape[1]):
+            for k in range(sums.shape[2]):
+                own, given, out = sums[p, b, k], by_inputs[p, b, k], by_sums[p, b, k]
+                share = 1.0 / (own[0] + some)
+                by_weight = given[0] * full / (own[0] + full) ** 2
+                for c in range(1, 8):
+                    unit = reach[k] if c < 5 else 1.0
+                    out[c] = given[c] * share / unit
+                    by_weight -= out[c] * own[c] * share
+                out[0] = by_weight
+
+
+@compiled
+def contact_field_backward(
+    frame: Array,
+    places: Array,
+    apart: Array,
+    reach: Array,
+    by_sums: Array,
+    by_frame: Array,
+    by_places: Array,
+) -> None:
+    """Pull derivatives by `contact_field`'s sums back, adding to frames and places."""
+    n_points, n_reaches = places.shape[2], len(reach)
+    largest = reach[-1] * reach[-1]
+    given = np.empty((n_reaches, 8), dtype=frame.dtype)
+    d, n, by_d = np.empty(3, frame.dtype), np.empty(3, frame.dtype), np.empty(3, frame.dtype)
+    for b in range(frame.shape[0]):
+        for p in range(n_points):
+            f, by_f = frame[b, p], by_frame[b, p]
+            for k in range(n_reaches):
+                # The offsets' and normals' derivatives, turned from the point's frame.
+                given[k, 0], given[k, 1] = by_sums[p, b, k, 0], by_sums[p, b, k, 1]
+                for i in range(3):
+                    given[k, 2 + i], given[k, 5 + i] = 0.0, 0.0
+                    for c in range(3):
+                        given[k, 2 + i] += f[i, c] * by_sums[p, b, k, 2 + c]
+                        given[k, 5 + i] += f[i, c] * by_sums[p, b, k, 5 + c]
+            for q in range(n_points):
+                for i in range(3):
+                    d[i], n[i] = places[b, i, q] - places[b, i, p], frame[b, q, i, 0]
+                squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + apart[p, q]
+                if squared >= largest:
+                    continue
+                ahead = d[0] * f[0, 0] + d[1] * f[1, 0] + d[2] * f[2, 0]
+                facing = _facing(ahead)
+                if facing == 0.0:
+                    continue
+                above = -(d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
+                by_facing, by_squared, by_above = 0.0, 0.0, 0.0
+                by_d[:] = 0.0
+                for k in range(n_reaches):
+                    inverse = 1.0 / (reach[k] * reach[k])
+                    t = 1.0 - squared * inverse
+                    if t <= 0.0:
+                        continue
+                    cube = t * t * t
+                    weight = facing * cube
+                    by_weight = given[k, 0] + given[k, 1] * above
+                    for i in range(3):
+                        by_weight += given[k, 2 + i] * d[i] + given[k, 5 + i] * n[i]
+                        by_d[i] += weight * given[k, 2 + i]
+                        by_frame[b, q, i, 0] += weight * given[k, 5 + i]
+                        # Of the two rotated sums by the rotation.
+                        for c in range(3):
+                            by_f[i, c] += weight * (
+                                d[i] * by_sums[p, b, k, 2 + c] + n[i] * by_sums[p, b, k, 5 + c]
+                            )
+                    by_above += weight * given[k, 1]
+                    by_facing += by_weight * cube
+                    by_squared -= by_weight * facing * 3.0 * t * t * inverse
+                by_ahead = by_facing * _facing_slope(ahead)
+                for i in range(3):
+                    by_frame[b, q, i, 0] -= by_above * d[i]
+                    by_f[i, 0] += by_ahead * d[i]
+                    change = (
+                        by_d[i] + 2.0 * by_squared * d[i] - by_above * n[i] + by_ahead * f[i, 0]
+                    )
+                    by_places[b, i, q] += change
+                    by_places[b, i, p] -= change
+
+
+@compiled
+def _facing(ahead: float) -> float:
+    """Return a smooth step of how far ahead along the normal another point is."""
+    s = min(max((ahead + BEHIND) / FADE, 0.0), 1.0)
+    return s * s * (3.0 - 2.0 * s)
+
+
+@compiled
+def _facing_slope(ahead: float) -> float:
+    """Return the derivative of `_facing`."""
+    s = min(max((ahead + BEHIND) / FADE, 0.0), 1.0)
+    return 6.0 * s * (1.0 - s) / FADE
+
+
+@compiled
+def fold_view(frame: Array, rows: Array, members: npt.NDArray[np.int32], inputs: Array) -> None:
+    """Fill in (S, B, 9 M): the members' gradients in the frame of each site's first member."""
+    for b in range(frame.shape[0]):
+        for s in range(members.shape[0]):
+            f, out = frame[b, members[s, 0]], inputs[s, b]
+            for m in range(members.shape[1]):
+                vertex = members[s, m]
+                for k in range(3):
+                    for j in range(3):
+                        out[9 * m + 3 * k + j] = (
+                            f[0, k] * rows[b, 0, vertex, j]
+                            + f[1, k] * rows[b, 1, vertex, j]
+                            + f[2, k] * rows[b, 2, vertex, j]
+                        )
+
+
+@compiled
+def fold_view_backward(
+    frame: Array,
+    rows: Array,
+    members: npt.NDArray[np.int32],
+    by_inputs: Array,
+    by_frame: Array,
+    by_rows: Array,
+) -> None:
+    """Pull derivatives by `fold_view`'s inputs back, adding to frames and gradients."""
+    for b in range(frame.shape[0]):
+        for s in range(members.shape[0]):
+            centre, given = members[s, 0], by_inputs[s, b]
+            for m in range(members.shape[1]):
+                vertex = members[s, m]
+                for i in range(3):
+                    for k in range(3):
+                        for j in range(3):
+                            by_frame[b, centre, i, k] += (
+                                given[9 * m + 3 * k + j] * rows[b, i, vertex, j]
+                            )
+                            by_rows[b, i, vertex, j] += (
+                                frame[b, centre, i, k] * given[9 * m + 3 * k + j]
+                            )

@@ -1,0 +1,102 @@
+"""Where skin folds onto itself, and the few vertices about such a place that tell when it does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.embedding import Embedding
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.predictor.body_points import skin_distances
+
+FOLD_REACH = 0.045
+"""Heights along the surface within which colliding faces are a fold of the skin, not two parts."""
+
+N_SITES = 48
+N_MEMBERS = 12
+
+_MEMBER_REACH = 0.03
+_SPREAD, _REDUNDANCE = 0.02, 0.85
+"""Heights within which a chosen site makes its neighbours redundant, and how much."""
+
+_MASKED_FOLD = 0.2
+"""What a fold is worth in a pose that collides elsewhere too."""
+
+_SEARCHED_POSES = 3000
+_POSES_AT_ONCE = 256
+
+
+@dataclass(frozen=True, eq=False)
+class FoldSites:
+    """S places where the skin folds, none for a body that does not.
+
+    Attributes
+    ----------
+    members : (S, M) int64 array, vertices spread about each site, its centre first
+    cell : (V,) int64 array, the site nearest to each vertex along the surface; -1 without sites
+    """
+
+    members: npt.NDArray[np.int64]
+    cell: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, embedding: Embedding, members: npt.NDArray[np.int64]) -> FoldSites:
+        """Make the sites that were found once."""
+        n_vertices = len(embedding.rest_vertices)
+        if not len(members):
+            return cls(members, np.full(n_vertices, -1))
+        return cls(members, skin_distances(embedding, members[:, 0]).argmin(axis=0))
+
+    @classmethod
+    def find(cls, embedding: Embedding, latent: npt.NDArray[np.floating]) -> FoldSites:
+        """Search colliding poses for the places that fold most often.
+
+        Parameters
+        ----------
+        embedding : decodes
+        latent : (n, D) poses that collide; some thousands are looked at
+        """
+        score = _fold_share(embedding, latent[:_SEARCHED_POSES])
+        members: list[npt.NDArray[np.int64]] = []
+        while len(members) < N_SITES and score.max(initial=0.0) > 0.0:
+            centre = int(score.argmax())
+            (distance,) = skin_distances(embedding, np.array([centre]))
+            members.append(_spread_members(embedding, distance))
+            score *= 1.0 - _REDUNDANCE * np.exp(-((distance / _SPREAD) ** 2))
+            score[centre] = 0.0
+        return cls.of(embedding, np.array(members, dtype=np.int64).reshape(-1, N_MEMBERS))
+
+
+def _fold_share(embedding: Embedding, latent: npt.NDArray[np.floating]) -> FloatArray:
+    """Return (V,) in what share of the poses each vertex is part of a fold."""
+    faces = embedding.topology.faces
+    detector = CollisionDetector(
+        embedding.topology, embedding.rest_vertices, near_exclusion=FOLD_REACH
+    )
+    share = np.zeros(len(embedding.rest_vertices))
+    for start in range(0, len(latent), _POSES_AT_ONCE):
+        for vertices in embedding.decode(latent[start : start + _POSES_AT_ONCE]):
+            found = detector.detect(vertices.astype(np.float32))
+            folded = np.unique(faces[found.near_pairs])
+            share[folded] += _MASKED_FOLD if len(found.pairs) else 1.0
+    return share / max(len(latent), 1)
+
+
+def _spread_members(embedding: Embedding, distance: FloatArray) -> npt.NDArray[np.int64]:
+    """Choose `N_MEMBERS` vertices about the one at distance 0, each farthest from those before."""
+    order = distance.argsort(kind="stable")
+    within = int((distance <= _MEMBER_REACH).sum())
+    # A coarse mesh has too few: the nearest then; a tiny one repeats its own.
+    near = np.resize(order[: max(within, N_MEMBERS)], max(within, N_MEMBERS))
+    places = embedding.rest_vertices[near]
+    chosen = [0]
+    nearest = np.linalg.norm(places - places[0], axis=1)
+    while len(chosen) < N_MEMBERS:
+        best = int(nearest.argmax())
+        chosen.append(best)
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[best], axis=1))
+    members: npt.NDArray[np.int64] = near[chosen]
+    return members
