@@ -90,6 +90,9 @@ class MainWindow(QMainWindow):
 
     def __init__(self, document: PoseDocument, settings: Settings) -> None:
         super().__init__()
+        # A closed window must not wait for the garbage collector, which takes its widgets apart in
+        # any order: Qt then reads what is freed.
+        self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.document = document
         self.settings = settings
         self._autosave: Autosave | None = None

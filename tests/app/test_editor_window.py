@@ -12,6 +12,7 @@ from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QLineEdit, QMessageBox
 from pytestqt.qtbot import QtBot
+from shiboken6 import isValid
 
 from app.dialogs.failure import FailureDialog
 from app.document import PoseDocument
@@ -357,3 +358,10 @@ def test_nothing_is_left_open(window: MainWindow) -> None:
     assert not window.isVisible()
     assert window.document.close()
     assert QApplication.activeModalWidget() is None
+
+
+def test_a_closed_window_is_deleted_at_once(qtbot: QtBot, window: MainWindow) -> None:
+    """The garbage collector takes widgets apart in any order, which Qt does not survive."""
+    with qtbot.waitSignal(window.destroyed, timeout=PATIENCE):
+        window.actions_by_key["quit"].trigger()
+    assert not isValid(window)
