@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError, ModelFileError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 BATCH_ROWS = 500
 """Rows that are predicted at a time: their hidden layers stay in the caches."""
+
+_ROWS_A_THREAD = 64
+"""Fewer poses than this are not worth a thread."""
 
 _ROWS_A_REPORT = 50 * BATCH_ROWS
 
@@ -202,12 +206,26 @@ class CollisionPredictor:
         codes = np.ascontiguousarray(latent, dtype=np.float32)
         n_outputs = self.n_domains if self.config.by_domain else 1
         domain_energy, logit = np.empty((len(codes), n_outputs)), np.empty(len(codes))
-        with torch.inference_mode():
-            for start in range(0, len(codes), BATCH_ROWS):
-                rows = slice(start, start + BATCH_ROWS)
-                output = self._network(torch.tensor(codes[rows], device=self._device))
-                domain_energy[rows] = output.domain_energy.double().cpu().numpy()
-                logit[rows] = output.logit.double().cpu().numpy()
+
+        def fill(start: int, stop: int) -> None:
+            with torch.inference_mode():
+                for first in range(start, stop, BATCH_ROWS):
+                    rows = slice(first, min(first + BATCH_ROWS, stop))
+                    output = self._network(torch.tensor(codes[rows], device=self._device))
+                    domain_energy[rows] = output.domain_energy.double().cpu().numpy()
+                    logit[rows] = output.logit.double().cpu().numpy()
+
+        n_threads = 1
+        if self._device.type == "cpu":
+            n_threads = max(1, min(available_cores(), len(codes) // _ROWS_A_THREAD))
+        cuts = np.linspace(0, len(codes), n_threads + 1).astype(int).tolist()
+        if n_threads == 1:
+            fill(0, len(codes))
+        else:
+            # The network's compiled loops run on one thread each.
+            with ThreadPoolExecutor(n_threads) as pool:
+                for _ in pool.map(fill, cuts[:-1], cuts[1:]):
+                    pass
         return domain_energy, logit
 
     def logit_and_gradient(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
