@@ -266,62 +266,88 @@ def contact_field_backward(
 ) -> None:
     """Pull derivatives by `contact_field`'s sums back, adding to frames and places."""
     n_points, n_reaches = places.shape[2], len(reach)
-    largest = reach[-1] * reach[-1]
+    largest, inverse = reach[-1] * reach[-1], 1.0 / (reach * reach)
+    squared = np.empty(n_points, dtype=frame.dtype)
+    near = np.empty(n_points, dtype=np.int32)
     given = np.empty((n_reaches, 8), dtype=frame.dtype)
-    d, n, by_d = np.empty(3, frame.dtype), np.empty(3, frame.dtype), np.empty(3, frame.dtype)
+    total = np.empty((n_reaches, 6), dtype=frame.dtype)
     for b in range(frame.shape[0]):
+        x, y, z = places[b, 0], places[b, 1], places[b, 2]
         for p in range(n_points):
+            n_near = 0
+            for q in range(n_points):
+                dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
+                squared[q] = dx * dx + dy * dy + dz * dz + apart[p, q]
+            for q in range(n_points):
+                near[n_near] = q
+                n_near += squared[q] < largest
             f, by_f = frame[b, p], by_frame[b, p]
             for k in range(n_reaches):
                 # The offsets' and normals' derivatives, turned from the point's frame.
-                given[k, 0], given[k, 1] = by_sums[p, b, k, 0], by_sums[p, b, k, 1]
+                by = by_sums[p, b, k]
+                given[k, 0], given[k, 1] = by[0], by[1]
                 for i in range(3):
-                    given[k, 2 + i], given[k, 5 + i] = 0.0, 0.0
-                    for c in range(3):
-                        given[k, 2 + i] += f[i, c] * by_sums[p, b, k, 2 + c]
-                        given[k, 5 + i] += f[i, c] * by_sums[p, b, k, 5 + c]
-            for q in range(n_points):
-                for i in range(3):
-                    d[i], n[i] = places[b, i, q] - places[b, i, p], frame[b, q, i, 0]
-                squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + apart[p, q]
-                if squared >= largest:
-                    continue
-                ahead = d[0] * f[0, 0] + d[1] * f[1, 0] + d[2] * f[2, 0]
+                    given[k, 2 + i] = f[i, 0] * by[2] + f[i, 1] * by[3] + f[i, 2] * by[4]
+                    given[k, 5 + i] = f[i, 0] * by[5] + f[i, 1] * by[6] + f[i, 2] * by[7]
+            total[:] = 0.0
+            for place in range(n_near):
+                q = near[place]
+                dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
+                ahead = dx * f[0, 0] + dy * f[1, 0] + dz * f[2, 0]
                 facing = _facing(ahead)
                 if facing == 0.0:
                     continue
-                above = -(d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
+                qx, qy, qz = frame[b, q, 0, 0], frame[b, q, 1, 0], frame[b, q, 2, 0]
+                above = -(dx * qx + dy * qy + dz * qz)
                 by_facing, by_squared, by_above = 0.0, 0.0, 0.0
-                by_d[:] = 0.0
+                by_x, by_y, by_z, by_qx, by_qy, by_qz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                 for k in range(n_reaches):
-                    inverse = 1.0 / (reach[k] * reach[k])
-                    t = 1.0 - squared * inverse
+                    t = 1.0 - squared[q] * inverse[k]
                     if t <= 0.0:
                         continue
+                    g, own = given[k], total[k]
                     cube = t * t * t
                     weight = facing * cube
-                    by_weight = given[k, 0] + given[k, 1] * above
-                    for i in range(3):
-                        by_weight += given[k, 2 + i] * d[i] + given[k, 5 + i] * n[i]
-                        by_d[i] += weight * given[k, 2 + i]
-                        by_frame[b, q, i, 0] += weight * given[k, 5 + i]
-                        # Of the two rotated sums by the rotation.
-                        for c in range(3):
-                            by_f[i, c] += weight * (
-                                d[i] * by_sums[p, b, k, 2 + c] + n[i] * by_sums[p, b, k, 5 + c]
-                            )
-                    by_above += weight * given[k, 1]
+                    by_weight = g[0] + g[1] * above + g[2] * dx + g[3] * dy + g[4] * dz
+                    by_weight += g[5] * qx + g[6] * qy + g[7] * qz
+                    by_x += weight * g[2]
+                    by_y += weight * g[3]
+                    by_z += weight * g[4]
+                    by_qx += weight * g[5]
+                    by_qy += weight * g[6]
+                    by_qz += weight * g[7]
+                    own[0] += weight * dx
+                    own[1] += weight * dy
+                    own[2] += weight * dz
+                    own[3] += weight * qx
+                    own[4] += weight * qy
+                    own[5] += weight * qz
+                    by_above += weight * g[1]
                     by_facing += by_weight * cube
-                    by_squared -= by_weight * facing * 3.0 * t * t * inverse
+                    by_squared -= by_weight * facing * 3.0 * t * t * inverse[k]
                 by_ahead = by_facing * _facing_slope(ahead)
+                by_frame[b, q, 0, 0] += by_qx - by_above * dx
+                by_frame[b, q, 1, 0] += by_qy - by_above * dy
+                by_frame[b, q, 2, 0] += by_qz - by_above * dz
+                by_f[0, 0] += by_ahead * dx
+                by_f[1, 0] += by_ahead * dy
+                by_f[2, 0] += by_ahead * dz
+                twice = 2.0 * by_squared
+                by_x += twice * dx - by_above * qx + by_ahead * f[0, 0]
+                by_y += twice * dy - by_above * qy + by_ahead * f[1, 0]
+                by_z += twice * dz - by_above * qz + by_ahead * f[2, 0]
+                by_places[b, 0, q] += by_x
+                by_places[b, 1, q] += by_y
+                by_places[b, 2, q] += by_z
+                by_places[b, 0, p] -= by_x
+                by_places[b, 1, p] -= by_y
+                by_places[b, 2, p] -= by_z
+            for k in range(n_reaches):
+                # Of the turned sums by the rotation.
+                by, own = by_sums[p, b, k], total[k]
                 for i in range(3):
-                    by_frame[b, q, i, 0] -= by_above * d[i]
-                    by_f[i, 0] += by_ahead * d[i]
-                    change = (
-                        by_d[i] + 2.0 * by_squared * d[i] - by_above * n[i] + by_ahead * f[i, 0]
-                    )
-                    by_places[b, i, q] += change
-                    by_places[b, i, p] -= change
+                    for c in range(3):
+                        by_f[i, c] += own[i] * by[2 + c] + own[3 + i] * by[5 + c]
 
 
 @compiled
@@ -368,14 +394,13 @@ def fold_view_backward(
     for b in range(frame.shape[0]):
         for s in range(members.shape[0]):
             centre, given = members[s, 0], by_inputs[s, b]
+            f, by_f = frame[b, centre], by_frame[b, centre]
             for m in range(members.shape[1]):
                 vertex = members[s, m]
                 for i in range(3):
+                    row, by_row = rows[b, i, vertex], by_rows[b, i, vertex]
                     for k in range(3):
+                        g = given[9 * m + 3 * k : 9 * m + 3 * k + 3]
+                        by_f[i, k] += g[0] * row[0] + g[1] * row[1] + g[2] * row[2]
                         for j in range(3):
-                            by_frame[b, centre, i, k] += (
-                                given[9 * m + 3 * k + j] * rows[b, i, vertex, j]
-                            )
-                            by_rows[b, i, vertex, j] += (
-                                frame[b, centre, i, k] * given[9 * m + 3 * k + j]
-                            )
+                            by_row[j] += f[i, k] * g[j]
