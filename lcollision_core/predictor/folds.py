@@ -7,18 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector
+from lcollision_core.contact import CollisionDetector, SelfCollisions
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.body_points import skin_distances
 
 FOLD_REACH = 0.045
-"""Heights along the surface within which colliding faces are a fold of the skin, not two parts."""
+"""Heights along the surface within which colliding faces are a fold of the skin, not two parts.
+
+Counted from the near exclusion, within which they are no collision.
+"""
 
 N_SITES = 48
 N_MEMBERS = 12
 
 _MEMBER_REACH = 0.03
+"""Likewise: how far a site's members spread."""
+
 _SPREAD, _REDUNDANCE = 0.02, 0.85
 """Heights within which a chosen site makes its neighbours redundant, and how much."""
 
@@ -27,6 +32,38 @@ _MASKED_FOLD = 0.2
 
 _SEARCHED_POSES = 3000
 _POSES_AT_ONCE = 256
+
+
+class FoldDetector:
+    """The exact check, with folds told from contact between parts.
+
+    Parameters
+    ----------
+    embedding : of the body; poses are in heights
+    near_exclusion : of pairs that do not count, in heights
+    """
+
+    def __init__(self, embedding: Embedding, near_exclusion: float) -> None:
+        topology, rest = embedding.topology, embedding.rest_vertices
+        reach = near_exclusion + FOLD_REACH
+        self._contacts = CollisionDetector(topology, rest, near_exclusion=reach)
+        self._all = None
+        if near_exclusion > 0.0:
+            self._all = CollisionDetector(topology, rest, near_exclusion=near_exclusion)
+
+    def detect(
+        self, vertices: npt.NDArray[np.floating]
+    ) -> tuple[SelfCollisions, npt.NDArray[np.int32], FloatArray]:
+        """Find the contacts, and the folds' pairs of faces (n, 2) with their depths (n,)."""
+        contacts = self._contacts.detect(vertices)
+        if self._all is None:
+            return contacts, contacts.near_pairs, contacts.near_penetration_depth
+        found = self._all.detect(vertices)
+        # Both are in ascending order, so a pair is one number.
+        unit = np.int64(len(self._all.topology.faces))
+        number, known = (one.pairs[:, 0] * unit + one.pairs[:, 1] for one in (found, contacts))
+        folds = ~np.isin(number, known, assume_unique=True)
+        return contacts, found.pairs[folds], found.penetration_depth[folds]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,44 +88,49 @@ class FoldSites:
         return cls(members, skin_distances(embedding, members[:, 0]).argmin(axis=0))
 
     @classmethod
-    def find(cls, embedding: Embedding, latent: npt.NDArray[np.floating]) -> FoldSites:
+    def find(
+        cls, embedding: Embedding, latent: npt.NDArray[np.floating], near_exclusion: float = 0.0
+    ) -> FoldSites:
         """Search colliding poses for the places that fold most often.
 
         Parameters
         ----------
         embedding : decodes
         latent : (n, D) poses that collide; some thousands are looked at
+        near_exclusion : of pairs that do not count, in heights
         """
-        score = _fold_share(embedding, latent[:_SEARCHED_POSES])
+        score = _fold_share(embedding, latent[:_SEARCHED_POSES], near_exclusion)
+        reach = _MEMBER_REACH + near_exclusion
         members: list[npt.NDArray[np.int64]] = []
         while len(members) < N_SITES and score.max(initial=0.0) > 0.0:
             centre = int(score.argmax())
             (distance,) = skin_distances(embedding, np.array([centre]))
-            members.append(_spread_members(embedding, distance))
+            members.append(_spread_members(embedding, distance, reach))
             score *= 1.0 - _REDUNDANCE * np.exp(-((distance / _SPREAD) ** 2))
             score[centre] = 0.0
         return cls.of(embedding, np.array(members, dtype=np.int64).reshape(-1, N_MEMBERS))
 
 
-def _fold_share(embedding: Embedding, latent: npt.NDArray[np.floating]) -> FloatArray:
+def _fold_share(
+    embedding: Embedding, latent: npt.NDArray[np.floating], near_exclusion: float
+) -> FloatArray:
     """Return (V,) in what share of the poses each vertex is part of a fold."""
     faces = embedding.topology.faces
-    detector = CollisionDetector(
-        embedding.topology, embedding.rest_vertices, near_exclusion=FOLD_REACH
-    )
+    detector = FoldDetector(embedding, near_exclusion)
     share = np.zeros(len(embedding.rest_vertices))
     for start in range(0, len(latent), _POSES_AT_ONCE):
         for vertices in embedding.decode(latent[start : start + _POSES_AT_ONCE]):
-            found = detector.detect(vertices.astype(np.float32))
-            folded = np.unique(faces[found.near_pairs])
-            share[folded] += _MASKED_FOLD if len(found.pairs) else 1.0
+            contacts, pairs, _ = detector.detect(vertices.astype(np.float32))
+            share[np.unique(faces[pairs])] += _MASKED_FOLD if len(contacts.pairs) else 1.0
     return share / max(len(latent), 1)
 
 
-def _spread_members(embedding: Embedding, distance: FloatArray) -> npt.NDArray[np.int64]:
+def _spread_members(
+    embedding: Embedding, distance: FloatArray, reach: float
+) -> npt.NDArray[np.int64]:
     """Choose `N_MEMBERS` vertices about the one at distance 0, each farthest from those before."""
     order = distance.argsort(kind="stable")
-    within = int((distance <= _MEMBER_REACH).sum())
+    within = int((distance <= reach).sum())
     # A coarse mesh has too few: the nearest then; a tiny one repeats its own.
     near = np.resize(order[: max(within, N_MEMBERS)], max(within, N_MEMBERS))
     places = embedding.rest_vertices[near]

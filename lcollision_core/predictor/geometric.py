@@ -157,8 +157,6 @@ class GeometricNetwork(PredictorNetwork):
     ) -> PredictorNetwork:
         """Make the network of an embedding, its points, sites and inputs fitted to the rows.
 
-        Where near pairs are excluded no folds are looked for.
-
         Raises
         ------
         LCollisionError : a network without domains is asked for.
@@ -169,8 +167,8 @@ class GeometricNetwork(PredictorNetwork):
             )
         if rows is None:
             return cls(embedding, seed, FoldSites.of(embedding, np.empty((0, N_MEMBERS), int)))
-        folding = rows.latent[rows.colliding if near_exclusion == 0.0 else slice(0)]
-        network = cls(embedding, seed, FoldSites.find(embedding, folding))
+        sites = FoldSites.find(embedding, rows.latent[rows.colliding], near_exclusion)
+        network = cls(embedding, seed, sites)
         network._fit(embedding, rows.latent)
         return network
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
-from lcollision_core.predictor.folds import FOLD_REACH
+from lcollision_core.predictor.folds import FoldDetector
 
 _ROWS_A_BLOCK = 256
 _PATCH_SHARE, _FOLD_SHARE = 0.05, 0.005
@@ -28,7 +27,7 @@ class SkinCells:
     Attributes
     ----------
     patch : (V,) the patch of each vertex, 0 to P - 1, for contact between parts
-    fold : (V,) the site of each vertex, 0 to S - 1, for folds; all -1 where folds count as contact
+    fold : (V,) the site of each vertex, 0 to S - 1, for folds; all -1 where there are none
     """
 
     patch: npt.NDArray[np.int64]
@@ -62,8 +61,8 @@ def patch_roots(
     embedding : decodes
     latent : (M, D) codes
     index : (n,) the rows wanted
-    cells : pairs within `FOLD_REACH` of each other along the surface go to the folds
-    near_exclusion : in heights; 0 where there are folds
+    cells : pairs within `FOLD_REACH` of each other along the surface go to the folds, if any
+    near_exclusion : in heights
     energy_scale : the mean energy of a colliding pose, in squared heights
     progress : in rows
     cancel : polled for every block of rows
@@ -78,11 +77,7 @@ def patch_roots(
     CancelledError : `cancel` was set.
     """
     n_patches, n_folds = cells.n_patches, cells.n_folds
-    detector = CollisionDetector(
-        embedding.topology,
-        embedding.rest_vertices,
-        near_exclusion=FOLD_REACH if n_folds else near_exclusion,
-    )
+    detector = FoldDetector(embedding, near_exclusion)
     faces = embedding.topology.faces
     roots = np.zeros((len(index), n_patches + n_folds), dtype=np.float16)
     unit = np.repeat([_PATCH_SHARE, _FOLD_SHARE], [n_patches, n_folds]) * energy_scale
@@ -93,12 +88,12 @@ def patch_roots(
         part = slice(start, start + _ROWS_A_BLOCK)
         poses = embedding.decode(latent[index[part]], n_threads=1).astype(np.float32)
         for row, vertices in enumerate(poses, start):
-            found = detector.detect(vertices)
-            energy = np.bincount(cells.patch, found.vertex_energy, n_patches)
-            if n_folds:
-                corners = cells.fold[faces[found.near_pairs]].reshape(-1, 6)
-                shares = np.repeat(found.near_penetration_depth**2 / 6.0, 6)
-                energy = np.append(energy, np.bincount(corners.ravel(), shares, n_folds))
+            contacts, pairs, depth = detector.detect(vertices)
+            energy = np.zeros(n_patches + n_folds)
+            energy[:n_patches] = np.bincount(cells.patch, contacts.vertex_energy, n_patches)
+            corners, shares = faces[pairs].ravel(), np.repeat(depth**2 / 6.0, 6)
+            cell = n_patches + cells.fold[corners] if n_folds else cells.patch[corners]
+            np.add.at(energy, cell, shares)
             hit = energy > 0.0
             roots[row, hit] = np.maximum(np.sqrt(energy[hit] / unit[hit]), _LEAST_ROOT)
 

@@ -281,21 +281,29 @@ def test_patches_and_folds_share_out_the_exact_energy(
     assert squares[:, cells.n_patches :].any()
 
 
-def test_folds_count_as_contact_where_there_are_no_sites(tube_model: PoseModel) -> None:
-    embedding = tube_model.embedding
-    cells = SkinCells(
-        BodyPoints.of(embedding, 25).patch, np.full(tube_model.n_vertices, -1, dtype=np.int64)
+@pytest.mark.parametrize("near_exclusion", [0.0, 0.1])
+def test_every_collision_that_counts_is_taught(
+    tube_model: PoseModel, near_exclusion: float
+) -> None:
+    """With sites and without, and beyond a near exclusion, within which nothing counts."""
+    embedding, latent = tube_model.embedding, _colliding_latent(tube_model)
+    detector = CollisionDetector(
+        embedding.topology, embedding.rest_vertices, near_exclusion=near_exclusion
     )
-    latent = _colliding_latent(tube_model)
-    for near_exclusion in (0.0, 0.1):
+    found = detector.detect_batch(embedding.decode(latent).astype(np.float32))
+    patch = BodyPoints.of(embedding, 25).patch
+    sites = FoldSites.find(embedding, latent, near_exclusion)
+    assert len(sites.members)
+    for fold in (sites.cell, np.full(tube_model.n_vertices, -1, dtype=np.int64)):
+        cells = SkinCells(patch, fold)
         roots = patch_roots(
             embedding, latent, np.arange(60), cells, near_exclusion, energy_scale=1e-4
         )
-        detector = CollisionDetector(
-            embedding.topology, embedding.rest_vertices, near_exclusion=near_exclusion
-        )
-        poses = embedding.decode(latent).astype(np.float32)
-        assert ((roots > 0.0).any(axis=1) == detector.detect_batch(poses).colliding).all()
+        assert ((roots > 0.0).any(axis=1) == found.colliding).all()
+        shares = np.repeat([0.05, 0.005], [cells.n_patches, cells.n_folds])
+        taught = (roots.astype(np.float64) ** 2 * shares).sum(axis=1) * 1e-4
+        energy = found.vertex_energy.sum(axis=1)
+        assert taught == pytest.approx(energy, rel=5e-3, abs=1e-9)
 
 
 def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
