@@ -9,6 +9,7 @@ from PySide6.QtCore import QObject, Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QInputDialog, QMenu
 
+from app.camera import CAMERAS
 from app.dialogs.failure import open_log_file
 from app.dialogs.forms import resolve_form
 from app.dialogs.help import AboutDialog, ShortcutsDialog
@@ -36,6 +37,7 @@ class ActionHandlers(QObject):
         self._window = window
         self._document = document = window.document
         files, library = window.files, window.library
+        window.viewport.waiting.open_wanted.connect(window.actions_by_key["open_model"].trigger)
         self.acts: dict[str, Callable[[], object]] = {
             "new": files.new_pose,
             "open": files.open,
@@ -62,7 +64,7 @@ class ActionHandlers(QObject):
             "rename": self._rename,
             "remove": self._remove,
             "ghost": self._toggle_ghost,
-            "reset_camera": window.viewport.reset_camera,
+            "reset_camera": lambda: window.viewport.set_camera(CAMERAS[0]),
             "full_screen": self._toggle_full_screen,
             "reset_layout": window.reset_layout,
             "shortcuts": self._show_shortcuts,
@@ -146,7 +148,7 @@ class ActionHandlers(QObject):
             model = self._document.model
             lines = [
                 f"{model.name}: {model.n_vertices} vertices, {len(model.domain_names)} parts, "
-                f"{model.latent_size} numbers a pose",
+                f"{model.latent_size} sliders",
                 f"trained on {model.card.source}, licence {model.card.licence}",
             ]
         self._open(AboutDialog(lines, self._window))

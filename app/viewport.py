@@ -41,8 +41,8 @@ FloatArray = npt.NDArray[np.float64]
 class Viewport(QWidget):
     """Draws the newest frame of a document, and nothing twice.
 
-    Cheap to construct: VTK is imported when the first model is in; until then a page says what is
-    waited for. Call `shut_down` before the window closes.
+    Cheap to construct: VTK is imported when the first model is in; until then the page
+    `waiting` says what is waited for. Call `shut_down` before the window closes.
 
     Parameters
     ----------
@@ -79,8 +79,8 @@ class Viewport(QWidget):
 
         self._layout = QStackedLayout(self)
         self._layout.setStackingMode(QStackedLayout.StackingMode.StackOne)
-        self._waiting = WaitingPage(self)
-        self._layout.addWidget(self._waiting)
+        self.waiting = WaitingPage(document, self)
+        self._layout.addWidget(self.waiting)
         self._legend = LegendCard(self)
         self._tag = DomainTag(self)
         # A window that gets its first OpenGL widget when it is already shown is made anew, and
@@ -103,8 +103,6 @@ class Viewport(QWidget):
         document.exact_changed.connect(self._on_exact_changed)
         document.ghost_changed.connect(self._on_ghost_changed)
         document.solve_finished.connect(self._on_solve_finished)
-        document.busy_changed.connect(self._waiting.set_text)
-        self._waiting.set_text(document.busy)
         if document.has_model:
             # After the window is on the screen.
             QTimer.singleShot(0, self, self._on_model_changed)
@@ -210,13 +208,6 @@ class Viewport(QWidget):
     def frame_pose(self) -> None:
         """Look at the document's pose as at a model's first, as soon as it is drawn."""
         self._framed = self._document.latent
-        if self._shown is not None and self._shown.latent is self._framed:
-            self._pose_stale = True
-            self._recolour()
-
-    def reset_camera(self) -> None:
-        """Look at the whole pose as at the start."""
-        self.set_camera("Three-quarter")
 
     @property
     def view(self) -> View | None:
@@ -288,7 +279,7 @@ class Viewport(QWidget):
         """Stop everything that moves and free what VTK holds; the widget stays empty."""
         self._glide.stop()
         self._turn.stop()
-        self._waiting.stop()
+        self.waiting.stop()
         self._importer.join()
         self._pictures.stop()
         if self._canvas is not None:
@@ -367,7 +358,7 @@ class Viewport(QWidget):
         if self._layout.currentWidget() is not self._canvas:
             self._layout.addWidget(self._canvas)
             self._layout.setCurrentWidget(self._canvas)
-            self._waiting.stop()
+            self.waiting.stop()
             self._legend.raise_()
             self._tag.raise_()
         self._pose_stale = True
@@ -425,8 +416,7 @@ class Viewport(QWidget):
         is_framed = frame.latent is self._framed
         if self._place_camera or is_framed:
             self._place_camera = False
-            if is_framed:
-                self._framed = None
+            self._framed = None if is_framed else self._framed
             self._turn.stop()
             scene.show(frame.vertices, frame.normals)
             middle = frame.vertices.mean(axis=0)

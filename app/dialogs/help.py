@@ -66,7 +66,7 @@ class ShortcutsDialog(QDialog):
         ("Page keys on a slider", "a tenth of its range"),
         ("Home, End on a slider", "its ends"),
         ("Delete or double-click on a slider", "reset it"),
-        ("Shift while dragging a slider", "small steps"),
+        ("Ctrl or Shift while dragging a slider", "ten times finer"),
         ("Escape while dragging a slider", "back to where it was"),
     )
 

@@ -16,7 +16,7 @@ class CodeSlider(Slider):
     """A slider whose bar grows from zero to its handle.
 
     Arrow keys, page keys, Home and End move it, Delete and a double click reset it; the wheel
-    moves it only when it has the focus. Shift makes a drag ten times finer.
+    moves it only when it has the focus. Ctrl or Shift makes a drag ten times finer.
 
     Signals
     -------
@@ -125,7 +125,7 @@ class CodeRow(HoverRow):
         self.slider.setAccessibleName(name)
         self.field.setAccessibleName(f"{name}, number")
         self.slider.setToolTip(
-            f"{name}: drag to move, hold Shift for small steps, double-click to reset"
+            f"{name}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
         )
         self.field.setToolTip(f"{name}: type a number; the arrow keys change it in small steps")
         row = QHBoxLayout(self)

@@ -35,7 +35,9 @@ HANDLE = 7.0
 """Radius of a slider's handle, in device-independent pixels."""
 
 _FINE = 0.1
-"""Of the pointer's way that a handle follows while Shift is held."""
+"""Of the pointer's way that a handle follows while Ctrl or Shift is held."""
+
+_FINE_KEYS = Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
 
 
 class Card(QFrame):
@@ -153,7 +155,7 @@ class Slider(QSlider):
     def __init__(self, colour: str | None = None) -> None:
         super().__init__(Qt.Orientation.Horizontal)
         self._colour = colour
-        self._grabbed = (0.0, 0)
+        self._pointer = self._exact_value = 0.0
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.setMinimumWidth(60)
 
@@ -180,18 +182,21 @@ class Slider(QSlider):
         self.setSliderDown(True)
         if abs(x - self._handle_x()) > HANDLE + 2:
             self.setValue(self._value_at(x))
-        self._grabbed = (x, self.value())
+        self._pointer, self._exact_value = x, float(self.value())
 
     def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
-        """Move the handle with the pointer; slowly while Shift is held."""
+        """Move the handle with the pointer; slowly while Ctrl or Shift is held."""
         if not self.isSliderDown():
             return
-        x, value = self._grabbed
+        x = event.position().x()
         steps = self.maximum() - self.minimum()
-        way = (event.position().x() - x) * steps / max(self.width() - 2 * HANDLE, 1.0)
-        if event.modifiers() & Qt.KeyboardModifier.ShiftModifier:
+        way = (x - self._pointer) * steps / max(self.width() - 2 * HANDLE, 1.0)
+        if event.modifiers() & _FINE_KEYS:
             way *= _FINE
-        self.setValue(round(value + way))
+        # Step by step, so that the handle does not jump as the key is pressed or let go.
+        self._pointer = x
+        self._exact_value += way
+        self.setValue(round(self._exact_value))
 
     def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: ARG002, N802
         """Let the handle go."""

@@ -10,13 +10,20 @@ import numpy.typing as npt
 import pytest
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QLineEdit, QMessageBox
+from PySide6.QtWidgets import (
+    QApplication,
+    QDialog,
+    QFileDialog,
+    QLineEdit,
+    QMessageBox,
+)
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
 from app.dialogs.failure import FailureDialog
 from app.document import PoseDocument
 from app.main_window import MainWindow
+from app.panels.parts import HANDLE
 from app.shading import Shading
 from lcollision_core.meshes import read_mesh, write_mesh
 from lcollision_core.model import PoseModel, read_poses, sample_poses
@@ -28,7 +35,9 @@ from tests.app.windows import (
     decoded,
     drag,
     drop,
+    handle,
     is_open,
+    move_held,
     open_window,
     rest,
     settings_in,
@@ -73,6 +82,33 @@ def test_a_dragged_slider_changes_the_mesh_as_the_model_says(
     assert document.latent.tobytes() == before.tobytes()
     assert np.array_equal(shown(window), mesh_before)
     assert row.slider.number == pytest.approx(before[1], abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "key", [Qt.KeyboardModifier.ControlModifier, Qt.KeyboardModifier.ShiftModifier]
+)
+def test_a_drag_with_a_key_held_is_ten_times_finer(
+    qtbot: QtBot, window: MainWindow, key: Qt.KeyboardModifier
+) -> None:
+    slider = window.sliders.row_of(1).slider
+    start = handle(window.sliders.row_of(1))
+    way, before = 20, slider.value()
+    per_pixel = slider.maximum() / (slider.width() - 2 * HANDLE)
+    left, no_key = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
+    QTest.mousePress(slider, left, key, start)
+    for step in range(1, way + 1):
+        move_held(slider, start + QPoint(step, 0), key)
+    assert slider.value() - before == pytest.approx(0.1 * way * per_pixel, abs=1.0)
+    # Let go of the key, the handle goes on from where it is.
+    fine = slider.value()
+    move_held(slider, start + QPoint(way + 1, 0), no_key)
+    assert slider.value() - fine == pytest.approx(per_pixel, abs=1.0)
+    QTest.mouseRelease(slider, left, no_key, start + QPoint(way + 1, 0))
+    rest(qtbot, window)
+    assert window.document.undo_stack.count() == 1
+    assert window.document.latent[1] == pytest.approx(slider.number)
+    assert np.array_equal(shown(window), decoded(window.document))
+    assert "Ctrl" in slider.toolTip()
 
 
 def test_prediction_and_exact_check_follow_the_pose(

@@ -20,6 +20,7 @@ from pytestqt.qtbot import QtBot
 from app.camera import CAMERAS
 from app.canvas import Canvas
 from app.document import PoseDocument
+from app.engine import Failure
 from app.legend import LegendCard
 from app.shading import Shading, rgb
 from app.theme import DARK, LIGHT, apply_theme
@@ -121,6 +122,45 @@ def test_before_the_model_there_is_a_page_that_says_so(
     document.set_model(editor_model)
     rest(qtbot, shown)
     assert shown.is_ready
+    assert document.close()
+    dispose(shown)
+    document.deleteLater()
+
+
+def test_where_no_model_could_be_opened_the_page_stands_still_and_offers_another(
+    qtbot: QtBot, editor_model: PoseModel, tmp_path: Path
+) -> None:
+    (tmp_path / "bad.safetensors").write_text("garbage")
+    document = PoseDocument()
+    shown = Viewport(document)
+    shown.resize(SIDE, SIDE)
+    shown.show()
+    qtbot.waitExposed(shown)
+    page = shown.waiting
+    assert page.turns
+    assert not page.button.isVisible()
+    with qtbot.waitSignal(document.failed, timeout=20_000):
+        document.open_model(tmp_path / "bad.safetensors")
+    assert not page.turns
+    assert "bad.safetensors" in page.text
+    assert page.text.endswith("; open another model.")
+    assert page.rect().contains(page.button.geometry())
+    still = pixels(shown)
+    qtbot.wait(150)
+    assert not changed(still, pixels(shown)).any()
+    with qtbot.waitSignal(shown.waiting.open_wanted):
+        QTest.mouseClick(page.button, Qt.MouseButton.LeftButton)
+    editor_model.save(tmp_path / "tube.safetensors")
+    document.open_model(tmp_path / "tube.safetensors")
+    assert page.turns
+    assert not page.button.isVisible()
+    qtbot.waitUntil(lambda: document.has_model, timeout=20_000)
+    rest(qtbot, shown)
+    assert not page.turns
+    document.failed.emit(Failure("later; no matter", ""))
+    assert shown.is_ready
+    assert not page.isVisible()
+    qtbot.waitUntil(lambda: not document.busy, timeout=60_000)
     assert document.close()
     dispose(shown)
     document.deleteLater()

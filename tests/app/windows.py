@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, QMimeData, QPoint, QPointF, QSettings, Qt, QTimer, QUrl
-from PySide6.QtGui import QDragEnterEvent, QDropEvent
+from PySide6.QtGui import QDragEnterEvent, QDropEvent, QMouseEvent
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialog, QWidget
 from pytestqt.qtbot import QtBot
@@ -119,6 +119,21 @@ def drag(qtbot: QtBot, row: CodeRow, by: int, steps: int = 6) -> None:
         QTest.mouseMove(row.slider, start + QPoint(by * step // steps, 0))
         qtbot.wait(5)
     QTest.mouseRelease(row.slider, Qt.MouseButton.LeftButton, pos=start + QPoint(by, 0))
+
+
+def move_held(widget: QWidget, place: QPoint, key: Qt.KeyboardModifier) -> None:
+    """Move the pointer with the left button and perhaps a key held."""
+    QApplication.sendEvent(
+        widget,
+        QMouseEvent(
+            QEvent.Type.MouseMove,
+            QPointF(place),
+            QPointF(widget.mapToGlobal(place)),
+            Qt.MouseButton.NoButton,
+            Qt.MouseButton.LeftButton,
+            key,
+        ),
+    )
 
 
 def drop(window: QWidget, *paths: Path) -> None:
