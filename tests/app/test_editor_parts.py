@@ -9,13 +9,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from PySide6.QtCore import QSettings, QtMsgType, qInstallMessageHandler, qWarning
 
 from app import log
 from app.engine import Failure
 from app.settings import SETTINGS, Settings
+from app.start_up import opening_pose
 from app.symmetry import mirror_vertices
+from app.tasks import mirror_of, mirrored
+from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.model import PoseModel
 
 OCTAHEDRON = np.array(
     [[1.0, 0, 0], [-1, 0, 0], [0, 0.8, 0], [0, -0.8, 0], [0, 0, 1.5], [0, 0, -1.5]]
@@ -154,3 +159,47 @@ def test_symmetric_points_with_other_faces_have_no_two_sides() -> None:
     turned = OCTAHEDRON_FACES.copy()
     turned[0] = turned[0, ::-1]
     assert mirror_vertices(OCTAHEDRON, turned, up_axis=2) is None
+
+
+@pytest.fixture(scope="module")
+def body() -> PoseModel:
+    return PoseModel.load("body")
+
+
+def mesh_distance(
+    model: PoseModel, vertices: npt.NDArray[np.float64], others: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Return the vertices' distances in heights, at the rigid motion that makes them least."""
+    a, b = vertices - vertices.mean(axis=0), others - others.mean(axis=0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    u[:, -1] *= np.sign(np.linalg.det(u @ vt))
+    return np.linalg.norm(a @ u @ vt - b, axis=1) / model.height
+
+
+@pytest.mark.parametrize("name", ["kneeling guard", "rest", "right side lunge", "twist right"])
+def test_the_mirror_image_of_the_body_is_as_near_as_an_unseen_pose(
+    body: PoseModel, name: str
+) -> None:
+    """Mirrored poses are unseen ones: the model's held-out error is what it may be off by."""
+    if name in body.pose_names:
+        latent = body.training_latent[body.pose_names.index(name)]
+    else:
+        opening = opening_pose(body)
+        assert opening.name == name
+        latent = opening.latent
+    mirror, metrics = mirror_of(body), body.metrics
+    assert mirror is not None
+    assert metrics is not None
+    assert metrics.held_out_mean is not None
+    assert metrics.held_out_max is not None
+    once = mirrored(body, latent, mirror)(no_progress, CancelToken())
+    twice = mirrored(body, once, mirror)(no_progress, CancelToken())
+    posed = body.decode(latent)
+    image = posed[mirror] * np.array([-1.0, 1.0, 1.0])
+    for found, wanted in ((body.decode(once), image), (body.decode(twice), posed)):
+        distance = mesh_distance(body, found, wanted)
+        assert distance.mean() < metrics.held_out_mean
+        assert distance.max() < metrics.held_out_max
+    # The first mirroring did something, unless the pose has two equal sides.
+    moved = mesh_distance(body, body.decode(once), posed).mean()
+    assert (moved > 10.0 * metrics.held_out_mean) == (name != "rest")
