@@ -76,13 +76,13 @@ ACTIONS: dict[str, ActionSpec] = {
 SHADINGS: dict[Shading, ActionSpec] = {
     Shading.PLAIN: ActionSpec("&Plain", "Ctrl+1", "The bare body", "", True),
     Shading.DOMAINS: ActionSpec(
-        "&Domains", "Ctrl+2", "Each part in its colour, darker where it owns more", "", True
+        "&Body parts", "Ctrl+2", "Each part in its colour, darker where it acts alone", "", True
     ),
     Shading.PREDICTED: ActionSpec(
         "P&redicted", "Ctrl+3", "Where the model believes it collides, and how deep", "", True
     ),
     Shading.EXACT: ActionSpec(
-        "E&xact", "Ctrl+4", "Where it collides in truth; crossing faces in red", "", True
+        "E&xact", "Ctrl+4", "Where it collides in truth; crossing triangles in red", "", True
     ),
 }
 """The ways to colour the body."""

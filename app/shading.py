@@ -56,9 +56,9 @@ class Shading(Enum):
     """What the colours of the mesh say; the value is what a menu calls it."""
 
     PLAIN = "Plain"
-    DOMAINS = "Domains"
-    PREDICTED = "Predicted energy"
-    EXACT = "Exact energy"
+    DOMAINS = "Body parts"
+    PREDICTED = "Predicted overlap"
+    EXACT = "Exact overlap"
 
 
 @dataclass(frozen=True)
@@ -167,18 +167,18 @@ class Shader:
             # Which colour is whose stands in the panels, and under the pointer.
             greys = ramp(("#ffffff", "#565b63"))
             return Legend(
-                "Domains",
+                "Body parts",
                 "darker where one acts alone",
                 ramp=_ramp_text(greys),
                 ticks=((0.0, "shared"), (1.0, "alone")),
             )
         if shading is Shading.PREDICTED:
             if domain_energy is None:
-                note = "computing …" if has_predictor else "this model has no predictor"
+                note = "computing …" if has_predictor else "this model does not predict"
                 return Legend("Predicted overlap", note)
             return Legend(
                 "Predicted overlap",
-                "of each domain, in % of the height",
+                "of each body part, in % of the height",
                 ramp=_ramp_text(self._ramp("predicted")),
                 ticks=_ticks(FULL_PREDICTED),
             )

@@ -138,7 +138,7 @@ def resolve_form(settings: Settings, parent: QWidget) -> Form:
         "Free enough at",
         " probability",
         0.05,
-        "Below this predicted probability of a collision a pose counts as predicted free",
+        "A pose that collides less likely than this counts as predicted free",
     )
     form.add_number(
         "resolve_time_budget",

@@ -8,7 +8,7 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel
 
 from app.icons import pixmap
 from app.panels.parts import Card, labelled, show_verdict
-from app.panels.wording import counted, energy_text
+from app.panels.wording import counted, overlap_text
 from app.theme import CLOSE, current_theme
 
 if TYPE_CHECKING:
@@ -67,13 +67,13 @@ class ExactCard(Card):
             if verdict.n_near_pairs:
                 folds = f"; {counted(verdict.n_near_pairs, 'skin fold')} not counted"
             if verdict.colliding:
-                self.verdict.setText(f"{counted(len(verdict.pairs), 'pair')} of faces collide")
-                self.details.setText(f"Penetration energy {energy_text(verdict.energy)}{folds}")
+                self.verdict.setText(f"{counted(len(verdict.pairs), 'pair')} of triangles collide")
+                self.details.setText(f"Overlap {overlap_text(verdict.energy)} of the height{folds}")
             else:
                 self.verdict.setText("Exactly collision-free")
-                self.details.setText(f"No face crosses another{folds}")
+                self.details.setText(f"No triangle crosses another{folds}")
             self.details.setToolTip(
-                "Squared depths of all crossing faces, for a body of height 1"
+                "How deep all crossing triangles lie in each other, taken together"
                 if verdict.colliding
                 else ""
             )

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy, QToolButton, QVB
 
 from app.icons import icon
 from app.panels.parts import Card, ElidedLabel, HoverRow, labelled, show_verdict, silent
-from app.panels.wording import energy_text, heading
+from app.panels.wording import heading, overlap_text
 from app.shading import FULL_PREDICTED
 from app.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme, visible_colour
 
@@ -174,7 +174,7 @@ class DomainRow(HoverRow):
         self.bar.setVisible(energy is not None)
         if energy is not None:
             self.bar.show_energy(energy)
-            self.setToolTip(f"{self._name}: predicted energy {energy_text(energy)}")
+            self.setToolTip(f"{self._name}: predicted overlap {overlap_text(energy)}")
 
     @property
     def is_lit(self) -> bool:
@@ -231,8 +231,8 @@ class PredictionCard(Card):
         self.percent = labelled("", "headline")
         self.meter = ProbabilityMeter()
         self._missing = QLabel(
-            "This model has no predictor, so there is nothing to predict and Resolve is off. "
-            "“lcollision train predictor” adds one."
+            "This model has not learnt to predict collisions, so Resolve is off. "
+            "“lcollision train predictor” teaches it."
         )
         self._missing.setObjectName("caption")
         self._missing.setWordWrap(True)

@@ -20,7 +20,7 @@ from PySide6.QtWidgets import (
 
 from app.icons import icon, pixmap
 from app.panels.parts import Card, ElidedLabel, labelled
-from app.panels.wording import energy_text, height_text, seconds_text
+from app.panels.wording import heading, height_text, overlap_text, seconds_text
 from app.theme import CLOSE, NORMAL, TIGHT, current_theme
 
 if TYPE_CHECKING:
@@ -130,9 +130,9 @@ class ResolveCard(Card):
     def _make_outcome(self) -> None:
         self.converged = Fact(
             {
-                True: "The solver converged",
-                False: "The solver did not converge",
-                None: "The solver was not needed",
+                True: "The search finished",
+                False: "The search stopped early",
+                None: "No search was needed",
             }
         )
         self.predicted_free = Fact(
@@ -155,7 +155,7 @@ class ResolveCard(Card):
         numbers.setVerticalSpacing(2)
         for place, (name, value) in enumerate(
             (
-                ("Energy", self._energy),
+                ("Overlap", self._energy),
                 ("Moved", self._moved),
                 ("Took", self._took),
             )
@@ -210,12 +210,12 @@ class ResolveCard(Card):
             self._energy.setText("not measured")
         else:
             self._energy.setText(
-                f"{energy_text(result.energy_before)} → {energy_text(result.energy_after)}"
+                f"{overlap_text(result.energy_before)} → {overlap_text(result.energy_after)}"
             )
         mean, largest = result.vertex_distance_mean, result.vertex_distance_max
         moved = f"{height_text(mean)}, at most {height_text(largest)}"
         self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
         self._moved.setToolTip("Of the body's height: on average, and where it moved furthest")
         self._took.setText(seconds_text(result.seconds))
-        self._note.setText(result.note or "")
+        self._note.setText(heading(result.note or ""))
         self._note.setVisible(bool(result.note))

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+import math
 
 
-def energy_text(energy: float) -> str:
-    """Write an energy in squared heights: "0", or as in "1.3 · 10⁻⁵"."""
-    if energy == 0.0:
-        return "0"
-    digits, exponent = f"{energy:.1e}".split("e")
-    return f"{digits} · 10{str(int(exponent)).translate(_SUPERSCRIPTS)}"
+def overlap_text(energy: float) -> str:
+    """Write an energy in squared heights as the depth that it stands for, as in "1.1 %"."""
+    return "none" if energy == 0.0 else height_text(math.sqrt(energy))
 
 
 def height_text(distance: float) -> str:

@@ -189,7 +189,7 @@ class Ladder:
             return "no free pose of the model is known to walk back to, so the pose still collides"
         if self._problem.movable.all():
             return "the poses that the model knows as free collide, so the pose still collides"
-        return "no free pose was found that keeps the locked domains; unlock one"
+        return "no free pose was found that keeps the locked body parts; unlock one"
 
     def _result(
         self,

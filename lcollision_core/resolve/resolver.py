@@ -94,7 +94,7 @@ class PoseResolver:
         correction = None if near is None else self._checked(near)
         outside = int(np.count_nonzero((target < self._low) | (target > self._high)))
         remark = (
-            f"{outside} of {len(target)} codes are outside the box that the model was trained on"
+            f"{outside} of {len(target)} sliders are beyond the poses that the model learnt from"
         )
         ladder = Ladder(
             problem,

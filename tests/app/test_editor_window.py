@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,13 +10,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from PySide6.QtCore import QPoint, Qt
+from PySide6.QtGui import QAction
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
+    QAbstractButton,
     QApplication,
     QDialog,
     QFileDialog,
+    QLabel,
     QLineEdit,
     QMessageBox,
+    QWidget,
 )
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
@@ -42,6 +47,10 @@ from tests.app.windows import (
     rest,
     settings_in,
     shown,
+)
+
+JARGON = re.compile(
+    r"\b(codes?|latents?|box|domains?|energy|solver|converged?|predictor)\b(?!”)|10[⁻⁰¹²³]", re.I
 )
 
 
@@ -211,6 +220,41 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     rest(qtbot, window)
     assert shown(window).tobytes() == after.tobytes()
     assert card.exactly_free.truth is True
+
+
+def words_on_the_screen(window: MainWindow) -> Iterator[str]:
+    """Return all texts and tool tips of the window, its menus and its legend."""
+    for widget in window.findChildren(QWidget):
+        yield widget.toolTip()
+        yield widget.accessibleName()
+        if isinstance(widget, QLabel | QAbstractButton):
+            yield widget.text()
+    for action in window.findChildren(QAction):
+        yield from (action.text(), action.toolTip(), action.statusTip())
+    legend = window.viewport.legend
+    yield from (legend.title, legend.note, *(name for name, _ in legend.swatches))
+
+
+def test_nothing_on_the_screen_speaks_of_the_mathematics(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
+) -> None:
+    document = window.document
+    # Further than the sliders go: Resolve remarks on that.
+    document.set_latent(1.5 * colliding, "Test")
+    rest(qtbot, window)
+    for shading in Shading:
+        window.viewport.set_shading(shading)
+        rest(qtbot, window)
+        found = [words for words in words_on_the_screen(window) if JARGON.search(words)]
+        assert found == []
+    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+        window.actions_by_key["resolve"].trigger()
+    rest(qtbot, window)
+    assert document.outcome is not None
+    assert "beyond the poses that the model learnt from" in (document.outcome.note or "")
+    words = list(words_on_the_screen(window))
+    assert any("beyond the poses" in text for text in words)
+    assert [text for text in words if JARGON.search(text)] == []
 
 
 def test_cancelled_in_the_middle_resolve_leaves_everything_as_it_was(

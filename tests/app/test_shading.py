@@ -73,7 +73,7 @@ def test_an_unknown_energy_is_plain_and_says_so(shader: Shader) -> None:
         assert legend.title
         assert legend.note
         assert not legend.ramp
-    assert "no predictor" in shader.legend(Shading.PREDICTED, has_predictor=False).note
+    assert "does not predict" in shader.legend(Shading.PREDICTED, has_predictor=False).note
 
 
 def test_predicted_energy_is_spread_by_the_masks(shader: Shader) -> None:
