@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialog, QMenu, QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
 
+from app.benchmarks.editor import EditorTiming
 from app.benchmarks.editor_session import Session
 from app.dialogs.failure import FailureDialog
 from app.document import PoseDocument
@@ -30,6 +33,7 @@ from app.start_up import StartUp, opening_pose
 from app.theme import DARK, LIGHT, Theme, visible_colour
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import PoseModel
+from tests.app.support import Lcollision
 from tests.app.windows import (
     PATIENCE,
     answer,
@@ -460,6 +464,32 @@ def test_random_actions_tell_what_goes_wrong_and_go_on(
     assert raised == "ValueError: not today"
     assert "no folder" in told
     window.findChild(FailureDialog).reject()
+
+
+@pytest.mark.usefixtures("home")
+def test_the_benchmark_measures_a_session_of_its_own(
+    lcollision: Lcollision, editor_model: PoseModel, tmp_path: Path
+) -> None:
+    editor_model.save(tmp_path / "tube.safetensors")
+    result = lcollision(
+        "benchmark", "editor", "--model", tmp_path / "tube.safetensors", "-n", 3, "--json"
+    )
+    assert result.exit_code == 0, result.stderr
+    (row,) = json.loads(result.stdout)
+    assert list(row) == [field.name for field in fields(EditorTiming)]
+    assert (row["model"], row["vertices"]) == ("tube", editor_model.n_vertices)
+    assert (row["actions"], row["exceptions"], row["errors"]) == (3, 0, [])
+    assert row["mesh_is_right"] is True
+    assert np.isfinite(row["leak_mb"])
+    numbers = {name: row[name] for name in row if name.endswith(("_ms", "_seconds", "_mb", "_cpu"))}
+    del numbers["leak_mb"]
+    assert all(0.0 <= number < np.inf for number in numbers.values()), numbers
+    assert 0.0 < row["decode_ms"] < row["event_p95_ms"]
+    assert row["event_p50_ms"] <= row["event_p95_ms"]
+    # The parts of a move are within it: both medians are of the same moves.
+    assert max(row["update_ms"], row["render_ms"]) <= row["event_p95_ms"]
+    assert row["memory_mb"] > 100.0
+    assert row["start_seconds"] > row["event_p50_ms"] / 1e3
 
 
 @THEMES
