@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 import socket
 import sys
@@ -105,6 +106,7 @@ def _run(path: Path | None, model_name: str | None) -> int:
     from PySide6.QtWidgets import QApplication
 
     from app.document import PoseDocument
+    from app.engine import any_unfinished
     from app.log import start_logging
     from app.main_window import MainWindow
     from app.memory import keep_memory_small
@@ -123,4 +125,9 @@ def _run(path: Path | None, model_name: str | None) -> int:
     start_logging(window.show_failure)
     window.show()
     StartUp(window, path, model_name).begin()
-    return application.exec()
+    status = application.exec()
+    if any_unfinished():
+        # All is saved; a thread in the middle of compiling ends with the process, or not at all.
+        logging.shutdown()
+        os._exit(status)
+    return status

@@ -402,9 +402,24 @@ def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
 
 
 def end_thread(thread: QThread, deadline: float) -> bool:
-    """Let a thread end after what it does now, and tell whether it has by the deadline."""
+    """Let a thread end after what it does now, and tell whether it has by the deadline.
+
+    One that has not, as in the first compiling, is kept from being destroyed, at which Qt aborts.
+    """
     thread.quit()
-    return thread.wait(max(1, int(1000 * (deadline - time.monotonic()))))
+    ended = thread.wait(max(1, int(1000 * (deadline - time.monotonic()))))
+    if not ended:
+        thread.setParent(None)
+        _unfinished.append(thread)
+    return ended
+
+
+_unfinished: list[QThread] = []
+
+
+def any_unfinished() -> bool:
+    """Return whether a thread that was left behind by `end_thread` still runs."""
+    return any(not thread.isFinished() for thread in _unfinished)
 
 
 def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], object]) -> QTimer:
