@@ -7,6 +7,7 @@ document keeps what is wanted next, so that the newest request wins and nothing 
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 import time
 import traceback
@@ -392,8 +393,13 @@ class LongWork(QObject):
         self.busy_changed.emit(self.busy)
 
 
+_SWITCH_SECONDS = 0.001
+
+
 def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
     """Move a worker, which has no parent, into a thread of its own."""
+    # A worker in plain Python holds the interpreter for so long before the window has its turn.
+    sys.setswitchinterval(_SWITCH_SECONDS)
     thread = QThread(parent)
     thread.setObjectName(name)
     worker.moveToThread(thread)
