@@ -1,11 +1,10 @@
-"""Points all over the body, and the patch of skin round each."""
+"""Points all over the body, and the skin round each."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 from scipy.sparse import csgraph
 
 from lcollision_core.embedding import Embedding
@@ -18,64 +17,60 @@ N_POINTS = 200
 _LEAST_LENGTH = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class BodyPoints:
-    """P points on the skin, a function of the embedding alone.
+def body_points(embedding: Embedding, n_points: int = N_POINTS) -> npt.NDArray[np.int64]:
+    """Return (P,) ascending vertices all over the body, a function of the embedding alone.
 
-    Attributes
+    Parameters
     ----------
-    vertex : (P,) int64 array, ascending vertex indices
-    distance : (P, V) float64 array, to every vertex along edges of the reference, in heights;
-        infinite between components
-    frame : (P, 3, 3) float64 array, columns: outer normal and two tangents on the reference
+    embedding : of the body
+    n_points : fewer are chosen of a mesh that has not as many used vertices
     """
-
-    vertex: npt.NDArray[np.int64]
-    distance: FloatArray
-    frame: FloatArray
-
-    @classmethod
-    def of(cls, embedding: Embedding, n_points: int = N_POINTS) -> BodyPoints:
-        """Choose points, each farthest from those before it.
-
-        Parameters
-        ----------
-        embedding : of the body
-        n_points : at most V are chosen
-        """
-        rest, topology = embedding.rest_vertices, embedding.topology
-        used = np.setdiff1d(np.arange(len(rest)), topology.unused_vertices)
-        places = rest[used]
-        chosen: list[int] = []
-        # The first is the one farthest from the middle.
-        nearest = np.linalg.norm(places - places.mean(axis=0), axis=1)
-        while len(chosen) < min(n_points, len(used)):
-            best = int(nearest.argmax())
-            to_best = np.linalg.norm(places - places[best], axis=1)
-            nearest = np.minimum(nearest, to_best) if chosen else to_best
-            chosen.append(int(used[best]))
-        vertex = np.sort(np.array(chosen))
-        distance = skin_distances(embedding, vertex)
-        return cls(vertex, distance, tangent_frames(embedding, vertex))
-
-    @property
-    def patch(self) -> npt.NDArray[np.int64]:
-        """(V,) int64 array: the point that each vertex is nearest to along the surface."""
-        nearest: npt.NDArray[np.int64] = self.distance.argmin(axis=0)
-        return nearest
+    rest, topology = embedding.rest_vertices, embedding.topology
+    used = np.setdiff1d(np.arange(len(rest)), topology.unused_vertices)
+    places = rest[used]
+    outermost = int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())
+    return np.sort(used[farthest_points(places, outermost, min(n_points, len(used)))])
 
 
-def skin_distances(embedding: Embedding, vertex: npt.NDArray[np.integer]) -> FloatArray:
-    """Return (n, V) lengths of the shortest edge paths from some vertices, in heights.
+def farthest_points(places: FloatArray, first: int, n_points: int) -> npt.NDArray[np.int64]:
+    """Choose some of (n, 3) places, each farthest from those before it.
 
-    They are infinite between components.
+    When all are chosen, the first is repeated.
     """
+    chosen = [first]
+    nearest = np.linalg.norm(places - places[first], axis=1)
+    while len(chosen) < n_points:
+        best = int(nearest.argmax())
+        chosen.append(best)
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[best], axis=1))
+    return np.array(chosen)
+
+
+def skin_graph(embedding: Embedding) -> sparse.csr_matrix:
+    """Return the (V, V) lengths of the reference's edges, in heights."""
     rest, topology = embedding.rest_vertices, embedding.topology
     # SciPy would drop edges of length 0.
     lengths = np.maximum(topology.edge_lengths(rest), _LEAST_LENGTH)
-    graph = edge_graph(topology.edges, len(rest), lengths)
-    distance: FloatArray = csgraph.dijkstra(graph, directed=False, indices=vertex)
+    return edge_graph(topology.edges, len(rest), lengths)
+
+
+def skin_distances(
+    graph: sparse.csr_matrix, vertex: npt.NDArray[np.integer], limit: float = np.inf
+) -> FloatArray:
+    """Return (n, V) lengths of the shortest edge paths from some vertices, in heights.
+
+    They are infinite between components, and beyond the limit.
+    """
+    distance: FloatArray = csgraph.dijkstra(graph, directed=False, indices=vertex, limit=limit)
     return distance
+
+
+def skin_cells(embedding: Embedding, centre: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+    """Return (V,) which of some vertices each is nearest to along the surface, -1 of none."""
+    if not len(centre):
+        return np.full(len(embedding.rest_vertices), -1)
+    nearest: npt.NDArray[np.int64] = skin_distances(skin_graph(embedding), centre).argmin(axis=0)
+    return nearest
 
 
 def tangent_frames(embedding: Embedding, vertex: npt.NDArray[np.integer]) -> FloatArray:

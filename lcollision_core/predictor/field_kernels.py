@@ -166,14 +166,7 @@ def contact_field(frame: Array, places: Array, apart: Array, reach: Array, sums:
         for p in range(n_points):
             nx[p], ny[p], nz[p] = frame[b, p, 0, 0], frame[b, p, 1, 0], frame[b, p, 2, 0]
         for p in range(n_points):
-            n_near = 0
-            for q in range(p + 1, n_points):
-                dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
-                squared[q] = dx * dx + dy * dy + dz * dz + apart[p, q]
-            for q in range(p + 1, n_points):
-                # Without a branch, which would be mispredicted.
-                near[n_near] = q
-                n_near += squared[q] < largest
+            n_near = _near(places[b], apart[p], p, p + 1, largest, squared, near)
             for place in range(n_near):
                 q = near[place]
                 dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
@@ -274,13 +267,7 @@ def contact_field_backward(
     for b in range(frame.shape[0]):
         x, y, z = places[b, 0], places[b, 1], places[b, 2]
         for p in range(n_points):
-            n_near = 0
-            for q in range(n_points):
-                dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
-                squared[q] = dx * dx + dy * dy + dz * dz + apart[p, q]
-            for q in range(n_points):
-                near[n_near] = q
-                n_near += squared[q] < largest
+            n_near = _near(places[b], apart[p], p, 0, largest, squared, near)
             f, by_f = frame[b, p], by_frame[b, p]
             for k in range(n_reaches):
                 # The offsets' and normals' derivatives, turned from the point's frame.
@@ -348,6 +335,29 @@ def contact_field_backward(
                 for i in range(3):
                     for c in range(3):
                         by_f[i, c] += own[i] * by[2 + c] + own[3 + i] * by[5 + c]
+
+
+@compiled
+def _near(
+    places: Array,
+    apart: Array,
+    p: int,
+    start: int,
+    largest: float,
+    squared: Array,
+    near: npt.NDArray[np.int32],
+) -> int:
+    """Fill in p's squared distances to the points from `start` on, and list those near it."""
+    x, y, z = places[0], places[1], places[2]
+    for q in range(start, len(x)):
+        dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
+        squared[q] = dx * dx + dy * dy + dz * dz + apart[q]
+    n_near = 0
+    for q in range(start, len(x)):
+        # Without a branch, which would be mispredicted.
+        near[n_near] = q
+        n_near += squared[q] < largest
+    return n_near
 
 
 @compiled

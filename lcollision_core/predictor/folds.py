@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector, SelfCollisions
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.predictor.body_points import skin_distances
+from lcollision_core.predictor.body_points import (
+    farthest_points,
+    skin_distances,
+    skin_graph,
+)
 
 FOLD_REACH = 0.045
 """Heights along the surface within which colliding faces are a fold of the skin, not two parts.
@@ -66,49 +68,33 @@ class FoldDetector:
         return contacts, found.pairs[folds], found.penetration_depth[folds]
 
 
-@dataclass(frozen=True, eq=False)
-class FoldSites:
-    """S places where the skin folds, none for a body that does not.
+def find_fold_sites(
+    embedding: Embedding, latent: npt.NDArray[np.floating], near_exclusion: float = 0.0
+) -> npt.NDArray[np.int64]:
+    """Search colliding poses for the places where the skin folds most often.
 
-    Attributes
+    Parameters
     ----------
-    members : (S, M) int64 array, vertices spread about each site, its centre first
-    cell : (V,) int64 array, the site nearest to each vertex along the surface; -1 without sites
+    embedding : decodes
+    latent : (n, D) poses that collide; some thousands are looked at
+    near_exclusion : of pairs that do not count, in heights
+
+    Returns
+    -------
+    members : (S, M) vertices spread about each site, its centre first; S is 0 for a body that does
+        not fold
     """
-
-    members: npt.NDArray[np.int64]
-    cell: npt.NDArray[np.int64]
-
-    @classmethod
-    def of(cls, embedding: Embedding, members: npt.NDArray[np.int64]) -> FoldSites:
-        """Make the sites that were found once."""
-        n_vertices = len(embedding.rest_vertices)
-        if not len(members):
-            return cls(members, np.full(n_vertices, -1))
-        return cls(members, skin_distances(embedding, members[:, 0]).argmin(axis=0))
-
-    @classmethod
-    def find(
-        cls, embedding: Embedding, latent: npt.NDArray[np.floating], near_exclusion: float = 0.0
-    ) -> FoldSites:
-        """Search colliding poses for the places that fold most often.
-
-        Parameters
-        ----------
-        embedding : decodes
-        latent : (n, D) poses that collide; some thousands are looked at
-        near_exclusion : of pairs that do not count, in heights
-        """
-        score = _fold_share(embedding, latent[:_SEARCHED_POSES], near_exclusion)
-        reach = _MEMBER_REACH + near_exclusion
-        members: list[npt.NDArray[np.int64]] = []
-        while len(members) < N_SITES and score.max(initial=0.0) > 0.0:
-            centre = int(score.argmax())
-            (distance,) = skin_distances(embedding, np.array([centre]))
-            members.append(_spread_members(embedding, distance, reach))
-            score *= 1.0 - _REDUNDANCE * np.exp(-((distance / _SPREAD) ** 2))
-            score[centre] = 0.0
-        return cls.of(embedding, np.array(members, dtype=np.int64).reshape(-1, N_MEMBERS))
+    score = _fold_share(embedding, latent[:_SEARCHED_POSES], near_exclusion)
+    reach = _MEMBER_REACH + near_exclusion
+    graph = skin_graph(embedding)
+    members: list[npt.NDArray[np.int64]] = []
+    while len(members) < N_SITES and score.max(initial=0.0) > 0.0:
+        centre = int(score.argmax())
+        (distance,) = skin_distances(graph, np.array([centre]))
+        members.append(_spread_members(embedding, distance, reach))
+        score *= 1.0 - _REDUNDANCE * np.exp(-((distance / _SPREAD) ** 2))
+        score[centre] = 0.0
+    return np.array(members, dtype=np.int64).reshape(-1, N_MEMBERS)
 
 
 def _fold_share(
@@ -130,15 +116,10 @@ def _spread_members(
 ) -> npt.NDArray[np.int64]:
     """Choose `N_MEMBERS` vertices about the one at distance 0, each farthest from those before."""
     order = distance.argsort(kind="stable")
-    within = int((distance <= reach).sum())
-    # A coarse mesh has too few: the nearest then; a tiny one repeats its own.
-    near = np.resize(order[: max(within, N_MEMBERS)], max(within, N_MEMBERS))
-    places = embedding.rest_vertices[near]
-    chosen = [0]
-    nearest = np.linalg.norm(places - places[0], axis=1)
-    while len(chosen) < N_MEMBERS:
-        best = int(nearest.argmax())
-        chosen.append(best)
-        nearest = np.minimum(nearest, np.linalg.norm(places - places[best], axis=1))
-    members: npt.NDArray[np.int64] = near[chosen]
+    # A coarse mesh has too few within reach: the nearest then; a tiny one repeats its own.
+    n_near = max(int((distance <= reach).sum()), N_MEMBERS)
+    near = np.resize(order[:n_near], n_near)
+    members: npt.NDArray[np.int64] = near[
+        farthest_points(embedding.rest_vertices[near], 0, N_MEMBERS)
+    ]
     return members

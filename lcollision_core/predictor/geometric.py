@@ -4,7 +4,7 @@ A latent code is a poor coordinate for collision: whether a hand touches a thigh
 both are, and that on every joint between. So the codes are decoded to some hundred points of the
 skin first (`ReducedBody`), and each feels what distant skin comes near it (`contact_field`): how
 much, how far above that skin's surface, in what direction. Skin that folds onto itself, in an
-elbow, shows in the deformation of the few vertices about it (`FoldSites`). Small networks, one for
+elbow, shows in the deformation of the few vertices about it (`fold_view`). Small networks, one for
 each point and each site, say whether the patch of skin round it is hit, and how deeply, and are
 taught that by its exact energy, which is worth hundreds of labels a pose. What follows joins them
 to the domains' energies and the logit.
@@ -45,9 +45,15 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, silu, smooth_l1_loss
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.predictor.body_points import BodyPoints, tangent_frames
+from lcollision_core.predictor.body_points import (
+    body_points,
+    skin_cells,
+    skin_distances,
+    skin_graph,
+    tangent_frames,
+)
 from lcollision_core.predictor.field import contact_field, fold_view, normalised
-from lcollision_core.predictor.folds import N_MEMBERS, FoldSites
+from lcollision_core.predictor.folds import N_MEMBERS, find_fold_sites
 from lcollision_core.predictor.losses import rank_loss
 from lcollision_core.predictor.networks import (
     NetworkOutput,
@@ -110,7 +116,12 @@ class GeometricNetwork(PredictorNetwork):
     ----------
     embedding : of the body
     seed : of the initial weights
-    sites : where the skin folds
+    sites : (S, M) integer array, vertices about each place where the skin folds, see
+        `find_fold_sites`
+
+    Attributes
+    ----------
+    point_vertices : (P,) int64 array, the vertices that are points of the body
     """
 
     apart: torch.Tensor
@@ -118,24 +129,23 @@ class GeometricNetwork(PredictorNetwork):
     site_vertices: torch.Tensor
     members: torch.Tensor
 
-    def __init__(self, embedding: Embedding, seed: int, sites: FoldSites) -> None:
+    def __init__(self, embedding: Embedding, seed: int, sites: npt.NDArray[np.integer]) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
-        self._points, self._sites = BodyPoints.of(embedding), sites
-        vertex = self._points.vertex
-        n_points, n_sites = len(vertex), len(sites.members)
+        self.point_vertices = vertex = body_points(embedding)
+        n_points, n_sites = len(vertex), len(sites)
         # The points first, then the sites' vertices that are none.
-        skin = np.append(vertex, np.setdiff1d(sites.members, vertex))
+        skin = np.append(vertex, np.setdiff1d(sites, vertex))
         self.body = ReducedBody(embedding, skin, tangent_frames(embedding, skin), n_points)
-        between = self._points.distance[:, vertex]
-        apart = torch.tensor(between <= _DISTANT, dtype=torch.float32)
+        between = skin_distances(skin_graph(embedding), vertex, limit=_DISTANT)[:, vertex]
+        apart = torch.tensor(np.isfinite(between), dtype=torch.float32)
         self.register_buffer("apart", apart, persistent=False)
         self.register_buffer("reach", torch.tensor(REACHES), persistent=False)
         # Of the model file: found in labelled poses.
-        self.register_buffer("site_vertices", torch.tensor(sites.members, dtype=torch.int32))
+        self.register_buffer("site_vertices", torch.tensor(sites, dtype=torch.int32))
         place = np.zeros(len(embedding.rest_vertices), dtype=np.int32)
         place[skin] = np.arange(len(skin))
-        members = torch.tensor(place[sites.members])
+        members = torch.tensor(place[sites])
         self.register_buffer("members", members, persistent=False)
         self.patch = _PatchNetworks(n_points, _SUMS_A_REACH * len(REACHES), generator)
         self.fold = _PatchNetworks(n_sites, 9 * N_MEMBERS, generator)
@@ -166,8 +176,8 @@ class GeometricNetwork(PredictorNetwork):
                 "only the preset paper has a network without domains; add --preset paper"
             )
         if rows is None:
-            return cls(embedding, seed, FoldSites.of(embedding, np.empty((0, N_MEMBERS), int)))
-        sites = FoldSites.find(embedding, rows.latent[rows.colliding], near_exclusion)
+            return cls(embedding, seed, np.empty((0, N_MEMBERS), dtype=np.int64))
+        sites = find_fold_sites(embedding, rows.latent[rows.colliding], near_exclusion)
         network = cls(embedding, seed, sites)
         network._fit(embedding, rows.latent)
         return network
@@ -192,12 +202,12 @@ class GeometricNetwork(PredictorNetwork):
         members = found.numpy().astype(np.int64)
         if members.size and not 0 <= members.min() <= members.max() < n_vertices:
             raise RuntimeError("the network's fold sites are not of this body")
-        network = cls(embedding, 0, FoldSites.of(embedding, members))
+        network = cls(embedding, 0, members)
         network.load_state_dict(state)
         return network
 
     def _fit(self, embedding: Embedding, latent: npt.NDArray[np.floating]) -> None:
-        vertex = self._points.vertex
+        vertex = self.point_vertices
         fitted = latent[:_FITTED_POSES]
         positions = np.concatenate(
             [
@@ -212,10 +222,10 @@ class GeometricNetwork(PredictorNetwork):
         self.patch.fit(torch.cat(fields, dim=1), _LEAST_DEVIATION)
         self.fold.fit(torch.cat(folds, dim=1), _LEAST_GRADIENT_DEVIATION)
 
-    @property
-    def cells(self) -> SkinCells:
-        """How the skin is divided into patches and folds, whose exact energies the loss wants."""
-        return SkinCells(self._points.patch, self._sites.cell)
+    def skin_cells(self, embedding: Embedding) -> SkinCells:
+        """Divide the skin into patches and folds, whose exact energies the loss wants."""
+        centres = self.site_vertices[:, 0].cpu().numpy()
+        return SkinCells(skin_cells(embedding, self.point_vertices), skin_cells(embedding, centres))
 
     def _inputs(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (P, B, n) what each point feels, and (S, B, n) how each site is deformed."""
@@ -264,7 +274,7 @@ class GeometricNetwork(PredictorNetwork):
         total = config.entropy_weight * binary_cross_entropy_with_logits(
             output.logit, own.colliding
         )
-        n_patches = len(self._points.vertex)
+        n_patches = len(self.point_vertices)
         for kind, weight, depth_weight in (
             (slice(0, n_patches), _PATCH_WEIGHT, _DEPTH_WEIGHT),
             (slice(n_patches, None), _FOLD_WEIGHT, _FOLD_DEPTH_WEIGHT),

@@ -149,7 +149,8 @@ class TrainingLoop:
         return network
 
     def _patch_roots(self, network: PredictorNetwork) -> npt.NDArray[np.float16]:
-        if network.cells is None:
+        cells = network.skin_cells(self._embedding)
+        if cells is None:
             return np.empty((len(self._training_index), 0), dtype=np.float16)
 
         def report(done: int, total: int) -> None:
@@ -160,7 +161,7 @@ class TrainingLoop:
             self._embedding,
             self._rows.latent,
             self._training_index,
-            network.cells,
+            cells,
             self._near_exclusion,
             self._facts.energy_scale,
             progress=report,

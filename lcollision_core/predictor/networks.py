@@ -101,9 +101,8 @@ class PredictorNetwork(nn.Module, ABC):
         network.load_state_dict(state)
         return network
 
-    @property
-    def cells(self) -> SkinCells | None:
-        """How the skin is divided, for a network that learns patch by patch."""
+    def skin_cells(self, embedding: Embedding) -> SkinCells | None:  # noqa: ARG002
+        """Divide the skin, for a network that learns patch by patch."""
         return None
 
     @abstractmethod

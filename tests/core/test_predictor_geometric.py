@@ -13,7 +13,13 @@ from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS
-from lcollision_core.predictor.body_points import BodyPoints, skin_distances
+from lcollision_core.predictor.body_points import (
+    body_points,
+    skin_cells,
+    skin_distances,
+    skin_graph,
+    tangent_frames,
+)
 from lcollision_core.predictor.field import (
     Decoding,
     contact_field,
@@ -22,7 +28,12 @@ from lcollision_core.predictor.field import (
     fold_view,
     normalised,
 )
-from lcollision_core.predictor.folds import FOLD_REACH, N_MEMBERS, FoldSites
+from lcollision_core.predictor.folds import (
+    _MEMBER_REACH,
+    FOLD_REACH,
+    N_MEMBERS,
+    find_fold_sites,
+)
 from lcollision_core.predictor.geometric import REACHES, GeometricNetwork
 from lcollision_core.predictor.patch_labels import SkinCells, patch_roots
 from tests.core.predictor_rows import made_up_rows
@@ -42,10 +53,10 @@ def _some_latent(model: PoseModel, n_poses: int) -> np.ndarray:
 
 def test_points_are_spread_and_every_vertex_belongs_to_the_nearest(tube_model: PoseModel) -> None:
     embedding = tube_model.embedding
-    points = BodyPoints.of(embedding, 20)
-    assert len(np.unique(points.vertex)) == 20
-    assert np.array_equal(points.patch[points.vertex], np.arange(20))
-    places = embedding.rest_vertices[points.vertex]
+    points = body_points(embedding, 20)
+    assert len(np.unique(points)) == 20
+    assert np.array_equal(skin_cells(embedding, points)[points], np.arange(20))
+    places = embedding.rest_vertices[points]
     apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.eye(20)
     covered = np.linalg.norm(embedding.rest_vertices[:, None] - places[None], axis=2).min(axis=1)
     # Farthest-point sampling: no vertex is farther from the points than they are from each other.
@@ -53,14 +64,15 @@ def test_points_are_spread_and_every_vertex_belongs_to_the_nearest(tube_model: P
 
 
 def test_frames_are_rotations_whose_first_axis_points_out(tube_model: PoseModel) -> None:
-    points = BodyPoints.of(tube_model.embedding, 30)
-    assert points.frame.transpose(0, 2, 1) @ points.frame == pytest.approx(
+    points = body_points(tube_model.embedding, 30)
+    frame = tangent_frames(tube_model.embedding, points)
+    assert frame.transpose(0, 2, 1) @ frame == pytest.approx(
         np.broadcast_to(np.eye(3), (30, 3, 3)), abs=1e-12
     )
-    assert np.linalg.det(points.frame) == pytest.approx(np.ones(30))
+    assert np.linalg.det(frame) == pytest.approx(np.ones(30))
     rest = tube_model.embedding.rest_vertices
     middle = rest.mean(axis=0)
-    outward = ((rest[points.vertex] - middle) * points.frame[:, :, 0]).sum(axis=1)
+    outward = ((rest[points] - middle) * frame[:, :, 0]).sum(axis=1)
     assert (outward > 0.0).mean() > 0.9
 
 
@@ -70,7 +82,7 @@ def test_reduced_body_lies_where_the_decoder_puts_it(
     latent = _some_latent(tube_model, 20)
     with torch.no_grad():
         _, _, places = network.body(torch.tensor(latent, dtype=torch.float32))
-    truth = tube_model.embedding.decode(latent)[:, network._points.vertex]
+    truth = tube_model.embedding.decode(latent)[:, network.point_vertices]
     errors = np.linalg.norm(places.numpy().transpose(0, 2, 1) - truth, axis=2)
     assert errors.mean() < 2e-3
     moved = truth - truth[:1]
@@ -83,10 +95,10 @@ def test_frames_and_gradients_are_those_of_the_embedding(
     """Each point's S is symmetric, R turns its frame, and both follow from its features alone."""
     embedding = tube_model.embedding
     latent = _some_latent(tube_model, 3)
-    exact = embedding.decoder.features(latent)[:, network._points.vertex]
+    exact = embedding.decoder.features(latent)[:, network.point_vertices]
     with torch.no_grad():
         found = network.body.features(torch.tensor(latent, dtype=torch.float32))
-    assert found[:, : len(network._points.vertex)].numpy() == pytest.approx(exact, abs=1e-5)
+    assert found[:, : len(network.point_vertices)].numpy() == pytest.approx(exact, abs=1e-5)
 
 
 @pytest.fixture
@@ -210,13 +222,13 @@ def test_features_are_differentiable() -> None:
 
 
 def test_folds_are_looked_for_where_the_skin_folds(
-    tube_model: PoseModel, tube_folds: FoldSites
+    tube_model: PoseModel, tube_folds: np.ndarray
 ) -> None:
     """Sites lie where near pairs collide, and their members about them."""
     embedding = tube_model.embedding
-    assert tube_folds.members.shape[1] == N_MEMBERS
-    assert 1 <= len(tube_folds.members) <= 48
-    centres = tube_folds.members[:, 0]
+    assert tube_folds.shape[1] == N_MEMBERS
+    assert 1 <= len(tube_folds) <= 48
+    centres = tube_folds[:, 0]
     assert len(np.unique(centres)) == len(centres)
     detector = CollisionDetector(
         embedding.topology, embedding.rest_vertices, near_exclusion=FOLD_REACH
@@ -228,16 +240,18 @@ def test_folds_are_looked_for_where_the_skin_folds(
     touched = np.unique(embedding.topology.faces[np.concatenate(folded)])
     assert len(touched)
     assert np.isin(centres, touched).all()
-    distance = skin_distances(embedding, centres)
-    assert (tube_folds.cell == distance.argmin(axis=0)).all()
+    distance = skin_distances(skin_graph(embedding), centres)
+    for members, own in zip(tube_folds, distance, strict=True):
+        nearest = np.sort(own)[:N_MEMBERS]
+        assert own[members].max() <= max(_MEMBER_REACH, nearest[-1])
 
 
 def test_a_body_without_folds_has_no_sites(tube_model: PoseModel) -> None:
     embedding = tube_model.embedding
-    sites = FoldSites.find(embedding, np.zeros((3, embedding.latent_size), dtype=np.float32))
-    assert sites.members.shape == (0, N_MEMBERS)
-    assert (sites.cell == -1).all()
+    sites = find_fold_sites(embedding, np.zeros((3, embedding.latent_size), dtype=np.float32))
+    assert sites.shape == (0, N_MEMBERS)
     network = GeometricNetwork(embedding, 0, sites)
+    assert (network.skin_cells(embedding).fold == -1).all()
     assert torch.isfinite(network(torch.zeros((2, embedding.latent_size))).logit).all()
 
 
@@ -246,8 +260,8 @@ def _colliding_latent(model: PoseModel) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def tube_folds(tube_model: PoseModel) -> FoldSites:
-    return FoldSites.find(tube_model.embedding, _colliding_latent(tube_model))
+def tube_folds(tube_model: PoseModel) -> np.ndarray:
+    return find_fold_sites(tube_model.embedding, _colliding_latent(tube_model))
 
 
 def test_a_batch_is_its_poses(tube_model: PoseModel, network: GeometricNetwork) -> None:
@@ -261,11 +275,13 @@ def test_a_batch_is_its_poses(tube_model: PoseModel, network: GeometricNetwork) 
 
 
 def test_patches_and_folds_share_out_the_exact_energy(
-    tube_model: PoseModel, tube_folds: FoldSites
+    tube_model: PoseModel, tube_folds: np.ndarray
 ) -> None:
     embedding = tube_model.embedding
     latent = _colliding_latent(tube_model)
-    cells = SkinCells(BodyPoints.of(embedding, 25).patch, tube_folds.cell)
+    cells = SkinCells(
+        skin_cells(embedding, body_points(embedding, 25)), skin_cells(embedding, tube_folds[:, 0])
+    )
     index = np.arange(0, 60, 2)
     roots = patch_roots(embedding, latent, index, cells, 0.0, energy_scale=1e-4)
     assert roots.shape == (30, cells.n_patches + cells.n_folds)
@@ -291,10 +307,10 @@ def test_every_collision_that_counts_is_taught(
         embedding.topology, embedding.rest_vertices, near_exclusion=near_exclusion
     )
     found = detector.detect_batch(embedding.decode(latent).astype(np.float32))
-    patch = BodyPoints.of(embedding, 25).patch
-    sites = FoldSites.find(embedding, latent, near_exclusion)
-    assert len(sites.members)
-    for fold in (sites.cell, np.full(tube_model.n_vertices, -1, dtype=np.int64)):
+    patch = skin_cells(embedding, body_points(embedding, 25))
+    sites = find_fold_sites(embedding, latent, near_exclusion)
+    assert len(sites)
+    for fold in (skin_cells(embedding, centres) for centres in (sites[:, 0], sites[:0, 0])):
         cells = SkinCells(patch, fold)
         roots = patch_roots(
             embedding, latent, np.arange(60), cells, near_exclusion, energy_scale=1e-4
@@ -323,7 +339,7 @@ def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
 
 
 def test_a_stored_network_predicts_the_same(
-    tube_model: PoseModel, tube_folds: FoldSites, network: GeometricNetwork
+    tube_model: PoseModel, tube_folds: np.ndarray, network: GeometricNetwork
 ) -> None:
     embedding, config = tube_model.embedding, PRESETS["default"]
     folding = GeometricNetwork(embedding, 3, tube_folds)
