@@ -39,6 +39,9 @@ _PATIENCE_SECONDS = 0.016
 _PROGRESS_SECONDS = 0.05
 """Between two reports of progress: more would only keep the window busy."""
 
+_SWITCH_SECONDS = 0.001
+"""A worker in plain Python holds the interpreter for so long before the window has its turn."""
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -393,12 +396,8 @@ class LongWork(QObject):
         self.busy_changed.emit(self.busy)
 
 
-_SWITCH_SECONDS = 0.001
-
-
 def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
     """Move a worker, which has no parent, into a thread of its own."""
-    # A worker in plain Python holds the interpreter for so long before the window has its turn.
     sys.setswitchinterval(_SWITCH_SECONDS)
     thread = QThread(parent)
     thread.setObjectName(name)

@@ -414,9 +414,10 @@ class Viewport(QWidget):
         self._shown = frame
         self._glide.stop()
         is_framed = frame.latent is self._framed
+        if is_framed:
+            self._framed = None
         if self._place_camera or is_framed:
             self._place_camera = False
-            self._framed = None if is_framed else self._framed
             self._turn.stop()
             scene.show(frame.vertices, frame.normals)
             middle = frame.vertices.mean(axis=0)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.meshes import PoseSet, read_pose_set
+from lcollision_core.meshes import PoseSet, read_pose_set, write_mesh
 from tests.app.support import Lcollision
 from tests.independent_check import crossing_pairs, read_obj
 
@@ -51,9 +51,7 @@ def test_scape_from_meshes_to_an_exported_pose(
     folder = tmp_path / "scans"
     folder.mkdir()
     for number, vertices in enumerate(scape.vertices):
-        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.astype(float).tolist()]
-        lines += ["f " + " ".join(map(str, face)) for face in (scape.topology.faces + 1).tolist()]
-        (folder / f"mesh{number:03}.obj").write_text("\n".join(lines) + "\n")
+        write_mesh(folder / f"mesh{number:03}.obj", vertices, scape.topology.faces)
     model, store = tmp_path / "dancer.safetensors", tmp_path / "dancer.store"
     # Two of the published poses run into themselves.
     scan, fixed = folder / "mesh007.obj", tmp_path / "fixed.obj"
