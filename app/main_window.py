@@ -20,6 +20,7 @@ from PySide6.QtGui import (
 )
 from PySide6.QtWidgets import (
     QApplication,
+    QDialog,
     QDockWidget,
     QLabel,
     QMainWindow,
@@ -96,7 +97,7 @@ class MainWindow(QMainWindow):
         self.document = document
         self.settings = settings
         self._autosave: Autosave | None = None
-        self._announced = False
+        self._announced = self._unasked = False
         self.setObjectName("editor")
         self.setWindowIcon(program_icon())
         self.setAcceptDrops(True)
@@ -218,15 +219,24 @@ class MainWindow(QMainWindow):
         if self.settings["window_layout"].isEmpty():
             QTimer.singleShot(0, self, self._size_docks)
 
+    def close_unasked(self) -> None:
+        """Close at once; what is not saved is offered at the next start."""
+        self._unasked = True
+        for widget in QApplication.topLevelWidgets():
+            if isinstance(widget, QDialog):
+                widget.reject()
+        self.close()
+
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
         """Settle unsaved changes, then end all work before the view goes."""
-        may_close = False
+        may_close = self._unasked
 
         def settle() -> None:
             nonlocal may_close
             may_close = self.files.may_lose_changes()
 
-        self.attempt(settle)
+        if not may_close:
+            self.attempt(settle)
         if not may_close:
             event.ignore()
             return
@@ -234,7 +244,7 @@ class MainWindow(QMainWindow):
         self.settings["window_layout"] = self.saveState(_LAYOUT_VERSION)
         self.settings["randomise_amount"] = self.randomise.amount.value() / 100
         if self._autosave is not None:
-            self._autosave.close()
+            self._autosave.close(keep=self._unasked)
         if not self.document.close():
             _log.warning("a thread was still busy when the window closed")
         self.statusBar().clearMessage()

@@ -237,18 +237,29 @@ class Autosave(QObject):
         self._recovering = lost
         self._document.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
 
-    def close(self, timeout: float = 5.0) -> bool:
-        """Give up what is not saved, and end: the user has been asked.
+    def close(self, timeout: float = 5.0, keep: bool = False) -> bool:
+        """End, and give up what is not saved unless it is to be kept for the next start.
+
+        Parameters
+        ----------
+        timeout : in seconds
+        keep : where the user has not been asked
 
         Returns
         -------
-        ended : whether the thread has ended within `timeout` seconds
+        ended : whether the thread has ended in time
         """
         self._due.stop()
         ended = end_thread(self._thread, time.monotonic() + timeout)
-        if self._session is not None:
+        if self._session is None:
+            return ended
+        if keep and self._document.modified:
+            if ended:
+                self._writer.write(self._snapshot(self._session))
+            self._session.release()
+        else:
             self._session.discard()
-            self._session = None
+        self._session = None
         return ended
 
     @Slot()
@@ -266,18 +277,18 @@ class Autosave(QObject):
 
     @Slot()
     def _write(self) -> None:
+        if self._session is not None and self._document.has_model:
+            self._wanted.emit(self._snapshot(self._session))
+
+    def _snapshot(self, session: Session) -> _Snapshot:
         document = self._document
-        if self._session is None or not document.has_model:
-            return
-        self._wanted.emit(
-            _Snapshot(
-                session=self._session,
-                model=document.model,
-                model_file=document.model_file,
-                pose_name=document.pose_name,
-                file=document.file,
-                poses=document.all_poses() if document.modified else None,
-            )
+        return _Snapshot(
+            session=session,
+            model=document.model,
+            model_file=document.model_file,
+            pose_name=document.pose_name,
+            file=document.file,
+            poses=document.all_poses() if document.modified else None,
         )
 
     @Slot(object)

@@ -114,7 +114,7 @@ class StartUp(QObject):
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         _log.info("signal %d: closing", number)
-        self._window.close()
+        self._window.close_unasked()
 
 
 def opening_pose(model: PoseModel) -> NamedPose:

@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 
 from app.document import PoseDocument
 from app.recovery import Autosave, Session, find_lost_poses
-from lcollision_core.model import PoseModel
+from lcollision_core.model import PoseModel, read_poses
 
 EDITOR = """
 import sys
@@ -93,6 +93,19 @@ def test_a_killed_editor_loses_nothing_that_was_written(
     qtbot.waitUntil(lambda: not lost.poses_file.exists())
     assert autosave.close()
     assert list(folder.iterdir()) == []
+
+
+def test_an_editor_told_to_end_keeps_its_last_edit(document: PoseDocument, tmp_path: Path) -> None:
+    """Even one so young that it was not yet due to be written; without an edit, nothing is kept."""
+    folder = tmp_path / "sessions"
+    for edited in (False, True):
+        if edited:
+            document.set_code(0, 0.5)
+        autosave = Autosave(document, folder, seconds=1000.0)
+        assert autosave.close(keep=True)
+        found = find_lost_poses(folder)
+        assert len(found) == edited
+    assert read_poses(found[0].poses_file, document.model)[0].latent[0] == 0.5
 
 
 def test_nothing_is_kept_of_what_is_saved(
