@@ -9,6 +9,10 @@ import socket
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from PySide6.QtGui import QSurfaceFormat
 
 _NO_DISPLAY = (
     "lcollision: there is no display to open a window on ({reason}); on a machine without one use "
@@ -102,7 +106,26 @@ def _why_no_plugin() -> str | None:
     return None
 
 
+def _surface_format() -> QSurfaceFormat:
+    """Return what VTK draws with, which all windows must share from the first one on.
+
+    On Wayland the canvas stays black otherwise: it is made after its window, and pyvistaqt sets
+    this default only then.
+    """
+    from PySide6.QtGui import QSurfaceFormat
+
+    wanted = QSurfaceFormat()
+    wanted.setRenderableType(QSurfaceFormat.RenderableType.OpenGL)
+    wanted.setProfile(QSurfaceFormat.OpenGLContextProfile.CoreProfile)
+    wanted.setVersion(3, 2)
+    wanted.setDepthBufferSize(8)
+    wanted.setAlphaBufferSize(8)
+    wanted.setStencilBufferSize(0)
+    return wanted
+
+
 def _run(path: Path | None, model_name: str | None) -> int:
+    from PySide6.QtGui import QSurfaceFormat
     from PySide6.QtWidgets import QApplication
 
     from app.document import PoseDocument
@@ -115,6 +138,7 @@ def _run(path: Path | None, model_name: str | None) -> int:
     from app.theme import apply_theme, wanted_theme
 
     keep_memory_small()
+    QSurfaceFormat.setDefaultFormat(_surface_format())
     application = QApplication(sys.argv[:1])
     application.setApplicationName("lcollision")
     application.setApplicationDisplayName("LCollision")
