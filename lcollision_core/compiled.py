@@ -19,10 +19,23 @@ def compiled(function: Function) -> Function:
     A compiled function calls only those of its own file: the cache is renewed when that file
     changes, and would not see a change elsewhere.
     """
+    return _compiled(function, fastmath=False)
+
+
+def compiled_sums(function: Function) -> Function:
+    """Compile as `compiled` does, and let sums be reordered: several terms are added at a time.
+
+    Which, and with what rounding, depends on the processor.
+    """
+    return _compiled(function, fastmath={"reassoc", "contract", "nsz"})
+
+
+def _compiled(function: Function, fastmath: bool | set[str]) -> Function:
+    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
     try:
-        dispatcher = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+        dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:
         # Neither the installation nor the user's cache folder can be written, as for a service
         # account without a home: slow at every start is better than not at all.
-        dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+        dispatcher = numba.njit(**options)(function)
     return cast(Function, dispatcher)

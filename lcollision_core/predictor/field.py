@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
@@ -14,20 +14,24 @@ from lcollision_core.predictor.field_kernels import BEHIND, FADE, SMALLEST_SQUAR
 _SYMMETRIC = [3, 4, 5, 4, 6, 7, 5, 7, 8]
 """Where the features hold the nine entries of S."""
 
+_FEW_ROWS = 4
+"""Of so few, calling a matrix product for each group costs more than the products do."""
+
 
 class Decoding(NamedTuple):
     """How features follow from latent codes: those of each group move the points it supports.
 
     Attributes
     ----------
-    blocks : for each group which codes, and which of the n = 9 N outputs they make
+    blocks : (G, 4) int64 for each group the first and past the last of its codes, and likewise of
+        the n = 9 N outputs that they make; all codes in their order; on the CPU
     tables : the groups' (codes, outputs) matrices one after the other, flat
     target : (N,) int32 the point that nine outputs belong to
     offset : (P, 9) features of codes 0, but for what the groups add
     scale : (9,) of the outputs
     """
 
-    blocks: Sequence[tuple[slice, slice]]
+    blocks: torch.Tensor
     tables: torch.Tensor
     target: torch.Tensor
     offset: torch.Tensor
@@ -36,23 +40,29 @@ class Decoding(NamedTuple):
     def products(self, latent: torch.Tensor) -> torch.Tensor:
         """Return (B, n) every group's codes times its table."""
         result = latent.new_empty((len(latent), len(self.target) * self.offset.shape[1]))
-        for (codes, columns), table in zip(self.blocks, self._split_tables(), strict=True):
+        if latent.device.type == "cpu" and len(latent) <= _FEW_ROWS:
+            field_kernels.products(*_arrays(latent, self.tables, self.blocks, result))
+            return result
+        for (codes, columns), table in self._groups():
             torch.mm(latent[:, codes], table, out=result[:, columns])
         return result
 
     def products_backward(self, by_products: torch.Tensor) -> torch.Tensor:
         """Pull derivatives by the products back to the codes."""
-        parts = [
-            by_products[:, columns] @ table.T
-            for (_, columns), table in zip(self.blocks, self._split_tables(), strict=True)
-        ]
+        if by_products.device.type == "cpu" and len(by_products) <= _FEW_ROWS:
+            result = by_products.new_empty((len(by_products), int(self.blocks[-1, 1])))
+            given = by_products, self.tables, self.blocks, result
+            field_kernels.products_backward(*_arrays(*given))
+            return result
+        parts = [by_products[:, columns] @ table.T for (_, columns), table in self._groups()]
         return torch.cat(parts, dim=1)
 
-    def _split_tables(self) -> Iterator[torch.Tensor]:
+    def _groups(self) -> Iterator[tuple[tuple[slice, slice], torch.Tensor]]:
         start = 0
-        for codes, columns in self.blocks:
-            shape = codes.stop - codes.start, columns.stop - columns.start
-            yield self.tables[start : start + shape[0] * shape[1]].view(shape)
+        for first, last, left, right in self.blocks.tolist():
+            shape = last - first, right - left
+            table = self.tables[start : start + shape[0] * shape[1]].view(shape)
+            yield (slice(first, last), slice(left, right)), table
             start += shape[0] * shape[1]
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_sums
 
 Array = npt.NDArray[np.floating[Any]]
 
@@ -21,6 +21,49 @@ BEHIND, FADE = 0.07, 0.04
 side of a limb is not, and over which they fade in."""
 
 SMALLEST_SQUARED_ANGLE = 1e-12
+
+_COLUMNS_AT_ONCE = 512
+"""Of a table, whose rows then stay in the first cache."""
+
+
+@compiled
+def products(latent: Array, tables: Array, blocks: npt.NDArray[np.int64], outputs: Array) -> None:
+    """Fill in every group's codes times its table: (B, n)."""
+    table = 0
+    for group in range(len(blocks)):
+        first, last, left, right = blocks[group]
+        width = right - left
+        for start in range(0, width, _COLUMNS_AT_ONCE):
+            stop = min(start + _COLUMNS_AT_ONCE, width)
+            for b in range(latent.shape[0]):
+                out = outputs[b, left + start : left + stop]
+                out[:] = 0.0
+                for k in range(last - first):
+                    code = latent[b, first + k]
+                    row = tables[table + k * width + start : table + k * width + stop]
+                    for n in range(len(out)):
+                        out[n] += code * row[n]
+        table += (last - first) * width
+
+
+@compiled_sums
+def products_backward(
+    by_outputs: Array, tables: Array, blocks: npt.NDArray[np.int64], by_latent: Array
+) -> None:
+    """Pull derivatives by `products`' outputs back to the codes (B, D)."""
+    table = 0
+    for group in range(len(blocks)):
+        first, last, left, right = blocks[group]
+        width = right - left
+        for k in range(last - first):
+            row = tables[table + k * width : table + (k + 1) * width]
+            for b in range(by_outputs.shape[0]):
+                given = by_outputs[b, left:right]
+                total = by_outputs.dtype.type(0.0)
+                for n in range(width):
+                    total += given[n] * row[n]
+                by_latent[b, first + k] = total
+        table += (last - first) * width
 
 
 @compiled
@@ -31,8 +74,9 @@ def add_features(
     for b in range(outputs.shape[0]):
         features[b] = offset
         for n in range(outputs.shape[1]):
-            for c in range(outputs.shape[2]):
-                features[b, target[n], c] += outputs[b, n, c] * scale[c]
+            given, out = outputs[b, n], features[b, target[n]]
+            for c in range(9):
+                out[c] += given[c] * scale[c]
 
 
 @compiled
@@ -56,19 +100,18 @@ def add_features_backward(
 def deform(features: Array, rest_frame: Array, frame: Array, rows: Array) -> None:
     """Fill in frames R F (B, P, 3, 3) and gradients R S as rows (B, 3, P, 3)."""
     rotation = np.empty((3, 3), dtype=features.dtype)
-    stretch = np.empty((3, 3), dtype=features.dtype)
     for b in range(features.shape[0]):
         for p in range(features.shape[1]):
-            _unpack(features[b, p], rotation, stretch)
+            given, rest = features[b, p], rest_frame[p]
+            _rotate(given, rotation)
             for i in range(3):
+                x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2]
                 for j in range(3):
-                    turned = features.dtype.type(0.0)
-                    stretched = features.dtype.type(0.0)
-                    for k in range(3):
-                        turned += rotation[i, k] * rest_frame[p, k, j]
-                        stretched += rotation[i, k] * stretch[k, j]
-                    frame[b, p, i, j] = turned
-                    rows[b, i, p, j] = stretched
+                    frame[b, p, i, j] = x * rest[0, j] + y * rest[1, j] + z * rest[2, j]
+                out = rows[b, i, p]
+                out[0] = x * given[3] + y * given[4] + z * given[5]
+                out[1] = x * given[4] + y * given[6] + z * given[7]
+                out[2] = x * given[5] + y * given[7] + z * given[8]
 
 
 @compiled
@@ -82,7 +125,8 @@ def deform_backward(
     by_stretch = np.empty((3, 3), dtype=features.dtype)
     for b in range(features.shape[0]):
         for p in range(features.shape[1]):
-            _unpack(features[b, p], rotation, stretch)
+            _rotate(features[b, p], rotation)
+            _stretch(features[b, p], stretch)
             for i in range(3):
                 for j in range(3):
                     turned = features.dtype.type(0.0)
@@ -103,19 +147,24 @@ def deform_backward(
 
 
 @compiled
-def _unpack(features: Array, rotation: Array, stretch: Array) -> None:
-    """Write exp of the rotation vector, by Rodrigues' formula, and S of nine features."""
-    x, y, z = features[0], features[1], features[2]
-    squared = x * x + y * y + z * z + SMALLEST_SQUARED_ANGLE
+def _rotate(w: Array, rotation: Array) -> None:
+    """Write exp of a rotation vector, by Rodrigues' formula."""
+    kind = w.dtype.type
+    x, y, z = w[0], w[1], w[2]
+    squared = x * x + y * y + z * z + kind(SMALLEST_SQUARED_ANGLE)
     angle = math.sqrt(squared)
-    half = math.sin(0.5 * angle)
-    s = math.sin(angle) / angle
-    v = 2.0 * half * half / squared
-    c = 1.0 - 2.0 * half * half
+    half = math.sin(kind(0.5) * angle)
+    versine = kind(2.0) * half * half
+    s, v, c = math.sin(angle) / angle, versine / squared, kind(1.0) - versine
     rotation[0, 0], rotation[1, 1], rotation[2, 2] = c + v * x * x, c + v * y * y, c + v * z * z
     rotation[0, 1], rotation[1, 0] = v * x * y - s * z, v * x * y + s * z
     rotation[0, 2], rotation[2, 0] = v * z * x + s * y, v * z * x - s * y
     rotation[1, 2], rotation[2, 1] = v * y * z - s * x, v * y * z + s * x
+
+
+@compiled
+def _stretch(features: Array, stretch: Array) -> None:
+    """Write S of nine features."""
     stretch[0, 0], stretch[0, 1], stretch[0, 2] = features[3], features[4], features[5]
     stretch[1, 0], stretch[1, 1], stretch[1, 2] = features[4], features[6], features[7]
     stretch[2, 0], stretch[2, 1], stretch[2, 2] = features[5], features[7], features[8]
@@ -148,68 +197,51 @@ def _pull_rotation(w: Array, by_rotation: Array, by_w: Array) -> None:
         by_w[i] = total
 
 
-@compiled
+@compiled_sums
 def contact_field(frame: Array, places: Array, apart: Array, reach: Array, sums: Array) -> None:
-    """Fill in the sums (P, B, R, 8) of `field.contact_field`."""
-    n_points, n_reaches = places.shape[2], len(reach)
+    """Fill in the sums (P, B, R, 8) of `field.contact_field`.
+
+    Far points weigh 0 rather than being left out: without branches and lists, several points are
+    added at a time, which is faster.
+    """
+    n_points = places.shape[2]
     kind = frame.dtype.type
-    one = kind(1.0)
-    largest, inverse = reach[-1] * reach[-1], one / (reach * reach)
-    squared = np.empty(n_points, dtype=frame.dtype)
-    near = np.empty(n_points, dtype=np.int32)
+    zero, one, two, three = kind(0.0), kind(1.0), kind(2.0), kind(3.0)
+    behind, sharpness = kind(BEHIND), kind(1.0 / FADE)
     normal = np.empty((3, n_points), dtype=frame.dtype)
-    total = np.empty((n_points, n_reaches, 8), dtype=frame.dtype)
+    nx, ny, nz = normal[0], normal[1], normal[2]
     for b in range(frame.shape[0]):
         x, y, z = places[b, 0], places[b, 1], places[b, 2]
-        nx, ny, nz = normal[0], normal[1], normal[2]
-        total[:] = 0.0
         for p in range(n_points):
             nx[p], ny[p], nz[p] = frame[b, p, 0, 0], frame[b, p, 1, 0], frame[b, p, 2, 0]
         for p in range(n_points):
-            n_near = _near(places[b], apart[p], p, p + 1, largest, squared, near)
-            for place in range(n_near):
-                q = near[place]
-                dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
-                # How far q is ahead of p, and p of q: each also how far the other is above its
-                # own tangent plane.
-                ahead = dx * nx[p] + dy * ny[p] + dz * nz[p]
-                back = -(dx * nx[q] + dy * ny[q] + dz * nz[q])
-                p_sees, q_sees = kind(_facing(ahead)), kind(_facing(back))
-                if p_sees + q_sees == 0.0:
-                    continue
-                for k in range(n_reaches):
-                    t = one - squared[q] * inverse[k]
-                    if t <= 0.0:
-                        continue
-                    cube = t * t * t
-                    if p_sees > 0.0:
-                        weight = p_sees * cube
-                        total[p, k, 0] += weight
-                        total[p, k, 1] += weight * back
-                        total[p, k, 2] += weight * dx
-                        total[p, k, 3] += weight * dy
-                        total[p, k, 4] += weight * dz
-                        total[p, k, 5] += weight * nx[q]
-                        total[p, k, 6] += weight * ny[q]
-                        total[p, k, 7] += weight * nz[q]
-                    if q_sees > 0.0:
-                        weight = q_sees * cube
-                        total[q, k, 0] += weight
-                        total[q, k, 1] += weight * ahead
-                        total[q, k, 2] -= weight * dx
-                        total[q, k, 3] -= weight * dy
-                        total[q, k, 4] -= weight * dz
-                        total[q, k, 5] += weight * nx[p]
-                        total[q, k, 6] += weight * ny[p]
-                        total[q, k, 7] += weight * nz[p]
-        for p in range(n_points):
-            f = frame[b, p]
-            for k in range(n_reaches):
-                own, out = total[p, k], sums[p, b, k]
-                out[0], out[1] = own[0], own[1]
+            px, py, pz, own_x, own_y, own_z = x[p], y[p], z[p], nx[p], ny[p], nz[p]
+            f, away = frame[b, p], apart[p]
+            for k in range(len(reach)):
+                inverse = one / (reach[k] * reach[k])
+                total, height = zero, zero
+                to_x, to_y, to_z, n_x, n_y, n_z = zero, zero, zero, zero, zero, zero
+                for q in range(n_points):
+                    dx, dy, dz = x[q] - px, y[q] - py, z[q] - pz
+                    t = one - (dx * dx + dy * dy + dz * dz + away[q]) * inverse
+                    t = t if t > zero else zero
+                    s = (dx * own_x + dy * own_y + dz * own_z + behind) * sharpness
+                    s = s if s > zero else zero
+                    s = s if s < one else one
+                    weight = s * s * (three - two * s) * t * t * t
+                    total += weight
+                    height -= weight * (dx * nx[q] + dy * ny[q] + dz * nz[q])
+                    to_x += weight * dx
+                    to_y += weight * dy
+                    to_z += weight * dz
+                    n_x += weight * nx[q]
+                    n_y += weight * ny[q]
+                    n_z += weight * nz[q]
+                out = sums[p, b, k]
+                out[0], out[1] = total, height
                 for c in range(3):
-                    out[2 + c] = f[0, c] * own[2] + f[1, c] * own[3] + f[2, c] * own[4]
-                    out[5 + c] = f[0, c] * own[5] + f[1, c] * own[6] + f[2, c] * own[7]
+                    out[2 + c] = f[0, c] * to_x + f[1, c] * to_y + f[2, c] * to_z
+                    out[5 + c] = f[0, c] * n_x + f[1, c] * n_y + f[2, c] * n_z
 
 
 @compiled
@@ -267,7 +299,7 @@ def contact_field_backward(
     for b in range(frame.shape[0]):
         x, y, z = places[b, 0], places[b, 1], places[b, 2]
         for p in range(n_points):
-            n_near = _near(places[b], apart[p], p, 0, largest, squared, near)
+            n_near = _near(places[b], apart[p], p, largest, squared, near)
             f, by_f = frame[b, p], by_frame[b, p]
             for k in range(n_reaches):
                 # The offsets' and normals' derivatives, turned from the point's frame.
@@ -342,18 +374,18 @@ def _near(
     places: Array,
     apart: Array,
     p: int,
-    start: int,
     largest: float,
     squared: Array,
     near: npt.NDArray[np.int32],
 ) -> int:
-    """Fill in p's squared distances to the points from `start` on, and list those near it."""
+    """Fill in p's squared distances to all points, and list those near it; return how many."""
     x, y, z = places[0], places[1], places[2]
-    for q in range(start, len(x)):
-        dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
+    px, py, pz = x[p], y[p], z[p]
+    for q in range(len(x)):
+        dx, dy, dz = x[q] - px, y[q] - py, z[q] - pz
         squared[q] = dx * dx + dy * dy + dz * dz + apart[q]
     n_near = 0
-    for q in range(start, len(x)):
+    for q in range(len(x)):
         # Without a branch, which would be mispredicted.
         near[n_near] = q
         n_near += squared[q] < largest

@@ -138,7 +138,7 @@ class GeometricNetwork(PredictorNetwork):
         skin = np.append(vertex, np.setdiff1d(sites, vertex))
         self.body = ReducedBody(embedding, skin, tangent_frames(embedding, skin), n_points)
         between = skin_distances(skin_graph(embedding), vertex, limit=_DISTANT)[:, vertex]
-        apart = torch.tensor(np.isfinite(between), dtype=torch.float32)
+        apart = torch.tensor(np.isfinite(between), dtype=torch.float32).contiguous()
         self.register_buffer("apart", apart, persistent=False)
         self.register_buffer("reach", torch.tensor(REACHES), persistent=False)
         # Of the model file: found in labelled poses.

@@ -222,10 +222,14 @@ class CollisionPredictor:
         if n_threads == 1:
             fill(0, len(codes))
         else:
-            # The network's compiled loops run on one thread each.
-            with ThreadPoolExecutor(n_threads) as pool:
-                for _ in pool.map(fill, cuts[:-1], cuts[1:]):
-                    pass
+            # Each thread has a core to itself, and torch must not share out its work again.
+            torch_threads = torch.get_num_threads()
+            try:
+                with ThreadPoolExecutor(n_threads, "predict", torch.set_num_threads, (1,)) as pool:
+                    for _ in pool.map(fill, cuts[:-1], cuts[1:]):
+                        pass
+            finally:
+                torch.set_num_threads(torch_threads)
         return domain_energy, logit
 
     def logit_and_gradient(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:

@@ -46,19 +46,19 @@ class ReducedBody(nn.Module):
         super().__init__()
         decoder = embedding.decoder
         self.n_placed = n_placed
-        self._blocks: list[tuple[slice, slice]] = []
-        tables, targets = [], []
+        blocks, tables, targets = [], [], []
         code = column = 0
         for group in decoder.groups:
             n_codes = len(group.weights)
             _, place, own = np.intersect1d(vertex, group.support, return_indices=True)
             weights = group.weights.reshape(n_codes, -1, N_FEATURES)[:, own]
-            codes = slice(code, code + n_codes)
-            columns = slice(column, column + N_FEATURES * len(own))
-            self._blocks.append((codes, columns))
+            n_outputs = N_FEATURES * len(own)
+            blocks.append((code, code + n_codes, column, column + n_outputs))
             tables.append(weights.reshape(-1))
             targets.append(place)
-            code, column = codes.stop, columns.stop
+            code, column = code + n_codes, column + n_outputs
+        # No buffer: it stays on the CPU.
+        self._blocks = torch.tensor(blocks)
         self._keep("tables", np.concatenate(tables))
         self._keep("offset", decoder.offset[vertex])
         self._keep("scale", decoder.scale)

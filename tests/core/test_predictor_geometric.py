@@ -207,7 +207,7 @@ def test_features_are_differentiable() -> None:
         return torch.randn(shape, generator=generator, dtype=torch.float64)
 
     # Two groups of 3 and 2 codes; both move point 1.
-    blocks = [(slice(0, 3), slice(0, 18)), (slice(3, 5), slice(18, 27))]
+    blocks = torch.tensor([[0, 3, 0, 18], [3, 5, 18, 27]])
     tables = torch.cat([normal(54), normal(18)])
     target = torch.tensor([0, 1, 1], dtype=torch.int32)
     decoding = Decoding(blocks, tables, target, normal(2, 9), normal(9).abs())
