@@ -85,7 +85,7 @@ class ActionHandlers(QObject):
         )
         if accepted:
             self._document.add_pose_to_library(name.strip())
-            self._window.library.show_own()
+            self._window.library.choose_own(self._document.pose_name)
 
     def _find_slider(self) -> None:
         dock = self._window.docks["sliders"]
@@ -112,7 +112,8 @@ class ActionHandlers(QObject):
         )
 
     def _rename(self) -> None:
-        chosen = self._window.library.chosen
+        library = self._window.library
+        chosen = library.chosen_own
         if chosen is None:
             return
         name, accepted = QInputDialog.getText(
@@ -120,9 +121,10 @@ class ActionHandlers(QObject):
         )
         if accepted:
             self._document.rename_pose(chosen.name, name.strip())
+            library.choose_own(name.strip())
 
     def _remove(self) -> None:
-        chosen = self._window.library.chosen
+        chosen = self._window.library.chosen_own
         if chosen is not None:
             self._document.remove_pose_from_library(chosen.name)
 

@@ -158,7 +158,13 @@ class PoseHistory(QObject):
         self._push(f"Keep {free}", state)
 
     def remove_pose_from_library(self, name: str) -> None:
-        """Drop a pose of the library."""
+        """Drop a pose of the library.
+
+        Raises
+        ------
+        ModelFileError : there is no such pose.
+        """
+        self._require_kept(name)
         kept = tuple(pose for pose in self.poses if pose.name != name)
         self._push(f"Remove {name}", replace(self._state, poses=kept))
 
@@ -167,8 +173,9 @@ class PoseHistory(QObject):
 
         Raises
         ------
-        ModelFileError : the new name is empty or another pose's.
+        ModelFileError : there is no such pose, or the new name is empty or another pose's.
         """
+        self._require_kept(old)
         if not new or any(pose.name == new != old for pose in self.poses):
             raise ModelFileError(f"a pose cannot be called {new!r}; choose another name")
         poses = tuple(replace(p, name=new) if p.name == old else p for p in self.poses)
@@ -183,6 +190,10 @@ class PoseHistory(QObject):
         if all(pose.name != edited.name for pose in self.poses):
             return (*self.poses, edited)
         return tuple(edited if pose.name == edited.name else pose for pose in self.poses)
+
+    def _require_kept(self, name: str) -> None:
+        if all(pose.name != name for pose in self.poses):
+            raise ModelFileError(f"your library has no pose {name!r}; choose one of your own")
 
     def _load(self, label: str, pose: NamedPose) -> None:
         latent = read_only(np.array(pose.latent, dtype=np.float64))

@@ -326,14 +326,13 @@ class MainWindow(QMainWindow):
         self.viewport.shading_changed.connect(self._on_shading)
         self.collision.resolve.options_wanted.connect(self._handlers.choose_resolve_options)
         self.library.keep_wanted.connect(self._handlers.keep_pose)
-        self.library.list.currentRowChanged.connect(self._update_actions)
+        self.library.chosen_changed.connect(self._update_actions)
         self.library.list.itemActivated.connect(self.library.load_chosen)
         self.randomise.wanted.connect(document.randomise)
         document.model_changed.connect(self._on_model)
         document.frame_changed.connect(self._on_frame)
         document.file_changed.connect(self._update_title)
         document.modified_changed.connect(self._update_title)
-        document.library_changed.connect(self._update_actions)
         document.locks_changed.connect(self._update_actions)
         document.ghost_changed.connect(self._on_ghost)
         document.solve_started.connect(self._update_actions)
@@ -397,7 +396,7 @@ class MainWindow(QMainWindow):
     def _update_actions(self) -> None:
         document, stack = self.document, self.document.undo_stack
         has_model = document.has_model
-        own_chosen = self.library.shows_own and self.library.chosen is not None
+        own_chosen = self.library.chosen_own is not None
         allowed = {
             "undo": stack.canUndo(),
             "redo": stack.canRedo(),

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QSize, Qt, QTimer, Signal, Slot
-from PySide6.QtGui import QIcon, QImage, QPixmap
+from PySide6.QtGui import QIcon, QImage, QPixmap, QShowEvent
 from PySide6.QtWidgets import (
     QButtonGroup,
     QHBoxLayout,
@@ -71,6 +71,7 @@ class LibraryPanel(QWidget):
     Signals
     -------
     keep_wanted : the user wants to keep the pose
+    chosen_changed : `chosen` or `chosen_own` may be another
 
     Parameters
     ----------
@@ -78,6 +79,7 @@ class LibraryPanel(QWidget):
     """
 
     keep_wanted = Signal()
+    chosen_changed = Signal()
 
     def __init__(self, document: PoseDocument) -> None:
         super().__init__()
@@ -134,7 +136,7 @@ class LibraryPanel(QWidget):
         row.addWidget(self.list, 1)
         self.training.setChecked(True)
         self._due.timeout.connect(self._draw_next)
-        self._sources.buttonClicked.connect(self.refresh)
+        self.own.toggled.connect(self._on_source)
         self.keep.clicked.connect(self.keep_wanted)
         self.list.itemDoubleClicked.connect(self._on_double_click)
         self.list.currentRowChanged.connect(self._on_chosen)
@@ -152,6 +154,11 @@ class LibraryPanel(QWidget):
         """The pose that is selected, None for none."""
         row = self.list.currentRow()
         return self._poses[row] if 0 <= row < len(self._poses) else None
+
+    @property
+    def chosen_own(self) -> NamedPose | None:
+        """The user's own pose that is selected, None for none or a training pose."""
+        return self.chosen if self.shows_own else None
 
     @property
     def shows_own(self) -> bool:
@@ -178,10 +185,15 @@ class LibraryPanel(QWidget):
         if self.chosen is not None:
             self._document.load_pose(self.chosen)
 
-    def show_own(self) -> None:
-        """Show the user's own poses."""
+    def choose_own(self, name: str) -> None:
+        """Show the user's own poses, and select the one of this name.
+
+        Raises
+        ------
+        ValueError : there is none.
+        """
         self.own.setChecked(True)
-        self.refresh()
+        self.list.setCurrentRow(self._names().index(name))
 
     @Slot()
     def refresh(self) -> None:
@@ -189,13 +201,13 @@ class LibraryPanel(QWidget):
         document = self._document
         if not document.has_model:
             return
+        before = self.chosen
         if self.shows_own:
             self._poses = list(document.poses)
         else:
             self._poses = [
                 document.training_pose(number) for number in range(len(document.model.pose_names))
             ]
-        row = self.list.currentRow()
         with silent(self.list):
             self.list.clear()
             for pose in self._poses:
@@ -204,11 +216,19 @@ class LibraryPanel(QWidget):
                 item.setTextAlignment(Qt.AlignmentFlag.AlignHCenter)
                 item.setIcon(self._pictures.get(pose.latent.tobytes(), self._blank()))
                 self.list.addItem(item)
-            if 0 <= row < len(self._poses):
-                self.list.setCurrentRow(row)
+            if before is not None and before.name in self._names():
+                self.list.setCurrentRow(self._names().index(before.name))
         self.own.setText(f"Yours ({len(document.poses)})" if document.poses else "Yours")
         self._on_chosen(self.list.currentRow())
         self._draw_soon()
+
+    def showEvent(self, event: QShowEvent) -> None:  # noqa: N802
+        """Go on with the pictures: none is drawn while nobody sees them."""
+        super().showEvent(event)
+        self._draw_soon()
+
+    def _names(self) -> list[str]:
+        return [pose.name for pose in self._poses]
 
     def _source(self, text: str, place: str, tip: str) -> QToolButton:
         button = QToolButton()
@@ -231,6 +251,12 @@ class LibraryPanel(QWidget):
     @Slot()
     def _on_model(self) -> None:
         self._pictures.clear()
+        self._on_source()
+
+    @Slot()
+    def _on_source(self) -> None:
+        # A pose of the other list, or of another model, may have the name of the selected one.
+        self.list.setCurrentRow(-1)
         self.refresh()
 
     @Slot()
@@ -301,6 +327,7 @@ class LibraryPanel(QWidget):
         name = f"Blend towards {self._poses[row].name}" if chosen else "Choose a pose to blend"
         self._target.setText(name)
         self._target.setToolTip(name)
+        self.chosen_changed.emit()
 
     @Slot()
     def _on_blend_pressed(self) -> None:

@@ -261,6 +261,12 @@ def test_the_library_is_undone_like_the_pose(document: PoseDocument) -> None:
     assert document.pose_name == "kick 2"
     with pytest.raises(ModelFileError, match="choose another name"):
         document.rename_pose("kick", "kick 2")
+    for change in (
+        lambda: document.rename_pose("bend 2", "leap"),
+        lambda: document.remove_pose_from_library("bend 2"),
+    ):
+        with pytest.raises(ModelFileError, match="no pose 'bend 2'"):
+            change()
     document.rename_pose("kick 2", "jump")
     assert document.pose_name == "jump"
     document.remove_pose_from_library("kick")

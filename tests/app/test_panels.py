@@ -1,0 +1,117 @@
+"""The panels round the viewport: whose pose an action changes, and what a slider is called."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QIcon
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QInputDialog
+from pytestqt.qtbot import QtBot
+
+from app.document import PoseDocument
+from app.main_window import MainWindow
+from app.panels.library import THUMBNAIL
+from tests.app.windows import PATIENCE, answer, close_window, is_open, open_window, settings_in
+
+CONTROL, LEFT = Qt.KeyboardModifier.ControlModifier, Qt.MouseButton.LeftButton
+
+
+@pytest.fixture
+def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[MainWindow]:
+    held = open_window(qtbot, document, settings_in(tmp_path))
+    yield held
+    if is_open(held):
+        close_window(held)
+
+
+def own_names(window: MainWindow) -> list[str]:
+    return [pose.name for pose in window.document.poses]
+
+
+def may_change_chosen(window: MainWindow) -> bool:
+    rename, remove = (window.actions_by_key[key] for key in ("rename", "remove"))
+    assert rename.isEnabled() == remove.isEnabled()
+    return remove.isEnabled()
+
+
+def choose(window: MainWindow, name: str) -> None:
+    held = window.library.list
+    (item,) = held.findItems(name, Qt.MatchFlag.MatchExactly)
+    held.setCurrentItem(item)
+    assert window.library.chosen is not None
+    assert window.library.chosen.name == name
+
+
+def test_remove_and_rename_spare_a_pose_that_a_training_pose_is_called_as(
+    window: MainWindow,
+) -> None:
+    document, library = window.document, window.library
+    shared = document.model.pose_names[2]
+    document.add_pose_to_library(shared)
+    QTest.mouseClick(library.own, LEFT)
+    choose(window, shared)
+    assert may_change_chosen(window)
+    QTest.mouseClick(library.training, LEFT)
+    assert library.chosen is None
+    assert not may_change_chosen(window)
+    choose(window, shared)
+    assert not may_change_chosen(window)
+    QTest.keyClick(window, Qt.Key.Key_Delete, CONTROL)
+    QTest.keyClick(window, Qt.Key.Key_F2)
+    assert own_names(window) == [shared]
+    QTest.mouseClick(library.own, LEFT)
+    choose(window, shared)
+    QTest.keyClick(window, Qt.Key.Key_Delete, CONTROL)
+    assert own_names(window) == []
+    assert not may_change_chosen(window)
+
+
+def test_a_kept_pose_is_chosen_and_stays_so_when_others_go(window: MainWindow) -> None:
+    document, library = window.document, window.library
+
+    def name_it(name: str) -> None:
+        asked = answer(lambda dialog: _enter(dialog, name))
+        window.actions_by_key["keep"].trigger()
+        assert not asked.isActive()
+
+    choose(window, document.model.pose_names[0])
+    for name in ("first", "second"):
+        name_it(name)
+        assert library.chosen_own is not None
+        assert library.chosen_own.name == name
+        assert may_change_chosen(window)
+    document.remove_pose_from_library("first")
+    assert library.chosen_own.name == "second"
+    asked = answer(lambda dialog: _enter(dialog, "third"))
+    window.actions_by_key["rename"].trigger()
+    assert not asked.isActive()
+    assert own_names(window) == ["third"]
+    assert library.chosen_own.name == "third"
+
+
+def _enter(dialog: object, text: str) -> None:
+    assert isinstance(dialog, QInputDialog)
+    dialog.setTextValue(text)
+    dialog.accept()
+
+
+def is_drawn(icon: QIcon) -> bool:
+    picture = icon.pixmap(THUMBNAIL).toImage()
+    return picture.pixelColor(picture.rect().center()).alpha() > 0
+
+
+def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_is_seen(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    library = window.library
+    items = [library.list.item(row) for row in range(library.list.count())]
+    window.docks["library"].hide()
+    library.allow_pictures()
+    qtbot.waitUntil(lambda: not library._due.isActive(), timeout=PATIENCE)
+    assert not any(is_drawn(item.icon()) for item in items)
+    window.docks["library"].show()
+    qtbot.waitUntil(lambda: is_drawn(items[0].icon()), timeout=PATIENCE)
