@@ -210,8 +210,9 @@ class PoseDocument(PoseHistory):
 
     def code_name(self, index: int) -> str:
         """Return what a person would call one number of the latent."""
-        names = [name for group in self.model.latent_space.groups for name in group.code_names]
-        return names[index]
+        groups = self.model.latent_space.groups
+        group = next(group for group in groups if index < group.codes.stop)
+        return group.full_name(index - group.codes.start)
 
     def set_locked(self, domain: int, locked: bool) -> None:
         """Lock a domain against Resolve, Randomise and Reset all, or let it go."""

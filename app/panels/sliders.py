@@ -149,14 +149,16 @@ class SliderGroup(QWidget):
         self.header.setChecked(is_open)
 
     def show_matching(self, words: str) -> None:
-        """Show only rows whose name holds the words; all where the group's own name does."""
+        """Show only rows whose name, with that of their group, holds all of the words."""
         if not words:
             self.setVisible(True)
             for row in self.rows:
                 row.setVisible(True)
             return
-        in_name = words in self._group.name.casefold()
-        hits = [in_name or words in name.casefold() for name in self._group.code_names]
+        hits = []
+        for place in range(len(self._group.code_names)):
+            name = f"{self._group.name} {self._group.full_name(place)}".casefold()
+            hits.append(all(word in name for word in words.split()))
         self.setVisible(any(hits))
         if any(hits):
             self.set_open(True)
@@ -164,10 +166,9 @@ class SliderGroup(QWidget):
                 row.setVisible(hit)
 
     def _make_rows(self) -> None:
-        from lcollision_core.labels.box import BOX_SCALE
-
         document = self._panel.document
         space = document.model.latent_space
+        low, high = space.low.tolist(), space.high.tolist()
         colours = document.model.domain_colours
         for place, name in enumerate(self._group.code_names):
             code = self._group.codes.start + place
@@ -175,10 +176,10 @@ class SliderGroup(QWidget):
             domain = place if self._domain is None else self._domain
             row = CodeRow(
                 code,
-                heading(name) if self._domain is None else f"Motion {place + 1}",
+                heading(name),
                 domain,
-                BOX_SCALE * float(space.minimum[code]),
-                BOX_SCALE * float(space.maximum[code]),
+                low[code],
+                high[code],
                 colours[domain],
             )
             row.show_number(float(document.latent[code]))

@@ -21,13 +21,19 @@ class LatentGroup:
     name : "Whole body", or the domain's name
     colour : "#rrggbb" of the domain, None for the whole body
     codes : where the group stands in the latent
-    code_names : one for each code; those of the whole body are the domains that they move most
+    code_names : what each code is called within the group: for the whole body the domain that it
+        moves most, for a domain "motion 1" and so on
     """
 
     name: str
     colour: str | None
     codes: slice
     code_names: tuple[str, ...]
+
+    def full_name(self, place: int) -> str:
+        """Return what the group's code at a place is called among all, as in "arm, motion 3"."""
+        name = self.code_names[place]
+        return name if self.colour is None else f"{self.name}, {name}"
 
 
 @dataclass(frozen=True)
@@ -50,12 +56,22 @@ class LatentSpace:
         """D, the number of codes."""
         return len(self.minimum)
 
+    @property
+    def low(self) -> npt.NDArray[np.float64]:
+        """(D,) array, the lower end of the box that is sampled: `BOX_SCALE` times the minimum."""
+        return BOX_SCALE * self.minimum
+
+    @property
+    def high(self) -> npt.NDArray[np.float64]:
+        """(D,) array, the upper end of that box."""
+        return BOX_SCALE * self.maximum
+
     def sample(self, n_poses: int, generator: np.random.Generator) -> npt.NDArray[np.float64]:
-        """Draw poses uniformly from the box of `BOX_SCALE` times the training range.
+        """Draw poses uniformly from the box between `low` and `high`.
 
         Returns
         -------
         latent : (n_poses, D) float64 array
         """
-        low, high = BOX_SCALE * self.minimum, BOX_SCALE * self.maximum
+        low, high = self.low, self.high
         return low + (high - low) * generator.random((n_poses, self.size))

@@ -419,7 +419,7 @@ class PoseModel:
             code_names = (
                 self.domain_names
                 if colour is None
-                else tuple(f"{name} {code + 1}" for code in range(size))
+                else tuple(f"motion {code + 1}" for code in range(size))
             )
             groups.append(LatentGroup(name, colour, slice(start, start + size), code_names))
             start += size

@@ -9,12 +9,13 @@ import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QIcon
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QInputDialog
+from PySide6.QtWidgets import QInputDialog, QLabel
 from pytestqt.qtbot import QtBot
 
 from app.document import PoseDocument
 from app.main_window import MainWindow
 from app.panels.library import THUMBNAIL
+from app.panels.wording import heading
 from tests.app.windows import PATIENCE, answer, close_window, is_open, open_window, settings_in
 
 CONTROL, LEFT = Qt.KeyboardModifier.ControlModifier, Qt.MouseButton.LeftButton
@@ -115,3 +116,33 @@ def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_i
     assert not any(is_drawn(item.icon()) for item in items)
     window.docks["library"].show()
     qtbot.waitUntil(lambda: is_drawn(items[0].icon()), timeout=PATIENCE)
+
+
+def shown_codes(window: MainWindow) -> list[int]:
+    rows = [row for group in window.sliders.groups for row in group.rows]
+    return [row.code for row in rows if row.isVisible()]
+
+
+def test_a_slider_is_found_by_what_its_row_and_undo_call_it(window: MainWindow) -> None:
+    document, panel = window.document, window.sliders
+    space = document.model.latent_space
+    group = space.groups[2]
+    code = group.codes.start + 2
+    name = document.code_name(code)
+    assert name == f"{group.name}, motion 3"
+    row = panel.row_of(code)
+    assert "Motion 3" in [label.text() for label in row.findChildren(QLabel)]
+    QTest.keyClick(row.slider, Qt.Key.Key_Right)
+    assert document.undo_stack.undoText() == f"Move {name}"
+    whole, parts = space.groups[0].codes, range(space.groups[1].codes.start, space.size)
+    for words, codes in (
+        (name, [code]),
+        (f"{group.name} 3", [code]),
+        ("motion", list(parts)),
+        ("Whole body", list(range(whole.start, whole.stop))),
+        ("knuckle", []),
+        ("", list(range(space.size))),
+    ):
+        panel.filter.setText(words)
+        assert shown_codes(window) == codes
+    assert panel.row_of(0).slider.accessibleName() == heading(space.groups[0].code_names[0])

@@ -159,13 +159,17 @@ def test_latent_space_names_every_code_and_straddles_zero(model: PoseModel) -> N
     for group in space.groups:
         assert len(group.code_names) == group.codes.stop - group.codes.start
     assert space.groups[0].code_names == model.domain_names
+    assert space.groups[0].full_name(1) == model.domain_names[1]
+    assert space.groups[1].full_name(2) == f"{model.domain_names[0]}, motion 3"
     assert (space.minimum < 0).all()
     assert (space.maximum > 0).all()
     assert (model.training_latent >= space.minimum).all()
     assert (model.training_latent <= space.maximum).all()
     sampled = _box(model, 2000)
-    assert (sampled >= BOX_SCALE * space.minimum).all()
-    assert (sampled <= BOX_SCALE * space.maximum).all()
+    assert np.array_equal(space.low, BOX_SCALE * space.minimum)
+    assert np.array_equal(space.high, BOX_SCALE * space.maximum)
+    assert (sampled >= space.low).all()
+    assert (sampled <= space.high).all()
     assert (sampled.min(axis=0) < 1.15 * space.minimum).all()
     assert (sampled.max(axis=0) > 1.15 * space.maximum).all()
 
