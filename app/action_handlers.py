@@ -57,7 +57,7 @@ class ActionHandlers(QObject):
             "filter": self._find_slider,
             "unlock": self._unlock,
             "resolve": self._resolve,
-            "cancel": document.cancel_all,
+            "cancel": self._cancel,
             "resolve_options": self.choose_resolve_options,
             "keep": self.keep_pose,
             "load": library.load_chosen,
@@ -110,6 +110,10 @@ class ActionHandlers(QObject):
                 time_budget=settings["resolve_time_budget"],
             )
         )
+
+    def _cancel(self) -> None:
+        self._document.cancel_all()
+        self._window.viewport.pictures.cancel()
 
     def _rename(self) -> None:
         library = self._window.library

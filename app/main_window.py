@@ -315,7 +315,7 @@ class MainWindow(QMainWindow):
             self.statusBar().addPermanentWidget(widget)
         self.statusBar().setSizeGripEnabled(False)
         self.statusBar().setContentsMargins(NORMAL, 0, NORMAL, 0)
-        self._on_busy("")
+        self._on_busy()
 
     def _connect(self) -> None:
         document = self.document
@@ -338,6 +338,7 @@ class MainWindow(QMainWindow):
         document.solve_started.connect(self._update_actions)
         document.solve_finished.connect(self._update_actions)
         document.busy_changed.connect(self._on_busy)
+        self.viewport.pictures.busy_changed.connect(self._on_busy)
         document.message.connect(self._on_message)
         document.failed.connect(self.show_failure)
         stack = document.undo_stack
@@ -404,7 +405,7 @@ class MainWindow(QMainWindow):
             "unlock": bool(document.locked_domains),
             "resolve": document.can_resolve and not document.solving,
             "resolve_options": document.can_resolve,
-            "cancel": bool(document.busy),
+            "cancel": bool(self._busy),
             "load": self.library.chosen is not None,
             "rename": own_chosen,
             "remove": own_chosen,
@@ -432,8 +433,14 @@ class MainWindow(QMainWindow):
             self.actions_by_key["ghost"].setChecked(self.document.ghost_shown)
         self.settings["show_ghost"] = self.document.ghost_shown
 
-    @Slot(str)
-    def _on_busy(self, work: str) -> None:
+    @property
+    def _busy(self) -> str:
+        """What is being done that can be cancelled, or "" where there is nothing."""
+        return self.document.busy or self.viewport.pictures.busy
+
+    @Slot()
+    def _on_busy(self) -> None:
+        work = self._busy
         self._busy_text.setText(f"{work}…" if work else "")
         for widget in (self._busy_text, self._busy_bar):
             widget.setVisible(bool(work))

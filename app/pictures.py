@@ -6,8 +6,9 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QObject, Slot
+from PySide6.QtCore import QObject, Signal, Slot
 
+from app.engine import Failure
 from app.rendering import PoseRenderer
 from app.theme import current_theme
 from app.turntable import Turntable
@@ -24,12 +25,24 @@ class Pictures(QObject):
     ----------
     document : whose mesh the scene shows; tells the user what has been saved
     parent : of the object
+
+    Signals
+    -------
+    busy_changed : `busy` may be another
     """
+
+    busy_changed = Signal()
 
     def __init__(self, document: PoseDocument, parent: QObject) -> None:
         super().__init__(parent)
         self._document = document
         self._film: Turntable | None = None
+
+    @property
+    def busy(self) -> str:
+        """Which film is being made, or "" where none is."""
+        film = self._film
+        return f"Filming {film.path.name}" if film is not None and film.is_running else ""
 
     def screenshot(
         self,
@@ -55,8 +68,14 @@ class Pictures(QObject):
         self._film = Turntable(renderer, scene.view, Path(path), seconds, self)
         self._film.progressed.connect(self._on_progressed)
         self._film.finished.connect(self._on_finished)
-        self._film.failed.connect(self._document.failed)
+        self._film.failed.connect(self._on_failed)
+        self.busy_changed.emit()
         return self._film
+
+    def cancel(self) -> None:
+        """Give up the film that is being made."""
+        if self._film is not None:
+            self._film.cancel()
 
     def stop(self) -> None:
         """Cancel a film that is being drawn, and wait for one that is being packed."""
@@ -64,6 +83,7 @@ class Pictures(QObject):
             self._film.wait()
             self._film.deleteLater()
             self._film = None
+            self.busy_changed.emit()
 
     def _copy(self, scene: Scene, width: int, height: int, transparent: bool) -> PoseRenderer:
         renderer = PoseRenderer(
@@ -80,3 +100,9 @@ class Pictures(QObject):
     def _on_finished(self, path: Path | None) -> None:
         words = f"Saved {path.name}" if path is not None else "The turntable was cancelled"
         self._document.message.emit(words)
+        self.busy_changed.emit()
+
+    @Slot(object)
+    def _on_failed(self, failure: Failure) -> None:
+        self._document.failed.emit(failure)
+        self.busy_changed.emit()

@@ -46,7 +46,7 @@ SETTINGS: dict[str, Setting] = {
     "screenshot_width": Setting(1920, 16, 16384),
     "screenshot_height": Setting(1080, 16, 16384),
     "screenshot_transparent": Setting(True),
-    "turntable_seconds": Setting(4.0, 0.5, 60.0),
+    "turntable_seconds": Setting(4.0, 0.5, 20.0),
 }
 """All settings by key; `Settings` refuses any other key."""
 

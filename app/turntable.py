@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import traceback
 from pathlib import Path
 from threading import Thread
@@ -12,12 +13,15 @@ from PySide6.QtCore import QObject, QTimer, Signal, Slot
 
 from app.camera import View, turned
 from app.engine import Failure
-from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
+from lcollision_core.jobs import CancelToken
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
     from app.rendering import PoseRenderer
+
+_log = logging.getLogger(__name__)
 
 FILMS = (".gif", ".webp")
 """What a film may be called; a GIF has 256 colours, a WebP all of them."""
@@ -41,7 +45,7 @@ class Turntable(QObject):
     -------
     progressed : int, int, the frames that are drawn and all frames
     finished : Path of the film, or None where it was cancelled
-    failed : Failure
+    failed : Failure; no film is written then
 
     Raises
     ------
@@ -69,7 +73,8 @@ class Turntable(QObject):
             )
         self._renderer: PoseRenderer | None = renderer
         self._view = view
-        self._path = path
+        self.path = path
+        self._cancel = CancelToken()
         self._frames: list[Image] = []
         self.n_frames = max(2, round(seconds / FRAME_SECONDS))
         self._packer: Thread | None = None
@@ -86,71 +91,95 @@ class Turntable(QObject):
 
     @Slot()
     def cancel(self) -> None:
-        """Stop drawing; a film that is being packed already is finished all the same."""
+        """Stop drawing; a film that is being packed already is thrown away once it is."""
+        self._cancel.cancel()
         if self._next.isActive():
             self._stop_drawing()
-            self._frames = []
             self.finished.emit(None)
 
     def wait(self) -> None:
-        """Cancel, and wait for a film that is being packed."""
-        self.cancel()
+        """Stop drawing, or wait for a film that is being packed already."""
+        if self._next.isActive():
+            self.cancel()
         if self._packer is not None:
             self._packer.join()
 
     @Slot()
     def _on_next(self) -> None:
+        try:
+            self._draw_next()
+        except Exception as error:
+            self._stop_drawing()
+            self.failed.emit(self._failure(error))
+            return
+        self.progressed.emit(len(self._frames), self.n_frames)
+        if len(self._frames) == self.n_frames:
+            frames = self._frames
+            self._stop_drawing()
+            self._packer = Thread(target=self._pack, args=(frames,), name="turntable")
+            self._packer.start()
+
+    def _draw_next(self) -> None:
         from PIL import Image
 
         assert self._renderer is not None
         angle = 2.0 * np.pi * len(self._frames) / self.n_frames
         self._renderer.scene.view = turned(self._view, angle)
         picture = Image.fromarray(np.ascontiguousarray(self._renderer.drawn()[:, :, :3]))
-        if self._path.suffix.lower() == ".gif":
+        if self.path.suffix.lower() == ".gif":
             # One palette for all frames: colours of their own would flicker.
             palette = (
                 self._frames[0] if self._frames else picture.quantize(dither=Image.Dither.NONE)
             )
             picture = picture.quantize(palette=palette, dither=Image.Dither.NONE)
         self._frames.append(picture)
-        self.progressed.emit(len(self._frames), self.n_frames)
-        if len(self._frames) == self.n_frames:
-            self._stop_drawing()
-            self._packer = Thread(target=self._pack, name="turntable")
-            self._packer.start()
 
     def _stop_drawing(self) -> None:
         self._next.stop()
+        self._frames = []
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
 
-    def _pack(self) -> None:
+    def _pack(self, frames: list[Image]) -> None:
         from lcollision_core.meshes import atomic_write
 
         try:
-            with atomic_write(self._path) as file:
-                self._frames[0].save(
+            with atomic_write(self.path) as file:
+                frames[0].save(
                     file,
-                    format=self._path.suffix[1:].upper(),
+                    format=self.path.suffix[1:].upper(),
                     save_all=True,
-                    append_images=self._frames[1:],
+                    append_images=frames[1:],
                     duration=round(1000 * FRAME_SECONDS),
                     loop=0,
                     optimize=False,
                 )
-        except LCollisionError as error:
-            self._packed.emit(Failure(str(error), traceback.format_exc()))
-        else:
+                self._cancel.raise_if_cancelled()
+        except CancelledError:
             self._packed.emit(None)
+        except Exception as error:
+            self._packed.emit(self._failure(error))
+        else:
+            self._packed.emit(self.path)
+
+    def _failure(self, error: Exception) -> Failure:
+        """Tell of what was raised, while it is handled."""
+        if isinstance(error, LCollisionError):
+            return Failure(str(error), traceback.format_exc())
+        _log.exception("no film")
+        return Failure(
+            f"the turntable {self.path.name} could not be made; try a shorter turn or another "
+            f"kind of file ({' or '.join(FILMS)})",
+            traceback.format_exc(),
+        )
 
     @Slot(object)
-    def _on_packed(self, failure: Failure | None) -> None:
+    def _on_packed(self, outcome: Path | Failure | None) -> None:
         if self._packer is not None:
             self._packer.join()
             self._packer = None
-        self._frames = []
-        if failure is not None:
-            self.failed.emit(failure)
+        if isinstance(outcome, Failure):
+            self.failed.emit(outcome)
         else:
-            self.finished.emit(self._path)
+            self.finished.emit(outcome)

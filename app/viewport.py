@@ -93,7 +93,7 @@ class Viewport(QWidget):
         self._glide.moved.connect(self._on_glided)
         self._turn = CameraTurn(self)
         self._turn.moved.connect(self._on_turned)
-        self._pictures = Pictures(document, self)
+        self.pictures = Pictures(document, self)
         # VTK takes a second to import: meanwhile the window is alive.
         self._importer = Thread(target=import_module, args=("app.canvas",), name="import VTK")
         self._importer.start()
@@ -245,7 +245,7 @@ class Viewport(QWidget):
         ------
         MeshFileError : the file cannot be written.
         """
-        self._pictures.screenshot(self._scene_now(), path, width, height, transparent)
+        self.pictures.screenshot(self._scene_now(), path, width, height, transparent)
 
     def turntable(
         self,
@@ -266,7 +266,7 @@ class Viewport(QWidget):
         ------
         MeshFileError : `path` has another extension.
         """
-        return self._pictures.turntable(self._scene_now(), path, seconds, width, height)
+        return self.pictures.turntable(self._scene_now(), path, seconds, width, height)
 
     def _scene_now(self) -> Scene:
         """Return the scene with what waits for the next picture on the screen."""
@@ -281,7 +281,7 @@ class Viewport(QWidget):
         self._turn.stop()
         self.waiting.stop()
         self._importer.join()
-        self._pictures.stop()
+        self.pictures.stop()
         if self._canvas is not None:
             self._canvas.shut_down()
             self._layout.removeWidget(self._canvas)

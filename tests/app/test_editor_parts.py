@@ -60,6 +60,8 @@ def test_every_setting_has_its_default_and_comes_back(store: QSettings) -> None:
         ("randomise_amount", "many"),
         ("randomise_amount", 17.0),
         ("screenshot_width", -5),
+        # As an older version allowed: more frames than memory may hold.
+        ("turntable_seconds", 60.0),
     ],
 )
 def test_what_cannot_be_reads_as_the_default(store: QSettings, key: str, value: object) -> None:

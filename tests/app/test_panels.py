@@ -118,6 +118,27 @@ def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_i
     qtbot.waitUntil(lambda: is_drawn(items[0].icon()), timeout=PATIENCE)
 
 
+def test_escape_stops_a_turntable_that_the_status_bar_tells_of(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    cancel = window.actions_by_key["cancel"]
+    assert not cancel.isEnabled()
+    film = window.viewport.turntable(tmp_path / "turn.gif", width=60, height=60)
+    assert cancel.isEnabled()
+    assert "Filming turn.gif…" in told_as_busy(window)
+    with qtbot.waitSignal(film.finished, timeout=PATIENCE) as finished:
+        QTest.keyClick(window, Qt.Key.Key_Escape)
+    assert finished.args == [None]
+    assert not cancel.isEnabled()
+    assert told_as_busy(window) == []
+    assert not list(tmp_path.glob("*turn*"))
+
+
+def told_as_busy(window: MainWindow) -> list[str]:
+    labels = window.statusBar().findChildren(QLabel)
+    return [label.text() for label in labels if label.isVisible() and label.text().endswith("…")]
+
+
 def shown_codes(window: MainWindow) -> list[int]:
     rows = [row for group in window.sliders.groups for row in group.rows]
     return [row.code for row in rows if row.isVisible()]

@@ -22,6 +22,7 @@ from app.canvas import Canvas
 from app.document import PoseDocument
 from app.engine import Failure
 from app.legend import LegendCard
+from app.rendering import PoseRenderer
 from app.shading import Shading, rgb
 from app.theme import DARK, LIGHT, apply_theme
 from app.viewport import Viewport
@@ -470,6 +471,60 @@ def test_a_cancelled_turntable_leaves_no_file(
         film.cancel()
     assert finished.args == [None]
     assert not film.is_running
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
+    qtbot: QtBot, viewport: Viewport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save, cancelled = Image.Image.save, threading.Event()
+
+    def save_slowly(*arguments: object, **options: object) -> None:
+        save(*arguments, **options)
+        assert cancelled.wait(20.0)
+
+    monkeypatch.setattr(Image.Image, "save", save_slowly)
+    film = viewport.turntable(tmp_path / "turn.gif", seconds=0.08, width=60, height=60)
+    qtbot.waitUntil(lambda: film._packer is not None, timeout=20_000)
+    with qtbot.waitSignal(film.finished, timeout=20_000) as finished:
+        film.cancel()
+        cancelled.set()
+    assert finished.args == [None]
+    assert not film.is_running
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("owner", "act", "error"),
+    [
+        (PoseRenderer, "drawn", MemoryError("no room for a picture")),
+        (Image.Image, "save", KeyError("WEBP")),
+    ],
+    ids=["drawing", "packing"],
+)
+def test_a_turntable_that_fails_ends_and_tells_so_once(
+    qtbot: QtBot,
+    document: PoseDocument,
+    viewport: Viewport,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    owner: type,
+    act: str,
+    error: Exception,
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(owner, act, fail)
+    told: list[Failure] = []
+    document.failed.connect(told.append)
+    film = viewport.turntable(tmp_path / "turn.webp", seconds=0.08, width=60, height=60)
+    assert "turn.webp" in viewport.pictures.busy
+    qtbot.waitUntil(lambda: not film.is_running, timeout=20_000)
+    (failure,) = told
+    assert "turn.webp could not be made; try" in failure.sentence
+    assert type(error).__name__ in failure.details
+    assert viewport.pictures.busy == ""
     assert list(tmp_path.iterdir()) == []
 
 
