@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from PySide6.QtGui import QSurfaceFormat
+    from PySide6.QtWidgets import QApplication
+
+    from app.settings import Settings
 
 _NO_DISPLAY = (
     "lcollision: there is no display to open a window on ({reason}); on a machine without one use "
@@ -124,17 +127,12 @@ def _surface_format() -> QSurfaceFormat:
     return wanted
 
 
-def _run(path: Path | None, model_name: str | None) -> int:
+def make_application(settings: Settings) -> QApplication:
+    """Make the editor's application, before its first window and its first thread."""
     from PySide6.QtGui import QSurfaceFormat
     from PySide6.QtWidgets import QApplication
 
-    from app.document import PoseDocument
-    from app.engine import any_unfinished
-    from app.log import start_logging
-    from app.main_window import MainWindow
     from app.memory import keep_memory_small
-    from app.settings import Settings
-    from app.start_up import StartUp
     from app.theme import apply_theme, wanted_theme
 
     keep_memory_small()
@@ -143,8 +141,20 @@ def _run(path: Path | None, model_name: str | None) -> int:
     application.setApplicationName("lcollision")
     application.setApplicationDisplayName("LCollision")
     application.setDesktopFileName("lcollision")
-    settings = Settings()
     apply_theme(application, wanted_theme(settings["theme"]))
+    return application
+
+
+def _run(path: Path | None, model_name: str | None) -> int:
+    from app.document import PoseDocument
+    from app.engine import any_unfinished
+    from app.log import start_logging
+    from app.main_window import MainWindow
+    from app.settings import Settings
+    from app.start_up import StartUp
+
+    settings = Settings()
+    application = make_application(settings)
     window = MainWindow(PoseDocument(), settings)
     start_logging(window.show_failure)
     window.show()

@@ -16,9 +16,13 @@ from typing import Any
 from app.editor import why_no_window
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Progress, no_progress
+from lcollision_core.model import find_model
 
 _STARTS = 3
 """Runs for each model: the first fills the caches, the last is the one that is measured."""
+
+_MOST_SECONDS, _MOST_SECONDS_AN_ACTION = 900.0, 10.0
+"""After which an editor is taken to hang: many times what a slow machine needs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +79,11 @@ def time_editor(
 
     Raises
     ------
-    LCollisionError : no window can be opened here, or an editor ended early.
+    LCollisionError : a model is not there, no window can be opened here, or an editor ended early
+        or hangs.
     """
+    for model in models:
+        find_model(model)
     reason = why_no_window(os.environ, sys.platform)
     if reason is not None:
         raise LCollisionError(
@@ -102,14 +109,21 @@ def _run(model: str, n_actions: int) -> dict[str, Any]:
             "XDG_STATE_HOME": str(Path(folder, "state")),
         }
         started = time.time()
-        ended = subprocess.run(
-            [sys.executable, "-m", "app.benchmarks.editor_session", model, str(n_actions)]
-            + [repr(started)],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        try:
+            ended = subprocess.run(
+                [sys.executable, "-m", "app.benchmarks.editor_session", model, str(n_actions)]
+                + [repr(started)],
+                env=environment,
+                capture_output=True,
+                text=True,
+                check=False,
+                timeout=_MOST_SECONDS + _MOST_SECONDS_AN_ACTION * max(n_actions, 0),
+            )
+        except subprocess.TimeoutExpired as error:
+            raise LCollisionError(
+                f"the editor hangs on {model}: no answer in {error.timeout:.0f} s; start it with "
+                f"`lcollision edit --model {model}` to see why"
+            ) from error
     try:
         answer = json.loads(ended.stdout.splitlines()[-1])
     except (IndexError, ValueError) as error:

@@ -16,18 +16,18 @@ from typing import Any
 
 import numpy as np
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
-from PySide6.QtWidgets import QApplication
 
+from app.benchmarks.timing import median_seconds
 from app.camera import CAMERAS
 from app.cli import main  # noqa: F401 - what the command would have loaded by then
 from app.document import PoseDocument
+from app.editor import make_application
 from app.engine import Failure
 from app.main_window import MainWindow
-from app.memory import keep_memory_small
 from app.settings import Settings
 from app.shading import Shading
 from app.start_up import StartUp
-from app.theme import apply_theme, wanted_theme
+from lcollision_core.errors import LCollisionError
 
 _EVENTS = 60
 _BURST_EVENTS, _BURST_SECONDS = 250, 2.0
@@ -236,11 +236,12 @@ class Session(QObject):
         model, latent = self._document.model, self._document.latent
         predict = None
         if model.predictor is not None:
-            predict = 1e3 * _median_seconds(lambda: model.predict(latent))
+            predict = 1e3 * median_seconds([lambda: model.predict(latent)] * _REPEATS)
+        decode = median_seconds([lambda: model.decode(latent, n_threads=1)] * _REPEATS)
         return {
             "model": model.name,
             "vertices": model.n_vertices,
-            "decode_ms": 1e3 * _median_seconds(lambda: model.decode(latent, n_threads=1)),
+            "decode_ms": 1e3 * decode,
             "predict_ms": predict,
         }
 
@@ -316,13 +317,23 @@ def memory_mb(peak: bool = False) -> float:
     return int(lines["VmHWM" if peak else "VmRSS"].split()[0]) / 1e3
 
 
-def _median_seconds(work: Callable[[], object]) -> float:
-    seconds = []
-    for _ in range(_REPEATS):
-        start = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)
+def show_first_pose(window: MainWindow, model: str) -> None:
+    """Show a window and wait until it shows the first pose of a model.
+
+    Raises
+    ------
+    LCollisionError : the model cannot be opened.
+    """
+    loop = QEventLoop()
+    failures: list[Failure] = []
+    window.ready.connect(loop.quit)
+    window.document.failed.connect(failures.append)
+    window.document.failed.connect(loop.quit)
+    window.show()
+    StartUp(window, None, model).begin()
+    loop.exec()
+    if failures:
+        raise LCollisionError(failures[0].sentence)
 
 
 def run(model: str, n_actions: int, started: float) -> None:
@@ -332,16 +343,15 @@ def run(model: str, n_actions: int, started: float) -> None:
     ----------
     started : when the command was given, in seconds since 1970
     """
-    keep_memory_small()
-    application = QApplication(sys.argv[:1])
     settings = Settings()
-    apply_theme(application, wanted_theme(settings["theme"]))
+    # Qt needs it for as long as there is a window.
+    _application = make_application(settings)
     window = MainWindow(PoseDocument(), settings)
-    loop = QEventLoop()
-    window.ready.connect(loop.quit)
-    window.show()
-    StartUp(window, None, model).begin()
-    loop.exec()
+    try:
+        show_first_pose(window, model)
+    except LCollisionError as error:
+        window.close_unasked()
+        sys.exit(str(error))
     answer: dict[str, Any] = {"start_seconds": time.time() - started}
     session = Session(window)
     if n_actions >= 0:

@@ -8,9 +8,7 @@ few poses and one core, and its time is scaled as if it spread over all cores wi
 
 from __future__ import annotations
 
-import statistics
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.benchmarks.detection import contacts_of_fcl, missing_peers
+from app.benchmarks.timing import median_seconds
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.labels import ROWS_A_BLOCK, LatentBox
@@ -151,7 +150,7 @@ def _time_exact(
     fcl = None
     if "python-fcl" not in missing_peers():
         faces = np.asarray(model.faces)
-        fcl = _median_seconds([partial(contacts_of_fcl, pose, faces) for pose in first[:FCL_POSES]])
+        fcl = median_seconds([partial(contacts_of_fcl, pose, faces) for pose in first[:FCL_POSES]])
     count = len(latent)
     return _Exact(decode / count, check / count, n_colliding / count, fcl)
 
@@ -167,7 +166,7 @@ def _time_on(
 
     batch = latent[:BATCH]
     predictor.predict(batch)
-    predicted = _median_seconds([lambda: predictor.predict(batch)] * ROUNDS) / BATCH
+    predicted = median_seconds([lambda: predictor.predict(batch)] * ROUNDS) / BATCH
     began = time.perf_counter()
     for start in range(0, len(latent), BATCH):
         predictor.predict(latent[start : start + BATCH])
@@ -177,7 +176,7 @@ def _time_on(
     torch.set_num_threads(1)
     try:
         predictor.logit_and_gradient(one)
-        gradient = _median_seconds([lambda: predictor.logit_and_gradient(one)] * GRADIENT_ROUNDS)
+        gradient = median_seconds([lambda: predictor.logit_and_gradient(one)] * GRADIENT_ROUNDS)
     finally:
         torch.set_num_threads(n_threads)
     cores = available_cores()
@@ -214,13 +213,4 @@ def _gemm_rate(device: str) -> float:
         float((left @ left)[0, 0])
 
     multiply()
-    return 2.0 * GEMM_SIZE**3 / _median_seconds([multiply] * ROUNDS)
-
-
-def _median_seconds(calls: list[Callable[[], object]]) -> float:
-    seconds = []
-    for call in calls:
-        began = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - began)
-    return statistics.median(seconds)
+    return 2.0 * GEMM_SIZE**3 / median_seconds([multiply] * ROUNDS)

@@ -21,7 +21,7 @@ from PySide6.QtWidgets import QApplication, QDialog, QMenu, QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
 
 from app.benchmarks.editor import EditorTiming
-from app.benchmarks.editor_session import Session
+from app.benchmarks.editor_session import Session, show_first_pose
 from app.dialogs.failure import FailureDialog
 from app.document import PoseDocument
 from app.editor import why_no_window
@@ -31,6 +31,7 @@ from app.recovery import sessions_folder
 from app.shading import Shading
 from app.start_up import StartUp, opening_pose
 from app.theme import DARK, LIGHT, Theme, visible_colour
+from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import PoseModel
 from tests.app.support import Lcollision
@@ -493,6 +494,26 @@ def test_the_benchmark_measures_a_session_of_its_own(
     assert max(row["update_ms"], row["render_ms"]) <= row["event_p95_ms"]
     assert row["memory_mb"] > 100.0
     assert row["start_seconds"] > row["event_p50_ms"] / 1e3
+
+
+def test_the_benchmark_refuses_a_model_that_is_not_there(lcollision: Lcollision) -> None:
+    result = lcollision("benchmark", "editor", "--model", "nobody")
+    assert result.exit_code == 2
+    (sentence,) = result.stderr.splitlines()
+    assert "nobody" in sentence
+
+
+@pytest.mark.usefixtures("signals")
+def test_the_benchmark_ends_where_a_model_cannot_be_opened(home: Path) -> None:
+    broken = home / "broken.safetensors"
+    broken.write_text("garbage")
+    window = MainWindow(PoseDocument(), settings_in(home))
+    with pytest.raises(LCollisionError, match="broken"):
+        show_first_pose(window, str(broken))
+    # It looks out for signals until the process ends.
+    window.findChild(StartUp).setParent(None)
+    window.close_unasked()
+    dispose(window)
 
 
 @THEMES

@@ -1,0 +1,17 @@
+"""How long calls take."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterable
+
+
+def median_seconds(calls: Iterable[Callable[[], object]]) -> float:
+    """Make some calls, one after the other, and return the median of their durations."""
+    seconds = []
+    for call in calls:
+        began = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - began)
+    return statistics.median(seconds)
