@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from typing import TYPE_CHECKING
 
@@ -50,10 +49,8 @@ def draw_masks(model: PoseModel, path: str | os.PathLike[str]) -> None:
     for place, view in enumerate(views):
         picture.paste(Image.fromarray(view), (place * _VIEW_WIDTH, 0))
     picture.paste(legend, (0, _VIEW_HEIGHT))
-    encoded = io.BytesIO()
-    picture.save(encoded, format="PNG", optimize=True)
     with atomic_write(path) as file:
-        file.write(encoded.getbuffer())
+        picture.save(file, format="PNG", optimize=True)
 
 
 def _two_sides(

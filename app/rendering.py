@@ -1,17 +1,12 @@
-"""Pictures of poses, drawn off the screen: thumbnails, screenshots and turntables."""
+"""Pictures of poses, drawn off the screen: screenshots and turntables."""
 
 from __future__ import annotations
 
-import io
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-
-from app.camera import View, front_direction, preset_view
-from app.frames import PoseShower
-from app.shading import Shader, Shading
 
 if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
@@ -51,8 +46,6 @@ class PoseRenderer:
 
         # Without a display VTK warns of that, then draws all the same.
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
-        self._model = model
-        self._aspect = width / height
         self._transparent = transparent
         self._plotter = pv.Plotter(
             off_screen=True, window_size=(width, height), lighting="light kit"
@@ -67,37 +60,15 @@ class PoseRenderer:
         self.scene.show_floor(not transparent)
         if transparent:
             self.scene.set_plain_background(_NOTHING)
-        self._shower = PoseShower(model)
-        self._shader = Shader.of(model, dark)
-        self._front = front_direction(model.reference, model.up_axis)
 
-    def picture(
-        self,
-        vertices: npt.NDArray[Any],
-        colours: npt.NDArray[np.uint8] | None = None,
-        view: View | None = None,
-    ) -> ImageArray:
-        """Draw one pose.
-
-        Parameters
-        ----------
-        vertices : (V, 3) array, in the data's unit
-        colours : (V, 3) uint8 array; plain where None
-        view : the camera; three-quarter, round the whole pose, where None
+    def drawn(self) -> ImageArray:
+        """Draw the scene as it is.
 
         Returns
         -------
         pixels : (height, width, 4) uint8 array, red, green, blue and alpha, which is 255
             throughout unless `transparent`
         """
-        points = np.asarray(vertices, dtype=np.float32)
-        painted = self._shader.colours(Shading.PLAIN) if colours is None else colours
-        self.scene.show(points, self._shower.normals(points), painted)
-        self.scene.view = view or self.preset("Three-quarter", points)
-        return self.drawn()
-
-    def drawn(self) -> ImageArray:
-        """Draw the scene as it is; as `picture` returns it."""
         # Or else pyvista hands out the last picture again.
         self._plotter.render()
         pixels = np.asarray(
@@ -107,16 +78,6 @@ class PoseRenderer:
             return _uncovered(pixels)
         opaque = np.full((*pixels.shape[:2], 1), 255, dtype=np.uint8)
         return np.concatenate([pixels, opaque], axis=2)
-
-    def preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
-        """Return the preset camera that shows a whole pose.
-
-        Parameters
-        ----------
-        name : one of `app.camera.CAMERAS`
-        vertices : (V, 3) array
-        """
-        return preset_view(name, vertices, self._model.up_axis, self._front, self._aspect)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Draw the scene as it is into a file.
@@ -135,11 +96,9 @@ class PoseRenderer:
 
         pixels = self.drawn()
         picture = Image.fromarray(pixels if self._transparent else pixels[:, :, :3].copy())
-        encoded = io.BytesIO()
-        # Level 6, the default, takes seconds for a large picture and saves little.
-        picture.save(encoded, format="PNG", compress_level=3)
         with atomic_write(path) as file:
-            file.write(encoded.getbuffer())
+            # Level 6, the default, takes seconds for a large picture and saves little.
+            picture.save(file, format="PNG", compress_level=3)
 
     def close(self) -> None:
         """Free the picture's memory on the graphics card."""

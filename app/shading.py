@@ -53,7 +53,7 @@ _OKLAB_OF_LMS = np.array(
 
 
 class Shading(Enum):
-    """What the colours of the mesh say; the value is what a menu calls it."""
+    """What the colours of the mesh say; the value is what their legend calls it."""
 
     PLAIN = "Plain"
     DOMAINS = "Body parts"

@@ -239,9 +239,6 @@ QToolButton#segment[place="first"] {{
 QToolButton#segment[place="last"] {{
     border-top-right-radius: {RADIUS}px; border-bottom-right-radius: {RADIUS}px;
 }}
-QToolButton#header {{
-    border-radius: 4px; padding: 5px 4px; font-weight: 600; text-align: left;
-}}
 QMainWindow::separator {{ background: {theme.window}; width: 5px; height: 5px; }}
 QMainWindow::separator:hover {{ background: {theme.accent}; }}
 QDockWidget {{ font-weight: 600; titlebar-close-icon: none; }}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -132,7 +131,5 @@ def _font(size: int) -> Any:
 
 
 def _save(picture: Image.Image, path: str | os.PathLike[str]) -> None:
-    encoded = io.BytesIO()
-    picture.save(encoded, format="PNG", optimize=True)
     with atomic_write(path) as file:
-        file.write(encoded.getbuffer())
+        picture.save(file, format="PNG", optimize=True)

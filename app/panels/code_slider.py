@@ -92,9 +92,8 @@ class CodeRow(HoverRow):
 
     Signals
     -------
-    number_changed : float, by the user
-    number_typed : float, by the user, in the number's field
-    reset_wanted, drag_started, drag_ended, drag_abandoned : as of the slider
+    number_changed : int and float, the code and its number, by the slider or in the field
+    reset_wanted : int, the code
 
     Parameters
     ----------
