@@ -46,7 +46,7 @@ ACTIONS: dict[str, ActionSpec] = {
     "undo": ActionSpec("&Undo", "Ctrl+Z", "Take back the last change", "undo"),
     "redo": ActionSpec("&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Do again what was taken back", "redo"),
     "reset": ActionSpec("Reset &all", "Ctrl+Backspace", "All sliders back to zero", "reset"),
-    "randomise": ActionSpec("Ra&ndomise", "Ctrl+D", "Move towards a pose by chance", "random"),
+    "randomise": ActionSpec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),
     "mirror": ActionSpec("&Mirror", "Ctrl+M", "Exchange left and right", "mirror"),
     "filter": ActionSpec("&Find a slider", "Ctrl+F", "Type what a slider is called", "search"),
     "unlock": ActionSpec("Un&lock everything", "Ctrl+L", "Let all locked parts move again"),

@@ -128,7 +128,7 @@ class LiveWorker(QObject):
     @Slot(object)
     def answer(self, request: FrameRequest | VerdictRequest) -> None:
         """Answer one request, whatever happens."""
-        self._answer = _guarded(request.request_id, "following the pose", self._value, request)
+        self._answer = _guarded(request.request_id, "showing the pose", self._value, request)
         self._has_answered.set()
         self.answered.emit(request, self._answer)
 

@@ -135,10 +135,10 @@ def resolve_form(settings: Settings, parent: QWidget) -> Form:
     )
     form.add_number(
         "resolve_threshold",
-        "Free enough at",
-        " probability",
+        "Stop when a collision is less likely than",
+        "",
         0.05,
-        "A pose that collides less likely than this counts as predicted free",
+        "From 0, certainly free, to 1, certainly colliding; less is safer but moves the pose more",
     )
     form.add_number(
         "resolve_time_budget",

@@ -231,8 +231,8 @@ class PredictionCard(Card):
         self.percent = labelled("", "headline")
         self.meter = ProbabilityMeter()
         self._missing = QLabel(
-            "This model has not learnt to predict collisions, so Resolve is off. "
-            "“lcollision train predictor” teaches it."
+            "This model has not learnt to predict collisions, so Resolve is off. Open another "
+            "model, or teach this one with “lcollision train predictor” in a terminal."
         )
         self._missing.setObjectName("caption")
         self._missing.setWordWrap(True)
