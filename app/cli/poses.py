@@ -9,7 +9,7 @@ import typer
 
 from app.cli.console import note, progress_bar
 from app.cli.models import ModelArgument
-from app.cli.results import MeshFormat, require_output, write_result
+from app.cli.results import MeshFormat, output_form, require_output, write_result
 from lcollision_core.errors import PoseSetError
 
 PosesOutput = Annotated[
@@ -73,9 +73,10 @@ def decode(
     """Turn latent poses into meshes; one that came in as a mesh returns to its place."""
     from lcollision_core.model import PoseModel, read_poses
 
+    form = output_form(output)
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
-    write_result(output, model, named, mesh_format)
+    write_result(output, form, model, named, mesh_format)
     note(f"wrote {len(named)} poses to {output}")
 
 

@@ -24,6 +24,7 @@ from lcollision_core.resolve import (
     ResolveResult,
     Solver,
     Step,
+    exported_vertices,
     find_free_poses,
     largest_correction_change,
 )
@@ -345,7 +346,7 @@ def test_a_pose_that_came_as_a_mesh_is_checked_where_it_lies(
     for latent in colliding[:4]:
         resolver = resolver_of(tube_model, around_the_mean(latent, 0.5), free_latents)
         result = resolver.resolve(latent, placement=placement)
-        placed = placement.apply(tube_model.decode(result.latent)).astype(np.float32)
+        placed = exported_vertices(tube_model.decode(result.latent), placement)
         tolerance = DEPTH_TOLERANCE * tube_model.height
         assert len(all_pairs(placed.astype(np.float64), tube_model.faces, tolerance).pairs) == 0
         assert result.exactly_free
