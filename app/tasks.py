@@ -156,12 +156,12 @@ def encoded(model: PoseModel, path: Path) -> Work:
 
     def work(_: Progress, cancel: CancelToken) -> NamedPose:
         from lcollision_core.meshes import read_mesh
-        from lcollision_core.model import NamedPose
+        from lcollision_core.model import NamedPose, name_of_file
 
         mesh = read_mesh(path, topology=model.topology)
         model.require_topology(mesh.topology, str(path))
         cancel.raise_if_cancelled()
-        return NamedPose.of_mesh(path.stem, model.encode(mesh.vertices, cancel=cancel))
+        return NamedPose.of_mesh(name_of_file(path), model.encode(mesh.vertices, cancel=cancel))
 
     return work
 

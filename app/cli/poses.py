@@ -27,14 +27,14 @@ def encode(
 ) -> None:
     """Turn meshes into latent poses, and say how well each fits."""
     from lcollision_core.meshes import read_mesh
-    from lcollision_core.model import NamedPose, PoseModel, unique_names, write_poses
+    from lcollision_core.model import NamedPose, PoseModel, name_of_file, unique_names, write_poses
 
     require_output(output, ".json")
     model = PoseModel.load(model_name)
     files = [read_mesh(path, topology=model.topology) for path in meshes]
     for mesh in files:
         model.require_topology(mesh.topology, str(mesh.source))
-    names = unique_names(mesh.source.stem for mesh in files)
+    names = unique_names(name_of_file(mesh.source) for mesh in files)
     poses = []
     with progress_bar("Encoding meshes") as progress:
         for name, mesh in zip(names, files, strict=True):
