@@ -12,7 +12,14 @@ import typer
 from app.cli.console import ExitStatus, counted, note, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
-from app.cli.results import MeshFormat, OutputForm, output_form, require_one_mesh, write_result
+from app.cli.results import (
+    MeshFormat,
+    OutputForm,
+    note_near_exclusion,
+    output_form,
+    require_one_mesh,
+    write_result,
+)
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 
 if TYPE_CHECKING:
@@ -165,7 +172,7 @@ def resolve(
         raise
     _write(output, form, model, requests, finished, mesh_format, keep_detail)
     results = [finished[place] for place in range(len(requests))]
-    _report(requests, results, as_json)
+    _report(model, requests, results, as_json)
     if sequence:
         before = np.array([request.pose.latent for request in requests])
         change = largest_correction_change(model.embedding, before, results)
@@ -239,7 +246,7 @@ def _read(model: PoseModel, inputs: Sequence[Path]) -> tuple[list[_Request], boo
 
 def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
     from lcollision_core.meshes import read_mesh
-    from lcollision_core.model import NamedPose, read_poses
+    from lcollision_core.model import NamedPose, name_of_file, read_poses
 
     if path.suffix.lower() == ".json":
         poses = read_poses(path, model)
@@ -254,7 +261,7 @@ def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
         encoded = model.encode(mesh.vertices)
     except LCollisionError as error:
         raise MeshFileError(f"{path} cannot be encoded: {error}") from error
-    pose = NamedPose.of_mesh(path.stem, encoded)
+    pose = NamedPose.of_mesh(name_of_file(path), encoded)
     note(
         f"{path} is encoded with a fit error of {100.0 * encoded.fit_error_mean:.3f} % of the "
         f"height, at most {100.0 * encoded.fit_error_max:.2f} %"
@@ -301,17 +308,24 @@ def _detailed(
     return detailed
 
 
-def _report(requests: Sequence[_Request], results: Sequence[ResolveResult], as_json: bool) -> None:
+def _report(
+    model: PoseModel,
+    requests: Sequence[_Request],
+    results: Sequence[ResolveResult],
+    as_json: bool,
+) -> None:
     rows: list[dict[str, Any]] = []
     for request, result in zip(requests, results, strict=True):
         if result.note:
             note(f"{request.source}: {result.note}")
         facts = {name: getattr(result, name) for name in _FIELDS}
-        rows.append({"source": request.source} | facts)
+        rows.append({"source": request.source} | facts | {"near_exclusion": model.near_exclusion})
         if not as_json:
             typer.echo(f"{request.source}: {_sentence(result)}")
     if as_json:
         print_json(rows)
+    else:
+        note_near_exclusion(model)
 
 
 def _sentence(result: ResolveResult) -> str:

@@ -7,6 +7,7 @@ from enum import Enum, StrEnum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from app.cli.console import note
 from lcollision_core.errors import LCollisionError, MeshFileError
 
 if TYPE_CHECKING:
@@ -51,6 +52,15 @@ def require_output(path: Path, suffix: str) -> None:
     if path.suffix.lower() != suffix:
         raise LCollisionError(f"{path} cannot be written: it must be a {suffix} file; rename it")
     require_writable(path)
+
+
+def note_near_exclusion(model: PoseModel) -> None:
+    """Say which pairs of faces the figures beside this leave out, where there are any."""
+    if model.near_exclusion:
+        note(
+            f"pairs of faces within {model.near_exclusion:g} heights along the surface are folds "
+            f"of the skin, which are no collisions"
+        )
 
 
 def output_form(output: Path) -> OutputForm:

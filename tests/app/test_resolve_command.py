@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,7 @@ FIELDS = [
     "iterations",
     "evaluations",
     "seconds",
+    "near_exclusion",
 ]
 
 
@@ -198,6 +200,22 @@ def test_a_folder_takes_several(
     ]
     for file in out.iterdir():
         assert n_pairs(model, read_mesh(file).vertices) == 0
+
+
+def test_the_near_exclusion_is_stated(
+    lcollision: Lcollision, model: PoseModel, colliding: np.ndarray, tmp_path: Path
+) -> None:
+    path, poses, out = (tmp_path / name for name in ("m.safetensors", "poses.json", "free.json"))
+    near = PoseModel(model.name, model.embedding, replace(model.card, near_exclusion=0.05))
+    assert model.predictor is not None
+    near.with_predictor(model.predictor).with_free_poses(model.free_latent).save(path)
+    write_poses(poses, model, [NamedPose("bent", colliding[0])])
+    sentence = "pairs of faces within 0.05 heights along the surface are folds of the skin"
+    assert sentence in lcollision("resolve", path, poses, "-o", out).stderr
+    rows = json.loads(lcollision("resolve", path, poses, "-o", out, "--json").stdout)
+    assert [row["near_exclusion"] for row in rows] == [0.05]
+    options = ("--model", path, "-n", "1", "--solver", "sqp")
+    assert sentence in lcollision("benchmark", "resolve", *options).stderr
 
 
 def test_a_folder_is_one_whatever_it_is_called(
@@ -402,6 +420,7 @@ def test_benchmark_compares_the_solvers_with_bisection(
     assert list(rows[0]) == [
         *("solver", "poses", "median_ms", "p95_ms", "feasible_rate", "exactly_free_rate"),
         *("free_before_walk_back", "energy_decrease", "latent_distance", "vertex_distance"),
+        "near_exclusion",
     ]
     for row in rows:
         assert row["poses"] == 6
