@@ -350,7 +350,7 @@ class PoseDocument(PoseHistory):
         self.end_gesture()
         self.cancel_resolve()
         chosen = replace(options or ResolveOptions(), locked_domains=self._locked)
-        work = tasks.resolved(self.model, self.latent, chosen)
+        work = tasks.resolved(self.model, self.latent, self.placement, chosen)
         self._solve = self._long.start("Resolving", work, self._on_resolved, self._on_solve_failed)
         self.solve_started.emit()
 

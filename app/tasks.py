@@ -156,12 +156,12 @@ def encoded(model: PoseModel, path: Path) -> Work:
 
     def work(_: Progress, cancel: CancelToken) -> NamedPose:
         from lcollision_core.meshes import read_mesh
-        from lcollision_core.model import NamedPose
+        from lcollision_core.model import NamedPose, name_of_file
 
         mesh = read_mesh(path, topology=model.topology)
         model.require_topology(mesh.topology, str(path))
         cancel.raise_if_cancelled()
-        return NamedPose.of_mesh(path.stem, model.encode(mesh.vertices, cancel=cancel))
+        return NamedPose.of_mesh(name_of_file(path), model.encode(mesh.vertices, cancel=cancel))
 
     return work
 
@@ -187,20 +187,26 @@ def exported(
 
     def work(_: Progress, __: CancelToken) -> Path:
         from lcollision_core.meshes import write_mesh
+        from lcollision_core.resolve import exported_vertices
 
-        vertices = drawn_vertices(model, latent)
-        placed = vertices if placement is None else placement.apply(vertices).astype(np.float32)
-        write_mesh(path, placed, model.faces)
+        vertices = exported_vertices(model.decode(latent, n_threads=1), placement)
+        write_mesh(path, vertices, model.faces)
         return path
 
     return work
 
 
-def resolved(model: PoseModel, latent: FloatArray, options: ResolveOptions) -> Work:
-    """Find the nearest free pose."""
+def resolved(
+    model: PoseModel,
+    latent: FloatArray,
+    placement: RigidTransform | None,
+    options: ResolveOptions,
+) -> Work:
+    """Find the nearest pose that is free where it is exported to."""
 
     def work(progress: Progress, cancel: CancelToken) -> Resolved:
         ghost = drawn_vertices(model, latent)
-        return Resolved(model.resolve(latent, options, progress=progress, cancel=cancel), ghost)
+        result = model.resolve(latent, options, progress, cancel, placement=placement)
+        return Resolved(result, ghost)
 
     return work

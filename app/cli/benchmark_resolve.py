@@ -11,6 +11,7 @@ import typer
 
 from app.cli.console import note, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
+from app.cli.results import note_near_exclusion
 from lcollision_core.errors import LCollisionError, MeshFileError
 
 if TYPE_CHECKING:
@@ -78,9 +79,11 @@ def resolve(
     if figure is not None:
         _draw(figure, drawn)
     if as_json:
-        print_json([asdict(row) for row in rows])
+        near = {"near_exclusion": model.near_exclusion}
+        print_json([asdict(row) | near for row in rows])
         return
     _print(rows)
+    note_near_exclusion(model)
     note(_PAPER)
 
 

@@ -9,7 +9,7 @@ import typer
 
 from app.cli.console import note, progress_bar
 from app.cli.models import ModelArgument
-from app.cli.results import MeshFormat, require_output, write_result
+from app.cli.results import MeshFormat, output_form, require_output, write_result
 from lcollision_core.errors import PoseSetError
 
 PosesOutput = Annotated[
@@ -27,14 +27,14 @@ def encode(
 ) -> None:
     """Turn meshes into latent poses, and say how well each fits."""
     from lcollision_core.meshes import read_mesh
-    from lcollision_core.model import NamedPose, PoseModel, unique_names, write_poses
+    from lcollision_core.model import NamedPose, PoseModel, name_of_file, unique_names, write_poses
 
     require_output(output, ".json")
     model = PoseModel.load(model_name)
     files = [read_mesh(path, topology=model.topology) for path in meshes]
     for mesh in files:
         model.require_topology(mesh.topology, str(mesh.source))
-    names = unique_names(mesh.source.stem for mesh in files)
+    names = unique_names(name_of_file(mesh.source) for mesh in files)
     poses = []
     with progress_bar("Encoding meshes") as progress:
         for name, mesh in zip(names, files, strict=True):
@@ -73,9 +73,10 @@ def decode(
     """Turn latent poses into meshes; one that came in as a mesh returns to its place."""
     from lcollision_core.model import PoseModel, read_poses
 
+    form = output_form(output)
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
-    write_result(output, model, named, mesh_format)
+    write_result(output, form, model, named, mesh_format)
     note(f"wrote {len(named)} poses to {output}")
 
 

@@ -12,7 +12,14 @@ import typer
 from app.cli.console import ExitStatus, counted, note, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
-from app.cli.results import MeshFormat, write_result
+from app.cli.results import (
+    MeshFormat,
+    OutputForm,
+    note_near_exclusion,
+    output_form,
+    require_one_mesh,
+    write_result,
+)
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 
 if TYPE_CHECKING:
@@ -135,19 +142,16 @@ def resolve(
         seed=seed,
     )
     resolver = model.resolver
-    if keep_detail and output.suffix.lower() == ".json":
+    form = output_form(output)
+    if keep_detail and form is OutputForm.POSES:
         raise LCollisionError(
             f"{output} would hold codes, which have no room for --keep-detail; name a mesh or a "
             f"folder"
         )
-    _require_room(output)
     requests, failed = _read(model, inputs)
     if not requests:
         raise typer.Exit(ExitStatus.BAD_INPUT)
-    if len(requests) > 1 and output.suffix.lower() not in {"", ".json"} and not output.is_dir():
-        raise LCollisionError(
-            f"{output} is one mesh, but there are {len(requests)} poses; name a folder"
-        )
+    require_one_mesh(output, form, len(requests))
     finished: dict[int, ResolveResult] = {}
     try:
         with cancel_on_interrupt() as cancel, progress_bar("Resolving poses") as progress:
@@ -163,12 +167,12 @@ def resolve(
             )
     except LCollisionError:
         if finished:
-            _write(output, model, requests, finished, mesh_format, keep_detail)
+            _write(output, form, model, requests, finished, mesh_format, keep_detail)
             note(f"stopped; {output} has {len(finished)} of {counted(len(requests), 'pose')}")
         raise
-    _write(output, model, requests, finished, mesh_format, keep_detail)
+    _write(output, form, model, requests, finished, mesh_format, keep_detail)
     results = [finished[place] for place in range(len(requests))]
-    _report(requests, results, as_json)
+    _report(model, requests, results, as_json)
     if sequence:
         before = np.array([request.pose.latent for request in requests])
         change = largest_correction_change(model.embedding, before, results)
@@ -218,22 +222,6 @@ def _group_weights(model: PoseModel, wanted: Sequence[str]) -> tuple[float, ...]
     return tuple(weights)
 
 
-def _require_room(output: Path) -> None:
-    """Refuse an output that cannot be written before the work for it is done."""
-    from lcollision_core.meshes import WRITABLE_SUFFIXES, require_writable
-
-    known = (*WRITABLE_SUFFIXES, ".json")
-    if output.is_dir():
-        require_writable(output / f"pose.{MeshFormat.OBJ}")
-    elif not output.suffix or output.suffix.lower() in known:
-        require_writable(output)
-    else:
-        raise LCollisionError(
-            f"{output} cannot be written: {output.suffix} is no format known here; use one of "
-            f"{', '.join(known)} or a folder"
-        )
-
-
 def _read(model: PoseModel, inputs: Sequence[Path]) -> tuple[list[_Request], bool]:
     """Read and encode what can be; say of each other input in a sentence why it cannot."""
     from lcollision_core.model import unique_names
@@ -258,7 +246,7 @@ def _read(model: PoseModel, inputs: Sequence[Path]) -> tuple[list[_Request], boo
 
 def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
     from lcollision_core.meshes import read_mesh
-    from lcollision_core.model import NamedPose, read_poses
+    from lcollision_core.model import NamedPose, name_of_file, read_poses
 
     if path.suffix.lower() == ".json":
         poses = read_poses(path, model)
@@ -273,7 +261,7 @@ def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
         encoded = model.encode(mesh.vertices)
     except LCollisionError as error:
         raise MeshFileError(f"{path} cannot be encoded: {error}") from error
-    pose = NamedPose.of_mesh(path.stem, encoded)
+    pose = NamedPose.of_mesh(name_of_file(path), encoded)
     note(
         f"{path} is encoded with a fit error of {100.0 * encoded.fit_error_mean:.3f} % of the "
         f"height, at most {100.0 * encoded.fit_error_max:.2f} %"
@@ -283,6 +271,7 @@ def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
 
 def _write(
     output: Path,
+    form: OutputForm,
     model: PoseModel,
     requests: Sequence[_Request],
     finished: dict[int, ResolveResult],
@@ -295,38 +284,48 @@ def _write(
     detailed = None
     if keep_detail:
         detailed = [_detailed(model, requests[place], finished[place]) for place in places]
-    write_result(output, model, poses, mesh_format, detailed)
+    write_result(output, form, model, poses, mesh_format, detailed)
 
 
 def _detailed(
     model: PoseModel, request: _Request, result: ResolveResult
-) -> npt.NDArray[np.float64] | None:
+) -> npt.NDArray[np.float32] | None:
     """Return the fixed mesh with what encoding lost of it, or None where that would collide."""
     import numpy as np
+
+    from lcollision_core.resolve import exported_vertices
 
     placement = request.pose.placement
     if request.mesh is None or placement is None:
         return None
     before, after = model.decode(np.stack([request.pose.latent, result.latent]))
-    # Not moved by a bit where the pose did not move.
-    detailed = request.mesh + (placement.apply(after) - placement.apply(before))
-    if model.detector.are_colliding(detailed[None].astype(np.float32), workers=1)[0]:
+    # Where the pose did not move, only rounded.
+    moved = request.mesh + (placement.apply(after) - placement.apply(before))
+    detailed = exported_vertices(moved)
+    if model.detector.are_colliding(detailed[None], workers=1)[0]:
         note(f"{request.source}: with its detail the fixed mesh would collide, so it has none")
         return None
     return detailed
 
 
-def _report(requests: Sequence[_Request], results: Sequence[ResolveResult], as_json: bool) -> None:
+def _report(
+    model: PoseModel,
+    requests: Sequence[_Request],
+    results: Sequence[ResolveResult],
+    as_json: bool,
+) -> None:
     rows: list[dict[str, Any]] = []
     for request, result in zip(requests, results, strict=True):
         if result.note:
             note(f"{request.source}: {result.note}")
         facts = {name: getattr(result, name) for name in _FIELDS}
-        rows.append({"source": request.source} | facts)
+        rows.append({"source": request.source} | facts | {"near_exclusion": model.near_exclusion})
         if not as_json:
             typer.echo(f"{request.source}: {_sentence(result)}")
     if as_json:
         print_json(rows)
+    else:
+        note_near_exclusion(model)
 
 
 def _sentence(result: ResolveResult) -> str:

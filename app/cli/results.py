@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
-from enum import StrEnum
+from enum import Enum, StrEnum, auto
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from app.cli.console import note
 from lcollision_core.errors import LCollisionError, MeshFileError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
     import numpy.typing as npt
 
     from lcollision_core.model import NamedPose, PoseModel
@@ -30,6 +32,14 @@ class MeshFormat(StrEnum):
     GLB = "glb"
 
 
+class OutputForm(Enum):
+    """What an output is to be."""
+
+    POSES = auto()
+    MESH = auto()
+    FOLDER = auto()
+
+
 def require_output(path: Path, suffix: str) -> None:
     """Refuse an output before the work for it is done.
 
@@ -44,18 +54,69 @@ def require_output(path: Path, suffix: str) -> None:
     require_writable(path)
 
 
+def note_near_exclusion(model: PoseModel) -> None:
+    """Say which pairs of faces the figures beside this leave out, where there are any."""
+    if model.near_exclusion:
+        note(
+            f"pairs of faces within {model.near_exclusion:g} heights along the surface are folds "
+            f"of the skin, which are no collisions"
+        )
+
+
+def output_form(output: Path) -> OutputForm:
+    """Say what an output is to be, before the work for it is done.
+
+    An existing folder is one whatever it is called; else the extension decides, and a name without
+    one is a folder that is yet to be made.
+
+    Raises
+    ------
+    LCollisionError : an unknown extension, or the file or folder could not be written.
+    """
+    from lcollision_core.meshes import WRITABLE_SUFFIXES, require_writable
+
+    suffix = output.suffix.lower()
+    if output.is_dir():
+        require_writable(output / f"pose.{MeshFormat.OBJ}")
+        return OutputForm.FOLDER
+    if suffix not in {"", ".json", *WRITABLE_SUFFIXES}:
+        raise LCollisionError(
+            f"{output} cannot be written: {suffix} is no format known here; use one of "
+            f"{', '.join(WRITABLE_SUFFIXES)}, .json or a folder"
+        )
+    require_writable(output)
+    if suffix:
+        return OutputForm.POSES if suffix == ".json" else OutputForm.MESH
+    if output.exists():
+        raise MeshFileError(f"the folder {output} cannot be made: it is a file; name another")
+    return OutputForm.FOLDER
+
+
+def require_one_mesh(output: Path, form: OutputForm, n_poses: int) -> None:
+    """Refuse to write any other number of poses than one as one mesh.
+
+    Raises
+    ------
+    LCollisionError : they are not one.
+    """
+    if form is OutputForm.MESH and n_poses != 1:
+        raise LCollisionError(f"{output} is one mesh, but there are {n_poses} poses; name a folder")
+
+
 def write_result(
     output: Path,
+    form: OutputForm,
     model: PoseModel,
     poses: Sequence[NamedPose],
     mesh_format: MeshFormat,
-    vertices: Sequence[npt.NDArray[Any] | None] | None = None,
+    vertices: Sequence[npt.NDArray[np.float32] | None] | None = None,
 ) -> None:
     """Write poses as a .json file, one pose as a mesh, or each as a mesh of a folder.
 
     Parameters
     ----------
-    output : its extension decides; without one that is known it is a folder, which is made
+    output : a folder is made where there is none
+    form : of `output`, by `output_form`
     model : of the poses
     poses : a pose with a placement returns to it
     mesh_format : of the meshes in a folder
@@ -63,29 +124,18 @@ def write_result(
 
     Raises
     ------
-    LCollisionError : several poses and one mesh file, an unknown extension, or a file or folder
-        cannot be written.
+    LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
-    from lcollision_core.meshes import WRITABLE_SUFFIXES, require_writable, write_mesh
+    from lcollision_core.meshes import write_mesh
     from lcollision_core.model import write_poses
+    from lcollision_core.resolve import exported_vertices
 
-    suffix = output.suffix.lower()
-    if suffix == ".json":
+    if form is OutputForm.POSES:
         write_poses(output, model, poses)
         return
-    if suffix in WRITABLE_SUFFIXES:
-        if len(poses) != 1:
-            raise LCollisionError(
-                f"{output} is one mesh, but there are {len(poses)} poses; name a folder"
-            )
-        require_writable(output)
-        files = [output]
-    elif suffix and not output.is_dir():
-        raise LCollisionError(
-            f"{output} cannot be written: {suffix} is no format known here; use one of "
-            f"{', '.join(WRITABLE_SUFFIXES)}, .json or a folder"
-        )
-    else:
+    require_one_mesh(output, form, len(poses))
+    files = [output]
+    if form is OutputForm.FOLDER:
         files = [output / f"{name}.{mesh_format}" for name in _file_names(poses)]
         try:
             output.mkdir(exist_ok=True)
@@ -96,10 +146,9 @@ def write_result(
     given = [None] * len(poses) if vertices is None else vertices
     for file, pose, mesh in zip(files, poses, given, strict=True):
         if mesh is None:
-            mesh = model.decode(pose.latent)
-            if pose.placement is not None:
-                mesh = pose.placement.apply(mesh)
-        write_mesh(file, mesh, model.faces)
+            mesh = exported_vertices(model.decode(pose.latent), pose.placement)
+        # OBJ and OFF would get float32's short decimals, which float64 readers take for others.
+        write_mesh(file, mesh.astype(float), model.faces)
 
 
 def _file_names(poses: Sequence[NamedPose]) -> list[str]:

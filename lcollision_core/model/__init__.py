@@ -11,7 +11,13 @@ from lcollision_core.model.library import (
     model_destination,
     user_models_folder,
 )
-from lcollision_core.model.pose_file import NamedPose, read_poses, unique_names, write_poses
+from lcollision_core.model.pose_file import (
+    NamedPose,
+    name_of_file,
+    read_poses,
+    unique_names,
+    write_poses,
+)
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.model.sampling import sample_poses
 
@@ -27,6 +33,7 @@ __all__ = [
     "find_model",
     "list_models",
     "model_destination",
+    "name_of_file",
     "read_poses",
     "sample_poses",
     "unique_names",

@@ -66,19 +66,27 @@ def write_poses(path: str | os.PathLike[str], model: PoseModel, poses: Sequence[
 
     Raises
     ------
-    ModelFileError : the extension is not .json, two poses share a name, or the file cannot be
-        written.
+    ModelFileError : the extension is not .json, two poses share a name, `read_poses` would refuse
+        a pose, or the file cannot be written.
     """
     if Path(path).suffix.lower() != ".json":
         raise ModelFileError(f"{path} cannot be written: poses are a .json file; rename it")
     name, times = Counter(pose.name for pose in poses).most_common(1)[0] if poses else ("", 0)
     if times > 1:
         raise ModelFileError(f"{path} cannot be written: {times} poses are called {name!r}")
+    entries = [_to_json(pose) for pose in poses]
+    for pose, entry in zip(poses, entries, strict=True):
+        try:
+            _from_json(entry, model.latent_size)
+        except ValueError as error:
+            raise ModelFileError(
+                f"{path} cannot be written: of the pose {pose.name[:80]!r}, {error}; mend that pose"
+            ) from error
     document = {
         "format": POSES_FORMAT,
         "format_version": POSES_VERSION,
         "model": {"name": model.name, "fingerprint": model.fingerprint},
-        "poses": [_to_json(pose) for pose in poses],
+        "poses": entries,
     }
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
     try:
@@ -117,15 +125,25 @@ def read_poses(path: str | os.PathLike[str], model: PoseModel) -> tuple[NamedPos
     return _parse(document, path, model)
 
 
+def name_of_file(path: Path) -> str:
+    """Name a pose after its file, without what a file of poses cannot hold."""
+    stem = path.stem.encode(errors="replace").decode()
+    return stem[:MAX_NAME_LENGTH]
+
+
 def unique_names(names: Iterable[str]) -> list[str]:
-    """Return the names, numbered where an earlier one differs by case at most: "a", "A 2"."""
+    """Return the names, numbered where an earlier one differs by case at most: "a", "A 2".
+
+    Numbered names are at most `MAX_NAME_LENGTH` long.
+    """
     taken: set[str] = set()
     result = []
     for name in names:
         candidate, number = name, 1
         while candidate.casefold() in taken:
             number += 1
-            candidate = f"{name} {number}"
+            ending = f" {number}"
+            candidate = name[: MAX_NAME_LENGTH - len(ending)] + ending
         taken.add(candidate.casefold())
         result.append(candidate)
     return result
@@ -181,6 +199,8 @@ def _from_json(entry: Any, latent_size: int) -> NamedPose:
     name = pose.get("name")
     if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH:
         raise ValueError(f"its name must be a text of 1 to {MAX_NAME_LENGTH} characters")
+    if any("\ud800" <= character <= "\udfff" for character in name):
+        raise ValueError("its name has half a character, which no text file holds")
     latent = _numbers(pose.get("latent"), (latent_size,), "latent")
     placement = None
     if "placement" in pose:

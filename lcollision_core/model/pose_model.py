@@ -51,7 +51,8 @@ class PoseModel:
     name : what the model is called
     embedding : its latent space
     card : its units, names and origin
-    other_sections : of its file, that this version of the program leaves as they are
+    other_sections : of its file, by name: a predictor, known free poses, and such as this version
+        of the program does not know, which are saved as they are
 
     Attributes
     ----------
@@ -223,6 +224,7 @@ class PoseModel:
         options: ResolveOptions | None = None,
         progress: Progress = no_progress,
         cancel: CancelToken | None = None,
+        placement: RigidTransform | None = None,
     ) -> ResolveResult:
         """Find the nearest pose that is exactly free of collisions.
 
@@ -232,14 +234,16 @@ class PoseModel:
         options : the solver, what is kept small, locked domains and limits
         progress : called with (steps of the ladder done, all steps)
         cancel : polled at every evaluation
+        placement : where the pose is exported to; the exact check is of the vertices there
 
         Raises
         ------
-        ShapeError : another shape, or a number that is not finite.
+        ShapeError : another shape, a number that is not finite or another number of weights.
+        LCollisionError : a locked domain that there is not.
         ModelFileError : the model has no predictor, or a damaged one.
         CancelledError : `cancel` was set.
         """
-        return self.resolver.resolve(latent, options, progress, cancel)
+        return self.resolver.resolve(latent, options, progress, cancel, placement)
 
     def encode(self, vertices: npt.ArrayLike, cancel: CancelToken | None = None) -> EncodedPose:
         """Find the latent pose whose mesh lies nearest to a given one, wherever that lies.

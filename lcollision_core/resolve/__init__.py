@@ -1,5 +1,6 @@
 """The nearest collision-free pose: the paper's problem, then a ladder that ends exactly free."""
 
+from lcollision_core.resolve.exact import exported_vertices
 from lcollision_core.resolve.free_poses import find_free_poses
 from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult, Solver, Step
 from lcollision_core.resolve.resolver import PoseResolver
@@ -12,6 +13,7 @@ __all__ = [
     "ResolveResult",
     "Solver",
     "Step",
+    "exported_vertices",
     "find_free_poses",
     "largest_correction_change",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,25 @@ from lcollision_core.contact import CollisionDetector, SelfCollisions
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
+
+
+def exported_vertices(
+    vertices: npt.NDArray[Any], placement: RigidTransform | None = None
+) -> npt.NDArray[np.float32]:
+    """Round vertices to what a file of them holds, and what is proved of them.
+
+    Parameters
+    ----------
+    vertices : (..., V, 3) array, in the data's unit
+    placement : where a decoded pose is exported to; None leaves it where it is
+
+    Returns
+    -------
+    exported : (..., V, 3) float32 array; a placed pose is rounded as it is drawn, moved, and
+        rounded again
+    """
+    drawn: npt.NDArray[np.float32] = vertices.astype(np.float32)
+    return drawn if placement is None else placement.apply(drawn).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +55,8 @@ class ExactCheck:
         return self.embedding.decode(np.atleast_2d(np.asarray(latent)), n_threads=1)
 
     def exported(self, decoded: FloatArray) -> npt.NDArray[np.float32]:
-        """Return decoded (..., V, 3) vertices in the data's unit, in place, rounded to float32."""
-        vertices = decoded * self.height
-        if self.placement is not None:
-            vertices = self.placement.apply(vertices)
-        return vertices.astype(np.float32)
+        """Return decoded (..., V, 3) vertices, in heights, as they are exported."""
+        return exported_vertices(decoded * self.height, self.placement)
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Tell which of (B, D) latent poses are exactly free: (B,) bool."""

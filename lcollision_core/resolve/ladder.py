@@ -10,6 +10,7 @@ from lcollision_core.contact import SelfCollisions
 from lcollision_core.jobs import Progress
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.exact import ExactCheck
+from lcollision_core.resolve.metric import relative_distance
 from lcollision_core.resolve.options import ResolveOptions, ResolveResult, Solver, Step
 from lcollision_core.resolve.polish import polish
 from lcollision_core.resolve.problem import ResolveProblem, SolverOutcome
@@ -31,7 +32,7 @@ _REMEMBERED, _POLISHED = 8, 3
 
 _ITERATIONS_ALONE = 60
 
-N_STEPS = 8
+_ALL_LOCKED = "every domain is locked, so the pose stays as it is; unlock one"
 
 
 class Ladder:
@@ -42,7 +43,7 @@ class Ladder:
     problem, check, options : of the pose
     free_latents : (F, D) float64 array of poses known to be free
     correction : (D,) float64 array to try first, or None
-    progress : called with (steps done, `N_STEPS`)
+    progress : called with (steps done, all steps), the last step being to shorten
     remark : what there is to say of the request whatever comes of it, or None
     """
 
@@ -65,7 +66,7 @@ class Ladder:
     def climb(self) -> ResolveResult:
         """Try the steps until one frees the pose, then shorten."""
         result = self._climb()
-        self._progress(N_STEPS, N_STEPS)
+        self._progress(self._n_steps, self._n_steps)
         return result
 
     def _climb(self) -> ResolveResult:
@@ -75,26 +76,36 @@ class Ladder:
         if not before.colliding:
             return self._result(problem.target, Step.UNCHANGED, before)
         if not problem.movable.any():
-            return self._result(
-                problem.target,
-                Step.NONE,
-                before,
-                "every domain is locked, so the pose stays as it is; unlock one",
-            )
-        for done, (step, latent) in enumerate(self._steps()):
-            self._progress(min(done, N_STEPS - 1), N_STEPS)
+            return self._result(problem.target, Step.NONE, before, _ALL_LOCKED)
+        for done, (step, latent) in enumerate(self._steps(), 1):
+            self._progress(done, self._n_steps)
             if latent is not None:
                 return self._result(shorten(check, problem, latent), step, before)
         return self._result(problem.target, Step.NONE, before, self._why_not())
 
     def solve_only(self) -> ResolveResult:
         """Solve the paper's problem and check nothing exactly."""
-        margin = self._options.margin or 0.0
+        problem, margin = self._problem, self._options.margin or 0.0
+        if not problem.movable.any():
+            excess, _ = problem.excess(problem.target[None])
+            if excess[0] + margin <= 0.0:
+                return self._result(problem.target, Step.UNCHANGED, None)
+            return self._result(problem.target, Step.NONE, None, _ALL_LOCKED)
         outcome = self._solve(margin)
         self._keep(outcome)
-        moved = not np.array_equal(outcome.latent, self._problem.target)
+        moved = not np.array_equal(outcome.latent, problem.target)
         step = Step.NONE if not outcome.feasible else Step.SOLVER if moved else Step.UNCHANGED
         return self._result(outcome.latent, step, None)
+
+    @property
+    def _n_steps(self) -> int:
+        """Count, at most, what `_steps` yields and the shortening."""
+        if self._options.solver == Solver.SQP:
+            n_tries = len(ITERATIONS) + 1
+        else:
+            n_tries = len(MARGINS) + min(len(self._free_latents), _KNOWN_STARTS) + _RANDOM_STARTS
+        # The neighbour's correction, the tries, polishing, the walk back and the shortening.
+        return int(self._correction is not None) + n_tries + _POLISHED + 2
 
     def _steps(self) -> Iterator[tuple[Step, FloatArray | None]]:
         """Yield each try: its step, and the free pose that it found or None."""
@@ -203,7 +214,6 @@ class Ladder:
         moved = np.linalg.norm(decoded[1] - decoded[0], axis=1)
         after = before if step == Step.UNCHANGED else check.find(decoded[1]) if before else None
         excess, _ = problem.excess(latent[None])
-        way = float(np.linalg.norm(latent - problem.target))
         answer = latent.copy()
         answer.flags.writeable = False
         return ResolveResult(
@@ -217,7 +227,7 @@ class Ladder:
             energy_after=after.energy if after else None,
             pairs_before=len(before.pairs) if before else None,
             pairs_after=len(after.pairs) if after else None,
-            latent_distance=way / float(np.linalg.norm(problem.target)) if way else 0.0,
+            latent_distance=relative_distance(latent, problem.target),
             vertex_distance_mean=float(moved.mean()),
             vertex_distance_max=float(moved.max()),
             iterations=self._iterations,

@@ -16,6 +16,11 @@ _STIFFENING = 1e-3
 """Of the mean diagonal: what a code costs that moves no vertex, so that the metric is definite."""
 
 
+def relative_distance(latent: FloatArray, target: FloatArray) -> float:
+    """Measure ||Z - Z*|| / ||Z*|| of two (D,) poses, or ||Z - Z*|| where Z* is the zero pose."""
+    return float(np.linalg.norm(latent - target)) / (float(np.linalg.norm(target)) or 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class LatentMetric:
     """The squared distance d(Z, Z') = (Z - Z')^T G (Z - Z').

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any
 
 import nlopt
@@ -22,6 +23,9 @@ _INNER_EVALUATIONS = 40
 OBJECTIVE_OFFSET = 1.0
 """Added to the objective, which is in units of ||Z*||^2: AUGLAG's first penalty is in proportion
 to the objective, and from Z* it would be its least one, with many rounds to grow."""
+
+_LEAST_SIZE = 1e-3
+"""Of the bounds' squared diagonal, the least unit of the objective: the zero pose has no length."""
 
 _STATUS = {
     nlopt.SUCCESS: "converged",
@@ -51,8 +55,8 @@ def solve_nlopt(
 
     Returns
     -------
-    outcome : the best iterate of all callbacks, however the solver ended; its iterations are
-        NLopt's evaluations
+    outcome : the best iterate of all callbacks, however the solver ended, the start where there
+        was none; its iterations are NLopt's evaluations
 
     Raises
     ------
@@ -74,14 +78,17 @@ class _Run:
         # What holds to the tolerance then holds in truth.
         self._margin = margin + FEASIBLE
         self._movable = np.flatnonzero(problem.movable)
-        self._scale = 1.0 / max(float(problem.target @ problem.target), 1e-12)
+        span = problem.high - problem.low
+        least = _LEAST_SIZE * float(span @ span)
+        self._scale = 1.0 / max(float(problem.target @ problem.target), least)
         self._best: tuple[tuple[float, float], FloatArray] | None = None
         self._cancelled: CancelledError | None = None
-        self._out_of_time = False
+        self._halt = ""
 
     def solve(self, solver: Solver, start: FloatArray) -> SolverOutcome:
         problem, movable = self._problem, self._movable
         low, high = problem.low[movable], problem.high[movable]
+        begin = np.clip(start, problem.low, problem.high)
         optimiser = nlopt.opt(_ALGORITHMS[solver], len(movable))
         if solver == Solver.AUGLAG:
             inner = nlopt.opt(nlopt.LD_LBFGS, len(movable))
@@ -97,20 +104,20 @@ class _Run:
         optimiser.set_ftol_rel(_TOLERANCE)
         optimiser.set_maxeval(MAX_EVALUATIONS)
         try:
-            optimiser.optimize(np.clip(start[movable], low, high))
+            optimiser.optimize(begin[movable])
             code = optimiser.last_optimize_result()
             status = _STATUS.get(code, "stopped")
         except nlopt.ForcedStop:
-            code, status = None, "out of time"
+            code, status = None, self._halt
         except _FAILURES:
             # An inner failure ends the outer loop; what the callbacks saw is as good as ever.
             code, status = None, "halted by rounding"
         if self._cancelled is not None:
             raise self._cancelled
-        if self._best is None:  # stopped before its first evaluation
-            self._look(np.clip(start, problem.low, problem.high))
-        assert self._best is not None
-        (over, _), latent = self._best
+        if self._best is None:  # stopped at its first evaluation
+            with suppress(nlopt.ForcedStop):
+                self._look(begin)
+        (over, _), latent = self._best or ((math.inf, 0.0), begin)
         return SolverOutcome(
             latent=latent,
             status=status,
@@ -128,6 +135,7 @@ class _Run:
 
     def _constraint(self, codes: npt.NDArray[Any], gradient: npt.NDArray[Any]) -> float:
         if self._problem.watch.expired:
+            self._halt = "out of time"
             raise nlopt.ForcedStop
         try:
             violation, slope = self._look(self._full(codes))
@@ -143,6 +151,7 @@ class _Run:
         excess, slope = self._problem.excess(latent[None])
         violation = float(excess[0]) + self._margin
         if not math.isfinite(violation):
+            self._halt = "prediction not finite"
             raise nlopt.ForcedStop
         placed = rank(float(self._problem.search_distance(latent)), violation)
         if self._best is None or placed < self._best[0]:

@@ -63,6 +63,10 @@ class ResolveOptions:
         With one, results depend on the machine's speed.
     verify : check exactly and climb the ladder; False stops at the solver's answer
     seed : >= 0, of the other starts
+
+    Raises
+    ------
+    LCollisionError : there is no such solver or metric, or a number is out of its range.
     """
 
     solver: str = Solver.SQP
@@ -112,16 +116,19 @@ class ResolveResult:
     Attributes
     ----------
     latent : (D,) float64 array, read-only
-    solver_status : what the solver of the paper's problem said last, "not run" where none ran
+    solver_status : what the solver of the paper's problem said at its least margin, "not run"
+        where none ran
     converged : that it ended by its own tolerances
     predicted_free : the collision probability of `latent` is at most the threshold
     exactly_free : by the exact check of the vertices rounded to float32; None without `verify`
     step : of the ladder, the one that freed the pose
     energy_before, energy_after : exact penetration energy; None without `verify`
     pairs_before, pairs_after : exact number of colliding pairs; None without `verify`
-    latent_distance : ||Z - Z*|| / ||Z*||, 0 for a pose that did not move
+    latent_distance : ||Z - Z*|| / ||Z*||, or ||Z - Z*|| where Z* is the zero pose; 0 for a pose
+        that did not move
     vertex_distance_mean, vertex_distance_max : from the decoded pose as it was
-    iterations : of the solver, over all its rounds
+    iterations : of the solver at its least margin, for those of NLopt its evaluations; further
+        margins and starts do not count
     evaluations : poses at which the predictor was asked
     seconds : spent
     note : a sentence for the user, None where there is nothing to say

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, repeat
 from threading import Lock
 
 import numpy as np
@@ -83,8 +83,8 @@ class PoseResolver:
 
         Raises
         ------
-        ShapeError : another shape, a number that is not finite, a locked domain that there is not
-            or another number of weights.
+        ShapeError : another shape, a number that is not finite or another number of weights.
+        LCollisionError : a locked domain that there is not.
         CancelledError : `cancel` was set.
         """
         chosen = options or ResolveOptions()
@@ -128,7 +128,7 @@ class PoseResolver:
         options : the defaults if None
         workers : threads, one for each available core by default; results do not depend on it
         progress : called with (poses done, B), from one thread at a time
-        cancel : polled at every evaluation
+        cancel : polled at every evaluation, and before each frame of a sequence is checked
         placements : where each pose is exported to
         sequence : the poses are the frames of a motion: a frame starts from the correction of the
             one before, so that the motion does not flicker. Frames that collide in a row are one
@@ -142,7 +142,7 @@ class PoseResolver:
 
         Raises
         ------
-        ShapeError, CancelledError : as of `resolve`.
+        ShapeError, LCollisionError, CancelledError : as of `resolve`.
         """
         rows = [self._checked(row) for row in np.atleast_2d(np.asarray(latents, np.float64))]
         placed = [None] * len(rows) if placements is None else placements
@@ -167,7 +167,7 @@ class PoseResolver:
         pool = ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="resolve")
         try:
             if sequence:
-                colliding = list(pool.map(self._is_colliding, rows, placed))
+                colliding = list(pool.map(self._is_colliding, rows, placed, repeat(cancel)))
                 starts = [at for at in range(len(rows)) if at == 0 or not colliding[at]]
             else:
                 starts = list(range(len(rows)))
@@ -178,7 +178,11 @@ class PoseResolver:
             pool.shutdown(cancel_futures=True)
         return [results[place] for place in range(len(rows))]
 
-    def _is_colliding(self, latent: FloatArray, placement: RigidTransform | None) -> bool:
+    def _is_colliding(
+        self, latent: FloatArray, placement: RigidTransform | None, cancel: CancelToken | None
+    ) -> bool:
+        if cancel is not None:
+            cancel.raise_if_cancelled()
         check = ExactCheck(self._embedding, self._detector, self._height, placement)
         return not check.is_free(latent)
 

@@ -11,6 +11,7 @@ from pytestqt.qtbot import QtBot
 
 from app.document import Failure, PoseDocument
 from app.frames import PoseShower
+from app.tasks import drawn_vertices
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
 from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
@@ -339,6 +340,23 @@ def test_an_exported_mesh_is_the_one_on_the_screen_in_its_place(
     placed = QUARTER_TURN.apply(document.frame.vertices).astype(np.float32)
     mesh = read_mesh(path)
     assert (mesh.vertices.astype(np.float32)[mesh.faces] == placed[document.model.faces]).all()
+
+
+def test_resolve_checks_the_mesh_that_would_be_exported(
+    qtbot: QtBot, document: PoseDocument, colliding: np.ndarray
+) -> None:
+    model = document.model
+    # So far away that rounding moves every vertex by much.
+    far = RigidTransform(QUARTER_TURN.rotation, np.full(3, 1e5 * model.height))
+    document.load_pose(NamedPose("far", colliding, far))
+    for domain in range(len(model.domain_names)):
+        document.set_locked(domain, True)
+    resolve(qtbot, document)
+    assert document.outcome is not None
+    drawn = drawn_vertices(model, colliding)
+    placed = model.detector.detect(far.apply(drawn).astype(np.float32))
+    assert document.outcome.energy_before == placed.energy
+    assert document.outcome.energy_before != model.detector.detect(drawn).energy
 
 
 def test_an_exported_mesh_comes_back_as_the_same_mesh(

@@ -280,8 +280,8 @@ def test_form_of_the_output_decides_what_decode_writes(
     for output, sentence in (
         (tmp_path / "both.obj", "2 poses; name a folder"),
         (tmp_path / "both.xyz", ".xyz is no format"),
-        (tmp_path / "none" / "folder", "cannot be made"),
-        (one / "folder", "cannot be made"),
+        (tmp_path / "none" / "folder", "there is no folder"),
+        (one / "folder", "there is no folder"),
     ):
         assert sentence in _refusal(lcollision, "decode", tube, two, "-o", output)
         assert not output.exists()

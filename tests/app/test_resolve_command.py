@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ import pytest
 from PIL import Image
 
 from lcollision_core.contact import DEPTH_TOLERANCE
-from lcollision_core.meshes import read_mesh, write_mesh, write_pose_set
+from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh, write_pose_set
 from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
 from lcollision_core.resolve import find_free_poses
+from lcollision_core.resolve.exact import ExactCheck
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 from tests.core.brute_force import all_pairs
@@ -37,6 +39,7 @@ FIELDS = [
     "iterations",
     "evaluations",
     "seconds",
+    "near_exclusion",
 ]
 
 
@@ -139,6 +142,7 @@ def test_a_mesh_comes_back_in_its_place(
     assert result.exit_code == 0, result.stderr
     assert "bent.obj is encoded with a fit error of " in result.stderr
     fixed = read_mesh(out)
+    assert np.array_equal(fixed.vertices, fixed.vertices.astype(np.float32))
     assert np.array_equal(fixed.topology.faces, model.faces)
     assert n_pairs(model, fixed.vertices) == 0
     assert n_pairs(model, vertices) > 0
@@ -181,7 +185,7 @@ def test_a_free_mesh_with_detail_comes_back_as_it_was(
     colliding_mesh(model, np.zeros(model.latent_size), source)
     result = lcollision("resolve", model_file, source, "-o", out, "--keep-detail")
     assert result.exit_code == 0
-    assert np.array_equal(read_mesh(out).vertices, read_mesh(source).vertices)
+    assert np.array_equal(read_mesh(out).vertices, read_mesh(source).vertices.astype(np.float32))
 
 
 def test_a_folder_takes_several(
@@ -196,6 +200,48 @@ def test_a_folder_takes_several(
     ]
     for file in out.iterdir():
         assert n_pairs(model, read_mesh(file).vertices) == 0
+
+
+def test_the_near_exclusion_is_stated(
+    lcollision: Lcollision, model: PoseModel, colliding: np.ndarray, tmp_path: Path
+) -> None:
+    path, poses, out = (tmp_path / name for name in ("m.safetensors", "poses.json", "free.json"))
+    near = PoseModel(model.name, model.embedding, replace(model.card, near_exclusion=0.05))
+    assert model.predictor is not None
+    near.with_predictor(model.predictor).with_free_poses(model.free_latent).save(path)
+    write_poses(poses, model, [NamedPose("bent", colliding[0])])
+    sentence = "pairs of faces within 0.05 heights along the surface are folds of the skin"
+    assert sentence in lcollision("resolve", path, poses, "-o", out).stderr
+    rows = json.loads(lcollision("resolve", path, poses, "-o", out, "--json").stdout)
+    assert [row["near_exclusion"] for row in rows] == [0.05]
+    options = ("--model", path, "-n", "1", "--solver", "sqp")
+    assert sentence in lcollision("benchmark", "resolve", *options).stderr
+
+
+def test_a_folder_is_one_whatever_it_is_called(
+    lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    for name in ("x.obj", "x.json"):
+        out = tmp_path / name
+        out.mkdir()
+        result = lcollision("resolve", model_file, poses, "-o", out)
+        assert result.exit_code == 0, result.stderr
+        assert len(list(out.glob("*.obj"))) == 5
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply", ".stl", ".glb"])
+def test_the_mesh_written_is_the_one_that_was_proved_free(
+    lcollision: Lcollision, model: PoseModel, model_file: Path, tmp_path: Path, suffix: str
+) -> None:
+    latent, turn = 0.3 * model.training_latent[4], random_rotation(np.random.default_rng(2))
+    pose = NamedPose("placed", latent, RigidTransform(turn, np.array([1e4, -70.0, 3.0])))
+    check = ExactCheck(model.embedding, model.detector, model.height, pose.placement)
+    proved = check.exported(check.decode(latent)[0])
+    path, out = tmp_path / "placed.json", tmp_path / f"placed{suffix}"
+    write_poses(path, model, [pose])
+    assert lcollision("decode", model_file, path, "-o", out).exit_code == 0
+    mesh = read_mesh(out)
+    assert np.array_equal(mesh.vertices[mesh.faces], proved[model.faces])
 
 
 def test_locks_and_weights_by_name(
@@ -315,9 +361,11 @@ def test_bad_inputs_are_one_sentence_each_and_the_rest_is_done(
 def test_an_output_that_cannot_be_is_refused_first(
     lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path
 ) -> None:
+    (tmp_path / "free").write_text("mine")
     for out, sentence in (
         (tmp_path / "no" / "free.json", "there is no folder"),
         (tmp_path / "free.docx", ".docx is no format known here"),
+        (tmp_path / "free", "cannot be made: it is a file; name another"),
         (tmp_path / "free.obj", "is one mesh, but there are 5 poses"),
     ):
         result = lcollision("resolve", model_file, poses, "-o", out)
@@ -372,6 +420,7 @@ def test_benchmark_compares_the_solvers_with_bisection(
     assert list(rows[0]) == [
         *("solver", "poses", "median_ms", "p95_ms", "feasible_rate", "exactly_free_rate"),
         *("free_before_walk_back", "energy_decrease", "latent_distance", "vertex_distance"),
+        "near_exclusion",
     ]
     for row in rows:
         assert row["poses"] == 6

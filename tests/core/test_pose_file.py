@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,14 @@ from hypothesis import strategies as st
 
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import RigidTransform
-from lcollision_core.model import NamedPose, PoseModel, read_poses, unique_names, write_poses
+from lcollision_core.model import (
+    NamedPose,
+    PoseModel,
+    name_of_file,
+    read_poses,
+    unique_names,
+    write_poses,
+)
 from lcollision_core.model.pose_file import POSES_VERSION
 from tests.core.shapes import random_rotation
 
@@ -102,6 +110,7 @@ def _broken(document: Any) -> list[tuple[str, Any]]:
         ("pose 0.*name", with_first(name="")),
         ("pose 0.*name", with_first(name=5)),
         ("pose 0.*name", with_first(name="x" * 201)),
+        ("pose 0.*half a character", with_first(name="\ud800")),
         ("pose 0.*latent", with_first(latent=first["latent"][:-1])),
         ("pose 0.*latent", with_first(latent=["1"] * len(first["latent"]))),
         ("pose 0.*latent", with_first(latent=[True] * len(first["latent"]))),
@@ -183,9 +192,28 @@ def test_refused_poses_leave_the_old_file(model: PoseModel, path: Path) -> None:
         write_poses(path.with_suffix(".obj"), model, [pose])
     with pytest.raises(ModelFileError, match="no folder"):
         write_poses(path.parent / "none" / "poses.json", model, [pose])
+    for change, sentence in (
+        ({"name": ""}, "1 to 200 characters"),
+        ({"name": "x" * 201}, "1 to 200 characters"),
+        ({"name": "\udcff"}, "half a character"),
+        ({"latent": np.full(model.latent_size, np.nan)}, "not finite"),
+        ({"latent": pose.latent[1:]}, "latent must be"),
+    ):
+        with pytest.raises(ModelFileError, match=rf"cannot be written: .*{sentence}"):
+            write_poses(path, model, [replace(pose, **change)])
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
 
 
 def test_names_are_numbered_until_they_differ_by_more_than_case() -> None:
     assert unique_names(["a", "b", "A", "a", "a 2"]) == ["a", "b", "A 2", "a 3", "a 2 2"]
+    long = "x" * 200
+    assert unique_names([long, long]) == [long, "x" * 198 + " 2"]
+
+
+def test_any_files_name_makes_a_poses_name(model: PoseModel, tmp_path: Path) -> None:
+    files = [Path("\udcff bend.obj"), Path("y" * 250 + ".obj")]
+    poses = [NamedPose(name_of_file(file), np.zeros(model.latent_size)) for file in files]
+    write_poses(tmp_path / "poses.json", model, poses)
+    names = [pose.name for pose in read_poses(tmp_path / "poses.json", model)]
+    assert names == ["? bend", "y" * 200]

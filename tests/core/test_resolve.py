@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import pairwise
 
 import numpy as np
@@ -24,6 +24,7 @@ from lcollision_core.resolve import (
     ResolveResult,
     Solver,
     Step,
+    exported_vertices,
     find_free_poses,
     largest_correction_change,
 )
@@ -206,6 +207,34 @@ def test_no_way_out_is_a_statement(tube_model: PoseModel, deep: FloatArray) -> N
     )
 
 
+@pytest.mark.parametrize("solver", [Solver.SQP, Solver.SLSQP])
+def test_progress_never_sticks(
+    tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray, solver: Solver
+) -> None:
+    reports: list[tuple[int, int]] = []
+    far = free_latents[np.argsort(-np.linalg.norm(free_latents - deep, axis=1))[:2]]
+    resolver = resolver_of(tube_model, useless(deep), far)
+    options = ResolveOptions(solver=solver)
+    resolver.resolve(deep, options, lambda *at: reports.append(at), near=0.0 * deep)
+    done, totals = zip(*reports, strict=True)
+    assert set(totals) == {done[-1]}
+    assert list(done[:-1]) == list(range(1, len(done)))
+    assert done[-2] < done[-1]
+
+
+@pytest.mark.parametrize("solver", Solver)
+def test_the_zero_pose_is_freed(tube_model: PoseModel, solver: Solver) -> None:
+    """The zero pose has no length to measure by: its distance is the length of the way."""
+    zero, pose = np.zeros(8), tube_model.training_latent[-1]
+    size = float(np.linalg.norm(pose))
+    predictor = Ball(0.2 * pose, 0.3 * size, steepness=100.0 / size)
+    resolver = resolver_of(tube_model, predictor, np.empty((0, 8)))
+    result = resolver.resolve(zero, ResolveOptions(solver=solver, verify=False))
+    assert result.predicted_free
+    assert result.latent_distance == np.linalg.norm(result.latent)
+    assert result.latent_distance == pytest.approx(0.1 * size, rel=0.05)
+
+
 def test_the_neighbours_correction_comes_first(
     tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray
 ) -> None:
@@ -265,6 +294,12 @@ def test_all_domains_locked_is_a_statement(
     assert result.note == "every domain is locked, so the pose stays as it is; unlock one"
     free = resolver.resolve(free_latents[2], options)
     assert (free.step, free.exactly_free, free.note) == (Step.UNCHANGED, True, None)
+    for solver in Solver:
+        alone = resolver.resolve(
+            colliding[0], replace(options, solver=solver, verify=False, threshold=0.4)
+        )
+        assert (alone.step, alone.predicted_free, alone.note) == (Step.NONE, False, result.note)
+        assert alone.latent.tobytes() == colliding[0].tobytes()
 
 
 def test_a_dear_group_moves_less(
@@ -345,7 +380,7 @@ def test_a_pose_that_came_as_a_mesh_is_checked_where_it_lies(
     for latent in colliding[:4]:
         resolver = resolver_of(tube_model, around_the_mean(latent, 0.5), free_latents)
         result = resolver.resolve(latent, placement=placement)
-        placed = placement.apply(tube_model.decode(result.latent)).astype(np.float32)
+        placed = exported_vertices(tube_model.decode(result.latent), placement)
         tolerance = DEPTH_TOLERANCE * tube_model.height
         assert len(all_pairs(placed.astype(np.float64), tube_model.faces, tolerance).pairs) == 0
         assert result.exactly_free
@@ -453,6 +488,36 @@ def test_cancelling_many_keeps_what_was_finished(
     assert all(result.exactly_free for result in kept.values())
 
 
+class _CancellingDetector:
+    """Checks as the model's own, and cancels at its second check."""
+
+    def __init__(self, model: PoseModel) -> None:
+        self.token, self.n_calls, self._detector = CancelToken(), 0, model.detector
+
+    def are_colliding(self, vertices: npt.NDArray, workers: int) -> npt.NDArray[np.bool_]:
+        self.n_calls += 1
+        if self.n_calls == 2:
+            self.token.cancel()
+        return self._detector.are_colliding(vertices, workers=workers)
+
+
+def test_cancelling_a_sequence_stops_its_first_check(
+    tube_model: PoseModel, colliding: FloatArray
+) -> None:
+    detector, size = _CancellingDetector(tube_model), tube_model.latent_size
+    resolver = PoseResolver(
+        tube_model.embedding,
+        useless(colliding[0]),
+        detector,  # type: ignore[arg-type]
+        tube_model.height,
+        np.empty((0, size)),
+        (np.full(size, -1.0), np.full(size, 1.0)),
+    )
+    with pytest.raises(CancelledError):
+        resolver.resolve_many(colliding, workers=1, cancel=detector.token, sequence=True)
+    assert detector.n_calls == 2
+
+
 @pytest.mark.parametrize(
     ("latent", "options", "sentence"),
     [
@@ -483,6 +548,7 @@ def test_a_result_is_read_only_and_progress_ends_full(
     result = resolver.resolve(colliding[0], progress=lambda *at: reports.append(at))
     assert reports[-1][0] == reports[-1][1] > 0
     assert list(reports) == sorted(reports)
+    assert len({total for _, total in reports}) == 1
     with pytest.raises(ValueError, match="read-only"):
         result.latent[0] = 1.0
     with pytest.raises(ShapeError):

@@ -143,6 +143,7 @@ def test_no_time_still_returns_a_pose(solver: Solver) -> None:
     half_space = HalfSpace(NORMAL, 0.5)
     outcome = solve(solver, toy_problem(half_space, TARGET, watch=Watch(budget=0.0)))
     assert half_space.n_calls == 1
+    assert outcome.status == ("stopped" if solver == Solver.SQP else "out of time")
     assert not outcome.converged
     assert outcome.latent.tolist() == TARGET.tolist()
 
@@ -160,8 +161,27 @@ def test_a_model_that_breaks_leaves_the_best_pose_so_far(solver: Solver) -> None
 
     outcome = solve(solver, toy_problem(Breaking(), TARGET))
     assert calls == 4
+    assert outcome.status == "prediction not finite"
     assert np.isfinite(outcome.latent).all()
     assert NORMAL @ outcome.latent <= NORMAL @ TARGET
+
+
+@pytest.mark.parametrize("solver", [Solver.AUGLAG, Solver.SLSQP, Solver.CCSAQ])
+def test_a_model_that_is_broken_leaves_the_start(solver: Solver) -> None:
+    outcome = solve(solver, toy_problem(HalfSpace(NORMAL, np.nan), TARGET, reach=1.5))
+    assert outcome.status == "prediction not finite"
+    assert not outcome.converged
+    assert not outcome.feasible
+    assert outcome.latent.tolist() == np.clip(TARGET, -1.5, 1.5).tolist()
+
+
+@pytest.mark.parametrize("solver", Solver)
+def test_from_the_zero_pose(solver: Solver) -> None:
+    problem = toy_problem(HalfSpace(NORMAL, -1.0), np.zeros(4))
+    outcome = solve(solver, problem)
+    assert outcome.feasible
+    assert outcome.converged
+    np.testing.assert_allclose(outcome.latent, -NORMAL / (NORMAL @ NORMAL), atol=2e-2)
 
 
 @pytest.mark.parametrize("solver", Solver)
