@@ -18,7 +18,7 @@ from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionEr
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.model import PoseModel
-from lcollision_core.predictor import LOSSES, PRESETS, PredictorStatus, train_predictor
+from lcollision_core.predictor import LOSSES, PRESETS, Loss, PredictorStatus, train_predictor
 from lcollision_core.predictor.loop import rate_at
 from tests.core.predictor_rows import PAPER, config, made_up_rows, weights_of
 
@@ -110,6 +110,13 @@ def test_every_row_of_table_1_trains(tube_model: PoseModel, rows: LabelRows) -> 
     assert undivided.metrics.accuracy > undivided.metrics.majority_rate + 0.1
     energy = undivided.predict(rows.latent[:9]).domain_energy
     np.testing.assert_array_equal(energy[:, 0], energy[:, 1])
+
+
+@pytest.mark.parametrize("loss", LOSSES[1:])
+def test_only_the_paper_s_losses_can_be_left_out(loss: Loss) -> None:
+    with pytest.raises(LCollisionError, match=f"the loss {loss}; add --preset paper"):
+        PRESETS["default"].with_loss(loss)
+    assert PRESETS["default"].with_loss("full") == PRESETS["default"]
 
 
 def test_progress_ends_at_the_last_step(tube_model: PoseModel, rows: LabelRows) -> None:
