@@ -209,7 +209,7 @@ class TrainingLoop:
 
     def _watched_accuracy(self, network: PredictorNetwork) -> float:
         device = next(network.parameters()).device
-        parts = torch.from_numpy(self._watched.latent).split(BATCH_ROWS)
+        parts = torch.split(torch.from_numpy(self._watched.latent), BATCH_ROWS)
         network.eval()
         with torch.inference_mode():
             logit = torch.cat([network(part.to(device)).logit for part in parts])

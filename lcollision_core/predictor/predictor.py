@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -434,12 +434,4 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
 
 def held_out_rows(rows: LabelRows) -> LabelRows:
     """Return copies of the rows that never train, of rows 0, 1, 2, ... of a store."""
-    return taken(rows, is_held_out(np.arange(len(rows))))
-
-
-def taken(rows: LabelRows, index: npt.NDArray[Any]) -> LabelRows:
-    """Return copies of the rows chosen by an index or a boolean array."""
-    return replace(
-        rows,
-        **{name: getattr(rows, name)[index] for name in LabelRows.__dataclass_fields__},
-    )
+    return rows.taken(is_held_out(np.arange(len(rows))))
