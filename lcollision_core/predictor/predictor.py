@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
-from lcollision_core.errors import LabelStoreError, ModelFileError, ShapeError
+from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
 from lcollision_core.meshes.topology import FloatArray
@@ -127,7 +127,7 @@ class PredictorRecord:
                 TrainingFacts.from_metadata(metadata["facts"]),
                 None if measured is None else PredictorMetrics.from_metadata(measured),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, LCollisionError) as error:
             raise ModelFileError(_MISFIT) from error
 
 
