@@ -9,7 +9,7 @@ import typer
 
 from app.cli.console import ExitStatus, note, print_json
 from app.cli.results import require_output
-from lcollision_core.errors import LCollisionError
+from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
@@ -28,12 +28,11 @@ def models(
     reports, failed = [], False
     for listed in list_models():
         try:
-            model = PoseModel.load(listed.path)
+            report = describe(PoseModel.load(listed.path))
         except LCollisionError as error:
             note(str(error))
             failed = True
             continue
-        report = describe(model)
         reports.append(report | {"bundled": listed.bundled, "file": str(listed.path)})
     if as_json:
         print_json(reports)
@@ -171,7 +170,10 @@ def describe(model: PoseModel) -> dict[str, Any]:
 def _describe_predictor(model: PoseModel) -> dict[str, Any] | None:
     from dataclasses import asdict
 
-    record = model.predictor_record
+    try:
+        record = model.predictor_record
+    except LCollisionError as error:
+        raise ModelFileError(f"the model {model.name!r} is unusable: {error}") from error
     if record is None:
         return None
     facts = record.facts

@@ -64,7 +64,7 @@ def predictor(
         Preset, typer.Option(help="What measures best, or the paper's network and training.")
     ] = Preset.DEFAULT,
     loss: Annotated[
-        LossName, typer.Option(help="Leave out the ranking loss, the depth loss, or both.")
+        LossName, typer.Option(help="Of the paper's losses, leave out ranking, depth, or both.")
     ] = LossName.FULL,
     no_domains: Annotated[
         bool, typer.Option("--no-domains", help="Predict the whole body's energy alone (ND).")

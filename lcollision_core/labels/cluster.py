@@ -34,7 +34,7 @@ def label_on_cluster(
     """Label chunks on the workers of a Dask scheduler.
 
     The workers need this program in the same version. Those that leave are replaced by others,
-    those that come later join in.
+    those that come later join in; every chunk tells which version labelled it.
 
     Parameters
     ----------
@@ -70,14 +70,16 @@ def label_on_cluster(
             f"the address"
         ) from error
     with client:
-        n_threads = _require_workers(client, scheduler)
+        _require_workers(client, scheduler)
         shared = client.scatter(labeller, broadcast=True, hash=False)
         remaining = deque(tasks)
         in_hand: dict[Any, ChunkTask] = {}
         while remaining or in_hand:
+            # Workers come and go; with none, a chunk waits for the next.
+            n_threads = max(sum(client.nthreads().values()), 1)
             while remaining and len(in_hand) < _CHUNKS_AHEAD * n_threads:
                 task = remaining.popleft()
-                in_hand[client.submit(label_chunk, shared, seed, task, pure=False)] = task
+                in_hand[client.submit(label_on_worker, shared, seed, task, pure=False)] = task
             cancel.raise_if_cancelled()
             try:
                 with client.as_current():
@@ -94,12 +96,19 @@ def label_on_cluster(
 
 
 def program_version() -> str:
-    """Return the version of this program: asked of every worker before it gets work."""
+    """Return the version of this program; workers are asked for theirs."""
     return version("lcollision")
 
 
-def _require_workers(client: Client, scheduler: str) -> int:
-    """Return the number of the workers' threads, after asking all for their version."""
+def label_on_worker(labeller: Labeller, seed: int, task: ChunkTask) -> tuple[str, str, LabelRows]:
+    """Label one chunk; returns the worker, its version of this program, and the rows."""
+    from distributed import get_worker
+
+    return get_worker().address, program_version(), label_chunk(labeller, seed, task)
+
+
+def _require_workers(client: Client, scheduler: str) -> None:
+    """Wait for a worker, and ask all that there are for their version, before they get work."""
     try:
         client.wait_for_workers(1, timeout=_CONNECT_SECONDS)
         versions = client.run(program_version)
@@ -109,29 +118,41 @@ def _require_workers(client: Client, scheduler: str) -> int:
             f"{scheduler}`"
         ) from error
     except ImportError as error:
-        raise LCollisionError(
-            f"a worker of {scheduler} lacks this program ({error}); install lcollision "
-            f"{program_version()} there"
-        ) from error
+        raise _lacks_program(scheduler, error) from error
     for worker, found in versions.items():
-        if found != program_version():
-            raise LCollisionError(
-                f"the worker {worker} has lcollision {found}, this is {program_version()}; "
-                f"install the same version there"
-            )
-    n_threads: int = sum(client.nthreads().values())
-    return n_threads
+        _require_version(worker, found)
+
+
+def _require_version(worker: str, found: str) -> None:
+    if found != program_version():
+        raise LCollisionError(
+            f"the worker {worker} has lcollision {found}, this is {program_version()}; "
+            f"install the same version there"
+        )
+
+
+def _lacks_program(scheduler: str, error: ImportError) -> LCollisionError:
+    return LCollisionError(
+        f"a worker of {scheduler} lacks this program ({error}); install lcollision "
+        f"{program_version()} there"
+    )
 
 
 def _result(future: Any, scheduler: str) -> LabelRows:
     from distributed import CancelledError as LostError
     from distributed import KilledWorker
 
+    worker: str
+    rows: LabelRows
     try:
-        rows: LabelRows = future.result()
+        worker, found, rows = future.result()
+    except ImportError as error:
+        raise _lacks_program(scheduler, error) from error
     except (KilledWorker, LostError) as error:
         raise LCollisionError(
             f"the workers of {scheduler} died while labelling; give them more memory, then run "
             f"the same command again to go on"
         ) from error
+    # Of every chunk: workers that come late are not asked before.
+    _require_version(worker, found)
     return rows

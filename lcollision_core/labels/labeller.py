@@ -46,6 +46,10 @@ class LabelRows:
         """Return the first `n_rows` rows, views of these."""
         return LabelRows(*(getattr(self, field.name)[:n_rows] for field in fields(self)))
 
+    def taken(self, index: npt.NDArray[Any]) -> LabelRows:
+        """Return copies of the rows chosen by an index or a boolean array."""
+        return LabelRows(*(getattr(self, field.name)[index] for field in fields(self)))
+
     @classmethod
     def joined(cls, parts: Sequence[LabelRows]) -> LabelRows:
         """Put rows one after the other, in one copy."""

@@ -83,7 +83,8 @@ def label_poses(
 
     Raises
     ------
-    LabelStoreError : the store belongs to another model or seed, is damaged, or cannot be written.
+    LabelStoreError : the store belongs to another model or seed, is damaged, or cannot be written,
+        or another run is labelling into it.
     MissingExtraError : `scheduler` without Dask installed.
     LCollisionError : no scheduler or worker answers at the address, or a worker has another
         version of the program.
@@ -95,7 +96,21 @@ def label_poses(
         )
     token = cancel or CancelToken()
     identity = StoreIdentity.of(labeller, seed)
-    store = LabelStore.open_to_append(path, identity, n_rows, token)
+    with LabelStore.open_to_append(path, identity, n_rows, token) as store:
+        _append(store, labeller, n_rows, seed, workers, scheduler, progress, token)
+    return store
+
+
+def _append(
+    store: LabelStore,
+    labeller: Labeller,
+    n_rows: int,
+    seed: int,
+    workers: int | None,
+    scheduler: str | None,
+    progress: StatusCallback,
+    cancel: CancelToken,
+) -> None:
     chunks = range(-(-n_rows // ROWS_A_CHUNK))
     missing, done, n_colliding = [], 0, 0
     for chunk in chunks:
@@ -117,14 +132,13 @@ def label_poses(
         progress(LabelStatus(done, total, n_colliding, rate, (total - done) / rate))
 
     if not missing:
-        return store
+        return
     if scheduler is None:
         n_threads = available_cores() if workers is None else workers
-        results = label_locally(labeller, seed, missing, n_threads, count, token)
+        results = label_locally(labeller, seed, missing, n_threads, count, cancel)
     else:
-        results = label_on_cluster(labeller, seed, missing, scheduler, count, token)
+        results = label_on_cluster(labeller, seed, missing, scheduler, count, cancel)
     # Closed even when a chunk cannot be written: the workers must not label on.
     with closing(results):
         for task, rows in results:
             store.write_chunk(task.chunk, rows)
-    return store

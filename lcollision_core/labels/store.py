@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,7 @@ from lcollision_core.labels.layout import (
     columns_of,
     create_store,
 )
+from lcollision_core.labels.lock import only_writer
 
 if TYPE_CHECKING:
     import zarr
@@ -73,14 +75,17 @@ class LabelStore:
         return cls._open(Path(path), "r")
 
     @classmethod
+    @contextmanager
     def open_to_append(
         cls,
         path: str | os.PathLike[str],
         identity: StoreIdentity,
         n_rows: int,
         cancel: CancelToken | None = None,
-    ) -> LabelStore:
+    ) -> Iterator[LabelStore]:
         """Open a store, made if there is none, and forget chunks that do not read back.
+
+        Until the context ends nobody else can append to it; the store can still be read then.
 
         Parameters
         ----------
@@ -91,20 +96,24 @@ class LabelStore:
 
         Raises
         ------
-        LabelStoreError : as for `open`, or the store labels something else, or cannot be written.
+        LabelStoreError : as for `open`, or the store labels something else, or cannot be written,
+            or another run appends to it.
         CancelledError : `cancel` was set.
         """
         target = Path(path)
-        try:
-            if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-                create_store(target, identity)
-            store = cls._open(target, "r+")
-            store.require(identity)
-            store._drop_unreadable(cancel)
-            store._make_room(n_rows)
-        except OSError as error:
-            raise _unwritable(target, error) from error
-        return store
+        with ExitStack() as held:
+            try:
+                if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+                    create_store(target, identity)
+                cls.open(target).require(identity)
+                held.enter_context(only_writer(target))
+                # Once more: until now another run may have appended.
+                store = cls._open(target, "r+")
+                store._drop_unreadable(cancel)
+                store._make_room(n_rows)
+            except OSError as error:
+                raise _unwritable(target, error) from error
+            yield store
 
     def require(self, identity: StoreIdentity) -> None:
         """Refuse a store of another model, seed, unit, near exclusion or box.

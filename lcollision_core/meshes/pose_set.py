@@ -38,11 +38,11 @@ class PoseSet:
     notes : sentences on what was done on reading
     near_exclusion : fraction of the height below which pairs are near, not colliding
     up_axis : 0, 1 or 2 for x, y or z; None where the longest side of the reference decides
-    vertex_labels : (V,) array of strings, the body part of each vertex, if known
+    vertex_labels : (V,) array of printable strings, the body part of each vertex, if known
 
     Raises
     ------
-    ShapeError : the arrays do not fit together.
+    ShapeError : the arrays do not fit together, or a vertex's label is blank or not printable.
     """
 
     vertices: npt.NDArray[Any]
@@ -68,8 +68,12 @@ class PoseSet:
             raise ShapeError(f"up_axis must be 0, 1, 2 or None, got {self.up_axis}")
         if not 0.0 <= self.near_exclusion < 1.0:
             raise ShapeError(f"near_exclusion must be in [0, 1), got {self.near_exclusion}")
-        if self.vertex_labels is not None and self.vertex_labels.shape != shape[1:2]:
-            raise ShapeError(f"vertex_labels must be ({shape[1]},), got {self.vertex_labels.shape}")
+        if self.vertex_labels is not None:
+            if self.vertex_labels.shape != shape[1:2]:
+                raise ShapeError(
+                    f"vertex_labels must be ({shape[1]},), got {self.vertex_labels.shape}"
+                )
+            _require_labels(self.vertex_labels)
         # A view, so that the caller's own array stays as writable as it was.
         view = self.vertices.view()
         view.flags.writeable = False
@@ -391,7 +395,18 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
             raise MeshFileError(f"up_axis must be 0, 1 or 2, got {extras['up_axis']}")
     if "vertex_labels" in arrays:
         extras["vertex_labels"] = strings("vertex_labels", shape[1])
+        _require_labels(extras["vertex_labels"])
     return extras
+
+
+def _require_labels(vertex_labels: npt.NDArray[np.str_]) -> None:
+    labels = vertex_labels.tolist()
+    for label in dict.fromkeys(labels):
+        if not label.strip() or not label.isprintable():
+            raise ShapeError(
+                f"vertex_labels must be printable and not blank, got {label[:80]!r} for vertex "
+                f"{labels.index(label)} (from 0); name the body part of every vertex"
+            )
 
 
 def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:

@@ -42,14 +42,14 @@ def names_from_labels(
     Parameters
     ----------
     attention_mask : (K, V) array
-    vertex_labels : (V,) strings, such as "left forearm"
+    vertex_labels : (V,) strings that are not blank, such as "left forearm"
     heights : (V,) array, each vertex's coordinate along the up axis, in any unit
 
     Returns
     -------
-    names : K different names
+    names : K different names of at most `MAX_NAME_LENGTH` characters
     """
-    parts, part_of_vertex = np.unique(vertex_labels, return_inverse=True)
+    parts, part_of_vertex = np.unique(np.char.strip(vertex_labels), return_inverse=True)
     ranked = []
     for row in np.asarray(attention_mask, dtype=np.float64):
         weights = np.bincount(part_of_vertex, row**2, len(parts))
@@ -137,4 +137,17 @@ def _told_apart(names: list[str], levels: npt.NDArray[Any]) -> tuple[str, ...]:
         for rank, domain in enumerate(domains):
             words = places.get(len(domains))
             names[domain] = f"{words[rank]} {shared}" if words else f"{shared} {rank + 1}"
-    return tuple(names)
+    return _made_fit(names)
+
+
+def _made_fit(names: Sequence[str]) -> tuple[str, ...]:
+    """Cut names that are too long, and number those that an earlier one is equal to."""
+    fit: list[str] = []
+    for name in names:
+        candidate, number = name[:MAX_NAME_LENGTH].rstrip(), 1
+        while candidate in fit:
+            number += 1
+            ending = f" {number}"
+            candidate = name[: MAX_NAME_LENGTH - len(ending)].rstrip() + ending
+        fit.append(candidate)
+    return tuple(fit)

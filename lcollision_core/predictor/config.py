@@ -26,7 +26,8 @@ class PredictorConfig:
     ----------
     preset : names the network, see `presets.NETWORKS`
     by_domain : whether there is a predictor for each domain; False is the paper's baseline ND
-    depth_weight, rank_weight, entropy_weight : of L_PD, L_rank, L_entropy; the entropy's is over 0
+    depth_weight, rank_weight, entropy_weight : of L_PD, L_rank, L_entropy; the entropy's is over
+        0; the default preset has its own losses, without ranking
     rate : Adam's step size; the largest one with the schedule "one-cycle"
     schedule : "constant", or "one-cycle": up to `rate` in the first fifth of the steps, then down
         to 0, along cosines
@@ -73,7 +74,16 @@ class PredictorConfig:
         return min(self.epochs, max(LEAST_PASSES, -(-self.shown_rows // n_rows)))
 
     def with_loss(self, loss: Loss) -> PredictorConfig:
-        """Return the same choices with some of the loss's terms left out."""
+        """Return the same choices with some of the loss's terms left out.
+
+        Raises
+        ------
+        LCollisionError : the preset's loss is another, without these terms.
+        """
+        if loss != "full" and self.preset != "paper":
+            raise LCollisionError(
+                f"only the preset paper can be trained with the loss {loss}; add --preset paper"
+            )
         return replace(
             self,
             depth_weight=0.0 if loss in ("no-depth", "entropy") else self.depth_weight,

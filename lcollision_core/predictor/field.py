@@ -57,6 +57,10 @@ class Decoding(NamedTuple):
         parts = [by_products[:, columns] @ table.T for (_, columns), table in self._groups()]
         return torch.cat(parts, dim=1)
 
+    def grouped(self, outputs: torch.Tensor) -> torch.Tensor:
+        """View (B, n) outputs as (B, N, 9)."""
+        return outputs.view(len(outputs), len(self.target), self.offset.shape[1])
+
     def _groups(self) -> Iterator[tuple[tuple[slice, slice], torch.Tensor]]:
         start = 0
         for first, last, left, right in self.blocks.tolist():
@@ -199,7 +203,7 @@ class _Features(torch.autograd.Function):
         outputs = decoding.products(latent).tanh_()
         ctx.save_for_backward(outputs)
         ctx.decoding = decoding
-        grouped = outputs.view(len(latent), len(decoding.target), -1)
+        grouped = decoding.grouped(outputs)
         if latent.device.type != "cpu":
             features = decoding.offset.repeat(len(latent), 1, 1)
             return features.index_add_(1, decoding.target, grouped * decoding.scale)
@@ -213,7 +217,7 @@ class _Features(torch.autograd.Function):
     def backward(ctx: Any, by_features: torch.Tensor) -> tuple[torch.Tensor, None]:
         (outputs,) = ctx.saved_tensors
         decoding: Decoding = ctx.decoding
-        grouped = outputs.view(len(outputs), len(decoding.target), -1)
+        grouped = decoding.grouped(outputs)
         if outputs.device.type != "cpu":
             by_outputs = by_features[:, decoding.target.long()] * decoding.scale
             by_inputs = by_outputs * (1.0 - grouped.square())
@@ -329,7 +333,7 @@ class _FoldView(torch.autograd.Function):
 
 def _gradients(rows: torch.Tensor) -> torch.Tensor:
     """View rows (B, 3, 3 P) as (B, 3, P, 3)."""
-    return rows.reshape(*rows.shape[:2], -1, 3)
+    return rows.reshape(*rows.shape[:2], rows.shape[2] // 3, 3)
 
 
 def _zeros_like(values: torch.Tensor) -> torch.Tensor:

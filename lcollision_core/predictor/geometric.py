@@ -54,7 +54,6 @@ from lcollision_core.predictor.body_points import (
 )
 from lcollision_core.predictor.field import contact_field, fold_view, normalised
 from lcollision_core.predictor.folds import N_MEMBERS, find_fold_sites
-from lcollision_core.predictor.losses import rank_loss
 from lcollision_core.predictor.networks import (
     NetworkOutput,
     PredictorNetwork,
@@ -265,10 +264,13 @@ class GeometricNetwork(PredictorNetwork):
         batch: Targets,
         part: tuple[int, int],
         config: PredictorConfig,
-        margin: float,
+        margin: float,  # noqa: ARG002
     ) -> torch.Tensor:
-        """Sum up this process's share of the batch's mean loss, patches included."""
+        """Sum up this process's share of the batch's mean loss: patches included, no ranking."""
         own = batch.part(*part)
+        if not len(own.energy):
+            # The mean of no row is not a number; their sum is 0, and depends on the parameters.
+            return output.logit.sum()
         share = len(own.energy) / len(batch.energy)
         patch_logit, patch_root, root = output.auxiliary
         total = config.entropy_weight * binary_cross_entropy_with_logits(
@@ -286,9 +288,6 @@ class GeometricNetwork(PredictorNetwork):
                 total = total + depth_weight * smooth_l1_loss(patch_root[:, kind], taught)
         truth = torch.cat([own.domain_energy, own.energy[:, None]], dim=1).sqrt()
         total = total + config.depth_weight * smooth_l1_loss(root, truth)
-        if config.rank_weight:
-            losses = rank_loss(root[:, -1], own.energy.sqrt(), margin)
-            total = total + config.rank_weight * losses.mean()
         return share * total
 
 

@@ -22,7 +22,7 @@ from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.predictor.config import PredictorConfig
 from lcollision_core.predictor.networks import PredictorNetwork, Targets
 from lcollision_core.predictor.patch_labels import patch_roots
-from lcollision_core.predictor.predictor import TrainingFacts, taken
+from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
 from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.processes import Processes, joined_processes
 from lcollision_core.predictor.training import PredictorStatus, StatusCallback
@@ -78,7 +78,7 @@ class TrainingLoop:
         self._near_exclusion = 0.0 if facts.store is None else facts.store.near_exclusion
         held_out = is_held_out(np.arange(len(rows)))
         self._training_index = np.flatnonzero(~held_out)
-        self._watched = taken(rows, np.flatnonzero(held_out)[:_WATCHED_ROWS])
+        self._watched = rows.taken(np.flatnonzero(held_out)[:_WATCHED_ROWS])
         self._steps_an_epoch = -(-len(self._training_index) // config.batch_rows)
         self._epochs = config.passes(len(self._training_index))
         self._total = self._epochs * self._steps_an_epoch
@@ -102,7 +102,7 @@ class TrainingLoop:
     def _run(self, processes: Processes) -> PredictorNetwork:
         config = self._config
         checkpoint = Checkpoint(self._path, self._key())
-        some = taken(self._rows, self._training_index[:_BUILDING_ROWS])
+        some = self._rows.taken(self._training_index[:_BUILDING_ROWS])
         network = NETWORKS[config.preset].build(
             self._embedding, config, some, self._facts.seed, self._near_exclusion
         )
@@ -209,9 +209,10 @@ class TrainingLoop:
 
     def _watched_accuracy(self, network: PredictorNetwork) -> float:
         device = next(network.parameters()).device
+        parts = torch.split(torch.from_numpy(self._watched.latent), BATCH_ROWS)
         network.eval()
         with torch.inference_mode():
-            logit = network(torch.tensor(self._watched.latent, device=device)).logit
+            logit = torch.cat([network(part.to(device)).logit for part in parts])
         network.train()
         return float(((logit > 0.0).cpu().numpy() == self._watched.colliding).mean())
 

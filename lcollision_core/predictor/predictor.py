@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
-from lcollision_core.errors import LabelStoreError, ModelFileError, ShapeError
+from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
 from lcollision_core.meshes.topology import FloatArray
@@ -127,7 +127,7 @@ class PredictorRecord:
                 TrainingFacts.from_metadata(metadata["facts"]),
                 None if measured is None else PredictorMetrics.from_metadata(measured),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, LCollisionError) as error:
             raise ModelFileError(_MISFIT) from error
 
 
@@ -434,12 +434,4 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
 
 def held_out_rows(rows: LabelRows) -> LabelRows:
     """Return copies of the rows that never train, of rows 0, 1, 2, ... of a store."""
-    return taken(rows, is_held_out(np.arange(len(rows))))
-
-
-def taken(rows: LabelRows, index: npt.NDArray[Any]) -> LabelRows:
-    """Return copies of the rows chosen by an index or a boolean array."""
-    return replace(
-        rows,
-        **{name: getattr(rows, name)[index] for name in LabelRows.__dataclass_fields__},
-    )
+    return rows.taken(is_held_out(np.arange(len(rows))))

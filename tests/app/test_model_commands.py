@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from app.cli.main import app
 from lcollision_core.meshes import read_mesh, write_mesh, write_pose_set
 from lcollision_core.model import PoseModel, read_poses
+from lcollision_core.model_file import Section
 from tests.app.support import Lcollision
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube
 from tests.core.shapes import random_rotation
@@ -194,10 +195,15 @@ def test_a_damaged_model_is_named_and_the_others_are_listed(
     user_models.mkdir(parents=True)
     shutil.copy(tube, user_models / "good.safetensors")
     (user_models / "bad.safetensors").write_bytes(tube.read_bytes()[:-1])
+    model = PoseModel.load(tube)
+    record = Section({}, {"preset": "paper", "config": {"epochs": 0}, "metrics": None})
+    odd = PoseModel("odd", model.embedding, model.card, {"predictor": record})
+    odd.save(user_models / "odd.safetensors")
     result = lcollision("models")
     assert result.exit_code == 2
     assert "good: 210 vertices" in result.stdout
     assert "bad.safetensors" in result.stderr
+    assert "the model 'odd' is unusable: the model's predictor does not fit" in result.stderr
 
 
 def test_no_models_are_no_error(

@@ -210,6 +210,9 @@ def test_what_cannot_be_trained_or_evaluated_is_refused(
     assert "there is no label store" in _refusal(
         lcollision, "train", "predictor", model, tmp_path / "none", "-o", output
     )
+    assert "only the preset paper can be trained with the loss no-rank" in _refusal(
+        lcollision, "train", "predictor", model, store, "-o", output, "--loss", "no-rank"
+    )
     too_many = ("--rows", N_ROWS + 1)
     assert f"has {N_ROWS} rows, not {N_ROWS + 1}" in _refusal(
         lcollision, "train", "predictor", model, store, "-o", output, *too_many

@@ -122,6 +122,66 @@ def test_a_worker_of_another_version_is_refused(
         label_poses(labeller, tmp_path / "store", 10, scheduler=scheduler)
 
 
+def test_workers_that_come_late_are_asked_for_their_version(
+    scheduler: str, labeller: Labeller, tmp_path: Path
+) -> None:
+    """As if it had come late: it changes after the first chunk."""
+
+    def change(found: str) -> None:
+        cluster.version = lambda _: found  # type: ignore[assignment]
+
+    with Client(scheduler, set_as_default=False) as client:
+        (worker, *_) = client.nthreads()
+
+        def change_one(status: LabelStatus) -> None:
+            if status.done:
+                client.run(change, "0.0.7", workers=[worker])
+
+        try:
+            with pytest.raises(LCollisionError, match=f"{worker} has lcollision 0.0.7, this is"):
+                label_poses(
+                    labeller,
+                    tmp_path / "store",
+                    12 * ROWS_A_CHUNK,
+                    scheduler=scheduler,
+                    progress=change_one,
+                )
+        finally:
+            client.run(change, cluster.program_version(), workers=[worker])
+
+
+def test_workers_that_come_late_get_as_much_to_do(labeller: Labeller, tmp_path: Path) -> None:
+    with (
+        LocalCluster(
+            n_workers=1,
+            threads_per_worker=1,
+            processes=False,
+            protocol="tcp",
+            host="127.0.0.1",
+            dashboard_address=":0",
+        ) as local,
+        Client(local, set_as_default=False) as client,
+    ):
+        in_hand: list[int] = []
+
+        def add_two(status: LabelStatus) -> None:
+            tasks = [key for key in list(local.scheduler.tasks) if "label_on_worker" in str(key)]
+            in_hand.append(len(tasks))
+            if status.done and len(in_hand) == 2:
+                local.scale(3)
+                client.wait_for_workers(3)
+
+        label_poses(
+            labeller,
+            tmp_path / "store",
+            8 * ROWS_A_CHUNK,
+            scheduler=local.scheduler_address,
+            progress=add_two,
+        )
+    assert in_hand[:2] == [0, 2]
+    assert max(in_hand) >= 6
+
+
 def test_no_scheduler_and_no_worker_are_told(
     labeller: Labeller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

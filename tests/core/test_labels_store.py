@@ -158,6 +158,20 @@ def test_a_run_that_died_while_it_wrote_leaves_the_rows_before(
     assert as_bytes(LabelStore.open(path).load(N_ROWS)) == as_bytes(truth)
 
 
+def test_one_run_at_a_time_appends(path: Path, labeller: Labeller, truth: LabelRows) -> None:
+    """A second run changes nothing, not even what looks like leftovers, until the first ends."""
+    written = path / "energy" / "c" / "3.partial"
+    with LabelStore.open_to_append(path, StoreIdentity.of(labeller, 0), N_ROWS):
+        written.write_bytes(b"by the first run")
+        with pytest.raises(LabelStoreError, match="another run is labelling into") as excinfo:
+            label_poses(labeller, path, N_ROWS + 50)
+        assert str(path) in _sentence(excinfo)
+        assert written.exists()
+        assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+    assert label_poses(labeller, path, N_ROWS + 50).n_rows == N_ROWS + 50
+    assert not written.exists()
+
+
 def test_a_store_of_something_else_is_refused_and_left_alone(
     path: Path, labeller: Labeller
 ) -> None:
@@ -264,13 +278,13 @@ def test_rows_that_are_not_finite_are_neither_written_nor_read(
     rows = truth.head(ROWS_A_CHUNK)
     energy = rows.energy.copy()
     energy[5] = np.nan
-    opened = LabelStore.open_to_append(path, StoreIdentity.of(labeller, 0), N_ROWS)
-    with pytest.raises(LabelStoreError, match="energy has a number that is not finite"):
-        opened.write_chunk(0, replace(rows, energy=energy))
-    assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
-    with monkeypatch.context() as patched:
-        patched.setattr(store, "_require_finite", lambda *_: None)
-        opened.write_chunk(0, replace(rows, energy=energy))
+    with LabelStore.open_to_append(path, StoreIdentity.of(labeller, 0), N_ROWS) as opened:
+        with pytest.raises(LabelStoreError, match="energy has a number that is not finite"):
+            opened.write_chunk(0, replace(rows, energy=energy))
+        assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+        with monkeypatch.context() as patched:
+            patched.setattr(store, "_require_finite", lambda *_: None)
+            opened.write_chunk(0, replace(rows, energy=energy))
     with pytest.raises(LabelStoreError, match=r"unusable: its energy .* not finite"):
         LabelStore.open(path).load()
 

@@ -102,6 +102,18 @@ def test_both_sides_of_a_part_are_named_as_one() -> None:
     assert names == ("thighs & belly", "feet", "toes", "left upper arm")
 
 
+def test_names_are_short_and_different_whatever_the_labels() -> None:
+    """Long ones are cut, and those that are still equal numbered."""
+    long = "the skin over the third of the thoracic vertebrae, seen from behind "
+    labels = np.array([long + "left", long + "right", "upper tail", "tail", " tail "])
+    names = names_from_labels(np.eye(5), labels, np.arange(5.0))
+    first, *_ = names
+    assert names == (first, f"{long[:58].rstrip()} 2", "upper tail", "lower tail", "upper tail 2")
+    assert first == long[:60].rstrip()
+    both = names_from_labels(np.ones((1, 2)), labels[:2], np.arange(2.0))
+    assert len(both[0]) <= 60
+
+
 def test_no_weight_at_all_still_gives_names() -> None:
     assert len(set(names_from_labels(np.zeros((2, 3)), np.array(["a", "b", "c"]), np.ones(3)))) == 2
 

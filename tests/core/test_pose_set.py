@@ -269,6 +269,14 @@ def _with_nan() -> np.ndarray:
         ({"vertices": _poses(2), "faces": FACES, "near_exclusion": np.array(-1.0)}, "got -1"),
         ({"vertices": _poses(2), "faces": FACES, "near_exclusion": np.ones(2)}, "one number"),
         ({"vertices": _poses(2), "faces": FACES, "format_version": np.array(2)}, "version 2"),
+        (
+            {"vertices": _poses(2), "faces": FACES, "vertex_labels": np.array(["a", "b", " ", ""])},
+            r"printable and not blank, got ' ' for vertex 2 \(from 0\)",
+        ),
+        (
+            {"vertices": _poses(2), "faces": FACES, "vertex_labels": np.array(["a\nb", *"bcd"])},
+            r"got 'a\\nb' for vertex 0",
+        ),
         ({"vertices": np.array([None, 1]), "faces": FACES}, "Python objects"),
     ],
 )
@@ -337,6 +345,7 @@ def test_failed_write_leaves_the_old_set(tmp_path: Path) -> None:
         {"up_axis": 3},
         {"near_exclusion": float("nan")},
         {"vertex_labels": np.array(["a"])},
+        {"vertex_labels": np.array(["a", "b", "c", ""])},
     ],
 )
 def test_pose_set_that_does_not_fit_together(changes: dict[str, Any]) -> None:

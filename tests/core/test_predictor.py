@@ -191,6 +191,7 @@ def test_a_section_that_does_not_fit_is_refused(
         Section(short, section.metadata),
         Section(fewer, section.metadata),
         Section(section.arrays, without_facts),
+        Section(section.arrays, {**section.metadata, "config": {"epochs": 0}}),
     ):
         with pytest.raises(ModelFileError, match="does not fit its latent space; train"):
             CollisionPredictor.from_section(broken, tube_model.embedding)

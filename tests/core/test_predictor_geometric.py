@@ -35,6 +35,7 @@ from lcollision_core.predictor.folds import (
     find_fold_sites,
 )
 from lcollision_core.predictor.geometric import REACHES, GeometricNetwork
+from lcollision_core.predictor.networks import Targets
 from lcollision_core.predictor.patch_labels import SkinCells, patch_roots
 from tests.core.predictor_rows import made_up_rows
 
@@ -351,6 +352,23 @@ def test_a_stored_network_predicts_the_same(
     state = folding.state_dict() | {"site_vertices": torch.tensor([[10**6] * N_MEMBERS])}
     with pytest.raises(RuntimeError, match="fold sites"):
         GeometricNetwork.restore(embedding, config, state)
+
+
+def test_a_process_without_rows_adds_nothing(tube_model: PoseModel, tube_folds: np.ndarray) -> None:
+    """As where the last batch is smaller than the number of processes."""
+    network = GeometricNetwork(tube_model.embedding, 0, tube_folds)
+    latent = torch.zeros((2, tube_model.latent_size))
+    n_cells = len(network.point_vertices) + len(tube_folds)
+    sizes = (2, tube_model.embedding.n_domains), (2,), (2,), (2, n_cells)
+    targets = Targets(*(torch.zeros(size) for size in sizes))
+    none = latent[2:].requires_grad_()
+    loss = network.loss(network(none), targets, (2, 2), PRESETS["default"], 0.0)
+    assert loss == 0.0
+    loss.backward()
+    assert none.grad is not None
+    for values in network.parameters():
+        assert values.grad is not None
+        assert (values.grad == 0.0).all()
 
 
 def test_a_network_without_domains_is_the_paper_s_alone(tube_model: PoseModel) -> None:

@@ -13,13 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.nn.modules.module import register_module_forward_pre_hook
 
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.model import PoseModel
-from lcollision_core.predictor import LOSSES, PRESETS, PredictorStatus, train_predictor
+from lcollision_core.predictor import LOSSES, PRESETS, Loss, PredictorStatus, train_predictor
 from lcollision_core.predictor.loop import rate_at
+from lcollision_core.predictor.predictor import BATCH_ROWS
 from tests.core.predictor_rows import PAPER, config, made_up_rows, weights_of
 
 SECONDS_TO_WAIT = 120.0
@@ -110,6 +112,28 @@ def test_every_row_of_table_1_trains(tube_model: PoseModel, rows: LabelRows) -> 
     assert undivided.metrics.accuracy > undivided.metrics.majority_rate + 0.1
     energy = undivided.predict(rows.latent[:9]).domain_energy
     np.testing.assert_array_equal(energy[:, 0], energy[:, 1])
+
+
+@pytest.mark.parametrize("loss", LOSSES[1:])
+def test_only_the_paper_s_losses_can_be_left_out(loss: Loss) -> None:
+    with pytest.raises(LCollisionError, match=f"the loss {loss}; add --preset paper"):
+        PRESETS["default"].with_loss(loss)
+    assert PRESETS["default"].with_loss("full") == PRESETS["default"]
+
+
+def test_many_rows_are_watched_a_few_at_a_time(tube_model: PoseModel) -> None:
+    sizes: list[int] = []
+    hook = register_module_forward_pre_hook(
+        lambda module, given: sizes.append(len(given[0])) if module.training is False else None
+    )
+    try:
+        many = made_up_rows(tube_model.embedding, 3 * BATCH_ROWS + 500)
+        seen: list[PredictorStatus] = []
+        train_predictor(many, tube_model.embedding, config(epochs=1), progress=seen.append)
+    finally:
+        hook.remove()
+    assert seen[-1].held_out_accuracy is not None
+    assert max(sizes) == BATCH_ROWS
 
 
 def test_progress_ends_at_the_last_step(tube_model: PoseModel, rows: LabelRows) -> None:
