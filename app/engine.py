@@ -208,7 +208,7 @@ class LivePose(QObject):
         self._asked: FrameRequest | VerdictRequest | None = None
         self._shown: tuple[FrameRequest, LiveFrame] | None = None
         self._last_id = 0
-        self._told = ""
+        self._told: dict[type, str] = {}
         self._is_quick = False
         self._is_due = False
         # Sooner than a timer of 0 ms, which Qt fires after it has drawn the slider alone.
@@ -282,14 +282,15 @@ class LivePose(QObject):
         if request is None or request.model is not self._model:
             return
         if answer.failure is not None:
-            if answer.failure.sentence != self._told:
-                self._told = answer.failure.sentence
+            if answer.failure.sentence != self._told.get(type(request)):
+                self._told[type(request)] = answer.failure.sentence
                 self.failed.emit(answer.failure)
         elif isinstance(request, FrameRequest) and answer.value is not None:
             if request.request_id == self._last_id:
                 self._shown = (request, answer.value)
                 self._rested.start()
-            self._told = ""
+            self._told.pop(VerdictRequest, None)
+            self._told.pop(FrameRequest, None)
             self._is_quick = answer.value.seconds < _QUICK_SECONDS
             self.frame_computed.emit(answer.value)
         elif answer.value is not None and answer.request_id == self._last_id:

@@ -177,7 +177,10 @@ class MainWindow(QMainWindow):
 
     @Slot(object)
     def show_failure(self, failure: Failure) -> None:
-        """Tell what went wrong, in a dialog that leaves all else running."""
+        """Tell what went wrong, in a dialog that leaves all else running; once while it is open."""
+        told = [held for held in self.findChildren(FailureDialog) if held.isVisible()]
+        if failure.sentence in [held.failure.sentence for held in told]:
+            return
         dialog = FailureDialog(failure, self)
         dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         dialog.open()

@@ -120,7 +120,8 @@ def test_the_log_holds_what_nobody_caught_and_what_qt_says(logging_into: Path) -
     thread.start()
     thread.join()
     text = logging_into.read_text()
-    assert text.count("nobody caught this\n") == 1
+    assert text.count("nobody caught this\n") == 2
+    assert "lost disk" in text
     assert "missing bone" in text
     assert "test_editor_parts" in text
     assert "a timer of another thread" in text
@@ -128,6 +129,10 @@ def test_the_log_holds_what_nobody_caught_and_what_qt_says(logging_into: Path) -
     (failure,) = told
     assert "missing bone" in failure.sentence
     assert "Traceback" in failure.details
+    # As Qt's threads do with what their slots raise.
+    slot = threading.Thread(target=sys.excepthook, args=(OSError, OSError("lost disk"), None))
+    slot.start()
+    slot.join()
     assert len(log._QT_LEVELS) == len(QtMsgType)
 
 
