@@ -13,7 +13,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app import tasks
-from app.commands import ChangeState, DocumentState
+from app.commands import DocumentState
 from app.engine import Failure, LivePose, LongWork, Work
 from app.frames import ExactVerdict, LiveFrame, PosePrediction
 from app.history import UNNAMED, PoseHistory, read_only
@@ -429,6 +429,7 @@ class PoseDocument(PoseHistory):
             f"the mesh on average, {pose.fit_error_max:.2%} at most"
         )
 
+        self.end_gesture()
     def _on_mirrored(self, latent: FloatArray) -> None:
         self._edit("Mirror", latent)
 
@@ -436,18 +437,15 @@ class PoseDocument(PoseHistory):
         self.message.emit(f"Exported {path.name}")
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
+        self.end_gesture()
         result, self._solve = resolved.result, None
         if np.array_equal(result.latent, self.latent):
             # Nothing to undo, but the reasons are worth seeing.
             self._amend(replace(self._state, outcome=result))
         else:
-            after = replace(
-                self._state,
-                latent=read_only(np.array(result.latent, dtype=np.float64)),
-                ghost=resolved.ghost,
-                outcome=result,
-            )
-            self.undo_stack.push(ChangeState("Resolve", self._apply, self._state, after))
+            latent = read_only(np.array(result.latent, dtype=np.float64))
+            after = replace(self._state, latent=latent, ghost=resolved.ghost, outcome=result)
+            self._push("Resolve", after)
         self.solve_finished.emit(result)
 
     def _on_solve_failed(self) -> None:

@@ -142,6 +142,31 @@ def test_steps_a_while_apart_do_not_merge(
     assert document.undo_stack.count() == 2
 
 
+def test_what_arrives_in_mid_drag_is_a_step_after_the_drag(
+    qtbot: QtBot, document: PoseDocument, colliding: np.ndarray, tmp_path: Path
+) -> None:
+    model = document.model
+    write_mesh(tmp_path / "bent.ply", model.decode(model.training_latent[1]), model.faces)
+    with qtbot.waitSignal(document.message, timeout=20_000):
+        document.import_mesh(tmp_path / "bent.ply")
+        document.begin_gesture("Drag")
+        document.set_code(0, 0.5)
+    document.end_gesture()
+    document.undo()
+    assert document.latent.tolist() == [0.5, *[0.0] * (model.latent_size - 1)]
+    document.set_latent(colliding, "Jump")
+    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
+        document.resolve()
+        document.begin_gesture("Drag")
+    solved = document.latent
+    document.set_code(0, 1.25)
+    document.end_gesture()
+    document.undo()
+    assert document.latent.tobytes() == solved.tobytes()
+    document.undo()
+    assert document.latent.tobytes() == colliding.tobytes()
+
+
 def test_a_number_that_is_not_finite_is_ignored(document: PoseDocument) -> None:
     document.set_code(0, float("nan"))
     assert document.undo_stack.count() == 0
