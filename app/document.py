@@ -166,10 +166,6 @@ class PoseDocument(PoseHistory):
         latent[index] = value
         self._edit(f"Move {self.code_name(index)}", latent, run=index)
 
-    def set_latent(self, latent: npt.ArrayLike, label: str) -> None:
-        """Set the whole pose, a (D,) finite array, in one step with this name in the menu."""
-        self._edit(label, np.array(latent, dtype=np.float64))
-
     def reset_code(self, index: int) -> None:
         """Set one number of the latent to 0."""
         latent = self.latent.copy()
@@ -192,12 +188,6 @@ class PoseDocument(PoseHistory):
         drawn = self.model.latent_space.sample(1, np.random.default_rng(seed))[0]
         latent = (1.0 - amount) * self.latent + amount * drawn
         self._edit("Randomise", self._with_locked(latent))
-
-    def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
-        """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1."""
-        start = self._gesture[1].latent if self._gesture else self.latent
-        target = np.asarray(latent, dtype=np.float64)
-        self._edit("Blend", target.copy() if share == 1.0 else start + share * (target - start))
 
     def mirror(self) -> None:
         """Exchange left and right, in the long worker, as the mirrored mesh is encoded."""
@@ -307,11 +297,7 @@ class PoseDocument(PoseHistory):
         if target is None:
             raise ModelFileError("the pose has no file yet; save it under a name")
         write_poses(target, self.model, poses)
-        self._file = target
-        # The library is now what the file is, whichever way undo comes back to this pose.
-        self._amend(replace(self._state, poses=poses))
-        self.undo_stack.setClean()
-        self.file_changed.emit()
+        self._keep_saved(poses, target)
         self.message.emit(f"Saved {target.name}")
 
     def import_mesh(self, path: str | Path) -> None:
@@ -405,19 +391,14 @@ class PoseDocument(PoseHistory):
         self.message.emit(f"Opened {opened.model.name}")
 
     def _on_poses(self, read: tasks.ReadPoses) -> None:
-        first = read.poses[0]
-        latent = read_only(first.latent)
-        self._begin(DocumentState(latent, first.name, first.placement, read.poses), read.path)
-        n_poses = len(read.poses)
-        self.message.emit(f"Opened {read.path.name}: {n_poses} pose{'s' * (n_poses != 1)}")
+        self._begin_with(read.poses[0], read.poses, read.path)
+        self.message.emit(f"Opened {read.path.name}: {counted(len(read.poses), 'pose')}")
 
     def _on_recovered(self, found: tasks.RecoveredPoses) -> None:
         if found.opened.model is not self._model:
             self._put_in(found.opened)
         edited = next((p for p in found.poses if p.name == found.name), found.poses[0])
-        latent = read_only(edited.latent)
-        state = DocumentState(latent, edited.name, edited.placement, found.poses)
-        self._begin(state, found.file)
+        self._begin_with(edited, found.poses, found.file)
         self.undo_stack.resetClean()
         self.message.emit(f"Recovered {edited.name}")
         self.recovered.emit(found.poses_file)
@@ -451,9 +432,6 @@ class PoseDocument(PoseHistory):
     def _on_solve_failed(self) -> None:
         self._solve = None
         self.solve_finished.emit(None)
-
-    def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
-        self._push(label, replace(self._state, latent=read_only(latent), outcome=None), run)
 
     def _load_predictor(self) -> None:
         """Have predictions soon: the pose is shown, and can be edited, before."""

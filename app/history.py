@@ -128,6 +128,16 @@ class PoseHistory(QObject):
             self._gesture = None
             self._apply(before)
 
+    def set_latent(self, latent: npt.ArrayLike, label: str) -> None:
+        """Set the whole pose, a (D,) finite array, in one step with this name in the menu."""
+        self._edit(label, np.array(latent, dtype=np.float64))
+
+    def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
+        """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1."""
+        start = self._gesture[1].latent if self._gesture else self.latent
+        target = np.asarray(latent, dtype=np.float64)
+        self._edit("Blend", target.copy() if share == 1.0 else start + share * (target - start))
+
     def undo(self) -> None:
         """Take back the last step; a drag that has not ended is that step."""
         self.end_gesture()
@@ -218,6 +228,20 @@ class PoseHistory(QObject):
 
     def _apply(self, state: DocumentState) -> None:
         """Put in a state and tell what has changed: the one place where the pose changes."""
+    def _keep_saved(self, poses: tuple[NamedPose, ...], file: Path) -> None:
+        """Remember what a file holds now as the library, whichever way undo comes back to it."""
+        self._file = file
+        self._amend(replace(self._state, poses=poses))
+        self.undo_stack.setClean()
+        self.file_changed.emit()
+
+    def _begin_with(
+        self, edited: NamedPose, poses: tuple[NamedPose, ...], file: Path | None
+    ) -> None:
+        """Put in a pose of a library, without a past."""
+        latent = read_only(edited.latent)
+        self._begin(DocumentState(latent, edited.name, edited.placement, poses), file)
+
         before, self._state = self._state, state
         if state.latent is not before.latent:
             self._follow_latent()
