@@ -149,7 +149,7 @@ class PoseHistory(QObject):
         self.undo_stack.redo()
 
     def load_pose(self, pose: NamedPose) -> None:
-        """Make a pose of the library, or a training pose, the one that is edited."""
+        """Edit a pose of the library under its name, or a training pose under a free one."""
         self._load(f"Load {pose.name}", pose)
 
     def add_pose_to_library(self, name: str) -> None:
@@ -159,10 +159,9 @@ class PoseHistory(QObject):
         ----------
         name : of the pose, which is called so from then on
         """
-        from lcollision_core.model import NamedPose, unique_names
+        from lcollision_core.model import NamedPose
 
-        taken = [pose.name for pose in self.poses]
-        free = unique_names([*taken, name or UNNAMED])[-1]
+        free = self._free_name(name or UNNAMED)
         added = NamedPose(free, self.latent, self.placement)
         state = replace(self._state, pose_name=free, poses=(*self.poses, added))
         self._push(f"Keep {free}", state)
@@ -194,10 +193,22 @@ class PoseHistory(QObject):
             return (*self.poses, edited)
         return tuple(edited if pose.name == edited.name else pose for pose in self.poses)
 
+    def _free_name(self, name: str) -> str:
+        """Return a name that no pose of the library has: this one, or with a number."""
+        from lcollision_core.model import unique_names
+
+        return unique_names([*(pose.name for pose in self.poses), name])[-1]
+
     def _load(self, label: str, pose: NamedPose) -> None:
+        # Under the name of another pose of the library, Save would put it in that one's place.
+        is_own = any(pose is own for own in self.poses)
+        name = pose.name if is_own else self._free_name(pose.name)
         latent = read_only(np.array(pose.latent, dtype=np.float64))
-        self._push(label, DocumentState(latent, pose.name, pose.placement, self.poses))
+        self._push(label, DocumentState(latent, name, pose.placement, self.poses))
         self.pose_loaded.emit()
+
+    def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
+        self._push(label, replace(self._state, latent=read_only(latent), outcome=None), run)
 
     def _push(self, label: str, state: DocumentState, run: int | None = None) -> None:
         """Go to another state, as a step of its own or as part of the gesture."""
@@ -217,17 +228,6 @@ class PoseHistory(QObject):
             later.before = state
         self._apply(state)
 
-    def _begin(self, state: DocumentState, file: Path | None) -> None:
-        """Put in a state without a past."""
-        self._gesture = None
-        self._file = file
-        self._apply(state)
-        self.undo_stack.clear()
-        self.file_changed.emit()
-        self.pose_loaded.emit()
-
-    def _apply(self, state: DocumentState) -> None:
-        """Put in a state and tell what has changed: the one place where the pose changes."""
     def _keep_saved(self, poses: tuple[NamedPose, ...], file: Path) -> None:
         """Remember what a file holds now as the library, whichever way undo comes back to it."""
         self._file = file
@@ -242,6 +242,17 @@ class PoseHistory(QObject):
         latent = read_only(edited.latent)
         self._begin(DocumentState(latent, edited.name, edited.placement, poses), file)
 
+    def _begin(self, state: DocumentState, file: Path | None) -> None:
+        """Put in a state without a past."""
+        self._gesture = None
+        self._file = file
+        self._apply(state)
+        self.undo_stack.clear()
+        self.file_changed.emit()
+        self.pose_loaded.emit()
+
+    def _apply(self, state: DocumentState) -> None:
+        """Put in a state and tell what has changed: the one place where the pose changes."""
         before, self._state = self._state, state
         if state.latent is not before.latent:
             self._follow_latent()
