@@ -44,6 +44,10 @@ class PoseDocument(PoseHistory):
     merges with the one before when it is the same slider within a second.
 
     Signals
+    Attributes
+    ----------
+    may_replace : asked before a model or a file comes in over edits made while it was read
+
     -------
     model_changed : another model is in; latent, library, locks and history are new too
     latent_changed, locks_changed, ghost_changed, library_changed, file_changed : look again;
@@ -87,6 +91,7 @@ class PoseDocument(PoseHistory):
         self._closed = False
         self._live = LivePose(REST_MILLISECONDS, self)
         self._live.frame_computed.connect(self._on_frame_computed)
+        self.may_replace: Callable[[], bool] = lambda: True
         self._live.verdict_computed.connect(self._on_verdict_computed)
         self._live.failed.connect(self.failed)
         self._long = LongWork(self)
@@ -303,7 +308,7 @@ class PoseDocument(PoseHistory):
     def import_mesh(self, path: str | Path) -> None:
         """Encode a mesh of the model's topology in the long worker and make it the pose."""
         work = tasks.encoded(self.model, Path(path))
-        self._bring(f"Importing {Path(path).name}", work, self._on_encoded)
+        self._bring(f"Importing {Path(path).name}", work, self._on_encoded, ask=False)
 
     def export_mesh(self, path: str | Path) -> None:
         """Write the mesh on the screen, back in its place, in the format that `path` says."""
@@ -444,11 +449,21 @@ class PoseDocument(PoseHistory):
             self._predicts = True
             self._live.follow(self.model, self.latent, self._predicts)
 
-    def _bring(self, label: str, work: Work, done: Callable[[Any], None]) -> None:
-        """Start what will replace the pose; the newest such wish wins, also over Resolve."""
+    def _bring(self, label: str, work: Work, done: Callable[[Any], None], ask: bool = True) -> None:
+        """Start what will bring another pose; the newest such wish wins, also over Resolve.
+
+        What undo does not take back is to `ask` before it comes in over later edits.
+        """
         self.cancel_resolve()
         self._long.cancel(self._incoming)
-        self._incoming = self._long.start(label, work, done)
+        known = self._state
+
+        def arrive(value: Any) -> None:
+            self.end_gesture()
+            if not ask or self._state.same_as(known) or self.may_replace():
+                done(value)
+
+        self._incoming = self._long.start(label, work, arrive)
 
     def _blank(self) -> DocumentState:
         return DocumentState(read_only(np.zeros(self.model.latent_size)), UNNAMED)

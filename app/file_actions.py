@@ -62,7 +62,7 @@ class FileActions(QObject):
         window: QWidget,
         document: PoseDocument,
         settings: Settings,
-        attempt: Callable[[Callable[[], object]], None],
+        attempt: Callable[[Callable[[], object]], object],
     ) -> None:
         super().__init__(window)
         self._attempt = attempt
@@ -71,6 +71,7 @@ class FileActions(QObject):
         self._settings = settings
         self._recent: QMenu | None = None
         document.file_changed.connect(self._on_file)
+        document.may_replace = lambda: bool(attempt(self.may_lose_changes))
 
     def open(self) -> None:
         """Ask for any file that can be opened, and open it."""

@@ -157,13 +157,19 @@ class MainWindow(QMainWindow):
 
     # What others may do to it.
 
-    def attempt(self, act: Callable[[], object]) -> None:
-        """Do something, and show what a user can mend of what goes wrong."""
+    def attempt(self, act: Callable[[], object]) -> object:
+        """Do something, and show what a user can mend of what goes wrong.
+
+        Returns
+        -------
+        value : what `act` returned; None where it went wrong
+        """
         try:
-            act()
+            return act()
         except LCollisionError as error:
             _log.info("shown to the user: %s", error, exc_info=True)
             self.show_failure(Failure(str(error), traceback.format_exc()))
+            return None
 
     def set_autosave(self, autosave: Autosave) -> None:
         """Take charge of an autosave: its failures are shown, and it ends with the window."""

@@ -296,6 +296,42 @@ def test_the_library_is_undone_like_the_pose(document: PoseDocument) -> None:
     assert not document.modified
 
 
+def test_a_pose_from_elsewhere_takes_no_name_of_the_library(document: PoseDocument) -> None:
+    document.add_pose_to_library("bend 2")
+    (own,) = document.poses
+    document.load_pose(document.training_pose(2))
+    assert document.pose_name == "bend 2 2"
+    assert [pose.name for pose in document.all_poses()] == ["bend 2", "bend 2 2"]
+    document.load_pose(own)
+    assert document.pose_name == "bend 2"
+
+
+@pytest.mark.parametrize("may", [False, True])
+def test_edits_made_while_a_file_is_read_are_not_replaced_unasked(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path, may: bool
+) -> None:
+    path = tmp_path / "pose.json"
+    write_poses(path, document.model, [NamedPose("a", document.model.training_latent[1])])
+    asked = []
+
+    def answer() -> bool:
+        asked.append(document.latent[0])
+        return may
+
+    document.may_replace = answer
+    document.open_poses(path)
+    document.set_code(0, 0.5)
+    qtbot.waitUntil(lambda: not document.busy)
+    assert asked == [0.5]
+    assert (document.pose_name == "a") == may
+    document.undo()
+    assert document.latent.any() == may
+    document.open_poses(path)
+    qtbot.waitUntil(lambda: not document.busy)
+    assert len(asked) == 1
+    assert document.pose_name == "a"
+
+
 def test_open_replaces_the_pose_the_library_and_the_history(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
