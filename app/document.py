@@ -17,6 +17,7 @@ from app.commands import DocumentState
 from app.engine import Failure, LivePose, LongWork, Work
 from app.frames import ExactVerdict, LiveFrame, PosePrediction
 from app.history import UNNAMED, PoseHistory, read_only
+from app.panels.wording import counted
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
@@ -43,11 +44,11 @@ class PoseDocument(PoseHistory):
     where they end as they began. A step on a slider outside a gesture, as from the keyboard,
     merges with the one before when it is the same slider within a second.
 
-    Signals
     Attributes
     ----------
     may_replace : asked before a model or a file comes in over edits made while it was read
 
+    Signals
     -------
     model_changed : another model is in; latent, library, locks and history are new too
     latent_changed, locks_changed, ghost_changed, library_changed, file_changed : look again;
@@ -87,11 +88,12 @@ class PoseDocument(PoseHistory):
         self._exact: ExactVerdict | None = None
 
         self._solve: int | None = None
-        self._mirroring = self._incoming = 0
+        self._mirroring = self._incoming = self._loading = 0
+        self._exports: list[int] = []
         self._closed = False
+        self.may_replace: Callable[[], bool] = lambda: True
         self._live = LivePose(REST_MILLISECONDS, self)
         self._live.frame_computed.connect(self._on_frame_computed)
-        self.may_replace: Callable[[], bool] = lambda: True
         self._live.verdict_computed.connect(self._on_verdict_computed)
         self._live.failed.connect(self.failed)
         self._long = LongWork(self)
@@ -239,7 +241,9 @@ class PoseDocument(PoseHistory):
         self._model_file, self._mirror = opened.file, opened.mirror
         self._locked = frozenset()
         self.cancel_resolve()
-        self._long.cancel_all()
+        # What is being exported is a snapshot, and goes on.
+        for number in (self._mirroring, self._incoming, self._loading):
+            self._long.cancel(number)
         self._frame = self._exact = self._gesture = self._file = None
         self._state = self._blank()
         self._predicts = False
@@ -312,11 +316,20 @@ class PoseDocument(PoseHistory):
 
     def export_mesh(self, path: str | Path) -> None:
         """Write the mesh on the screen, back in its place, in the format that `path` says."""
-        self._long.start(
-            f"Exporting {Path(path).name}",
-            tasks.exported(self.model, self.latent, self.placement, Path(path)),
-            self._on_exported,
-        )
+        work = tasks.exported(self.model, self.latent, self.placement, Path(path))
+        number = self._long.start(f"Exporting {Path(path).name}", work, self._on_exported)
+        self._exports.append(number)
+
+    def finish_exports(self) -> None:
+        """Write here and now what still waits to be exported, as before the window closes.
+
+        Raises
+        ------
+        MeshFileError : a file cannot be written; asked again, the others are.
+        """
+        for number in self._exports:
+            self._long.finish(number)
+        self._exports.clear()
 
     # Resolve.
 
@@ -415,16 +428,16 @@ class PoseDocument(PoseHistory):
             f"the mesh on average, {pose.fit_error_max:.2%} at most"
         )
 
-        self.end_gesture()
     def _on_mirrored(self, latent: FloatArray) -> None:
+        self.end_gesture()
         self._edit("Mirror", latent)
 
     def _on_exported(self, path: Path) -> None:
         self.message.emit(f"Exported {path.name}")
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
-        self.end_gesture()
         result, self._solve = resolved.result, None
+        self.end_gesture()
         if np.array_equal(result.latent, self.latent):
             # Nothing to undo, but the reasons are worth seeing.
             self._amend(replace(self._state, outcome=result))
@@ -442,7 +455,7 @@ class PoseDocument(PoseHistory):
         """Have predictions soon: the pose is shown, and can be edited, before."""
         if self.can_resolve and not self._predicts and not self._closed:
             work = tasks.loaded_predictor(self.model)
-            self._long.start("Loading predictions", work, self._on_predictor)
+            self._loading = self._long.start("Loading predictions", work, self._on_predictor)
 
     def _on_predictor(self, model: PoseModel) -> None:
         if model is self._model:

@@ -21,7 +21,7 @@ from PySide6.QtCore import QObject, Qt, QThread, QTimer, Signal, Slot
 
 from app.frames import LiveFrame, PoseShower, keep_torch_to_one_thread
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import CancelToken, Progress, no_progress
 
 if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
@@ -360,6 +360,17 @@ class LongWork(QObject):
             self.busy_changed.emit(self.busy)
 
     def cancel_all(self) -> None:
+    def finish(self, number: int) -> None:
+        """Do a job here and now, instead of in its turn; does nothing where it is done.
+
+        Raises whatever its work raises.
+        """
+        held = self._jobs.get(number)
+        if held is not None:
+            job, done, _ = held
+            self.cancel(number)
+            done(job.work(no_progress, CancelToken()))
+
         """Stop all jobs."""
         for number in list(self._jobs):
             self.cancel(number)

@@ -238,15 +238,14 @@ class MainWindow(QMainWindow):
 
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
         """Settle unsaved changes, then end all work before the view goes."""
-        may_close = self._unasked
 
-        def settle() -> None:
-            nonlocal may_close
-            may_close = self.files.may_lose_changes()
+        def settle() -> bool:
+            self.document.finish_exports()
+            return self._unasked or self.files.may_lose_changes()
 
-        if not may_close:
-            self.attempt(settle)
-        if not may_close:
+        may_close = self.attempt(settle)
+        # `close_unasked` takes an open question away, but cannot close what is closing.
+        if not (may_close or self._unasked):
             event.ignore()
             return
         self.settings["window_geometry"] = self.saveGeometry()

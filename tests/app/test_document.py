@@ -396,6 +396,16 @@ def test_an_exported_mesh_is_the_one_on_the_screen_in_its_place(
     assert (mesh.vertices.astype(np.float32)[mesh.faces] == placed[document.model.faces]).all()
 
 
+def test_another_model_stops_no_export(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    model = document.model
+    with qtbot.waitSignal(document.message):
+        document.export_mesh(tmp_path / "pose.obj")
+        document.set_model(PoseModel("bare", model.embedding, model.card))
+    assert (tmp_path / "pose.obj").is_file()
+
+
 def test_an_exported_mesh_comes_back_as_the_same_mesh(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
