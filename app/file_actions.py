@@ -238,16 +238,24 @@ class FileActions(QObject):
     def _ask_save(self, title: str, proposed: Path, kinds: dict[str, str]) -> Path | None:
         """Ask for a name; the chosen kind's extension is added to a name without one."""
         filters = {f"{kind} (*{suffix})": suffix for kind, suffix in kinds.items()}
-        name, chosen = QFileDialog.getSaveFileName(
-            self._window, title, str(proposed), ";;".join(filters)
-        )
-        if not name:
-            return None
-        path = Path(name)
-        self._settings["last_folder"] = str(path.resolve().parent)
-        if path.suffix.lower() in kinds.values():
-            return path
-        return path.with_name(path.name + filters.get(chosen, next(iter(kinds.values()))))
+        dialog = QFileDialog(self._window, title, str(proposed))
+        dialog.setAcceptMode(QFileDialog.AcceptMode.AcceptSave)
+        dialog.setNameFilters(list(filters))
+        dialog.setDefaultSuffix(next(iter(kinds.values())))
+        dialog.filterSelected.connect(lambda chosen: dialog.setDefaultSuffix(filters[chosen]))
+        path = None
+        while path is None and dialog.exec() == QDialog.DialogCode.Accepted:
+            path = Path(dialog.selectedFiles()[0])
+            if path.suffix.lower() not in kinds.values():
+                # Qt adds no extension behind a dot, so that it has asked about another file.
+                path = path.with_name(f"{path.name}.{dialog.defaultSuffix()}")
+                if path.exists():
+                    dialog.selectFile(str(path))
+                    path = None
+        dialog.deleteLater()
+        if path is not None:
+            self._settings["last_folder"] = str(path.resolve().parent)
+        return path
 
     @staticmethod
     def _after(form: QDialog, act: Callable[[], None]) -> None:
