@@ -12,6 +12,7 @@ from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
 from app.dialogs.forms import screenshot_form, turntable_form
 from app.dialogs.questions import Answer, ask_about_changes
+from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class FileActions(QObject):
     ----------
     window : that dialogs belong to
     document : opened into and saved from
-    settings : remembers the last folder and the recent files
+    settings : remembers the last folder, the recent files and the model
     attempt : does something and shows what a user can mend of what goes wrong
     """
 
@@ -70,8 +71,9 @@ class FileActions(QObject):
         self._document = document
         self._settings = settings
         self._recent: QMenu | None = None
-        document.file_changed.connect(self._on_file)
         document.may_replace = lambda: bool(attempt(self.may_lose_changes))
+        document.file_changed.connect(self._on_file)
+        document.model_changed.connect(self._on_model)
 
     def open(self) -> None:
         """Ask for any file that can be opened, and open it."""
@@ -222,6 +224,13 @@ class FileActions(QObject):
     def _on_file(self) -> None:
         if self._document.file is not None:
             self._remember(self._document.file)
+
+    @Slot()
+    def _on_model(self) -> None:
+        file = Path(self._document.model_file)
+        # By its name a bundled one is found after the program has moved.
+        is_bundled = file.parent == bundled_folder("models")
+        self._settings["model"] = file.stem if is_bundled else str(file)
 
     def _remember(self, path: Path) -> None:
         self._settings.remember_file(str(path.resolve()))

@@ -51,7 +51,7 @@ class StartUp(QObject):
         self._window = window
         self._document = window.document
         self._path = path
-        self._model: str | Path = model_name or DEFAULT_MODEL
+        self._model: str | Path = model_name or last_model(window.settings["model"])
         self._poll = QTimer(self)
         self._poll.setInterval(_POLL_MILLISECONDS)
         self._poll.timeout.connect(_nothing)
@@ -115,6 +115,12 @@ class StartUp(QObject):
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         _log.info("signal %d: closing", number)
         self._window.close_unasked()
+
+
+def last_model(remembered: str) -> str:
+    """Return the remembered file, or name of a bundled model, or the default where it is gone."""
+    bundled = bundled_folder("models") / f"{remembered}{MODEL_SUFFIX}"
+    return remembered if bundled.is_file() or Path(remembered).is_file() else DEFAULT_MODEL
 
 
 def opening_pose(model: PoseModel) -> NamedPose:
