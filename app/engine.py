@@ -110,10 +110,6 @@ class Answer:
     cancelled: bool = False
 
 
-def _nothing() -> None:
-    """Do nothing: the default of what may be told."""
-
-
 class LiveWorker(QObject):
     """Computes frames and verdicts, in its own thread; `answered` tells what was asked too."""
 
@@ -289,11 +285,11 @@ class LivePose(QObject):
             if request.request_id == self._last_id:
                 self._shown = (request, answer.value)
                 self._rested.start()
-            self._told.pop(VerdictRequest, None)
             self._told.pop(FrameRequest, None)
             self._is_quick = answer.value.seconds < _QUICK_SECONDS
             self.frame_computed.emit(answer.value)
         elif answer.value is not None and answer.request_id == self._last_id:
+            self._told.pop(VerdictRequest, None)
             self.verdict_computed.emit(answer.value)
 
 
@@ -330,7 +326,7 @@ class LongWork(QObject):
         label: str,
         work: Work,
         done: Callable[[Any], None],
-        failed: Callable[[], None] = _nothing,
+        failed: Callable[[], None] = lambda: None,
     ) -> int:
         """Do some work when what was started before is done.
 
@@ -360,6 +356,10 @@ class LongWork(QObject):
             self.busy_changed.emit(self.busy)
 
     def cancel_all(self) -> None:
+        """Stop all jobs."""
+        for number in list(self._jobs):
+            self.cancel(number)
+
     def finish(self, number: int) -> None:
         """Do a job here and now, instead of in its turn; does nothing where it is done.
 
@@ -370,10 +370,6 @@ class LongWork(QObject):
             job, done, _ = held
             self.cancel(number)
             done(job.work(no_progress, CancelToken()))
-
-        """Stop all jobs."""
-        for number in list(self._jobs):
-            self.cancel(number)
 
     def close(self, deadline: float) -> bool:
         """Cancel all jobs and end the thread.
