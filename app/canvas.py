@@ -123,7 +123,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._vtk_interactor.RemoveObserver(self._observer)
         self._vtk_interactor.EnableRenderOn()
         del self._vtk_interactor
-        self._before_paint = _nothing
+        self._before_paint = lambda: None
         self.close()
 
     def paintGL(self) -> None:  # noqa: N802 - Qt's name
@@ -199,7 +199,3 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         if not self._painting:
             self.redraw()
             self.camera_moved.emit()
-
-
-def _nothing() -> None:
-    """Do nothing before a picture that is not drawn."""

@@ -13,10 +13,11 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app import tasks
-from app.commands import ChangeState, DocumentState
+from app.commands import DocumentState
 from app.engine import Failure, LivePose, LongWork, Work
 from app.frames import ExactVerdict, LiveFrame, PosePrediction
 from app.history import UNNAMED, PoseHistory, read_only
+from app.panels.wording import counted
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
@@ -42,6 +43,10 @@ class PoseDocument(PoseHistory):
     `begin_gesture` and `end_gesture` changes show at once but make one step together, and none
     where they end as they began. A step on a slider outside a gesture, as from the keyboard,
     merges with the one before when it is the same slider within a second.
+
+    Attributes
+    ----------
+    may_replace : asked before a model or a file comes in over edits made while it was read
 
     Signals
     -------
@@ -83,8 +88,10 @@ class PoseDocument(PoseHistory):
         self._exact: ExactVerdict | None = None
 
         self._solve: int | None = None
-        self._mirroring = self._incoming = 0
+        self._mirroring = self._incoming = self._loading = 0
+        self._exports: list[int] = []
         self._closed = False
+        self.may_replace: Callable[[], bool] = lambda: True
         self._live = LivePose(REST_MILLISECONDS, self)
         self._live.frame_computed.connect(self._on_frame_computed)
         self._live.verdict_computed.connect(self._on_verdict_computed)
@@ -166,10 +173,6 @@ class PoseDocument(PoseHistory):
         latent[index] = value
         self._edit(f"Move {self.code_name(index)}", latent, run=index)
 
-    def set_latent(self, latent: npt.ArrayLike, label: str) -> None:
-        """Set the whole pose, a (D,) finite array, in one step with this name in the menu."""
-        self._edit(label, np.array(latent, dtype=np.float64))
-
     def reset_code(self, index: int) -> None:
         """Set one number of the latent to 0."""
         latent = self.latent.copy()
@@ -192,12 +195,6 @@ class PoseDocument(PoseHistory):
         drawn = self.model.latent_space.sample(1, np.random.default_rng(seed))[0]
         latent = (1.0 - amount) * self.latent + amount * drawn
         self._edit("Randomise", self._with_locked(latent))
-
-    def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
-        """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1."""
-        start = self._gesture[1].latent if self._gesture else self.latent
-        target = np.asarray(latent, dtype=np.float64)
-        self._edit("Blend", target.copy() if share == 1.0 else start + share * (target - start))
 
     def mirror(self) -> None:
         """Exchange left and right, in the long worker, as the mirrored mesh is encoded."""
@@ -245,7 +242,9 @@ class PoseDocument(PoseHistory):
         self._model_file, self._mirror = opened.file, opened.mirror
         self._locked = frozenset()
         self.cancel_resolve()
-        self._long.cancel_all()
+        # What is being exported is a snapshot, and goes on.
+        for number in (self._mirroring, self._incoming, self._loading):
+            self._long.cancel(number)
         self._frame = self._exact = self._gesture = self._file = None
         self._state = self._blank()
         self._predicts = False
@@ -308,25 +307,30 @@ class PoseDocument(PoseHistory):
         if target is None:
             raise ModelFileError("the pose has no file yet; save it under a name")
         write_poses(target, self.model, poses)
-        self._file = target
-        # The library is now what the file is, whichever way undo comes back to this pose.
-        self._amend(replace(self._state, poses=poses))
-        self.undo_stack.setClean()
-        self.file_changed.emit()
+        self._keep_saved(poses, target)
         self.message.emit(f"Saved {target.name}")
 
     def import_mesh(self, path: str | Path) -> None:
         """Encode a mesh of the model's topology in the long worker and make it the pose."""
         work = tasks.encoded(self.model, Path(path))
-        self._bring(f"Importing {Path(path).name}", work, self._on_encoded)
+        self._bring(f"Importing {Path(path).name}", work, self._on_encoded, ask=False)
 
     def export_mesh(self, path: str | Path) -> None:
         """Write the mesh on the screen, back in its place, in the format that `path` says."""
-        self._long.start(
-            f"Exporting {Path(path).name}",
-            tasks.exported(self.model, self.latent, self.placement, Path(path)),
-            self._on_exported,
-        )
+        work = tasks.exported(self.model, self.latent, self.placement, Path(path))
+        number = self._long.start(f"Exporting {Path(path).name}", work, self._on_exported)
+        self._exports.append(number)
+
+    def finish_exports(self) -> None:
+        """Write here and now what still waits to be exported, as before the window closes.
+
+        Raises
+        ------
+        MeshFileError : a file cannot be written; asked again, the others are.
+        """
+        for number in self._exports:
+            self._long.finish(number)
+        self._exports.clear()
 
     # Resolve.
 
@@ -406,19 +410,14 @@ class PoseDocument(PoseHistory):
         self.message.emit(f"Opened {opened.model.name}")
 
     def _on_poses(self, read: tasks.ReadPoses) -> None:
-        first = read.poses[0]
-        latent = read_only(first.latent)
-        self._begin(DocumentState(latent, first.name, first.placement, read.poses), read.path)
-        n_poses = len(read.poses)
-        self.message.emit(f"Opened {read.path.name}: {n_poses} pose{'s' * (n_poses != 1)}")
+        self._begin_with(read.poses[0], read.poses, read.path)
+        self.message.emit(f"Opened {read.path.name}: {counted(len(read.poses), 'pose')}")
 
     def _on_recovered(self, found: tasks.RecoveredPoses) -> None:
         if found.opened.model is not self._model:
             self._put_in(found.opened)
         edited = next((p for p in found.poses if p.name == found.name), found.poses[0])
-        latent = read_only(edited.latent)
-        state = DocumentState(latent, edited.name, edited.placement, found.poses)
-        self._begin(state, found.file)
+        self._begin_with(edited, found.poses, found.file)
         self.undo_stack.resetClean()
         self.message.emit(f"Recovered {edited.name}")
         self.recovered.emit(found.poses_file)
@@ -431,6 +430,7 @@ class PoseDocument(PoseHistory):
         )
 
     def _on_mirrored(self, latent: FloatArray) -> None:
+        self.end_gesture()
         self._edit("Mirror", latent)
 
     def _on_exported(self, path: Path) -> None:
@@ -438,42 +438,46 @@ class PoseDocument(PoseHistory):
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
         result, self._solve = resolved.result, None
+        self.end_gesture()
         if np.array_equal(result.latent, self.latent):
             # Nothing to undo, but the reasons are worth seeing.
             self._amend(replace(self._state, outcome=result))
         else:
-            after = replace(
-                self._state,
-                latent=read_only(np.array(result.latent, dtype=np.float64)),
-                ghost=resolved.ghost,
-                outcome=result,
-            )
-            self.undo_stack.push(ChangeState("Resolve", self._apply, self._state, after))
+            latent = read_only(np.array(result.latent, dtype=np.float64))
+            after = replace(self._state, latent=latent, ghost=resolved.ghost, outcome=result)
+            self._push("Resolve", after)
         self.solve_finished.emit(result)
 
     def _on_solve_failed(self) -> None:
         self._solve = None
         self.solve_finished.emit(None)
 
-    def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
-        self._push(label, replace(self._state, latent=read_only(latent), outcome=None), run)
-
     def _load_predictor(self) -> None:
         """Have predictions soon: the pose is shown, and can be edited, before."""
         if self.can_resolve and not self._predicts and not self._closed:
             work = tasks.loaded_predictor(self.model)
-            self._long.start("Loading predictions", work, self._on_predictor)
+            self._loading = self._long.start("Loading predictions", work, self._on_predictor)
 
     def _on_predictor(self, model: PoseModel) -> None:
         if model is self._model:
             self._predicts = True
             self._live.follow(self.model, self.latent, self._predicts)
 
-    def _bring(self, label: str, work: Work, done: Callable[[Any], None]) -> None:
-        """Start what will replace the pose; the newest such wish wins, also over Resolve."""
+    def _bring(self, label: str, work: Work, done: Callable[[Any], None], ask: bool = True) -> None:
+        """Start what will bring another pose; the newest such wish wins, also over Resolve.
+
+        What undo does not take back is to `ask` before it comes in over later edits.
+        """
         self.cancel_resolve()
         self._long.cancel(self._incoming)
-        self._incoming = self._long.start(label, work, done)
+        known = self._state
+
+        def arrive(value: Any) -> None:
+            self.end_gesture()
+            if not ask or self._state.same_as(known) or self.may_replace():
+                done(value)
+
+        self._incoming = self._long.start(label, work, arrive)
 
     def _blank(self) -> DocumentState:
         return DocumentState(read_only(np.zeros(self.model.latent_size)), UNNAMED)

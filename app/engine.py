@@ -21,7 +21,7 @@ from PySide6.QtCore import QObject, Qt, QThread, QTimer, Signal, Slot
 
 from app.frames import LiveFrame, PoseShower, keep_torch_to_one_thread
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import CancelToken, Progress, no_progress
 
 if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
@@ -108,10 +108,6 @@ class Answer:
     value: Any = None
     failure: Failure | None = None
     cancelled: bool = False
-
-
-def _nothing() -> None:
-    """Do nothing: the default of what may be told."""
 
 
 class LiveWorker(QObject):
@@ -208,7 +204,7 @@ class LivePose(QObject):
         self._asked: FrameRequest | VerdictRequest | None = None
         self._shown: tuple[FrameRequest, LiveFrame] | None = None
         self._last_id = 0
-        self._told = ""
+        self._told: dict[type, str] = {}
         self._is_quick = False
         self._is_due = False
         # Sooner than a timer of 0 ms, which Qt fires after it has drawn the slider alone.
@@ -282,17 +278,18 @@ class LivePose(QObject):
         if request is None or request.model is not self._model:
             return
         if answer.failure is not None:
-            if answer.failure.sentence != self._told:
-                self._told = answer.failure.sentence
+            if answer.failure.sentence != self._told.get(type(request)):
+                self._told[type(request)] = answer.failure.sentence
                 self.failed.emit(answer.failure)
         elif isinstance(request, FrameRequest) and answer.value is not None:
             if request.request_id == self._last_id:
                 self._shown = (request, answer.value)
                 self._rested.start()
-            self._told = ""
+            self._told.pop(FrameRequest, None)
             self._is_quick = answer.value.seconds < _QUICK_SECONDS
             self.frame_computed.emit(answer.value)
         elif answer.value is not None and answer.request_id == self._last_id:
+            self._told.pop(VerdictRequest, None)
             self.verdict_computed.emit(answer.value)
 
 
@@ -329,7 +326,7 @@ class LongWork(QObject):
         label: str,
         work: Work,
         done: Callable[[Any], None],
-        failed: Callable[[], None] = _nothing,
+        failed: Callable[[], None] = lambda: None,
     ) -> int:
         """Do some work when what was started before is done.
 
@@ -362,6 +359,17 @@ class LongWork(QObject):
         """Stop all jobs."""
         for number in list(self._jobs):
             self.cancel(number)
+
+    def finish(self, number: int) -> None:
+        """Do a job here and now, instead of in its turn; does nothing where it is done.
+
+        Raises whatever its work raises.
+        """
+        held = self._jobs.get(number)
+        if held is not None:
+            job, done, _ = held
+            self.cancel(number)
+            done(job.work(no_progress, CancelToken()))
 
     def close(self, deadline: float) -> bool:
         """Cancel all jobs and end the thread.

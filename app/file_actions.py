@@ -12,6 +12,7 @@ from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
 from app.dialogs.forms import screenshot_form, turntable_form
 from app.dialogs.questions import Answer, ask_about_changes
+from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class FileActions(QObject):
     ----------
     window : that dialogs belong to
     document : opened into and saved from
-    settings : remembers the last folder and the recent files
+    settings : remembers the last folder, the recent files and the model
     attempt : does something and shows what a user can mend of what goes wrong
     """
 
@@ -62,7 +63,7 @@ class FileActions(QObject):
         window: QWidget,
         document: PoseDocument,
         settings: Settings,
-        attempt: Callable[[Callable[[], object]], None],
+        attempt: Callable[[Callable[[], object]], object],
     ) -> None:
         super().__init__(window)
         self._attempt = attempt
@@ -70,7 +71,9 @@ class FileActions(QObject):
         self._document = document
         self._settings = settings
         self._recent: QMenu | None = None
+        document.may_replace = lambda: bool(attempt(self.may_lose_changes))
         document.file_changed.connect(self._on_file)
+        document.model_changed.connect(self._on_model)
 
     def open(self) -> None:
         """Ask for any file that can be opened, and open it."""
@@ -222,6 +225,13 @@ class FileActions(QObject):
         if self._document.file is not None:
             self._remember(self._document.file)
 
+    @Slot()
+    def _on_model(self) -> None:
+        file = Path(self._document.model_file)
+        # By its name a bundled one is found after the program has moved.
+        is_bundled = file.parent == bundled_folder("models")
+        self._settings["model"] = file.stem if is_bundled else str(file)
+
     def _remember(self, path: Path) -> None:
         self._settings.remember_file(str(path.resolve()))
         self._settings["last_folder"] = str(path.resolve().parent)
@@ -237,16 +247,24 @@ class FileActions(QObject):
     def _ask_save(self, title: str, proposed: Path, kinds: dict[str, str]) -> Path | None:
         """Ask for a name; the chosen kind's extension is added to a name without one."""
         filters = {f"{kind} (*{suffix})": suffix for kind, suffix in kinds.items()}
-        name, chosen = QFileDialog.getSaveFileName(
-            self._window, title, str(proposed), ";;".join(filters)
-        )
-        if not name:
-            return None
-        path = Path(name)
-        self._settings["last_folder"] = str(path.resolve().parent)
-        if path.suffix.lower() in kinds.values():
-            return path
-        return path.with_name(path.name + filters.get(chosen, next(iter(kinds.values()))))
+        dialog = QFileDialog(self._window, title, str(proposed))
+        dialog.setAcceptMode(QFileDialog.AcceptMode.AcceptSave)
+        dialog.setNameFilters(list(filters))
+        dialog.setDefaultSuffix(next(iter(kinds.values())))
+        dialog.filterSelected.connect(lambda chosen: dialog.setDefaultSuffix(filters[chosen]))
+        path = None
+        while path is None and dialog.exec() == QDialog.DialogCode.Accepted:
+            path = Path(dialog.selectedFiles()[0])
+            if path.suffix.lower() not in kinds.values():
+                # Qt adds no extension behind a dot, so that it has asked about another file.
+                path = path.with_name(f"{path.name}.{dialog.defaultSuffix()}")
+                if path.exists():
+                    dialog.selectFile(str(path))
+                    path = None
+        dialog.deleteLater()
+        if path is not None:
+            self._settings["last_folder"] = str(path.resolve().parent)
+        return path
 
     @staticmethod
     def _after(form: QDialog, act: Callable[[], None]) -> None:

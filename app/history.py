@@ -128,6 +128,16 @@ class PoseHistory(QObject):
             self._gesture = None
             self._apply(before)
 
+    def set_latent(self, latent: npt.ArrayLike, label: str) -> None:
+        """Set the whole pose, a (D,) finite array, in one step with this name in the menu."""
+        self._edit(label, np.array(latent, dtype=np.float64))
+
+    def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
+        """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1."""
+        start = self._gesture[1].latent if self._gesture else self.latent
+        target = np.asarray(latent, dtype=np.float64)
+        self._edit("Blend", target.copy() if share == 1.0 else start + share * (target - start))
+
     def undo(self) -> None:
         """Take back the last step; a drag that has not ended is that step."""
         self.end_gesture()
@@ -139,7 +149,7 @@ class PoseHistory(QObject):
         self.undo_stack.redo()
 
     def load_pose(self, pose: NamedPose) -> None:
-        """Make a pose of the library, or a training pose, the one that is edited."""
+        """Edit a pose of the library under its name, or a training pose under a free one."""
         self._load(f"Load {pose.name}", pose)
 
     def add_pose_to_library(self, name: str) -> None:
@@ -149,10 +159,9 @@ class PoseHistory(QObject):
         ----------
         name : of the pose, which is called so from then on
         """
-        from lcollision_core.model import NamedPose, unique_names
+        from lcollision_core.model import NamedPose
 
-        taken = [pose.name for pose in self.poses]
-        free = unique_names([*taken, name or UNNAMED])[-1]
+        free = self._free_name(name or UNNAMED)
         added = NamedPose(free, self.latent, self.placement)
         state = replace(self._state, pose_name=free, poses=(*self.poses, added))
         self._push(f"Keep {free}", state)
@@ -195,10 +204,22 @@ class PoseHistory(QObject):
         if all(pose.name != name for pose in self.poses):
             raise ModelFileError(f"your library has no pose {name!r}; choose one of your own")
 
+    def _free_name(self, name: str) -> str:
+        """Return a name that no pose of the library has: this one, or with a number."""
+        from lcollision_core.model import unique_names
+
+        return unique_names([*(pose.name for pose in self.poses), name])[-1]
+
     def _load(self, label: str, pose: NamedPose) -> None:
+        # Under the name of another pose of the library, Save would put it in that one's place.
+        is_own = any(pose is own for own in self.poses)
+        name = pose.name if is_own else self._free_name(pose.name)
         latent = read_only(np.array(pose.latent, dtype=np.float64))
-        self._push(label, DocumentState(latent, pose.name, pose.placement, self.poses))
+        self._push(label, DocumentState(latent, name, pose.placement, self.poses))
         self.pose_loaded.emit()
+
+    def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
+        self._push(label, replace(self._state, latent=read_only(latent), outcome=None), run)
 
     def _push(self, label: str, state: DocumentState, run: int | None = None) -> None:
         """Go to another state, as a step of its own or as part of the gesture."""
@@ -217,6 +238,20 @@ class PoseHistory(QObject):
         if isinstance(later, ChangeState):
             later.before = state
         self._apply(state)
+
+    def _keep_saved(self, poses: tuple[NamedPose, ...], file: Path) -> None:
+        """Remember what a file holds now as the library, whichever way undo comes back to it."""
+        self._file = file
+        self._amend(replace(self._state, poses=poses))
+        self.undo_stack.setClean()
+        self.file_changed.emit()
+
+    def _begin_with(
+        self, edited: NamedPose, poses: tuple[NamedPose, ...], file: Path | None
+    ) -> None:
+        """Put in a pose of a library, without a past."""
+        latent = read_only(edited.latent)
+        self._begin(DocumentState(latent, edited.name, edited.placement, poses), file)
 
     def _begin(self, state: DocumentState, file: Path | None) -> None:
         """Put in a state without a past."""

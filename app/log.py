@@ -59,7 +59,8 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
             sys.__excepthook__(kind, error, trace)
             return
         _log.error("nobody caught this", exc_info=(kind, error, trace))
-        if tell is not None:
+        # Qt's threads too tell here of what their slots raise.
+        if tell is not None and threading.current_thread() is threading.main_thread():
             tell(unexpected(error))
 
     def on_thread_exception(caught: threading.ExceptHookArgs) -> None:

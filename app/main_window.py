@@ -157,13 +157,19 @@ class MainWindow(QMainWindow):
 
     # What others may do to it.
 
-    def attempt(self, act: Callable[[], object]) -> None:
-        """Do something, and show what a user can mend of what goes wrong."""
+    def attempt(self, act: Callable[[], object]) -> object:
+        """Do something, and show what a user can mend of what goes wrong.
+
+        Returns
+        -------
+        value : what `act` returned; None where it went wrong
+        """
         try:
-            act()
+            return act()
         except LCollisionError as error:
             _log.info("shown to the user: %s", error, exc_info=True)
             self.show_failure(Failure(str(error), traceback.format_exc()))
+            return None
 
     def set_autosave(self, autosave: Autosave) -> None:
         """Take charge of an autosave: its failures are shown, and it ends with the window."""
@@ -177,7 +183,10 @@ class MainWindow(QMainWindow):
 
     @Slot(object)
     def show_failure(self, failure: Failure) -> None:
-        """Tell what went wrong, in a dialog that leaves all else running."""
+        """Tell what went wrong, in a dialog that leaves all else running; once while it is open."""
+        told = [held for held in self.findChildren(FailureDialog) if held.isVisible()]
+        if failure.sentence in [held.failure.sentence for held in told]:
+            return
         dialog = FailureDialog(failure, self)
         dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         dialog.open()
@@ -229,15 +238,14 @@ class MainWindow(QMainWindow):
 
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
         """Settle unsaved changes, then end all work before the view goes."""
-        may_close = self._unasked
 
-        def settle() -> None:
-            nonlocal may_close
-            may_close = self.files.may_lose_changes()
+        def settle() -> bool:
+            self.document.finish_exports()
+            return self._unasked or self.files.may_lose_changes()
 
-        if not may_close:
-            self.attempt(settle)
-        if not may_close:
+        may_close = self.attempt(settle)
+        # `close_unasked` takes an open question away, but cannot close what is closing.
+        if not (may_close or self._unasked):
             event.ignore()
             return
         self.settings["window_geometry"] = self.saveGeometry()

@@ -21,7 +21,6 @@ from PySide6.QtCore import QLockFile, QObject, QThread, QTimer, Signal, Slot
 
 from app.document import PoseDocument
 from app.engine import Failure, end_thread, single_shot, started_thread
-from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import atomic_write
 
 if TYPE_CHECKING:
@@ -178,7 +177,7 @@ class _Writer(QObject):
             with atomic_write(folder / _SESSION) as file:
                 file.write(json.dumps(held).encode())
             self.written.emit()
-        except (LCollisionError, OSError) as error:
+        except Exception as error:
             _log.warning("autosave failed", exc_info=True)
             self.failed.emit(error)
 

@@ -14,12 +14,10 @@ from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper
 
 from app.camera import VIEW_ANGLE, View
 from app.shading import COLLIDING_FACE, rgb
+from app.waiting import BACKGROUND
 
 if TYPE_CHECKING:
     from pyvista import BasePlotter
-
-BACKGROUND = {False: ("#e4e8ed", "#fafbfc"), True: ("#191c21", "#343a44")}
-"""Bottom and top, by whether the theme is dark."""
 
 _FLOOR = {False: ("#d3d9e1", "#c2c9d3"), True: ("#2a2f37", "#1d2127")}
 _GHOST = {False: "#6b7c93", True: "#c3d2e6"}

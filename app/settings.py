@@ -42,7 +42,6 @@ SETTINGS: dict[str, Setting] = {
     "resolve_threshold": Setting(0.5, 0.01, 0.99),
     "resolve_metric": Setting("eye", choices=("eye", "latent")),
     "resolve_time_budget": Setting(20.0, 0.1, 3600.0),
-    "autosave_seconds": Setting(3.0, 0.1, 600.0),
     "screenshot_width": Setting(1920, 16, 16384),
     "screenshot_height": Setting(1080, 16, 16384),
     "screenshot_transparent": Setting(True),

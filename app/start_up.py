@@ -43,7 +43,7 @@ class StartUp(QObject):
     ----------
     window : shown
     path : a poses file, a mesh or a model; None for a pose of the editor's own
-    model_name : a model's file or name; the default model where None
+    model_name : a model's file or name; the one that was used last where None
     """
 
     def __init__(self, window: MainWindow, path: Path | None, model_name: str | None) -> None:
@@ -51,10 +51,10 @@ class StartUp(QObject):
         self._window = window
         self._document = window.document
         self._path = path
-        self._model: str | Path = model_name or DEFAULT_MODEL
+        self._model: str | Path = model_name or last_model(window.settings["model"])
         self._poll = QTimer(self)
         self._poll.setInterval(_POLL_MILLISECONDS)
-        self._poll.timeout.connect(_nothing)
+        self._poll.timeout.connect(lambda: None)
 
     def begin(self) -> None:
         """Start loading; returns at once."""
@@ -117,6 +117,12 @@ class StartUp(QObject):
         self._window.close_unasked()
 
 
+def last_model(remembered: str) -> str:
+    """Return the remembered file, or name of a bundled model, or the default where it is gone."""
+    bundled = bundled_folder("models") / f"{remembered}{MODEL_SUFFIX}"
+    return remembered if bundled.is_file() or Path(remembered).is_file() else DEFAULT_MODEL
+
+
 def opening_pose(model: PoseModel) -> NamedPose:
     """Return a pose worth looking at.
 
@@ -135,7 +141,3 @@ def opening_pose(model: PoseModel) -> NamedPose:
     names = model.pose_names
     number = next((names.index(name) for name in _LIVELY if name in names), len(names) - 1)
     return NamedPose(names[number], model.training_latent[number])
-
-
-def _nothing() -> None:
-    """Do nothing, in Python."""

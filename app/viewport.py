@@ -18,6 +18,7 @@ from app.camera import View, front_direction, preset_view
 from app.frames import LiveFrame, PoseShower
 from app.legend import DomainTag, LegendCard
 from app.motion import CameraTurn, Glide
+from app.panels.wording import heading
 from app.pictures import Pictures
 from app.shading import Legend, Shader, Shading
 from app.theme import NORMAL, current_theme
@@ -213,20 +214,6 @@ class Viewport(QWidget):
     def view(self) -> View | None:
         """From where the mesh is looked at; None before there is one."""
         return self._scene.view if self._scene is not None else None
-
-    # Moving without the document.
-
-    def glide(self, from_vertices: npt.NDArray[Any], to_vertices: npt.NDArray[Any]) -> None:
-        """Move the mesh from one pose to another in a third of a second.
-
-        A frame of the document that arrives meanwhile ends it.
-
-        Parameters
-        ----------
-        from_vertices, to_vertices : (V, 3) arrays, in the data's unit
-        """
-        if self._canvas is not None:
-            self._glide.begin(from_vertices, to_vertices)
 
     # Pictures.
 
@@ -492,8 +479,8 @@ class Viewport(QWidget):
             self._tag.hide()
         else:
             model = self._document.model
-            name = model.domain_names[domain]
-            self._tag.point_at(place, name[:1].upper() + name[1:], model.domain_colours[domain])
+            name = heading(model.domain_names[domain])
+            self._tag.point_at(place, name, model.domain_colours[domain])
         if domain != self._hovered:
             self._hovered = domain
             self.domain_hovered.emit(domain)

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from app.document import PoseDocument
     from app.engine import Failure
 
-_BACKGROUND = {False: ("#e4e8ed", "#fafbfc"), True: ("#191c21", "#343a44")}
+BACKGROUND = {False: ("#e4e8ed", "#fafbfc"), True: ("#191c21", "#343a44")}
+"""Bottom and top of the page and of the scene after it, by whether the theme is dark."""
+
 _RADIUS = 17.0
 _TURN_MILLISECONDS = 33
 _DEGREES_A_TURN = 11
@@ -111,7 +113,7 @@ class WaitingPage(QWidget):
         theme = current_theme()
         painter = QPainter(self)
         painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-        bottom, top = _BACKGROUND[theme.is_dark]
+        bottom, top = BACKGROUND[theme.is_dark]
         sky = QLinearGradient(0, 0, 0, self.height())
         sky.setColorAt(0.0, QColor(top))
         sky.setColorAt(1.0, QColor(bottom))

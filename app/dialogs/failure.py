@@ -26,7 +26,7 @@ class FailureDialog(QDialog):
 
     Parameters
     ----------
-    failure : its sentence may say what to do behind its last semicolon
+    failure : its sentence may say what to do behind its last semicolon; kept as an attribute
     parent : the window that it belongs to
     """
 
@@ -34,6 +34,7 @@ class FailureDialog(QDialog):
         super().__init__(parent)
         self.setWindowTitle("That did not work")
         self.setMinimumWidth(480)
+        self.failure = failure
         what, advice = split_sentence(failure.sentence)
         sign = QLabel()
         sign.setPixmap(pixmap("warning", current_theme().colliding, 36, self.devicePixelRatioF()))

@@ -47,7 +47,7 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Answer:
     moment = datetime.fromtimestamp(lost.saved).astimezone()
     box = _box(parent, "Recover a pose")
     box.setText(f"The editor closed unexpectedly while “{lost.pose_name}” was not saved.")
-    box.setInformativeText(f"It was kept on {moment:%-d %B at %H:%M}. Recover it?")
+    box.setInformativeText(f"It was kept on {moment.day} {moment:%B at %H:%M}. Recover it?")
     recover = box.addButton("Recover", QMessageBox.ButtonRole.AcceptRole)
     discard = box.addButton("Delete it", QMessageBox.ButtonRole.DestructiveRole)
     later = box.addButton("Ask later", QMessageBox.ButtonRole.RejectRole)

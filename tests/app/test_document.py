@@ -143,6 +143,31 @@ def test_steps_a_while_apart_do_not_merge(
     assert document.undo_stack.count() == 2
 
 
+def test_what_arrives_in_mid_drag_is_a_step_after_the_drag(
+    qtbot: QtBot, document: PoseDocument, colliding: np.ndarray, tmp_path: Path
+) -> None:
+    model = document.model
+    write_mesh(tmp_path / "bent.ply", model.decode(model.training_latent[1]), model.faces)
+    with qtbot.waitSignal(document.message, timeout=20_000):
+        document.import_mesh(tmp_path / "bent.ply")
+        document.begin_gesture("Drag")
+        document.set_code(0, 0.5)
+    document.end_gesture()
+    document.undo()
+    assert document.latent.tolist() == [0.5, *[0.0] * (model.latent_size - 1)]
+    document.set_latent(colliding, "Jump")
+    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
+        document.resolve()
+        document.begin_gesture("Drag")
+    solved = document.latent
+    document.set_code(0, 1.25)
+    document.end_gesture()
+    document.undo()
+    assert document.latent.tobytes() == solved.tobytes()
+    document.undo()
+    assert document.latent.tobytes() == colliding.tobytes()
+
+
 def test_a_number_that_is_not_finite_is_ignored(document: PoseDocument) -> None:
     document.set_code(0, float("nan"))
     assert document.undo_stack.count() == 0
@@ -278,6 +303,42 @@ def test_the_library_is_undone_like_the_pose(document: PoseDocument) -> None:
     assert not document.modified
 
 
+def test_a_pose_from_elsewhere_takes_no_name_of_the_library(document: PoseDocument) -> None:
+    document.add_pose_to_library("bend 2")
+    (own,) = document.poses
+    document.load_pose(document.training_pose(2))
+    assert document.pose_name == "bend 2 2"
+    assert [pose.name for pose in document.all_poses()] == ["bend 2", "bend 2 2"]
+    document.load_pose(own)
+    assert document.pose_name == "bend 2"
+
+
+@pytest.mark.parametrize("may", [False, True])
+def test_edits_made_while_a_file_is_read_are_not_replaced_unasked(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path, may: bool
+) -> None:
+    path = tmp_path / "pose.json"
+    write_poses(path, document.model, [NamedPose("a", document.model.training_latent[1])])
+    asked = []
+
+    def answer() -> bool:
+        asked.append(document.latent[0])
+        return may
+
+    document.may_replace = answer
+    document.open_poses(path)
+    document.set_code(0, 0.5)
+    qtbot.waitUntil(lambda: not document.busy)
+    assert asked == [0.5]
+    assert (document.pose_name == "a") == may
+    document.undo()
+    assert document.latent.any() == may
+    document.open_poses(path)
+    qtbot.waitUntil(lambda: not document.busy)
+    assert len(asked) == 1
+    assert document.pose_name == "a"
+
+
 def test_open_replaces_the_pose_the_library_and_the_history(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
@@ -357,6 +418,16 @@ def test_resolve_checks_the_mesh_that_would_be_exported(
     placed = model.detector.detect(far.apply(drawn).astype(np.float32))
     assert document.outcome.energy_before == placed.energy
     assert document.outcome.energy_before != model.detector.detect(drawn).energy
+
+
+def test_another_model_stops_no_export(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    model = document.model
+    with qtbot.waitSignal(document.message):
+        document.export_mesh(tmp_path / "pose.obj")
+        document.set_model(PoseModel("bare", model.embedding, model.card))
+    assert (tmp_path / "pose.obj").is_file()
 
 
 def test_an_exported_mesh_comes_back_as_the_same_mesh(

@@ -16,7 +16,7 @@ from PySide6.QtCore import QSettings, QtMsgType, qInstallMessageHandler, qWarnin
 from app import log
 from app.engine import Failure
 from app.settings import SETTINGS, Settings
-from app.start_up import opening_pose
+from app.start_up import DEFAULT_MODEL, last_model, opening_pose
 from app.symmetry import mirror_vertices
 from app.tasks import mirror_of, mirrored
 from lcollision_core.jobs import CancelToken, no_progress
@@ -91,6 +91,15 @@ def test_recent_files_are_few_and_each_there_once(store: QSettings) -> None:
     assert settings["recent_files"][:2] == ("15.json", "18.json")
 
 
+def test_a_model_that_is_gone_gives_way_to_the_default(tmp_path: Path) -> None:
+    file = tmp_path / "mine.safetensors"
+    assert last_model(str(file)) == DEFAULT_MODEL
+    file.touch()
+    assert last_model(str(file)) == str(file)
+    assert last_model("body-swing") == "body-swing"
+    assert last_model("") == last_model("no such model") == DEFAULT_MODEL
+
+
 @pytest.fixture
 def logging_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Log into a file of the test's own, and put everything back."""
@@ -121,8 +130,13 @@ def test_the_log_holds_what_nobody_caught_and_what_qt_says(logging_into: Path) -
     thread = threading.Thread(target=lambda: 1 / 0, name="worker")
     thread.start()
     thread.join()
+    # As Qt's threads do with what their slots raise.
+    slot = threading.Thread(target=sys.excepthook, args=(OSError, OSError("lost disk"), None))
+    slot.start()
+    slot.join()
     text = logging_into.read_text()
-    assert text.count("nobody caught this\n") == 1
+    assert text.count("nobody caught this\n") == 2
+    assert "lost disk" in text
     assert "missing bone" in text
     assert "test_editor_parts" in text
     assert "a timer of another thread" in text

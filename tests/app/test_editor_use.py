@@ -194,19 +194,21 @@ def share_of_height(window: MainWindow) -> float:
 def test_it_opens_with_the_camera_on_its_first_pose_and_leaves_it_there(
     qtbot: QtBot, home: Path, body: PoseModel, opens_a_mesh: bool
 ) -> None:
-    document = PoseDocument()
-    window = MainWindow(document, settings_in(home))
+    document, settings = PoseDocument(), settings_in(home)
+    settings["model"] = str(home / "gone.safetensors")
+    window = MainWindow(document, settings)
     window.resize(1280, 800)
     window.show()
     mesh = home / "kneeling.obj"
     kneeling = opening_pose(body)
     if opens_a_mesh:
         write_mesh(mesh, body.decode(kneeling.latent), body.faces)
-    start_up = StartUp(window, mesh if opens_a_mesh else None, "body")
+    start_up = StartUp(window, mesh if opens_a_mesh else None, None)
     with qtbot.waitSignal(document.pose_loaded, timeout=4 * PATIENCE):
         start_up.begin()
     start_up.setParent(None)
     rest(qtbot, window)
+    assert settings["model"] == "body"
     assert document.pose_name == ("kneeling" if opens_a_mesh else kneeling.name)
     # It was half before, framed as the standing body.
     assert 0.62 < share_of_height(window) < 0.85

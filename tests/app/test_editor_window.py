@@ -27,6 +27,7 @@ from shiboken6 import isValid
 
 from app.dialogs.failure import FailureDialog
 from app.document import PoseDocument
+from app.engine import Failure
 from app.main_window import MainWindow
 from app.panels.parts import HANDLE
 from app.shading import Shading
@@ -418,6 +419,86 @@ def test_changes_are_saved_kept_or_given_up_as_the_user_says(
     assert window.close()
     assert not asked.isActive()
     assert read_poses(path, document.model)[0].latent.tobytes() == latent.tobytes()
+
+
+def test_an_edit_while_a_file_is_read_is_asked_about(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document, path = window.document, tmp_path / "pose.json"
+    document.save(path)
+    before = document.latent
+    asked = answer(lambda dialog: dialog.reject())
+    window.files.open_path(path)
+    document.set_code(0, 0.5)
+    qtbot.waitUntil(lambda: not asked.isActive(), timeout=PATIENCE)
+    assert document.latent[0] == 0.5
+    document.undo()
+    assert document.latent.tobytes() == before.tobytes()
+
+
+@pytest.mark.parametrize("typed", ["mine", "mine.v2"])
+def test_no_file_is_saved_over_under_another_name_than_was_asked_about(
+    window: MainWindow, tmp_path: Path, typed: str
+) -> None:
+    path = tmp_path / f"{typed}.json"
+    path.write_text("precious")
+    questions = []
+
+    def name_of(dialog: QDialog) -> QLineEdit:
+        name = dialog.findChild(QLineEdit, "fileNameEdit")
+        assert isinstance(name, QLineEdit)
+        return name
+
+    def refuse(dialog: QDialog) -> None:
+        asks = isinstance(dialog, QMessageBox)
+        questions.append(dialog.text() if asks else name_of(dialog).text())
+        dialog.reject()
+
+    def choose(dialog: QDialog) -> None:
+        name_of(dialog).setText(str(tmp_path / typed))
+        timers.append(answer(refuse))
+        dialog.accept()
+        if not timers[-1].isActive():
+            dialog.reject()
+
+    timers = [answer(choose)]
+    window.actions_by_key["save_as"].trigger()
+    assert [path.name in question for question in questions] == [True]
+    assert path.read_text() == "precious"
+    assert window.document.file is None
+
+
+def test_closing_writes_what_waits_to_be_exported(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64], tmp_path: Path
+) -> None:
+    document = window.document
+    document.set_latent(colliding, "Test")
+    rest(qtbot, window)
+    window.actions_by_key["resolve"].trigger()
+    document.export_mesh(tmp_path / "no such folder" / "pose.obj")
+    document.export_mesh(tmp_path / "pose.obj")
+    assert not window.close()
+    assert "no folder" in failures(window)[0].what.text()
+    close_window(window)
+    assert (tmp_path / "pose.obj").is_file()
+
+
+def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -> None:
+    window.document.set_code(0, 0.5)
+    asked = answer(lambda _: window.close_unasked())
+    assert window.close()
+    assert not asked.isActive()
+    assert not is_open(window)
+
+
+def test_a_failure_is_told_once_while_its_dialog_is_open(window: MainWindow) -> None:
+    failure = Failure("the disk is full; make room", "details")
+    for _ in range(3):
+        window.show_failure(failure)
+    (dialog,) = failures(window)
+    dialog.reject()
+    window.show_failure(failure)
+    assert len(failures(window)) == 1
 
 
 def test_a_failing_worker_leaves_the_editor_usable(

@@ -263,6 +263,27 @@ def test_a_live_worker_that_fails_tells_once_and_goes_on(
     assert document.frame.latent[0] == 0.4
 
 
+def test_a_verdict_that_fails_from_pose_to_pose_is_told_once(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures = []
+    document.failed.connect(failures.append)
+    checked = []
+
+    def fail(_: PoseShower, frame: LiveFrame) -> None:
+        checked.append(frame.latent[0])
+        raise MemoryError("no more")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(PoseShower, "verdict", fail)
+        for value in (0.1, 0.2, 0.3):
+            document.set_code(0, value)
+            qtbot.waitUntil(lambda value=value: value in checked)
+    document.set_code(0, 0.4)
+    settle(qtbot, document)
+    assert len(failures) == 1
+
+
 def test_a_frame_of_another_model_is_not_shown(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -179,6 +179,14 @@ def test_an_editor_without_a_disk_to_write_to_works(
     assert autosave.close()
 
 
+def test_an_unforeseen_failure_to_write_is_told(
+    qtbot: QtBot, document: PoseDocument, autosave: Autosave, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lcollision_core.model.write_poses", lambda *_: 1 / 0)
+    with qtbot.waitSignal(autosave.failed):
+        document.set_code(0, 0.5)
+
+
 def test_a_failing_disk_is_told_of_once(
     qtbot: QtBot, document: PoseDocument, autosave: Autosave, tmp_path: Path
 ) -> None:
