@@ -206,7 +206,9 @@ def resolved(
 
     def work(progress: Progress, cancel: CancelToken) -> Resolved:
         ghost = drawn_vertices(model, latent)
-        result = model.resolve(latent, options, progress, cancel, placement=placement)
+        result = model.resolve(
+            latent, options, progress=progress, cancel=cancel, placement=placement
+        )
         return Resolved(result, ghost)
 
     return work

@@ -191,7 +191,7 @@ def endless_resolve(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, t
     """Make Resolve work until it is cancelled; return what it sets when it begins and ends."""
     working, ended = threading.Event(), threading.Event()
 
-    def resolve(*_: object, progress: Progress, cancel: CancelToken) -> None:
+    def resolve(*_: object, progress: Progress, cancel: CancelToken, **__: object) -> None:
         working.set()
         try:
             while True:
