@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.console import note, progress_bar
+from app.cli.console import counted, note, progress_bar
 from app.cli.models import ModelArgument
 from app.cli.results import MeshFormat, output_form, require_output, write_result
 from lcollision_core.errors import PoseSetError
@@ -77,7 +77,7 @@ def decode(
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
     write_result(output, form, model, named, mesh_format)
-    note(f"wrote {len(named)} poses to {output}")
+    note(f"wrote {counted(len(named), 'pose')} to {output}")
 
 
 def sample(
@@ -100,4 +100,4 @@ def sample(
     width = len(str(count))
     poses = [NamedPose(f"sample {place + 1:0{width}d}", row) for place, row in enumerate(latent)]
     write_poses(output, model, poses)
-    note(f"wrote {count} poses to {output}")
+    note(f"wrote {counted(count, 'pose')} to {output}")

@@ -171,6 +171,7 @@ def resolve(
             note(f"stopped; {output} has {len(finished)} of {counted(len(requests), 'pose')}")
         raise
     _write(output, form, model, requests, finished, mesh_format, keep_detail)
+    note(f"wrote {counted(len(requests), 'pose')} to {output}")
     results = [finished[place] for place in range(len(requests))]
     _report(model, requests, results, as_json)
     if sequence:

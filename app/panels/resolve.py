@@ -51,13 +51,15 @@ class Fact(QWidget):
         """What is shown."""
         return self._truth
 
-    def show_truth(self, truth: bool | None) -> None:
-        """Say yes, no, or that it is not known."""
+    def show_truth(self, truth: bool | None, excuse: str = "") -> None:
+        """Say yes, no, or that it is not known; with an excuse, no is nothing to worry about."""
         self._truth = truth
+        excused = truth is False and bool(excuse)
+        shown = None if excused else truth
         theme = current_theme()
-        ink = {True: theme.free, False: theme.colliding, None: theme.muted}[truth]
-        self._sign.setPixmap(pixmap(_SIGNS[truth], ink, 18, self.devicePixelRatioF()))
-        self._text.setText(self._sentences[truth])
+        ink = {True: theme.free, False: theme.colliding, None: theme.muted}[shown]
+        self._sign.setPixmap(pixmap(_SIGNS[shown], ink, 18, self.devicePixelRatioF()))
+        self._text.setText(excuse if excused else self._sentences[truth])
 
 
 class ResolveCard(Card):
@@ -147,7 +149,7 @@ class ResolveCard(Card):
         column = QVBoxLayout(self.outcome)
         column.setContentsMargins(0, TIGHT, 0, 0)
         column.setSpacing(TIGHT)
-        for fact in (self.converged, self.predicted_free, self.exactly_free):
+        for fact in (self.exactly_free, self.converged, self.predicted_free):
             column.addWidget(fact)
         numbers = QGridLayout()
         numbers.setContentsMargins(0, TIGHT, 0, TIGHT)
@@ -203,9 +205,14 @@ class ResolveCard(Card):
 
     def _show(self, result: ResolveResult) -> None:
         ran = result.solver_status != "not run"
-        self.converged.show_truth(result.converged if ran else None)
-        self.predicted_free.show_truth(result.predicted_free)
+        proved = bool(result.exactly_free)
         self.exactly_free.show_truth(result.exactly_free)
+        self.converged.show_truth(
+            result.converged if ran else None, "The search ended at a free pose" if proved else ""
+        )
+        self.predicted_free.show_truth(
+            result.predicted_free, "Predicted colliding, wrongly" if proved else ""
+        )
         if result.energy_before is None or result.energy_after is None:
             self._energy.setText("not measured")
         else:

@@ -9,7 +9,14 @@ from lcollision_core.errors import PoseSetError, ShapeError
 from lcollision_core.meshes import Topology, height
 from lcollision_core.meshes.topology import FloatArray
 
-_LARGEST_SIZE = 20.0
+_LARGEST_SIZE = 1.25
+"""Times larger or smaller that a body may be; poses stretch its edges by a few percent."""
+
+_UNIFORM = 1.5
+"""Between the edges that are scaled most and least, all but tenths: within it, it is the unit."""
+
+_MOST_SIZE = 20.0
+"""Beyond it, whatever the edges."""
 
 
 def require_same_faces(topology: Topology, needed: Topology, source: str, model: str) -> None:
@@ -50,19 +57,22 @@ def _sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     return rows[np.lexsort(rows.T)]
 
 
-def checked_mesh(vertices: npt.ArrayLike, reference: FloatArray, model: str) -> FloatArray:
+def checked_mesh(
+    vertices: npt.ArrayLike, reference: FloatArray, topology: Topology, model: str
+) -> FloatArray:
     """Return a mesh that a model can encode as a float64 array.
 
     Parameters
     ----------
     vertices : (V, 3) array, in the data's unit
     reference : (V, 3) array, the model's
+    topology : of both
     model : its name
 
     Raises
     ------
     ShapeError : another shape, or a coordinate that is not finite.
-    PoseSetError : 20 times larger or smaller than the reference.
+    PoseSetError : larger or smaller than the reference, as in another unit.
     """
     mesh = np.asarray(vertices, dtype=np.float64)
     if mesh.shape != reference.shape:
@@ -70,10 +80,15 @@ def checked_mesh(vertices: npt.ArrayLike, reference: FloatArray, model: str) -> 
     if not np.isfinite(mesh).all():
         vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
         raise ShapeError(f"vertex {vertex} (from 0) is not finite")
-    size = height(mesh) / height(reference)
-    if not 1.0 / _LARGEST_SIZE < size < _LARGEST_SIZE:
+    lengths, known = (topology.edge_lengths(one) for one in (mesh, reference))
+    low, size, high = np.percentile(lengths[known > 0.0] / known[known > 0.0], (10, 50, 90))
+    outer = height(mesh) / height(reference)
+    if not 1.0 / _MOST_SIZE < outer < _MOST_SIZE:
+        low = high = size = outer
+    if high <= _UNIFORM * low and not 1.0 / _LARGEST_SIZE < size < _LARGEST_SIZE:
+        advice = f"scale it by {1.0 / size:.3g}" if 0.0 < size < np.inf else "export it again"
         raise PoseSetError(
-            f"the mesh is {size:.3g} times as large as the reference of {model!r}; export it in "
-            f"the unit of the model's data"
+            f"the mesh is {size:.3g} times as large as the body of {model!r}, which is "
+            f"{height(reference):.3g} tall in its own unit; {advice}"
         )
     return mesh

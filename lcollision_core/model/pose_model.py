@@ -262,7 +262,7 @@ class PoseModel:
         PoseSetError : 20 times larger or smaller than the reference.
         CancelledError : `cancel` was set.
         """
-        mesh = checked_mesh(vertices, self.reference, self.name)
+        mesh = checked_mesh(vertices, self.reference, self.topology, self.name)
         fit = self.embedding.encode(mesh[None] / self.card.height, cancel=cancel)
         aligning = RigidTransform(fit.rotations[0], fit.translations[0] * self.card.height)
         return EncodedPose(

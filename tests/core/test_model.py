@@ -264,9 +264,9 @@ def test_taken_names_and_missing_domains_are_refused(model: PoseModel) -> None:
             model.rename_domains({domain: "tail"})
 
 
-@pytest.mark.parametrize("scale", [0.0, 0.01, 100.0, 1e150])
+@pytest.mark.parametrize("scale", [0.0, 0.01, 0.75, 1.5, 3.28, 100.0, 1e150])
 def test_meshes_in_another_unit_are_refused(model: PoseModel, scale: float) -> None:
-    with pytest.raises(PoseSetError, match="times as large as the reference of 'tube'"):
+    with pytest.raises(PoseSetError, match="times as large as the body of 'tube'"):
         model.encode(scale * model.reference)
 
 
