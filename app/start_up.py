@@ -114,7 +114,8 @@ class StartUp(QObject):
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         _log.info("signal %d: closing", number)
-        self._window.close_unasked()
+        # Python tells of signals between any two of its steps, in the middle of a picture too.
+        QTimer.singleShot(0, self._window, self._window.close_unasked)
 
 
 def last_model(remembered: str) -> str:
