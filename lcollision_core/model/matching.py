@@ -16,7 +16,7 @@ _UNIFORM = 1.5
 """Between the edges that are scaled most and least, all but tenths: within it, it is the unit."""
 
 _MOST_SIZE = 20.0
-"""Beyond it, whatever the edges."""
+"""Of meshes whose edges are not scaled alike."""
 
 
 def require_same_faces(topology: Topology, needed: Topology, source: str, model: str) -> None:
@@ -82,10 +82,11 @@ def checked_mesh(
         raise ShapeError(f"vertex {vertex} (from 0) is not finite")
     lengths, known = (topology.edge_lengths(one) for one in (mesh, reference))
     low, size, high = np.percentile(lengths[known > 0.0] / known[known > 0.0], (10, 50, 90))
-    outer = height(mesh) / height(reference)
-    if not 1.0 / _MOST_SIZE < outer < _MOST_SIZE:
-        low = high = size = outer
-    if high <= _UNIFORM * low and not 1.0 / _LARGEST_SIZE < size < _LARGEST_SIZE:
+    limit = _LARGEST_SIZE
+    if high > _UNIFORM * low:
+        # Not scaled as a whole: not a pose perhaps, but no other unit unless it is far off.
+        size, limit = height(mesh) / height(reference), _MOST_SIZE
+    if not 1.0 / limit < size < limit:
         advice = f"scale it by {1.0 / size:.3g}" if 0.0 < size < np.inf else "export it again"
         raise PoseSetError(
             f"the mesh is {size:.3g} times as large as the body of {model!r}, which is "
