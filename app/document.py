@@ -17,7 +17,7 @@ from app.commands import DocumentState
 from app.engine import Failure, LivePose, LongWork, Work
 from app.frames import ExactVerdict, LiveFrame, PosePrediction
 from app.history import UNNAMED, PoseHistory, read_only
-from app.panels.wording import counted
+from app.wording import counted
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:

@@ -18,11 +18,11 @@ from app.camera import View, front_direction, preset_view
 from app.frames import LiveFrame, PoseShower
 from app.legend import DomainTag, LegendCard
 from app.motion import CameraTurn, Glide
-from app.panels.wording import heading
 from app.pictures import Pictures
 from app.shading import Legend, Shader, Shading
 from app.theme import NORMAL, current_theme
 from app.waiting import WaitingPage
+from app.wording import heading
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, counted, note, print_json
+from app.cli.console import ExitStatus, note, print_json
+from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
 

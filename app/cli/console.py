@@ -43,11 +43,6 @@ def note(sentence: str) -> None:
     typer.echo(f"lcollision: {sentence}", err=True)
 
 
-def counted(number: int, noun: str, nouns: str | None = None) -> str:
-    """Return the number with its noun, "1 pose" or "2 poses"."""
-    return f"{number} {noun if number == 1 else nouns or noun + 's'}"
-
-
 @contextmanager
 def progress_bar(task: str) -> Iterator[Progress]:
     """Give a `Progress` that draws a bar on a terminal, and nothing in a pipe."""

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, counted, note, print_json, progress_bar
+from app.cli.console import ExitStatus, note, print_json, progress_bar
+from app.wording import counted
 
 app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no_args_is_help=True)
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.console import counted, print_json, progress_bar
+from app.cli.console import print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
+from app.wording import counted
 from lcollision_core.errors import LabelStoreError
 
 if TYPE_CHECKING:

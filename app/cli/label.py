@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import counted, note, print_json, status_bar
+from app.cli.console import note, print_json, status_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
+from app.wording import counted
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
 
 if TYPE_CHECKING:

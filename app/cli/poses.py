@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from app.cli.console import counted, note, progress_bar
+from app.cli.console import note, progress_bar
 from app.cli.models import ModelArgument
 from app.cli.results import MeshFormat, output_form, require_output, write_result
+from app.wording import counted
 from lcollision_core.errors import PoseSetError
 
 PosesOutput = Annotated[

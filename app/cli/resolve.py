@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, counted, note, print_json, progress_bar
+from app.cli.console import ExitStatus, note, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import (
@@ -20,6 +20,7 @@ from app.cli.results import (
     require_one_mesh,
     write_result,
 )
+from app.wording import counted
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 
 if TYPE_CHECKING:

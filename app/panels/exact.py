@@ -8,8 +8,8 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel
 
 from app.icons import pixmap
 from app.panels.parts import Card, labelled, show_verdict
-from app.panels.wording import counted, overlap_text
 from app.theme import CLOSE, current_theme
+from app.wording import counted, overlap_text
 
 if TYPE_CHECKING:
     from app.document import PoseDocument

@@ -11,9 +11,9 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy, QToolButton, QVB
 
 from app.icons import icon
 from app.panels.parts import Card, ElidedLabel, HoverRow, labelled, show_verdict, silent
-from app.panels.wording import heading, overlap_text
 from app.shading import FULL_PREDICTED
 from app.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme, visible_colour
+from app.wording import heading, overlap_text
 
 if TYPE_CHECKING:
     from app.document import PoseDocument

@@ -20,8 +20,8 @@ from PySide6.QtWidgets import (
 
 from app.icons import icon, pixmap
 from app.panels.parts import Card, ElidedLabel, labelled
-from app.panels.wording import heading, height_text, overlap_text, seconds_text
 from app.theme import CLOSE, NORMAL, TIGHT, current_theme
+from app.wording import heading, height_text, overlap_text, seconds_text
 
 if TYPE_CHECKING:
     from app.document import PoseDocument

@@ -12,8 +12,8 @@ from PySide6.QtWidgets import QAbstractButton, QLineEdit, QVBoxLayout, QWidget
 from app.icons import pixmap
 from app.panels.code_slider import CodeRow, tab_order
 from app.panels.parts import scrolling
-from app.panels.wording import heading
 from app.theme import CLOSE, NORMAL, TIGHT, current_theme, visible_colour
+from app.wording import heading
 
 if TYPE_CHECKING:
     from app.document import PoseDocument

@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QIcon
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QInputDialog, QLabel
 from pytestqt.qtbot import QtBot
 
-from app.document import PoseDocument
 from app.main_window import MainWindow
 from app.panels.library import THUMBNAIL
-from app.panels.wording import heading
-from tests.app.windows import PATIENCE, answer, close_window, is_open, open_window, settings_in
+from app.wording import heading
+from tests.app.windows import PATIENCE, answer
 
 CONTROL, LEFT = Qt.KeyboardModifier.ControlModifier, Qt.MouseButton.LeftButton
-
-
-@pytest.fixture
-def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[MainWindow]:
-    held = open_window(qtbot, document, settings_in(tmp_path))
-    yield held
-    if is_open(held):
-        close_window(held)
 
 
 def own_names(window: MainWindow) -> list[str]:

@@ -18,9 +18,9 @@ def height_text(distance: float) -> str:
     return f"{percent:.1f} %"
 
 
-def counted(number: int, noun: str) -> str:
+def counted(number: int, noun: str, nouns: str | None = None) -> str:
     """Write a number with its noun, "1 pair" or "2 pairs"."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    return f"{number} {noun if number == 1 else nouns or noun + 's'}"
 
 
 def heading(name: str) -> str:
