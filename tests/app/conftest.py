@@ -9,9 +9,11 @@ import pytest
 from pytestqt.qtbot import QtBot
 
 from app.document import PoseDocument
+from app.main_window import MainWindow
 from lcollision_core.model import PoseModel
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
+from tests.app.windows import close_window, is_open, open_window, settings_in
 
 
 @pytest.fixture
@@ -54,3 +56,12 @@ def document(qtbot: QtBot, editor_model: PoseModel) -> Iterator[PoseDocument]:
     yield held
     assert held.close()
     held.deleteLater()
+
+
+@pytest.fixture
+def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[MainWindow]:
+    """Return a window of the document that has drawn its pose; it closes with the test."""
+    held = open_window(qtbot, document, settings_in(tmp_path))
+    yield held
+    if is_open(held):
+        close_window(held)

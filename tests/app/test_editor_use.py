@@ -42,7 +42,6 @@ from tests.app.windows import (
     close_window,
     decoded,
     dispose,
-    is_open,
     open_window,
     rest,
     settings_in,
@@ -53,14 +52,6 @@ from tests.app.windows import (
 ROOT = Path(__file__).parents[2]
 N_ACTIONS = int(os.environ.get("LCOLLISION_RANDOM_ACTIONS", "300"))
 THEMES = pytest.mark.parametrize("theme", [LIGHT, DARK], ids=lambda theme: theme.name)
-
-
-@pytest.fixture
-def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[MainWindow]:
-    held = open_window(qtbot, document, settings_in(tmp_path))
-    yield held
-    if is_open(held):
-        close_window(held)
 
 
 @pytest.fixture

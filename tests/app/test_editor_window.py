@@ -26,7 +26,6 @@ from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
 from app.dialogs.failure import FailureDialog
-from app.document import PoseDocument
 from app.engine import Failure
 from app.main_window import MainWindow
 from app.panels.parts import HANDLE
@@ -44,9 +43,7 @@ from tests.app.windows import (
     handle,
     is_open,
     move_held,
-    open_window,
     rest,
-    settings_in,
     shown,
 )
 
@@ -58,14 +55,6 @@ JARGON = re.compile(
 @pytest.fixture(scope="module")
 def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
     return sample_poses(editor_model, 1, 0, colliding=True)[0]
-
-
-@pytest.fixture
-def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[MainWindow]:
-    held = open_window(qtbot, document, settings_in(tmp_path))
-    yield held
-    if is_open(held):
-        close_window(held)
 
 
 def failures(window: MainWindow) -> list[FailureDialog]:
