@@ -184,9 +184,9 @@ def keep_torch_to_one_thread(model: PoseModel) -> None:
     """Let torch use one core in the calling thread: a single pose has nothing to spread.
 
     On a busy machine torch's threads wait for each other: one prediction took 32 ms instead of
-    0.4. Does nothing for a model without a predictor, which needs no torch.
+    0.4. Does nothing for a model whose predictions of a pose need no torch.
     """
-    if model.has_predictor:
+    if model.predictor is not None and model.predictor.needs_torch:
         import torch
 
         torch.set_num_threads(1)

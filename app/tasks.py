@@ -113,7 +113,7 @@ def warm_up(model: PoseModel) -> None:
 
 
 def loaded_predictor(model: PoseModel) -> Work:
-    """Load what predicts: torch takes longer than all else that the window needs."""
+    """Load what predicts, and use it once: what it compiles or imports may take seconds."""
 
     def work(_: Progress, __: CancelToken) -> PoseModel:
         keep_torch_to_one_thread(model)

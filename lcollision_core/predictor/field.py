@@ -8,14 +8,17 @@ from typing import Any, NamedTuple
 import torch
 from torch.autograd.function import once_differentiable
 
+from lcollision_core.errors import ShapeError
 from lcollision_core.predictor import field_kernels
-from lcollision_core.predictor.field_kernels import BEHIND, FADE, SMALLEST_SQUARED_ANGLE
+from lcollision_core.predictor.field_kernels import (
+    BEHIND,
+    FADE,
+    REACHES,
+    SMALLEST_SQUARED_ANGLE,
+)
 
 _SYMMETRIC = [3, 4, 5, 4, 6, 7, 5, 7, 8]
 """Where the features hold the nine entries of S."""
-
-_FEW_ROWS = 4
-"""Of so few, calling a matrix product for each group costs more than the products do."""
 
 
 class Decoding(NamedTuple):
@@ -40,20 +43,12 @@ class Decoding(NamedTuple):
     def products(self, latent: torch.Tensor) -> torch.Tensor:
         """Return (B, n) every group's codes times its table."""
         result = latent.new_empty((len(latent), len(self.target) * self.offset.shape[1]))
-        if latent.device.type == "cpu" and len(latent) <= _FEW_ROWS:
-            field_kernels.products(*_arrays(latent, self.tables, self.blocks, result))
-            return result
         for (codes, columns), table in self._groups():
             torch.mm(latent[:, codes], table, out=result[:, columns])
         return result
 
     def products_backward(self, by_products: torch.Tensor) -> torch.Tensor:
         """Pull derivatives by the products back to the codes."""
-        if by_products.device.type == "cpu" and len(by_products) <= _FEW_ROWS:
-            result = by_products.new_empty((len(by_products), int(self.blocks[-1, 1])))
-            given = by_products, self.tables, self.blocks, result
-            field_kernels.products_backward(*_arrays(*given))
-            return result
         parts = [by_products[:, columns] @ table.T for (_, columns), table in self._groups()]
         return torch.cat(parts, dim=1)
 
@@ -111,13 +106,19 @@ def contact_field(
     frame : (B, P, 3, 3) of each point, as columns, the outer normal first
     places : (B, 3, P)
     apart : (P, P) added to squared distances: 0 for pairs that see each other, else 1
-    reach : (R,) ascending, below 1
+    reach : (2,) ascending, below 1
 
     Returns
     -------
-    sums : (P, B, R, 8): of the weights; of the point's heights above the others' tangent planes;
+    sums : (P, B, 2, 8): of the weights; of the point's heights above the others' tangent planes;
         of the offsets to them (3) and of their normals (3), in the point's frame
+
+    Raises
+    ------
+    ShapeError : there are not two reaches.
     """
+    if len(reach) != len(REACHES):
+        raise ShapeError(f"the field has {len(REACHES)} reaches, got {len(reach)}")
     if frame.device.type == "cpu":
         sums: torch.Tensor = _ContactField.apply(frame, places, apart, reach)  # type: ignore[no-untyped-call]
         return sums
@@ -140,7 +141,7 @@ def contact_field(
 
 
 def normalised(sums: torch.Tensor, reach: torch.Tensor, full: float, some: float) -> torch.Tensor:
-    """Turn the sums of `contact_field` into what a network takes, (P, B, 8 R).
+    """Turn the sums of `contact_field` into what a network takes, (P, B, 16).
 
     Parameters
     ----------

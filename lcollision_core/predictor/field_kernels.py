@@ -15,12 +15,20 @@ import numpy.typing as npt
 from lcollision_core.compiled import compiled, compiled_sums
 
 Array = npt.NDArray[np.floating[Any]]
+Number = np.floating[Any]
 
 BEHIND, FADE = 0.07, 0.04
 """Heights behind a point's tangent plane at which others are not seen any more, so that the far
 side of a limb is not, and over which they fade in."""
 
 SMALLEST_SQUARED_ANGLE = 1e-12
+
+REACHES = (0.07, 0.14)
+"""Heights within which distant skin is felt."""
+
+SUMS_A_REACH = 8
+FULL, SOME = 0.3, 0.05
+"""Sums of weights: one that fills half of the scale, and one that keeps means of nothing at 0."""
 
 _COLUMNS_AT_ONCE = 512
 """Of a table, whose rows then stay in the first cache."""
@@ -199,15 +207,16 @@ def _pull_rotation(w: Array, by_rotation: Array, by_w: Array) -> None:
 
 @compiled_sums
 def contact_field(frame: Array, places: Array, apart: Array, reach: Array, sums: Array) -> None:
-    """Fill in the sums (P, B, R, 8) of `field.contact_field`.
+    """Fill in the sums (P, B, 2, 8) of `field.contact_field`, for two reaches.
 
-    Far points weigh 0 rather than being left out: without branches and lists, several points are
-    added at a time, which is faster.
+    Far points weigh 0 rather than being left out, and both reaches are summed up in one pass:
+    without branches and lists, several points are added at a time, which is faster.
     """
     n_points = places.shape[2]
     kind = frame.dtype.type
     zero, one, two, three = kind(0.0), kind(1.0), kind(2.0), kind(3.0)
     behind, sharpness = kind(BEHIND), kind(1.0 / FADE)
+    inner, outer = one / (reach[0] * reach[0]), one / (reach[1] * reach[1])
     normal = np.empty((3, n_points), dtype=frame.dtype)
     nx, ny, nz = normal[0], normal[1], normal[2]
     for b in range(frame.shape[0]):
@@ -216,32 +225,64 @@ def contact_field(frame: Array, places: Array, apart: Array, reach: Array, sums:
             nx[p], ny[p], nz[p] = frame[b, p, 0, 0], frame[b, p, 1, 0], frame[b, p, 2, 0]
         for p in range(n_points):
             px, py, pz, own_x, own_y, own_z = x[p], y[p], z[p], nx[p], ny[p], nz[p]
-            f, away = frame[b, p], apart[p]
-            for k in range(len(reach)):
-                inverse = one / (reach[k] * reach[k])
-                total, height = zero, zero
-                to_x, to_y, to_z, n_x, n_y, n_z = zero, zero, zero, zero, zero, zero
-                for q in range(n_points):
-                    dx, dy, dz = x[q] - px, y[q] - py, z[q] - pz
-                    t = one - (dx * dx + dy * dy + dz * dz + away[q]) * inverse
-                    t = t if t > zero else zero
-                    s = (dx * own_x + dy * own_y + dz * own_z + behind) * sharpness
-                    s = s if s > zero else zero
-                    s = s if s < one else one
-                    weight = s * s * (three - two * s) * t * t * t
-                    total += weight
-                    height -= weight * (dx * nx[q] + dy * ny[q] + dz * nz[q])
-                    to_x += weight * dx
-                    to_y += weight * dy
-                    to_z += weight * dz
-                    n_x += weight * nx[q]
-                    n_y += weight * ny[q]
-                    n_z += weight * nz[q]
-                out = sums[p, b, k]
-                out[0], out[1] = total, height
-                for c in range(3):
-                    out[2 + c] = f[0, c] * to_x + f[1, c] * to_y + f[2, c] * to_z
-                    out[5 + c] = f[0, c] * n_x + f[1, c] * n_y + f[2, c] * n_z
+            away = apart[p]
+            # Sums with the inner reach, then with the outer one: of weights, heights, offsets and
+            # normals. Local numbers, as only those stay in registers.
+            w0, h0, x0, y0, z0, a0, b0, c0 = zero, zero, zero, zero, zero, zero, zero, zero
+            w1, h1, x1, y1, z1, a1, b1, c1 = zero, zero, zero, zero, zero, zero, zero, zero
+            for q in range(n_points):
+                dx, dy, dz = x[q] - px, y[q] - py, z[q] - pz
+                squared = dx * dx + dy * dy + dz * dz + away[q]
+                s = (dx * own_x + dy * own_y + dz * own_z + behind) * sharpness
+                s = s if s > zero else zero
+                s = s if s < one else one
+                facing = s * s * (three - two * s)
+                above = dx * nx[q] + dy * ny[q] + dz * nz[q]
+                t = one - squared * inner
+                t = t if t > zero else zero
+                weight = facing * t * t * t
+                w0 += weight
+                h0 -= weight * above
+                x0 += weight * dx
+                y0 += weight * dy
+                z0 += weight * dz
+                a0 += weight * nx[q]
+                b0 += weight * ny[q]
+                c0 += weight * nz[q]
+                t = one - squared * outer
+                t = t if t > zero else zero
+                weight = facing * t * t * t
+                w1 += weight
+                h1 -= weight * above
+                x1 += weight * dx
+                y1 += weight * dy
+                z1 += weight * dz
+                a1 += weight * nx[q]
+                b1 += weight * ny[q]
+                c1 += weight * nz[q]
+            f = frame[b, p]
+            _write_sums(f, w0, h0, x0, y0, z0, a0, b0, c0, sums[p, b, 0])
+            _write_sums(f, w1, h1, x1, y1, z1, a1, b1, c1, sums[p, b, 1])
+
+
+@compiled
+def _write_sums(
+    frame: Array,
+    weight: Number,
+    height: Number,
+    x: Number,
+    y: Number,
+    z: Number,
+    normal_x: Number,
+    normal_y: Number,
+    normal_z: Number,
+    out: Array,
+) -> None:
+    """Write a point's eight sums, vectors among them turned into its frame."""
+    out[0], out[1] = weight, height
+    for c in range(3):
+        out[2 + c] = frame[0, c] * x + frame[1, c] * y + frame[2, c] * z
+        out[5 + c] = frame[0, c] * normal_x + frame[1, c] * normal_y + frame[2, c] * normal_z
 
 
 @compiled

@@ -45,14 +45,9 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, silu, smooth_l1_loss
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.predictor.body_points import (
-    body_points,
-    skin_cells,
-    skin_distances,
-    skin_graph,
-    tangent_frames,
-)
+from lcollision_core.predictor.body_points import N_POINTS, skin_cells
 from lcollision_core.predictor.field import contact_field, fold_view, normalised
+from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
 from lcollision_core.predictor.folds import N_MEMBERS, find_fold_sites
 from lcollision_core.predictor.networks import (
     NetworkOutput,
@@ -63,6 +58,7 @@ from lcollision_core.predictor.networks import (
 )
 from lcollision_core.predictor.patch_labels import SkinCells
 from lcollision_core.predictor.reduced_body import ReducedBody
+from lcollision_core.predictor.skin_geometry import SkinGeometry
 
 if TYPE_CHECKING:
     from lcollision_core.embedding import Embedding
@@ -71,16 +67,6 @@ if TYPE_CHECKING:
 
 PATCH_WIDTH = 32
 HEAD_SIZES = (256, 64)
-
-REACHES = (0.07, 0.14)
-"""Heights within which distant skin is felt."""
-
-_DISTANT = 0.10
-"""Heights along the surface beyond which two points feel each other."""
-
-_SUMS_A_REACH = 8
-_FULL, _SOME = 0.3, 0.05
-"""Sums of weights: one that fills half of the scale, and one that keeps means of nothing at 0."""
 
 _PATCH_WEIGHT, _DEPTH_WEIGHT = 20.0, 5.0
 _FOLD_WEIGHT, _FOLD_DEPTH_WEIGHT = 5.0, 1.25
@@ -117,10 +103,15 @@ class GeometricNetwork(PredictorNetwork):
     seed : of the initial weights
     sites : (S, M) integer array, vertices about each place where the skin folds, see
         `find_fold_sites`
+    n_points, width : P, and the size of the patches' hidden layers
+
+    Raises
+    ------
+    ValueError : the sites are not of this body.
 
     Attributes
     ----------
-    point_vertices : (P,) int64 array, the vertices that are points of the body
+    skin : what it looks at
     """
 
     apart: torch.Tensor
@@ -128,27 +119,27 @@ class GeometricNetwork(PredictorNetwork):
     site_vertices: torch.Tensor
     members: torch.Tensor
 
-    def __init__(self, embedding: Embedding, seed: int, sites: npt.NDArray[np.integer]) -> None:
+    def __init__(
+        self,
+        embedding: Embedding,
+        seed: int,
+        sites: npt.NDArray[np.integer],
+        n_points: int = N_POINTS,
+        width: int = PATCH_WIDTH,
+    ) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
-        self.point_vertices = vertex = body_points(embedding)
-        n_points, n_sites = len(vertex), len(sites)
-        # The points first, then the sites' vertices that are none.
-        skin = np.append(vertex, np.setdiff1d(sites, vertex))
-        self.body = ReducedBody(embedding, skin, tangent_frames(embedding, skin), n_points)
-        between = skin_distances(skin_graph(embedding), vertex, limit=_DISTANT)[:, vertex]
-        apart = torch.tensor(np.isfinite(between), dtype=torch.float32).contiguous()
-        self.register_buffer("apart", apart, persistent=False)
+        self.skin = skin = SkinGeometry.of(embedding, sites, n_points)
+        self.body = ReducedBody(skin)
+        self.register_buffer("apart", torch.tensor(skin.apart), persistent=False)
         self.register_buffer("reach", torch.tensor(REACHES), persistent=False)
         # Of the model file: found in labelled poses.
         self.register_buffer("site_vertices", torch.tensor(sites, dtype=torch.int32))
-        place = np.zeros(len(embedding.rest_vertices), dtype=np.int32)
-        place[skin] = np.arange(len(skin))
-        members = torch.tensor(place[sites])
-        self.register_buffer("members", members, persistent=False)
-        self.patch = _PatchNetworks(n_points, _SUMS_A_REACH * len(REACHES), generator)
-        self.fold = _PatchNetworks(n_sites, 9 * N_MEMBERS, generator)
-        sizes = (2 * (n_points + n_sites), *HEAD_SIZES)
+        self.register_buffer("members", torch.tensor(skin.members), persistent=False)
+        n_sums = SUMS_A_REACH * len(REACHES)
+        self.patch = _PatchNetworks(skin.n_points, n_sums, width, generator)
+        self.fold = _PatchNetworks(len(sites), 9 * N_MEMBERS, width, generator)
+        sizes = (2 * (skin.n_points + len(sites)), *HEAD_SIZES)
         self.head = nn.ModuleList(
             SeededLinear(n_in, n_out, generator)
             for n_in, n_out in zip(sizes, (*HEAD_SIZES, embedding.n_domains + 2), strict=True)
@@ -188,25 +179,21 @@ class GeometricNetwork(PredictorNetwork):
         config: PredictorConfig,  # noqa: ARG003
         state: dict[str, torch.Tensor],
     ) -> PredictorNetwork:
-        """Make a trained network from its state dict.
+        """Make a trained network from its state dict, whose sizes may be an older program's.
 
         Raises
         ------
-        RuntimeError : the state dict does not fit the embedding.
+        KeyError, ValueError, RuntimeError : the state dict does not fit the embedding.
         """
-        found = state.get("site_vertices")
-        n_vertices = len(embedding.rest_vertices)
-        if found is None or found.ndim != 2 or found.shape[1] != N_MEMBERS:
-            raise RuntimeError("the network has no fold sites")
-        members = found.numpy().astype(np.int64)
-        if members.size and not 0 <= members.min() <= members.max() < n_vertices:
-            raise RuntimeError("the network's fold sites are not of this body")
-        network = cls(embedding, 0, members)
+        sites = state["site_vertices"].numpy().astype(np.int64)
+        n_points = state["body.points"].shape[1]
+        width = state["patch.layers.0.weight"].shape[2]
+        network = cls(embedding, 0, sites, n_points, width)
         network.load_state_dict(state)
         return network
 
     def _fit(self, embedding: Embedding, latent: npt.NDArray[np.floating]) -> None:
-        vertex = self.point_vertices
+        vertex = self.skin.point_vertices
         fitted = latent[:_FITTED_POSES]
         positions = np.concatenate(
             [
@@ -224,13 +211,15 @@ class GeometricNetwork(PredictorNetwork):
     def skin_cells(self, embedding: Embedding) -> SkinCells:
         """Divide the skin into patches and folds, whose exact energies the loss wants."""
         centres = self.site_vertices[:, 0].cpu().numpy()
-        return SkinCells(skin_cells(embedding, self.point_vertices), skin_cells(embedding, centres))
+        return SkinCells(
+            skin_cells(embedding, self.skin.point_vertices), skin_cells(embedding, centres)
+        )
 
     def _inputs(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (P, B, n) what each point feels, and (S, B, n) how each site is deformed."""
         frame, rows, places = self.body(latent)
         sums = contact_field(frame, places, self.apart, self.reach)
-        return normalised(sums, self.reach, _FULL, _SOME), fold_view(frame, rows, self.members)
+        return normalised(sums, self.reach, FULL, SOME), fold_view(frame, rows, self.members)
 
     def forward(self, latent: torch.Tensor) -> NetworkOutput:
         """Predict from (B, D) latent codes."""
@@ -276,7 +265,7 @@ class GeometricNetwork(PredictorNetwork):
         total = config.entropy_weight * binary_cross_entropy_with_logits(
             output.logit, own.colliding
         )
-        n_patches = len(self.point_vertices)
+        n_patches = self.skin.n_points
         for kind, weight, depth_weight in (
             (slice(0, n_patches), _PATCH_WEIGHT, _DEPTH_WEIGHT),
             (slice(n_patches, None), _FOLD_WEIGHT, _FOLD_DEPTH_WEIGHT),
@@ -297,11 +286,11 @@ class _PatchNetworks(nn.Module):
     mean: torch.Tensor
     deviation: torch.Tensor
 
-    def __init__(self, n_patches: int, n_in: int, generator: torch.Generator) -> None:
+    def __init__(self, n_patches: int, n_in: int, width: int, generator: torch.Generator) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(n_patches, 1, n_in))
         self.register_buffer("deviation", torch.ones(n_patches, 1, n_in))
-        sizes = (n_in, PATCH_WIDTH, PATCH_WIDTH, 2)
+        sizes = (n_in, width, width, 2)
         self.layers = nn.ModuleList(
             StackedLinear(n_patches, a, b, generator) for a, b in pairwise(sizes)
         )

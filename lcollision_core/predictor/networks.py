@@ -95,7 +95,7 @@ class PredictorNetwork(nn.Module, ABC):
 
         Raises
         ------
-        RuntimeError : the state dict does not fit the embedding.
+        KeyError, ValueError, RuntimeError : the state dict does not fit the embedding.
         """
         network = cls.build(embedding, config)
         network.load_state_dict(state)

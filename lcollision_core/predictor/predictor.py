@@ -18,15 +18,17 @@ from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
+from lcollision_core.predictor.few_poses import FewPosesNetwork
 from lcollision_core.predictor.metrics import EnergyScores, PredictorMetrics, measure
 
 if TYPE_CHECKING:
-    import torch
-
     from lcollision_core.predictor.networks import PredictorNetwork
 
 BATCH_ROWS = 500
 """Rows that are predicted at a time: their hidden layers stay in the caches."""
+
+_FEW_ROWS = 8
+"""Up to so many poses take less time without torch."""
 
 _ROWS_A_THREAD = 64
 """Fewer poses than this are not worth a thread."""
@@ -134,30 +136,46 @@ class PredictorRecord:
 class CollisionPredictor:
     """Predicts energy per domain and collision from latent codes.
 
-    Immutable, and safe to share between threads. Made by `train_predictor` or `from_section`.
+    Immutable, and safe to share between threads. Made by `train_predictor` or `from_section`. The
+    default preset needs torch for many poses at a time only, and on a GPU.
 
     Parameters
     ----------
-    network : on the device that is to predict; it must not change any more
+    embedding : whose latent codes come in
+    arrays : the network's state dict
     config : how it was trained
     facts : what it was trained upon
-    n_domains : K
-    latent_size : D
     metrics : measured on held-out rows, None before they are
+    device : that is to predict, "cpu" or "cuda"
     """
 
     def __init__(
         self,
-        network: PredictorNetwork,
+        embedding: Embedding,
+        arrays: Mapping[str, npt.NDArray[Any]],
         config: PredictorConfig,
         facts: TrainingFacts,
-        n_domains: int,
-        latent_size: int,
         metrics: PredictorMetrics | None = None,
+        device: str = "cpu",
     ) -> None:
         self.config, self.facts, self.metrics = config, facts, metrics
-        self.n_domains, self.latent_size = n_domains, latent_size
-        self._network = network.requires_grad_(False).eval()
+        self.device = device
+        self._embedding, self._arrays = embedding, dict(arrays)
+
+    @property
+    def n_domains(self) -> int:
+        """K."""
+        return self._embedding.n_domains
+
+    @property
+    def latent_size(self) -> int:
+        """D."""
+        return self._embedding.latent_size
+
+    @property
+    def needs_torch(self) -> bool:
+        """Whether a few poses do."""
+        return self._few is None
 
     @property
     def preset(self) -> str:
@@ -200,37 +218,47 @@ class CollisionPredictor:
         ------
         ShapeError : another shape, or a number that is not finite.
         """
-        import torch
-
         self._require(latent)
         codes = np.ascontiguousarray(latent, dtype=np.float32)
         n_outputs = self.n_domains if self.config.by_domain else 1
         domain_energy, logit = np.empty((len(codes), n_outputs)), np.empty(len(codes))
+        if self._few is not None and len(codes) <= _FEW_ROWS:
+            domain_energy[:], logit[:] = self._few.outputs(codes.astype(np.float64))
+        else:
+            self._predict_many(codes, domain_energy, logit)
+        return domain_energy, logit
+
+    def _predict_many(
+        self, codes: npt.NDArray[np.float32], domain_energy: FloatArray, logit: FloatArray
+    ) -> None:
+        """Fill in what torch says, on all cores or on the GPU."""
+        import torch
+
+        network = self._network
 
         def fill(start: int, stop: int) -> None:
             with torch.inference_mode():
                 for first in range(start, stop, BATCH_ROWS):
                     rows = slice(first, min(first + BATCH_ROWS, stop))
-                    output = self._network(torch.tensor(codes[rows], device=self._device))
+                    output = network(torch.tensor(codes[rows], device=self.device))
                     domain_energy[rows] = output.domain_energy.double().cpu().numpy()
                     logit[rows] = output.logit.double().cpu().numpy()
 
         n_threads = 1
-        if self._device.type == "cpu":
+        if self.device == "cpu":
             n_threads = max(1, min(available_cores(), len(codes) // _ROWS_A_THREAD))
         cuts = np.linspace(0, len(codes), n_threads + 1).astype(int).tolist()
         if n_threads == 1:
             fill(0, len(codes))
-        else:
-            # Each thread has a core to itself, and torch must not share out its work again.
-            torch_threads = torch.get_num_threads()
-            try:
-                with ThreadPoolExecutor(n_threads, "predict", torch.set_num_threads, (1,)) as pool:
-                    for _ in pool.map(fill, cuts[:-1], cuts[1:]):
-                        pass
-            finally:
-                torch.set_num_threads(torch_threads)
-        return domain_energy, logit
+            return
+        # Each thread has a core to itself, and torch must not share out its work again.
+        torch_threads = torch.get_num_threads()
+        try:
+            with ThreadPoolExecutor(n_threads, "predict", torch.set_num_threads, (1,)) as pool:
+                for _ in pool.map(fill, cuts[:-1], cuts[1:]):
+                    pass
+        finally:
+            torch.set_num_threads(torch_threads)
 
     def logit_and_gradient(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Return the logit of the collision probability and its derivative, in double precision.
@@ -248,10 +276,13 @@ class CollisionPredictor:
         ------
         ShapeError : another shape, or a number that is not finite.
         """
+        self._require(latent)
+        poses = np.asarray(latent, dtype=np.float64)
+        if self._few is not None:
+            return self._few.logit_and_gradient(poses)
         import torch
 
-        self._require(latent)
-        codes = torch.tensor(np.asarray(latent, dtype=np.float64), device=self._device)
+        codes = torch.tensor(poses, device=self.device)
         with torch.enable_grad():
             codes.requires_grad_()
             logit = self._exact_network(codes).logit
@@ -267,32 +298,30 @@ class CollisionPredictor:
         from torch.utils.flop_counter import FlopCounterMode
 
         with torch.no_grad(), FlopCounterMode(display=False) as counter:
-            self._network(torch.zeros((n_rows, self.latent_size), device=self._device))
+            self._network(torch.zeros((n_rows, self.latent_size), device=self.device))
         return int(counter.get_total_flops())
 
     def on(self, device: str) -> CollisionPredictor:
-        """Return the same predictor with its network on a device, such as "cuda" or "cpu"."""
-        from copy import deepcopy
-
-        return self._copy(deepcopy(self._network).to(device), self.metrics)
+        """Return the same predictor on a device, "cuda" or "cpu"."""
+        return CollisionPredictor(
+            self._embedding, self._arrays, self.config, self.facts, self.metrics, device
+        )
 
     def with_metrics(self, metrics: PredictorMetrics) -> CollisionPredictor:
         """Return the same predictor with what was measured of it."""
-        return self._copy(self._network, metrics)
+        return CollisionPredictor(
+            self._embedding, self._arrays, self.config, self.facts, metrics, self.device
+        )
 
     def to_section(self) -> Section:
         """Return what the model file keeps: the weights in float32, and JSON values."""
-        arrays = {
-            name: values.detach().cpu().numpy()
-            for name, values in self._network.state_dict().items()
-        }
         metadata = {
             "preset": self.preset,
             "config": asdict(self.config),
             "facts": asdict(self.facts),
             "metrics": self.metrics and self.metrics.to_metadata(),
         }
-        return Section(arrays, metadata)
+        return Section(self._arrays, metadata)
 
     @classmethod
     def from_section(cls, section: Section, embedding: Embedding) -> CollisionPredictor:
@@ -307,31 +336,36 @@ class CollisionPredictor:
         ------
         ModelFileError : the preset is unknown, or the weights do not fit the embedding.
         """
+        record = PredictorRecord.from_metadata(section.metadata)
+        predictor = cls(embedding, section.arrays, record.config, record.facts, record.metrics)
+        try:
+            # Built at once, as the arrays may be anything.
+            if predictor.needs_torch:
+                _ = predictor._network
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise ModelFileError(_MISFIT) from error
+        return predictor
+
+    def __getstate__(self) -> dict[str, Any]:
+        networks = ("_few", "_network", "_exact_network")
+        return {name: value for name, value in vars(self).items() if name not in networks}
+
+    @cached_property
+    def _few(self) -> FewPosesNetwork | None:
+        """What computes a few poses without torch, if that is possible."""
+        if self.preset != "default" or self.device != "cpu":
+            return None
+        return FewPosesNetwork(self._embedding, self._arrays)
+
+    @cached_property
+    def _network(self) -> PredictorNetwork:
         import torch
 
         from lcollision_core.predictor.presets import NETWORKS
 
-        record = PredictorRecord.from_metadata(section.metadata)
-        try:
-            state = {name: torch.tensor(array) for name, array in section.arrays.items()}
-            network = NETWORKS[record.config.preset].restore(embedding, record.config, state)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise ModelFileError(_MISFIT) from error
-        return cls(
-            network,
-            record.config,
-            record.facts,
-            embedding.n_domains,
-            embedding.latent_size,
-            record.metrics,
-        )
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_exact_network"}
-
-    @property
-    def _device(self) -> torch.device:
-        return next(self._network.parameters()).device
+        state = {name: torch.tensor(array) for name, array in self._arrays.items()}
+        network = NETWORKS[self.preset].restore(self._embedding, self.config, state)
+        return network.to(self.device).requires_grad_(False).eval()
 
     @cached_property
     def _exact_network(self) -> PredictorNetwork:
@@ -339,13 +373,6 @@ class CollisionPredictor:
         from copy import deepcopy
 
         return deepcopy(self._network).double()
-
-    def _copy(
-        self, network: PredictorNetwork, metrics: PredictorMetrics | None
-    ) -> CollisionPredictor:
-        return CollisionPredictor(
-            network, self.config, self.facts, self.n_domains, self.latent_size, metrics
-        )
 
     def _require(self, latent: npt.NDArray[Any]) -> None:
         if np.ndim(latent) != 2 or np.shape(latent)[1] != self.latent_size:

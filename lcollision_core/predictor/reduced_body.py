@@ -7,25 +7,21 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from lcollision_core.acap.features import N_FEATURES
-from lcollision_core.embedding import Embedding
 from lcollision_core.predictor.field import Decoding, decode_features, deform
+from lcollision_core.predictor.skin_geometry import SkinGeometry
 
 _DAMPING = 1e-8
 
 
 class ReducedBody(nn.Module):
-    """Latent codes to the deformation of some points of the body, and to where most of them are.
+    """Latent codes to the deformation of the skin, and to where the points of the body are.
 
-    The gradients are those of the embedding at the points. Places are a linear map of them, as the
+    The gradients are those of the embedding. Places are a linear map of those at the points, as the
     body's vertices are of all gradients, fitted to decoded poses.
 
     Parameters
     ----------
-    embedding : of the body
-    vertex : (Q,) integer array, the points, none twice
-    rest_frame : (Q, 3, 3) array, their frames on the reference, as columns
-    n_placed : P, how many of them, the first, have places
+    skin : of the body
     """
 
     offset: torch.Tensor
@@ -36,42 +32,18 @@ class ReducedBody(nn.Module):
     points: torch.Tensor
     origin: torch.Tensor
 
-    def __init__(
-        self,
-        embedding: Embedding,
-        vertex: npt.NDArray[np.int64],
-        rest_frame: npt.NDArray[np.float64],
-        n_placed: int,
-    ) -> None:
+    def __init__(self, skin: SkinGeometry) -> None:
         super().__init__()
-        decoder = embedding.decoder
-        self.n_placed = n_placed
-        blocks, tables, targets = [], [], []
-        code = column = 0
-        for group in decoder.groups:
-            n_codes = len(group.weights)
-            _, place, own = np.intersect1d(vertex, group.support, return_indices=True)
-            weights = group.weights.reshape(n_codes, -1, N_FEATURES)[:, own]
-            n_outputs = N_FEATURES * len(own)
-            blocks.append((code, code + n_codes, column, column + n_outputs))
-            tables.append(weights.reshape(-1))
-            targets.append(place)
-            code, column = code + n_codes, column + n_outputs
+        self.n_placed = skin.n_points
         # No buffer: it stays on the CPU.
-        self._blocks = torch.tensor(blocks)
-        self._keep("tables", np.concatenate(tables))
-        self._keep("offset", decoder.offset[vertex])
-        self._keep("scale", decoder.scale)
-        self._keep("rest_frame", rest_frame)
-        target = torch.tensor(np.concatenate(targets), dtype=torch.int32)
-        self.register_buffer("target", target, persistent=False)
+        self._blocks = torch.tensor(skin.blocks)
+        for name in ("tables", "offset", "scale", "rest_frame"):
+            kept = torch.tensor(getattr(skin, name), dtype=torch.float32)
+            self.register_buffer(name, kept, persistent=False)
+        self.register_buffer("target", torch.tensor(skin.target), persistent=False)
         # Of the model file: fitted, not a function of the embedding.
-        self.register_buffer("points", torch.zeros(3 * n_placed, n_placed))
-        self.register_buffer("origin", torch.zeros(3, n_placed))
-
-    def _keep(self, name: str, values: npt.NDArray[np.floating]) -> None:
-        kept = torch.tensor(np.asarray(values, dtype=np.float32))
-        self.register_buffer(name, kept, persistent=False)
+        self.register_buffer("points", torch.zeros(3 * self.n_placed, self.n_placed))
+        self.register_buffer("origin", torch.zeros(3, self.n_placed))
 
     def fit(self, latent: npt.NDArray[np.floating], positions: npt.NDArray[np.floating]) -> None:
         """Fit the places' linear map by ridge regression.

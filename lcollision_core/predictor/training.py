@@ -123,8 +123,7 @@ def train_predictor(
     loop = TrainingLoop(
         rows, embedding, config, facts, device, checkpoint, progress, cancel or CancelToken()
     )
-    network = loop.run()
-    predictor = CollisionPredictor(
-        network.cpu(), config, facts, embedding.n_domains, embedding.latent_size
-    )
+    state = loop.run().state_dict()
+    arrays = {name: values.detach().cpu().numpy() for name, values in state.items()}
+    predictor = CollisionPredictor(embedding, arrays, config, facts)
     return predictor.with_metrics(evaluate_predictor(predictor, held_out_rows(rows)))

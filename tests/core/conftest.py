@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from lcollision_core.meshes import PoseSet
 from lcollision_core.model import PoseModel
 from tests.bending_tube import bending_tube
+from tests.core.predictor_rows import colliding_latent
 
 
 @pytest.fixture(scope="session")
@@ -27,3 +29,11 @@ def tube_model(tube_poses: PoseSet) -> PoseModel:
     return PoseModel.from_training(
         "tube", train_embedding(tube_poses, config), tube_poses, "a tube", "CC0-1.0"
     )
+
+
+@pytest.fixture(scope="session")
+def tube_folds(tube_model: PoseModel) -> np.ndarray:
+    """Return the sites where its skin folds."""
+    from lcollision_core.predictor.folds import find_fold_sites
+
+    return find_fold_sites(tube_model.embedding, colliding_latent(tube_model))

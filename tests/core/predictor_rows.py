@@ -8,6 +8,7 @@ import numpy as np
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.labels import LabelRows
+from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS, PredictorConfig
 
 N_ROWS = 1500
@@ -31,6 +32,12 @@ def made_up_rows(embedding: Embedding, n_rows: int = N_ROWS, seed: int = 1) -> L
         n_pairs=(depth > 0.0).astype(np.int32),
         n_near_pairs=np.zeros(n_rows, dtype=np.int32),
     )
+
+
+def colliding_latent(model: PoseModel) -> np.ndarray:
+    """Draw 60 poses far outside the latent box, where a tube folds onto itself."""
+    latent = model.latent_space.sample(60, np.random.default_rng(3))
+    return (2.5 * latent).astype(np.float32)
 
 
 def weights_of(section_arrays: dict[str, np.ndarray]) -> bytes:

@@ -28,16 +28,17 @@ from lcollision_core.predictor.field import (
     fold_view,
     normalised,
 )
+from lcollision_core.predictor.field_kernels import REACHES
 from lcollision_core.predictor.folds import (
     _MEMBER_REACH,
     FOLD_REACH,
     N_MEMBERS,
     find_fold_sites,
 )
-from lcollision_core.predictor.geometric import REACHES, GeometricNetwork
+from lcollision_core.predictor.geometric import GeometricNetwork
 from lcollision_core.predictor.networks import Targets
 from lcollision_core.predictor.patch_labels import SkinCells, patch_roots
-from tests.core.predictor_rows import made_up_rows
+from tests.core.predictor_rows import colliding_latent, made_up_rows
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +84,7 @@ def test_reduced_body_lies_where_the_decoder_puts_it(
     latent = _some_latent(tube_model, 20)
     with torch.no_grad():
         _, _, places = network.body(torch.tensor(latent, dtype=torch.float32))
-    truth = tube_model.embedding.decode(latent)[:, network.point_vertices]
+    truth = tube_model.embedding.decode(latent)[:, network.skin.point_vertices]
     errors = np.linalg.norm(places.numpy().transpose(0, 2, 1) - truth, axis=2)
     assert errors.mean() < 2e-3
     moved = truth - truth[:1]
@@ -96,10 +97,10 @@ def test_frames_and_gradients_are_those_of_the_embedding(
     """Each point's S is symmetric, R turns its frame, and both follow from its features alone."""
     embedding = tube_model.embedding
     latent = _some_latent(tube_model, 3)
-    exact = embedding.decoder.features(latent)[:, network.point_vertices]
+    exact = embedding.decoder.features(latent)[:, network.skin.point_vertices]
     with torch.no_grad():
         found = network.body.features(torch.tensor(latent, dtype=torch.float32))
-    assert found[:, : len(network.point_vertices)].numpy() == pytest.approx(exact, abs=1e-5)
+    assert found[:, : len(network.skin.point_vertices)].numpy() == pytest.approx(exact, abs=1e-5)
 
 
 @pytest.fixture
@@ -126,17 +127,18 @@ def test_field_by_hand() -> None:
     places[0, :, 1] = torch.tensor([0.05, 0.01, 0.0], dtype=torch.float64)
     places[0, 0, 2] = -0.08
     apart = torch.eye(3, dtype=torch.float64)
-    reach = torch.tensor([0.1], dtype=torch.float64)
-    (first, second, _) = contact_field(frame, places, apart, reach)[:, 0, 0].numpy()
-    weight = (1.0 - (0.05**2 + 0.01**2) / 0.1**2) ** 3
-    # The first is 0.05 above the second's plane, whose normal points back at it.
-    assert first == pytest.approx(
-        weight * np.array([1.0, 0.05, 0.05, 0.01, 0.0, -1.0, 0.0, 0.0]), abs=1e-12
-    )
-    # The second's own frame turns what it sees: ahead is -x of the world.
-    assert second == pytest.approx(
-        weight * np.array([1.0, 0.05, 0.05, -0.01, 0.0, -1.0, 0.0, 0.0]), abs=1e-12
-    )
+    reach = torch.tensor([0.06, 0.1], dtype=torch.float64)
+    (first, second, _) = contact_field(frame, places, apart, reach)[:, 0].numpy()
+    for k in range(2):
+        weight = (1.0 - (0.05**2 + 0.01**2) / reach[k].item() ** 2) ** 3
+        # The first is 0.05 above the second's plane, whose normal points back at it.
+        assert first[k] == pytest.approx(
+            weight * np.array([1.0, 0.05, 0.05, 0.01, 0.0, -1.0, 0.0, 0.0]), abs=1e-12
+        )
+        # The second's own frame turns what it sees: ahead is -x of the world.
+        assert second[k] == pytest.approx(
+            weight * np.array([1.0, 0.05, 0.05, -0.01, 0.0, -1.0, 0.0, 0.0]), abs=1e-12
+        )
 
 
 def test_pairs_that_are_apart_do_not_feel_each_other(made_up: tuple[torch.Tensor, ...]) -> None:
@@ -236,7 +238,7 @@ def test_folds_are_looked_for_where_the_skin_folds(
     )
     folded = [
         detector.detect(pose.astype(np.float32)).near_pairs
-        for pose in embedding.decode(_colliding_latent(tube_model))
+        for pose in embedding.decode(colliding_latent(tube_model))
     ]
     touched = np.unique(embedding.topology.faces[np.concatenate(folded)])
     assert len(touched)
@@ -256,15 +258,6 @@ def test_a_body_without_folds_has_no_sites(tube_model: PoseModel) -> None:
     assert torch.isfinite(network(torch.zeros((2, embedding.latent_size))).logit).all()
 
 
-def _colliding_latent(model: PoseModel) -> np.ndarray:
-    return (2.5 * _some_latent(model, 60)).astype(np.float32)
-
-
-@pytest.fixture(scope="module")
-def tube_folds(tube_model: PoseModel) -> np.ndarray:
-    return find_fold_sites(tube_model.embedding, _colliding_latent(tube_model))
-
-
 def test_a_batch_is_its_poses(tube_model: PoseModel, network: GeometricNetwork) -> None:
     latent = torch.tensor(_some_latent(tube_model, 70), dtype=torch.float32)
     with torch.no_grad():
@@ -279,7 +272,7 @@ def test_patches_and_folds_share_out_the_exact_energy(
     tube_model: PoseModel, tube_folds: np.ndarray
 ) -> None:
     embedding = tube_model.embedding
-    latent = _colliding_latent(tube_model)
+    latent = colliding_latent(tube_model)
     cells = SkinCells(
         skin_cells(embedding, body_points(embedding, 25)), skin_cells(embedding, tube_folds[:, 0])
     )
@@ -303,7 +296,7 @@ def test_every_collision_that_counts_is_taught(
     tube_model: PoseModel, near_exclusion: float
 ) -> None:
     """With sites and without, and beyond a near exclusion, within which nothing counts."""
-    embedding, latent = tube_model.embedding, _colliding_latent(tube_model)
+    embedding, latent = tube_model.embedding, colliding_latent(tube_model)
     detector = CollisionDetector(
         embedding.topology, embedding.rest_vertices, near_exclusion=near_exclusion
     )
@@ -350,7 +343,7 @@ def test_a_stored_network_predicts_the_same(
         with torch.no_grad():
             assert torch.equal(restored(latent).logit, given(latent).logit)
     state = folding.state_dict() | {"site_vertices": torch.tensor([[10**6] * N_MEMBERS])}
-    with pytest.raises(RuntimeError, match="fold sites"):
+    with pytest.raises(ValueError, match="fold sites"):
         GeometricNetwork.restore(embedding, config, state)
 
 
@@ -358,7 +351,7 @@ def test_a_process_without_rows_adds_nothing(tube_model: PoseModel, tube_folds: 
     """As where the last batch is smaller than the number of processes."""
     network = GeometricNetwork(tube_model.embedding, 0, tube_folds)
     latent = torch.zeros((2, tube_model.latent_size))
-    n_cells = len(network.point_vertices) + len(tube_folds)
+    n_cells = len(network.skin.point_vertices) + len(tube_folds)
     sizes = (2, tube_model.embedding.n_domains), (2,), (2,), (2, n_cells)
     targets = Targets(*(torch.zeros(size) for size in sizes))
     none = latent[2:].requires_grad_()
