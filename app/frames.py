@@ -94,20 +94,8 @@ class PoseShower:
     """
 
     def __init__(self, model: PoseModel) -> None:
-        from scipy.sparse import csr_matrix
-
         self.model = model
         self.predicts = True
-        self._corners = tuple(np.ascontiguousarray(corner) for corner in model.faces.T)
-        n_faces = len(model.faces)
-        # Sums the faces' normals into their vertices: one product instead of a scattered sum.
-        self._faces_of_vertex = csr_matrix(
-            (
-                np.ones(3 * n_faces, dtype=np.float32),
-                (model.faces.ravel(), np.repeat(np.arange(n_faces), 3)),
-            ),
-            shape=(model.n_vertices, n_faces),
-        )
 
     def frame(self, latent: FloatArray, request_id: int) -> LiveFrame:
         """Decode, shade and predict one pose.
@@ -157,27 +145,10 @@ class PoseShower:
         )
 
     def normals(self, vertices: Float32Array) -> Float32Array:
-        """Return the vertices' normals.
+        """Return the (V, 3) float32 normals of (V, 3) float32 vertices."""
+        from lcollision_core.meshes.normals import vertex_normals
 
-        Parameters
-        ----------
-        vertices : (V, 3) float32 array
-
-        Returns
-        -------
-        normals : (V, 3) float32 array: the mean of the faces' normals by area, of length 1; 0 at
-            a vertex whose faces have no area
-        """
-        a, b, c = (vertices[corner] for corner in self._corners)
-        edge_b, edge_c = (b - a).T, (c - a).T
-        face_normals = np.empty((len(a), 3), dtype=np.float32)
-        for axis in range(3):
-            u, v = (axis + 1) % 3, (axis + 2) % 3
-            face_normals[:, axis] = edge_b[u] * edge_c[v] - edge_b[v] * edge_c[u]
-        normals: Float32Array = self._faces_of_vertex @ face_normals
-        lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-        normals /= np.maximum(lengths, np.finfo(np.float32).tiny)[:, None]
-        return normals
+        return vertex_normals(vertices, self.model.faces)
 
 
 def keep_torch_to_one_thread(model: PoseModel) -> None:

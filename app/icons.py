@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from PySide6.QtCore import QByteArray, QRectF, QSize, Qt
-from PySide6.QtGui import QIcon, QPainter, QPixmap
+from PySide6.QtGui import QIcon, QPainter, QPixmap, QPixmapCache
 from PySide6.QtSvg import QSvgRenderer
 
 from app.theme import current_theme, mixed
@@ -36,7 +36,7 @@ def icon(name: str, colour: str | None = None) -> QIcon:
 
 
 def pixmap(name: str, colour: str, size: int, sharpness: float = 1.0) -> QPixmap:
-    """Draw an icon at one size.
+    """Draw an icon at one size, unless it is known from before.
 
     Parameters
     ----------
@@ -45,6 +45,10 @@ def pixmap(name: str, colour: str, size: int, sharpness: float = 1.0) -> QPixmap
     size : side in device-independent pixels
     sharpness : device pixels per pixel
     """
+    key = f"{name} {colour} {size} {sharpness}"
+    canvas = QPixmap()
+    if QPixmapCache.find(key, canvas):
+        return canvas
     drawing = bundled_file("icons", f"{name}.svg").read_text().replace("currentColor", colour)
     renderer = QSvgRenderer(QByteArray(drawing.encode()))
     side = round(size * sharpness)
@@ -54,6 +58,7 @@ def pixmap(name: str, colour: str, size: int, sharpness: float = 1.0) -> QPixmap
     renderer.render(painter, QRectF(0, 0, side, side))
     painter.end()
     canvas.setDevicePixelRatio(sharpness)
+    QPixmapCache.insert(key, canvas)
     return canvas
 
 

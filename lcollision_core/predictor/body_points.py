@@ -9,6 +9,7 @@ from scipy.sparse import csgraph
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.embedding.seeding import edge_graph
+from lcollision_core.meshes.normals import vertex_normals
 from lcollision_core.meshes.topology import FloatArray
 
 N_POINTS = 200
@@ -75,14 +76,8 @@ def skin_cells(embedding: Embedding, centre: npt.NDArray[np.integer]) -> npt.NDA
 
 def tangent_frames(embedding: Embedding, vertex: npt.NDArray[np.integer]) -> FloatArray:
     """Return (P, 3, 3): columns normal and two tangents of the reference at some vertices."""
-    rest, faces = embedding.rest_vertices, embedding.topology.faces
-    corner = rest[faces]
-    face_normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = np.zeros_like(rest)
-    np.add.at(normal, faces.ravel(), np.repeat(face_normal, 3, axis=0))
-    normal = normal[vertex]
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = np.where(length > 0.0, normal / np.where(length > 0.0, length, 1.0), [1.0, 0.0, 0.0])
+    normal = vertex_normals(embedding.rest_vertices, embedding.topology.faces)[vertex]
+    normal[~normal.any(axis=1)] = [1.0, 0.0, 0.0]
     axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
     tangent = np.cross(normal, axis)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
