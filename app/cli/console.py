@@ -1,9 +1,10 @@
-"""What all commands share: progress on a terminal, one JSON document, notes on standard error."""
+"""What all commands share: progress, one JSON document, notes on standard error."""
 
 from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -12,6 +13,9 @@ from typing import Any, Protocol
 import typer
 
 from lcollision_core.jobs import Progress, no_progress
+
+SECONDS_BETWEEN_LINES = 30.0
+"""Of progress, where it goes to a file or a pipe."""
 
 
 class ExitStatus(IntEnum):
@@ -43,6 +47,28 @@ def note(sentence: str) -> None:
     typer.echo(f"lcollision: {sentence}", err=True)
 
 
+class _StatusLines:
+    """A `ShowStatus` for log files: a line every half minute.
+
+    Parameters
+    ----------
+    task, rows : see `status_bar`
+    """
+
+    def __init__(self, task: str, rows: bool) -> None:
+        self._task, self._rows = task, rows
+        self._told = time.monotonic()
+
+    def __call__(
+        self, done: float, total: float, facts: Iterable[str] = (), description: str | None = None
+    ) -> None:
+        if time.monotonic() - self._told < SECONDS_BETWEEN_LINES:
+            return
+        self._told = time.monotonic()
+        amount = f"{done:.0f} of {total:.0f}" if self._rows else f"{100.0 * done / total:.0f} %"
+        note(", ".join([f"{description or self._task}: {amount}", *facts]))
+
+
 @contextmanager
 def progress_bar(task: str) -> Iterator[Progress]:
     """Give a `Progress` that draws a bar on a terminal, and nothing in a pipe."""
@@ -69,8 +95,8 @@ def progress_bar(task: str) -> Iterator[Progress]:
 
 
 @contextmanager
-def status_bar(task: str, *, rows: bool = False) -> Iterator[ShowStatus | None]:
-    """Give a `ShowStatus` that draws a bar on a terminal, and None in a pipe.
+def status_bar(task: str, *, rows: bool = False) -> Iterator[ShowStatus]:
+    """Give a `ShowStatus` that draws a bar on a terminal, and in a pipe tells now and then.
 
     Parameters
     ----------
@@ -78,7 +104,7 @@ def status_bar(task: str, *, rows: bool = False) -> Iterator[ShowStatus | None]:
     rows : show how many of how many are done, not the share and the time left
     """
     if not sys.stderr.isatty():
-        yield None
+        yield _StatusLines(task, rows)
         return
     from rich import progress as rich_progress
     from rich.console import Console

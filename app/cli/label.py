@@ -121,12 +121,7 @@ def _labelling_bar() -> Iterator[StatusCallback]:
     """Give a callback that draws rows, rate, time left and share colliding on a terminal."""
     from datetime import timedelta
 
-    from lcollision_core.labels import no_status
-
     with status_bar("Labelling", rows=True) as draw:
-        if draw is None:
-            yield no_status
-            return
 
         def show(status: LabelStatus) -> None:
             facts = []

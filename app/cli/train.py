@@ -120,12 +120,7 @@ def _provenance(vertices: Any, seed: int) -> dict[str, Any]:
 @contextmanager
 def _training_bar() -> Iterator[StatusCallback]:
     """Give a callback that draws the stage and both levels' errors on a terminal."""
-    from lcollision_core.embedding.training import no_status
-
     with status_bar("reading features") as draw:
-        if draw is None:
-            yield no_status
-            return
 
         def show(status: TrainingStatus) -> None:
             errors = [

@@ -142,9 +142,6 @@ def _training_bar(leads: bool) -> Iterator[StatusCallback]:
         yield no_status
         return
     with status_bar("reading rows") as draw:
-        if draw is None:
-            yield no_status
-            return
 
         def show(status: PredictorStatus) -> None:
             if status.preparing is not None:

@@ -1,4 +1,4 @@
-"""The bars of long commands: drawn on a real terminal, silent in a pipe."""
+"""The bars of long commands: drawn on a real terminal, a line now and then in a pipe."""
 
 from __future__ import annotations
 
@@ -46,9 +46,10 @@ BARS = {
 }
 
 
-def draw(code: str, error: int) -> None:
+def draw(code: str, error: int, before: str = "") -> None:
     """Draw one status in another process, whose standard error is `error`."""
-    held = f"{code}\nwith made as progress:\n    progress(status)\n    import time; time.sleep(0.3)"
+    held = f"{before}\n{code}\nwith made as progress:\n    progress(status)\n"
+    held += "    import time; time.sleep(0.3)"
     environment = {**os.environ, "COLUMNS": "160", "TERM": "xterm"}
     subprocess.run([sys.executable, "-c", held], env=environment, stderr=error, check=True)
 
@@ -68,9 +69,23 @@ def test_on_a_terminal_a_bar_tells_how_far_the_work_is(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BARS)
-def test_in_a_pipe_there_is_no_bar(name: str) -> None:
+def test_in_a_pipe_short_work_says_nothing(name: str) -> None:
     ours, theirs = os.pipe()
     draw(BARS[name][0], theirs)
     os.close(theirs)
     with os.fdopen(ours) as reader:
         assert reader.read() == ""
+
+
+@pytest.mark.parametrize("name", BARS)
+def test_in_a_pipe_a_line_comes_every_half_minute(name: str) -> None:
+    """Here at once."""
+    code, told = BARS[name]
+    ours, theirs = os.pipe()
+    draw(code, theirs, "import app.cli.console as c; c.SECONDS_BETWEEN_LINES = 0.0")
+    os.close(theirs)
+    with os.fdopen(ours) as reader:
+        (line,) = reader.read().splitlines()
+    assert line.startswith("lcollision: ")
+    for words in told:
+        assert words.replace("/200", " of 200").replace("%", " %").replace("  ", " ") in line
