@@ -62,21 +62,53 @@ def preset_view(
         # Straight from above, a camera that keeps upright has no direction to turn in.
         "Top": up + 0.02 * front,
     }[name]
+    return framing(vertices, towards, up, aspect)
+
+
+def framing(vertices: npt.NDArray[Any], towards: FloatArray, up: FloatArray, aspect: float) -> View:
+    """Look at a whole mesh from a direction.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array
+    towards : (3,) array, from the mesh to the camera
+    up : (3,) array of length 1, upright in the picture
+    aspect : the picture's width over its height
+    """
     towards = towards / np.linalg.norm(towards)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     focus = 0.5 * (low + high).astype(np.float64)
+    needed, depth = _needed_distances(vertices - focus, towards, up, aspect)
+    distance = float((_MARGIN * needed + depth).max())
+    return View(focus + distance * towards, focus, up)
+
+
+def sees_all(view: View, vertices: npt.NDArray[Any], aspect: float) -> bool:
+    """Tell whether a whole mesh is inside the picture.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array
+    aspect : the picture's width over its height
+    """
+    arm = view.position - view.focus
+    distance = float(np.linalg.norm(arm))
+    needed, depth = _needed_distances(vertices - view.focus, arm / distance, view.up, aspect)
+    return bool((needed + depth <= distance).all())
+
+
+def _needed_distances(
+    offset: npt.NDArray[Any], towards: FloatArray, up: FloatArray, aspect: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return how far before the camera each point must lie to be seen, and its own depth."""
     upward = up - (up @ towards) * towards
     upward /= np.linalg.norm(upward)
     half_height = np.tan(np.radians(0.5 * VIEW_ANGLE))
-    offset = vertices - focus
-    depth = offset @ towards
-    # The nearest distance at which each vertex is inside the picture.
     needed = np.maximum(
         np.abs(offset @ upward) / half_height,
         np.abs(offset @ np.cross(upward, towards)) / (half_height * aspect),
     )
-    distance = float((_MARGIN * needed + depth).max())
-    return View(focus + distance * towards, focus, up)
+    return needed, offset @ towards
 
 
 def turned(view: View, angle: float) -> View:

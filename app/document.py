@@ -433,8 +433,11 @@ class PoseDocument(PoseHistory):
         self.end_gesture()
         self._edit("Mirror", latent)
 
-    def _on_exported(self, path: Path) -> None:
-        self.message.emit(f"Exported {path.name}")
+    def _on_exported(self, exported: tasks.Exported) -> None:
+        state = "exactly collision-free"
+        if exported.n_pairs:
+            state = f"{counted(exported.n_pairs, 'pair')} of its triangles collide"
+        self.message.emit(f"Exported {exported.path.name}: {state}")
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
         result, self._solve = resolved.result, None

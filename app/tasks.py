@@ -67,6 +67,14 @@ class RecoveredPoses:
     file: Path | None
 
 
+@dataclass(frozen=True)
+class Exported:
+    """A mesh that was written, and how many pairs of its triangles collide."""
+
+    path: Path
+    n_pairs: int
+
+
 @dataclass(frozen=True, eq=False)
 class Resolved:
     """What Resolve found, and the mesh before, (V, 3) float32, read-only."""
@@ -183,15 +191,15 @@ def exported(
     placement: RigidTransform | None,
     path: Path,
 ) -> Work:
-    """Write the mesh that is drawn of a pose, moved back to where it came from."""
+    """Write the mesh that is drawn of a pose, moved back to where it came from, and check it."""
 
-    def work(_: Progress, __: CancelToken) -> Path:
+    def work(_: Progress, __: CancelToken) -> Exported:
         from lcollision_core.meshes import write_mesh
         from lcollision_core.resolve import exported_vertices
 
         vertices = exported_vertices(model.decode(latent, n_threads=1), placement)
         write_mesh(path, vertices, model.faces)
-        return path
+        return Exported(path, len(model.detector.detect(vertices).pairs))
 
     return work
 

@@ -14,7 +14,7 @@ from PySide6.QtGui import QCloseEvent, QResizeEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QStackedLayout, QWidget
 
-from app.camera import View, front_direction, preset_view
+from app.camera import View, framing, front_direction, preset_view, sees_all
 from app.frames import LiveFrame, PoseShower
 from app.legend import DomainTag, LegendCard
 from app.motion import CameraTurn, Glide
@@ -77,6 +77,7 @@ class Viewport(QWidget):
         self._place_camera = False
         self._framed: npt.NDArray[np.float64] | None = None
         self._glide_to: npt.NDArray[np.float64] | None = None
+        self._loaded: npt.NDArray[np.float64] | None = None
 
         self._layout = QStackedLayout(self)
         self._layout.setStackingMode(QStackedLayout.StackingMode.StackOne)
@@ -104,6 +105,7 @@ class Viewport(QWidget):
         document.exact_changed.connect(self._on_exact_changed)
         document.ghost_changed.connect(self._on_ghost_changed)
         document.solve_finished.connect(self._on_solve_finished)
+        document.pose_loaded.connect(self._on_pose_loaded)
         if document.has_model:
             # After the window is on the screen.
             QTimer.singleShot(0, self, self._on_model_changed)
@@ -368,6 +370,10 @@ class Viewport(QWidget):
     def _on_solve_finished(self, result: ResolveResult | None) -> None:
         self._glide_to = result.latent if result is not None else None
 
+    @Slot()
+    def _on_pose_loaded(self) -> None:
+        self._loaded = self._document.latent
+
     # Drawing.
 
     def _recolour(self, crossing: bool = False) -> None:
@@ -398,7 +404,7 @@ class Viewport(QWidget):
             scene.show_crossing(exact.pairs if exact is not None and shown else None)
 
     def _put(self, scene: Scene, frame: LiveFrame) -> None:
-        self._shown = frame
+        before, self._shown = self._shown, frame
         self._glide.stop()
         is_framed = frame.latent is self._framed
         if is_framed:
@@ -413,9 +419,18 @@ class Viewport(QWidget):
             self._glide.begin(scene.surface.vertices.copy(), frame.vertices)
         else:
             scene.show(frame.vertices, frame.normals)
-        self._glide_to = None
+            if frame.latent is self._loaded and before is not None:
+                self._keep_in_view(scene, before, frame)
+        self._glide_to = self._loaded = None
         if self._shading is Shading.EXACT:
             self._crossing_stale = True
+
+    def _keep_in_view(self, scene: Scene, before: LiveFrame, frame: LiveFrame) -> None:
+        """Go on seeing the whole body, if it was seen until another pose came in."""
+        view, aspect = scene.view, self._aspect
+        if sees_all(view, before.vertices, aspect) and not sees_all(view, frame.vertices, aspect):
+            towards = view.position - view.focus
+            self._turn.begin(view, framing(frame.vertices, towards, view.up, aspect))
 
     def _paint(self, scene: Scene, frame: LiveFrame) -> None:
         assert self._shader is not None
@@ -444,8 +459,12 @@ class Viewport(QWidget):
         self._legend.move(NORMAL, self.height() - self._legend.height() - NORMAL)
 
     def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
-        aspect = self.width() / max(1, self.height())
-        return preset_view(name, vertices, self._document.model.up_axis, self._front, aspect)
+        up_axis = self._document.model.up_axis
+        return preset_view(name, vertices, up_axis, self._front, self._aspect)
+
+    @property
+    def _aspect(self) -> float:
+        return self.width() / max(1, self.height())
 
     # Motion.
 

@@ -12,6 +12,7 @@ from pytestqt.qtbot import QtBot
 from app.document import Failure, PoseDocument
 from app.frames import PoseShower
 from app.tasks import drawn_vertices
+from app.wording import counted
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
 from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
@@ -401,6 +402,21 @@ def test_an_exported_mesh_is_the_one_on_the_screen_in_its_place(
     placed = QUARTER_TURN.apply(document.frame.vertices).astype(np.float32)
     mesh = read_mesh(path)
     assert (mesh.vertices.astype(np.float32)[mesh.faces] == placed[document.model.faces]).all()
+
+
+def test_an_export_says_whether_the_mesh_collides(
+    qtbot: QtBot, document: PoseDocument, colliding: np.ndarray, tmp_path: Path
+) -> None:
+    with qtbot.waitSignal(document.message) as free:
+        document.export_mesh(tmp_path / "free.obj")
+    assert free.args == ["Exported free.obj: exactly collision-free"]
+    document.set_latent(colliding, "Jump")
+    with qtbot.waitSignal(document.message) as told:
+        document.export_mesh(tmp_path / "bad.obj")
+    mesh = read_mesh(tmp_path / "bad.obj")
+    n_pairs = len(document.model.detector.detect(mesh.vertices.astype(np.float32)).pairs)
+    assert told.args == [f"Exported bad.obj: {counted(n_pairs, 'pair')} of its triangles collide"]
+    assert n_pairs > 0
 
 
 def test_resolve_checks_the_mesh_that_would_be_exported(

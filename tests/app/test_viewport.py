@@ -17,7 +17,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from app.camera import CAMERAS
+from app.camera import CAMERAS, View, framing, sees_all
 from app.canvas import Canvas
 from app.document import PoseDocument
 from app.engine import Failure
@@ -27,7 +27,7 @@ from app.shading import Shading, rgb
 from app.theme import DARK, LIGHT, apply_theme
 from app.viewport import Viewport
 from lcollision_core.errors import LCollisionError, MeshFileError
-from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.model import NamedPose, PoseModel, sample_poses
 
 SIDE = 420
 
@@ -349,6 +349,41 @@ def test_each_camera_shows_the_whole_body(viewport: Viewport) -> None:
         assert viewport.view is not None
         positions.add(viewport.view.position.tobytes())
     assert len(positions) == len(CAMERAS)
+
+
+@pytest.mark.parametrize("closely", [False, True])
+def test_who_sees_the_whole_body_goes_on_seeing_it(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport, closely: bool
+) -> None:
+    """But who looks at a part of it is left in peace."""
+    model, scene = document.model, viewport.scene
+    assert scene is not None
+    straight, bent = (
+        NamedPose(name, latent)
+        for name, latent in (
+            ("straight", np.zeros(model.latent_size)),
+            ("bent", model.training_latent[np.abs(model.training_latent).sum(axis=1).argmax()]),
+        )
+    )
+    document.load_pose(bent)
+    rest(qtbot, viewport)
+    vertices, up = scene.surface.vertices.copy(), np.eye(3)[model.up_axis]
+    # As narrow as the bent tube allows, so that the straight one does not fit; or narrower.
+    near = framing(vertices, np.array([0.3, 0.0, 1.0]), up, 1.0)
+    share = 0.3 if closely else 0.9
+    scene.view = View(near.focus + share * (near.position - near.focus), near.focus, near.up)
+    before = scene.view
+    assert sees_all(before, vertices, 1.0) is not closely
+    document.load_pose(straight)
+    rest(qtbot, viewport)
+    assert not sees_all(before, scene.surface.vertices, 1.0)
+    after = scene.view
+    assert sees_all(after, scene.surface.vertices, 1.0) is not closely
+    arms = [view.position - view.focus for view in (before, after)]
+    directions = [arm / np.linalg.norm(arm) for arm in arms]
+    np.testing.assert_allclose(directions[0], directions[1], atol=1e-6)
+    if closely:
+        np.testing.assert_array_equal(after.position, before.position)
 
 
 def test_a_camera_is_turned_to_by_degrees_and_arrives(qtbot: QtBot, viewport: Viewport) -> None:
