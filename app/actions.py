@@ -45,7 +45,12 @@ ACTIONS: dict[str, ActionSpec] = {
     "quit": ActionSpec("&Quit", "Ctrl+Q", "Close the editor"),
     "undo": ActionSpec("&Undo", "Ctrl+Z", "Take back the last change", "undo"),
     "redo": ActionSpec("&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Do again what was taken back", "redo"),
-    "reset": ActionSpec("Reset &all", "Ctrl+Backspace", "All sliders back to zero", "reset"),
+    "reset": ActionSpec(
+        "Reset &all",
+        "Ctrl+Backspace",
+        "All sliders back to zero: the average of the poses it learnt from",
+        "reset",
+    ),
     "randomise": ActionSpec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),
     "mirror": ActionSpec("&Mirror", "Ctrl+M", "Exchange left and right", "mirror"),
     "filter": ActionSpec("&Find a slider", "Ctrl+F", "Type what a slider is called", "search"),
@@ -93,9 +98,9 @@ CAMERA_ACTIONS: dict[str, ActionSpec] = {
 }
 
 THEMES: dict[str, ActionSpec] = {
-    "system": ActionSpec("As the &system", "Ctrl+Alt+S", "Follow the desktop", "", True),
-    "light": ActionSpec("&Light", "Ctrl+Alt+L", "Dark text on light", "", True),
-    "dark": ActionSpec("&Dark", "Ctrl+Alt+D", "Light text on dark", "", True),
+    "system": ActionSpec("As the &system", "F6", "Follow the desktop", "", True),
+    "light": ActionSpec("&Light", "F7", "Dark text on light", "", True),
+    "dark": ActionSpec("&Dark", "F8", "Light text on dark", "", True),
 }
 
 DOCKS: dict[str, ActionSpec] = {
