@@ -72,24 +72,25 @@ def decode_features(latent: torch.Tensor, decoding: Decoding) -> torch.Tensor:
 
 
 def deform(features: torch.Tensor, rest_frame: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Turn the points' frames, and return their deformation gradients R S.
+    """Turn the first points' frames, and return all points' deformation gradients R S.
 
     Parameters
     ----------
-    features : (B, P, 9) unscaled deformation features: log R, then the upper triangle of S
-    rest_frame : (P, 3, 3) frames on the reference, as columns
+    features : (B, Q, 9) unscaled deformation features: log R, then the upper triangle of S
+    rest_frame : (N, 3, 3) frames of the first N points on the reference, as columns
 
     Returns
     -------
-    frame : (B, P, 3, 3) R F
-    rows : (B, 3, 3 P) the first, second and third rows of all gradients
+    frame : (B, N, 3, 3) R F
+    rows : (B, 3, 3 Q) the first, second and third rows of all gradients
     """
     if features.device.type == "cpu":
         frame, rows = _Deform.apply(features, rest_frame)  # type: ignore[no-untyped-call]
         return frame, rows.flatten(2)
     rotation = _rotations(features[..., :3])
     stretch = features[..., _SYMMETRIC].reshape(*features.shape[:-1], 3, 3)
-    return rotation @ rest_frame, (rotation @ stretch).transpose(1, 2).flatten(2)
+    frame = rotation[:, : len(rest_frame)] @ rest_frame
+    return frame, (rotation @ stretch).transpose(1, 2).flatten(2)
 
 
 def contact_field(
@@ -236,7 +237,7 @@ class _Deform(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         ctx.save_for_backward(features, rest_frame)
         n_rows, n_points, _ = features.shape
-        frame = features.new_empty((n_rows, n_points, 3, 3))
+        frame = features.new_empty((n_rows, len(rest_frame), 3, 3))
         rows = features.new_empty((n_rows, 3, n_points, 3))
         field_kernels.deform(*_arrays(features, rest_frame, frame, rows))
         return frame, rows

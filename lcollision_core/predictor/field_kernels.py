@@ -106,16 +106,20 @@ def add_features_backward(
 
 @compiled
 def deform(features: Array, rest_frame: Array, frame: Array, rows: Array) -> None:
-    """Fill in frames R F (B, P, 3, 3) and gradients R S as rows (B, 3, P, 3)."""
+    """Fill in gradients R S as rows (B, 3, Q, 3), and frames R F of the first points."""
     rotation = np.empty((3, 3), dtype=features.dtype)
     for b in range(features.shape[0]):
         for p in range(features.shape[1]):
-            given, rest = features[b, p], rest_frame[p]
+            given = features[b, p]
             _rotate(given, rotation)
+            if p < len(rest_frame):
+                rest = rest_frame[p]
+                for i in range(3):
+                    x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2]
+                    for j in range(3):
+                        frame[b, p, i, j] = x * rest[0, j] + y * rest[1, j] + z * rest[2, j]
             for i in range(3):
                 x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2]
-                for j in range(3):
-                    frame[b, p, i, j] = x * rest[0, j] + y * rest[1, j] + z * rest[2, j]
                 out = rows[b, i, p]
                 out[0] = x * given[3] + y * given[4] + z * given[5]
                 out[1] = x * given[4] + y * given[6] + z * given[7]
@@ -126,7 +130,7 @@ def deform(features: Array, rest_frame: Array, frame: Array, rows: Array) -> Non
 def deform_backward(
     features: Array, rest_frame: Array, by_frame: Array, by_rows: Array, by_features: Array
 ) -> None:
-    """Pull derivatives by `deform`'s results back to its (B, P, 9) features."""
+    """Pull derivatives by `deform`'s results back to its (B, Q, 9) features."""
     rotation = np.empty((3, 3), dtype=features.dtype)
     stretch = np.empty((3, 3), dtype=features.dtype)
     by_rotation = np.empty((3, 3), dtype=features.dtype)
@@ -140,7 +144,8 @@ def deform_backward(
                     turned = features.dtype.type(0.0)
                     stretched = features.dtype.type(0.0)
                     for k in range(3):
-                        turned += by_frame[b, p, i, k] * rest_frame[p, j, k]
+                        if p < len(rest_frame):
+                            turned += by_frame[b, p, i, k] * rest_frame[p, j, k]
                         turned += by_rows[b, i, p, k] * stretch[j, k]
                         stretched += rotation[k, i] * by_rows[b, k, p, j]
                     by_rotation[i, j] = turned

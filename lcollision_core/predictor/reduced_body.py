@@ -75,7 +75,7 @@ class ReducedBody(nn.Module):
         return decode_features(latent, decoding)
 
     def forward(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return frames (B, Q, 3, 3), rows (B, 3, 3 Q) of gradients, and places (B, 3, P).
+        """Return frames (B, N, 3, 3), rows (B, 3, 3 Q) of gradients, and places (B, 3, P).
 
         Places are in heights.
         """

@@ -34,12 +34,13 @@ class SkinGeometry:
     members : (S, M) int32 array, each site's vertices as numbers of the skin
     apart : (P, P) float32 array, added to squared distances: 1 for pairs so near along the surface
         that they do not feel each other, else 0
-    rest_frame : (Q, 3, 3) array: of each point of the skin on the reference, as columns, the outer
-        normal first; the skin is the P points first, then the sites' vertices that are none
+    rest_frame : (N, 3, 3) array: of the first N points of the skin, on the reference, as columns,
+        the outer normal first; the skin is the P points, then the sites' centres that are none,
+        and last their other vertices, which need no frame
     blocks : (G, 4) int64 array: of each group of codes its first and past its last, and likewise
         of the outputs that they make, nine for each point that they move
     tables : the groups' (codes, outputs) matrices one after the other, flat float32
-    target : (N,) int32 array, the point of the skin that nine outputs belong to
+    target : (T,) int32 array, the point of the skin that nine outputs belong to
     offset : (Q, 9) float32 array, deformation features of codes 0
     scale : (9,) float32 array, of the outputs
     """
@@ -79,7 +80,8 @@ class SkinGeometry:
         if sites.ndim != 2 or (sites.size and not 0 <= sites.min() <= sites.max() < n_vertices):
             raise ValueError("the fold sites are not of this body")
         vertex = body_points(embedding, n_points)
-        skin = np.append(vertex, np.setdiff1d(sites, vertex))
+        framed = np.append(vertex, np.setdiff1d(sites[:, 0], vertex))
+        skin = np.append(framed, np.setdiff1d(sites, framed))
         between = skin_distances(skin_graph(embedding), vertex, limit=DISTANT)[:, vertex]
         place = np.zeros(n_vertices, dtype=np.int32)
         place[skin] = np.arange(len(skin))
@@ -99,7 +101,7 @@ class SkinGeometry:
             point_vertices=vertex,
             members=place[sites],
             apart=np.isfinite(between, order="C").astype(np.float32),
-            rest_frame=tangent_frames(embedding, skin),
+            rest_frame=tangent_frames(embedding, framed),
             blocks=np.array(blocks),
             tables=np.concatenate(tables),
             target=np.concatenate(targets).astype(np.int32),

@@ -159,6 +159,9 @@ def test_compiled_and_torch_paths_agree(made_up: tuple[torch.Tensor, ...]) -> No
     frame, rows = deform(features, rest_frame)
     frame_torch, rows_torch = deform(_elsewhere(features), rest_frame)
     assert torch.allclose(frame, frame_torch, atol=1e-12)
+    for some in (deform(features, rest_frame[:4]), deform(_elsewhere(features), rest_frame[:4])):
+        assert torch.allclose(some[0], frame[:, :4], atol=1e-12)
+        assert torch.allclose(some[1], rows, atol=1e-12)
     assert torch.allclose(rows, rows_torch, atol=1e-12)
     sums = contact_field(frame, places, apart, reach)
     sums_torch = contact_field(_elsewhere(frame), places, apart, reach)
@@ -190,6 +193,7 @@ def test_derivatives_are_those_of_finite_differences(made_up: tuple[torch.Tensor
     features, rest_frame, places, apart, reach = made_up
     moving = features.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda values: deform(values, rest_frame), moving)
+    assert torch.autograd.gradcheck(lambda values: deform(values, rest_frame[:4]), moving)
     frame, rows = (values.requires_grad_() for values in deform(features, rest_frame))
     places.requires_grad_()
     assert torch.autograd.gradcheck(
