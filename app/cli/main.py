@@ -59,15 +59,20 @@ class _Commands(TyperGroup):
             typer.echo("lcollision: out of memory; give it smaller meshes or fewer poses", err=True)
             raise typer.Exit(ExitStatus.BAD_INPUT) from None
         except BrokenPipeError:
-            # The reader left, as `head` does; typer's own status 1 would be an answer. What is
-            # still buffered must not fail once more at the exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            # The reader left, as `head` does; typer's own status 1 would be an answer.
+            _drop_what_is_buffered()
             raise typer.Exit(ExitStatus.INTERRUPTED) from None
         except OSError as error:
             if error.errno != errno.ENOSPC:
                 raise
+            _drop_what_is_buffered()
             typer.echo("lcollision: the answer cannot be written: the disk is full", err=True)
             raise typer.Exit(ExitStatus.BAD_INPUT) from None
+
+
+def _drop_what_is_buffered() -> None:
+    """Let standard output not fail once more at the exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _refuse_usage(error: Any) -> NoReturn:

@@ -12,7 +12,7 @@ from lcollision_core.embedding.seeding import edge_graph
 from lcollision_core.meshes.normals import vertex_normals
 from lcollision_core.meshes.topology import FloatArray
 
-N_POINTS = 200
+N_POINTS = 240
 """Of a mesh that has as many vertices; see the table in `geometric`."""
 
 _LEAST_LENGTH = 1e-9

@@ -20,7 +20,7 @@ FOLD_REACH = 0.045
 Counted from the near exclusion, within which they are no collision.
 """
 
-N_SITES = 48
+N_SITES = 128
 N_MEMBERS = 12
 
 _MEMBER_REACH = 0.03

@@ -33,6 +33,7 @@ from lcollision_core.predictor.folds import (
     _MEMBER_REACH,
     FOLD_REACH,
     N_MEMBERS,
+    N_SITES,
     find_fold_sites,
 )
 from lcollision_core.predictor.geometric import GeometricNetwork
@@ -234,7 +235,7 @@ def test_folds_are_looked_for_where_the_skin_folds(
     """Sites lie where near pairs collide, and their members about them."""
     embedding = tube_model.embedding
     assert tube_folds.shape[1] == N_MEMBERS
-    assert 1 <= len(tube_folds) <= 48
+    assert 1 <= len(tube_folds) <= N_SITES
     centres = tube_folds[:, 0]
     assert len(np.unique(centres)) == len(centres)
     detector = CollisionDetector(
