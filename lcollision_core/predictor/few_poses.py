@@ -279,12 +279,15 @@ def _silu_slope(values: FloatArray) -> FloatArray:
 def _shaped(
     values: npt.NDArray[Any], shape: tuple[int | None, ...], kind: npt.DTypeLike = np.float64
 ) -> npt.NDArray[Any]:
-    """Return an array of a type, or raise ValueError where its shape is another; None is any."""
+    """Copy an array to a type, or raise ValueError where its shape is another; None is any.
+
+    Never read-only, which a model file's arrays are: loops would be compiled for both.
+    """
     if len(values.shape) != len(shape) or any(
         wanted not in (None, size) for wanted, size in zip(shape, values.shape, strict=True)
     ):
         raise ValueError(f"expected an array of shape {shape}, got {values.shape}")
-    return np.ascontiguousarray(values, dtype=kind)
+    return np.array(values, dtype=kind, order="C")
 
 
 @compiled

@@ -277,7 +277,8 @@ class CollisionPredictor:
         ShapeError : another shape, or a number that is not finite.
         """
         self._require(latent)
-        poses = np.asarray(latent, dtype=np.float64)
+        # Never read-only: the loops would be compiled for that, too.
+        poses = np.array(latent, dtype=np.float64)
         if self._few is not None:
             return self._few.logit_and_gradient(poses)
         import torch

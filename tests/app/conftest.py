@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
 from app.document import PoseDocument
+from app.frames import PoseShower
 from app.main_window import MainWindow
-from lcollision_core.model import PoseModel
+from lcollision_core.model import PoseModel, find_model
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 from tests.app.windows import close_window, is_open, open_window, settings_in
@@ -36,6 +38,15 @@ def apart(tmp_path: Path) -> Path:
 def editor_model() -> PoseModel:
     """Return a small model with a predictor."""
     return trained_tube()
+
+
+@pytest.fixture(scope="session")
+def compiled_body() -> None:
+    """Compile what a window with the bundled body needs: the first time that takes a minute."""
+    model = PoseModel.load(find_model("body"))
+    shower = PoseShower(model)
+    shower.verdict(shower.frame(model.training_latent[0].astype(np.float64), 0))
+    model.require_predictor().logit_and_gradient(model.training_latent[:1])
 
 
 @pytest.fixture

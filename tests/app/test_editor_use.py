@@ -22,6 +22,7 @@ from pytestqt.qtbot import QtBot
 
 from app.benchmarks.editor import EditorTiming
 from app.benchmarks.editor_session import Session, show_first_pose
+from app.camera import sees_all
 from app.dialogs.failure import FailureDialog
 from app.document import PoseDocument
 from app.editor import why_no_window
@@ -48,6 +49,8 @@ from tests.app.windows import (
     shown,
     take_picture,
 )
+
+pytestmark = pytest.mark.usefixtures("compiled_body")
 
 ROOT = Path(__file__).parents[2]
 N_ACTIONS = int(os.environ.get("LCOLLISION_RANDOM_ACTIONS", "300"))
@@ -182,7 +185,7 @@ def share_of_height(window: MainWindow) -> float:
 
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("opens_a_mesh", [False, True], ids=["pose", "mesh"])
-def test_it_opens_with_the_camera_on_its_first_pose_and_leaves_it_there(
+def test_it_opens_with_the_camera_on_its_first_pose_and_then_steps_back_only(
     qtbot: QtBot, home: Path, body: PoseModel, opens_a_mesh: bool
 ) -> None:
     document, settings = PoseDocument(), settings_in(home)
@@ -212,8 +215,15 @@ def test_it_opens_with_the_camera_on_its_first_pose_and_leaves_it_there(
     after = window.viewport.view
     assert view is not None
     assert after is not None
-    assert after.position == pytest.approx(view.position)
-    assert after.focus == pytest.approx(view.focus)
+    # The standing body would not be seen whole from there: only as far back as that takes.
+    assert window.viewport.shown_frame is not None
+    vertices = window.viewport.shown_frame.vertices
+    aspect = window.viewport.width() / window.viewport.height()
+    assert not sees_all(view, vertices, aspect)
+    assert sees_all(after, vertices, aspect)
+    arms = [one.position - one.focus for one in (view, after)]
+    directions = [arm / np.linalg.norm(arm) for arm in arms]
+    np.testing.assert_allclose(directions[0], directions[1], atol=1e-6)
     close_window(window)
 
 
