@@ -101,7 +101,7 @@ PRESETS = {
         schedule="one-cycle",
         batch_rows=128,
         epochs=10,
-        shown_rows=1_500_000,
+        shown_rows=2_800_000,
     ),
     "paper": PredictorConfig("paper"),
 }
