@@ -97,8 +97,8 @@ def body() -> PoseModel:
 
 
 def wait_for_file(editor: subprocess.Popen[str], pattern: str) -> Path:
-    """Wait until an editor has written a file into its session."""
-    deadline = time.monotonic() + PATIENCE / 1000
+    """Wait until an editor has written a file into its session; it may have to compile before."""
+    deadline = time.monotonic() + 4 * PATIENCE / 1000
     while time.monotonic() < deadline and editor.poll() is None:
         found = list(sessions_folder().glob(pattern))
         if found:
