@@ -97,6 +97,25 @@ def sees_all(view: View, vertices: npt.NDArray[Any], aspect: float) -> bool:
     return bool((needed + depth <= distance).all())
 
 
+def kept_in_view(
+    view: View, before: npt.NDArray[Any], after: npt.NDArray[Any], aspect: float
+) -> View | None:
+    """Go on seeing the whole mesh from the same side, if it was seen until another pose came in.
+
+    Parameters
+    ----------
+    before, after : (V, 3) arrays
+    aspect : the picture's width over its height
+
+    Returns
+    -------
+    wanted : None where the view may stay as it is
+    """
+    if not sees_all(view, before, aspect) or sees_all(view, after, aspect):
+        return None
+    return framing(after, view.position - view.focus, view.up, aspect)
+
+
 def _needed_distances(
     offset: npt.NDArray[Any], towards: FloatArray, up: FloatArray, aspect: float
 ) -> tuple[FloatArray, FloatArray]:

@@ -434,10 +434,7 @@ class PoseDocument(PoseHistory):
         self._edit("Mirror", latent)
 
     def _on_exported(self, exported: tasks.Exported) -> None:
-        state = "exactly collision-free"
-        if exported.n_pairs:
-            state = f"{counted(exported.n_pairs, 'pair')} of its triangles collide"
-        self.message.emit(f"Exported {exported.path.name}: {state}")
+        self.message.emit(exported.sentence)
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
         result, self._solve = resolved.result, None

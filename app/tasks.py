@@ -12,6 +12,7 @@ import numpy.typing as npt
 from app.engine import Work
 from app.frames import PoseShower, keep_torch_to_one_thread
 from app.symmetry import mirror_vertices
+from app.wording import counted
 from lcollision_core.errors import ModelFileError
 from lcollision_core.jobs import CancelToken, Progress
 
@@ -73,6 +74,14 @@ class Exported:
 
     path: Path
     n_pairs: int
+
+    @property
+    def sentence(self) -> str:
+        """What the status bar says of it."""
+        state = "exactly collision-free"
+        if self.n_pairs:
+            state = f"{counted(self.n_pairs, 'pair')} of its triangles collide"
+        return f"Exported {self.path.name}: {state}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from PySide6.QtGui import QCloseEvent, QResizeEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QStackedLayout, QWidget
 
-from app.camera import View, framing, front_direction, preset_view, sees_all
+from app.camera import View, front_direction, kept_in_view, preset_view
 from app.frames import LiveFrame, PoseShower
 from app.legend import DomainTag, LegendCard
 from app.motion import CameraTurn, Glide
@@ -420,17 +420,12 @@ class Viewport(QWidget):
         else:
             scene.show(frame.vertices, frame.normals)
             if frame.latent is self._loaded and before is not None:
-                self._keep_in_view(scene, before, frame)
+                view = kept_in_view(scene.view, before.vertices, frame.vertices, self._aspect)
+                if view is not None:
+                    self._turn.begin(scene.view, view)
         self._glide_to = self._loaded = None
         if self._shading is Shading.EXACT:
             self._crossing_stale = True
-
-    def _keep_in_view(self, scene: Scene, before: LiveFrame, frame: LiveFrame) -> None:
-        """Go on seeing the whole body, if it was seen until another pose came in."""
-        view, aspect = scene.view, self._aspect
-        if sees_all(view, before.vertices, aspect) and not sees_all(view, frame.vertices, aspect):
-            towards = view.position - view.focus
-            self._turn.begin(view, framing(frame.vertices, towards, view.up, aspect))
 
     def _paint(self, scene: Scene, frame: LiveFrame) -> None:
         assert self._shader is not None
