@@ -7,7 +7,7 @@ compiled loops are called one after the other, and back again for the gradients.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,7 @@ from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_
 from lcollision_core.predictor.skin_geometry import SkinGeometry
 
 State = Mapping[str, npt.NDArray[Any]]
+_Product = Callable[[FloatArray, npt.NDArray[np.float32], FloatArray], None]
 Float32Array = npt.NDArray[np.float32]
 
 
@@ -43,18 +44,20 @@ class FewPosesNetwork:
 
     def __init__(self, embedding: Embedding, state: State) -> None:
         sites = state["site_vertices"].astype(np.int64)
-        self._points = _shaped(state["body.points"], (None, None), np.float32)
-        self._skin = skin = SkinGeometry.of(embedding, sites, self._points.shape[1])
+        _, n_points = state["body.points"].shape
+        self._skin = skin = SkinGeometry.of(embedding, sites, n_points)
         n_points, n_sites = skin.n_points, len(sites)
+        self._points = _shaped(state["body.points"], (3 * n_points, n_points), np.float32)
         self._origin = _shaped(state["body.origin"], (3, n_points))
-        _shaped(self._points, (3 * n_points, n_points))
         self._reach = np.array(REACHES)
         # Loops over numbers of two sizes are slow.
         self._apart = skin.apart.astype(np.float64)
         n_members = sites.shape[1]
         self._patch = _Perceptrons(state, "patch", n_points, SUMS_A_REACH * len(REACHES), 2)
         self._fold = _Perceptrons(state, "fold", n_sites, 9 * n_members, 2)
-        self._head = _Head(state, 2 * (n_points + n_sites), embedding.n_domains + 2)
+        sizes = 2 * (n_points + n_sites), embedding.n_domains + 2
+        head = list(_read_layers(state, "head", (), *sizes))
+        self._head = _Network(head, _add_product, _add_product_backward)
         self._any_hit = _shaped(state["any_hit"], (2,))
 
     def outputs(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -167,19 +170,60 @@ class _Trace:
     logit: FloatArray
 
 
+class _Network:
+    """Layers with silu between them.
+
+    The weights stay in single precision: reading them takes the time.
+
+    Parameters
+    ----------
+    layers : float32 weights and float64 biases, as `add` and `add_backward` want them
+    add : adds inputs times weights to outputs
+    add_backward : adds what it pulls back from the outputs to the derivatives by the inputs
+    """
+
+    def __init__(
+        self, layers: list[tuple[Float32Array, FloatArray]], add: _Product, add_backward: _Product
+    ) -> None:
+        self._layers, self._add, self._add_backward = layers, add, add_backward
+
+    def forward(self, values: FloatArray) -> _Layers:
+        """Apply all layers to B poses' inputs."""
+        before = []
+        for number, (weight, bias) in enumerate(self._layers):
+            if number:
+                before.append(values)
+                values = _silu(values)
+            outputs = np.repeat(bias[None], len(values), axis=0)
+            self._add(values, weight, outputs)
+            values = outputs
+        return _Layers(before, values)
+
+    def backward(self, layers: _Layers, by_outputs: FloatArray) -> FloatArray:
+        """Pull derivatives by the outputs back to the inputs."""
+        by = by_outputs
+        for number, (weight, _) in reversed(list(enumerate(self._layers))):
+            by_inputs = np.zeros((len(by), weight.shape[0], *weight.shape[2:]))
+            self._add_backward(by, weight, by_inputs)
+            by = by_inputs
+            if number:
+                by *= _silu_slope(layers.before[number - 1])
+        return by
+
+
 class _Perceptrons:
-    """n networks of one size with silu between their layers, each with inputs of its own.
+    """n networks of one size, each with inputs of its own.
 
     Numbers of all networks lie side by side, as they are computed: (B, n_in, n) to (B, n_out, n).
-    The weights stay in single precision: reading them takes the time.
     """
 
     def __init__(self, state: State, name: str, n: int, n_in: int, n_out: int) -> None:
         self.n_in = n_in
-        self._layers = [
-            (_side_by_side(weight, np.float32), _side_by_side(bias)[0])
+        layers = [
+            (_side_by_side(weight), _side_by_side(bias)[0])
             for weight, bias in _read_layers(state, f"{name}.layers", (n,), n_in, n_out)
         ]
+        self._network = _Network(layers, _add_products, _add_products_backward)
         self._mean, deviation = (
             _side_by_side(_shaped(state[f"{name}.{kind}"], (n, 1, n_in)))[0]
             for kind in ("mean", "deviation")
@@ -188,65 +232,17 @@ class _Perceptrons:
 
     def forward(self, inputs: FloatArray) -> _Layers:
         """Scale (n, B, n_in) inputs and apply to each its network."""
-        values = (inputs.transpose(1, 2, 0) - self._mean) * self._inverse
-        before = []
-        for number, (weight, bias) in enumerate(self._layers):
-            if number:
-                before.append(values)
-                values = _silu(values)
-            outputs = np.repeat(bias[None], len(values), axis=0)
-            _add_products(values, weight, outputs)
-            values = outputs
-        return _Layers(before, values)
+        return self._network.forward((inputs.transpose(1, 2, 0) - self._mean) * self._inverse)
 
     def backward(self, layers: _Layers, by_outputs: FloatArray) -> FloatArray:
         """Pull derivatives by the (B, n_out, n) outputs back to the (n, B, n_in) inputs."""
-        by = by_outputs
-        for number, (weight, _) in reversed(list(enumerate(self._layers))):
-            by_inputs = np.zeros((len(by), weight.shape[0], weight.shape[2]))
-            _add_products_backward(by, weight, by_inputs)
-            by = by_inputs
-            if number:
-                by *= _silu_slope(layers.before[number - 1])
-        return np.ascontiguousarray((by * self._inverse).transpose(2, 0, 1))
-
-
-class _Head:
-    """One network with silu between its layers: (B, n_in) to (B, n_out)."""
-
-    def __init__(self, state: State, n_in: int, n_out: int) -> None:
-        self._layers = [
-            (_shaped(weight, (None, None), np.float32), _shaped(bias, (None,)))
-            for weight, bias in _read_layers(state, "head", (), n_in, n_out)
-        ]
-
-    def forward(self, inputs: FloatArray) -> _Layers:
-        """Apply it."""
-        values, before = inputs, []
-        for number, (weight, bias) in enumerate(self._layers):
-            if number:
-                before.append(values)
-                values = _silu(values)
-            outputs = np.repeat(bias[None], len(values), axis=0)
-            _add_product(values, weight, outputs)
-            values = outputs
-        return _Layers(before, values)
-
-    def backward(self, layers: _Layers, by_outputs: FloatArray) -> FloatArray:
-        """Pull derivatives by the outputs back to the inputs."""
-        by = by_outputs
-        for number, (weight, _) in reversed(list(enumerate(self._layers))):
-            by_inputs = np.empty((len(by), weight.shape[0]))
-            _add_product_backward(by, weight, by_inputs)
-            by = by_inputs
-            if number:
-                by *= _silu_slope(layers.before[number - 1])
-        return by
+        by = self._network.backward(layers, by_outputs) * self._inverse
+        return np.ascontiguousarray(by.transpose(2, 0, 1))
 
 
 def _read_layers(
     state: State, name: str, stacked: tuple[int, ...], n_in: int, n_out: int
-) -> Iterator[tuple[npt.NDArray[Any], npt.NDArray[Any]]]:
+) -> Iterator[tuple[Float32Array, FloatArray]]:
     """Yield each layer's weight and bias, (n_in, n_out) and (n_out,) or so many of them stacked."""
     extra = (1,) if stacked else ()
     n_layers = sum(key.startswith(name) for key in state) // 2
@@ -254,38 +250,43 @@ def _read_layers(
         weight, bias = (state[f"{name}.{number}.{kind}"] for kind in ("weight", "bias"))
         width = n_out if number == n_layers - 1 else weight.shape[-1]
         yield (
-            _shaped(weight, (*stacked, n_in, width), weight.dtype),
+            _shaped(weight, (*stacked, n_in, width), np.float32),
             _shaped(bias, (*stacked, *extra, width)),
         )
         n_in = width
 
 
-def _side_by_side(stacked: npt.NDArray[Any], kind: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+def _side_by_side(stacked: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Move the first axis of (n, a, b) to the end."""
-    return np.ascontiguousarray(stacked.transpose(1, 2, 0), dtype=kind)
+    return np.ascontiguousarray(stacked.transpose(1, 2, 0))
+
+
+def _sigmoid(values: FloatArray) -> FloatArray:
+    # Far below 0 the exponential is infinite, and the result 0 as it should be.
+    with np.errstate(over="ignore"):
+        result: FloatArray = 1.0 / (1.0 + np.exp(-values))
+    return result
 
 
 def _silu(values: FloatArray) -> FloatArray:
-    result: FloatArray = values / (1.0 + np.exp(-values))
+    result: FloatArray = values * _sigmoid(values)
     return result
 
 
 def _silu_slope(values: FloatArray) -> FloatArray:
-    sigmoid = 1.0 / (1.0 + np.exp(-values))
+    sigmoid = _sigmoid(values)
     slope: FloatArray = sigmoid * (1.0 + values * (1.0 - sigmoid))
     return slope
 
 
 def _shaped(
-    values: npt.NDArray[Any], shape: tuple[int | None, ...], kind: npt.DTypeLike = np.float64
+    values: npt.NDArray[Any], shape: tuple[int, ...], kind: npt.DTypeLike = np.float64
 ) -> npt.NDArray[Any]:
-    """Copy an array to a type, or raise ValueError where its shape is another; None is any.
+    """Copy an array to a type, or raise ValueError where its shape is another.
 
     Never read-only, which a model file's arrays are: loops would be compiled for both.
     """
-    if len(values.shape) != len(shape) or any(
-        wanted not in (None, size) for wanted, size in zip(shape, values.shape, strict=True)
-    ):
+    if values.shape != shape:
         raise ValueError(f"expected an array of shape {shape}, got {values.shape}")
     return np.array(values, dtype=kind, order="C")
 
@@ -331,7 +332,7 @@ def _add_product(inputs: FloatArray, weight: Float32Array, outputs: FloatArray) 
 def _add_product_backward(
     by_outputs: FloatArray, weight: Float32Array, by_inputs: FloatArray
 ) -> None:
-    """Pull derivatives by `_add_product`'s outputs back to the inputs."""
+    """Pull derivatives by `_add_product`'s outputs back, adding to those by the inputs."""
     for i in range(weight.shape[0]):
         row = weight[i]
         for b in range(by_inputs.shape[0]):
@@ -339,7 +340,7 @@ def _add_product_backward(
             total = 0.0
             for j in range(len(row)):
                 total += given[j] * row[j]
-            by_inputs[b, i] = total
+            by_inputs[b, i] += total
 
 
 @compiled

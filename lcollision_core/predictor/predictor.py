@@ -222,7 +222,7 @@ class CollisionPredictor:
         codes = np.ascontiguousarray(latent, dtype=np.float32)
         n_outputs = self.n_domains if self.config.by_domain else 1
         domain_energy, logit = np.empty((len(codes), n_outputs)), np.empty(len(codes))
-        if self._few is not None and len(codes) <= _FEW_ROWS:
+        if len(codes) <= _FEW_ROWS and self._few is not None:
             domain_energy[:], logit[:] = self._few.outputs(codes.astype(np.float64))
         else:
             self._predict_many(codes, domain_energy, logit)

@@ -77,7 +77,8 @@ class SkinGeometry:
         ValueError : the sites are not of this body.
         """
         n_vertices = len(embedding.rest_vertices)
-        if sites.ndim != 2 or (sites.size and not 0 <= sites.min() <= sites.max() < n_vertices):
+        is_table = sites.ndim == 2 and sites.shape[1] > 0
+        if not is_table or (sites.size and not 0 <= sites.min() <= sites.max() < n_vertices):
             raise ValueError("the fold sites are not of this body")
         vertex = body_points(embedding, n_points)
         framed = np.append(vertex, np.setdiff1d(sites[:, 0], vertex))

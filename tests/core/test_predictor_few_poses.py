@@ -88,6 +88,14 @@ def test_arrays_of_another_network_are_refused(
             )
 
 
+def test_sites_without_vertices_are_refused(
+    tube_model: PoseModel, network: GeometricNetwork
+) -> None:
+    arrays = {**_arrays(network), "site_vertices": np.zeros((3, 0), dtype=np.int32)}
+    with pytest.raises(ValueError, match="fold sites"):
+        FewPosesNetwork(tube_model.embedding, arrays)
+
+
 def test_predicting_and_resolving_a_pose_need_no_torch() -> None:
     """It would double the memory and the time until the editor's predictions are there."""
     code = (
