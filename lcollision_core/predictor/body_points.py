@@ -47,6 +47,26 @@ def farthest_points(places: FloatArray, first: int, n_points: int) -> npt.NDArra
     return np.array(chosen)
 
 
+def neighbour_order(places: FloatArray, block: int) -> npt.NDArray[np.int32]:
+    """Order (n, 3) places so that each block of so many in turn lies close together.
+
+    They are halved across their longest extent, and the halves likewise. The order ends with some
+    places again, as many as fill the last block.
+    """
+
+    def ordered(index: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:
+        n_blocks = -(-len(index) // block)
+        if n_blocks < 2:
+            return [index]
+        own = places[index]
+        along = own[:, np.ptp(own, axis=0).argmax()].argsort(kind="stable")
+        half = n_blocks // 2 * block
+        return ordered(index[along[:half]]) + ordered(index[along[half:]])
+
+    order = np.concatenate(ordered(np.arange(len(places))))
+    return np.resize(order, -(-len(order) // block) * block).astype(np.int32)
+
+
 def skin_graph(embedding: Embedding) -> sparse.csr_matrix:
     """Return the (V, V) lengths of the reference's edges, in heights."""
     rest, topology = embedding.rest_vertices, embedding.topology

@@ -9,13 +9,9 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from lcollision_core.errors import ShapeError
-from lcollision_core.predictor import field_kernels
-from lcollision_core.predictor.field_kernels import (
-    BEHIND,
-    FADE,
-    REACHES,
-    SMALLEST_SQUARED_ANGLE,
-)
+from lcollision_core.predictor import field_kernels, skin_kernels
+from lcollision_core.predictor.field_kernels import BEHIND, FADE, REACHES
+from lcollision_core.predictor.skin_kernels import SMALLEST_SQUARED_ANGLE
 
 _SYMMETRIC = [3, 4, 5, 4, 6, 7, 5, 7, 8]
 """Where the features hold the nine entries of S."""
@@ -94,7 +90,11 @@ def deform(features: torch.Tensor, rest_frame: torch.Tensor) -> tuple[torch.Tens
 
 
 def contact_field(
-    frame: torch.Tensor, places: torch.Tensor, apart: torch.Tensor, reach: torch.Tensor
+    frame: torch.Tensor,
+    places: torch.Tensor,
+    order: torch.Tensor,
+    apart: torch.Tensor,
+    reach: torch.Tensor,
 ) -> torch.Tensor:
     """Sum up at each point what distant parts of the skin come near it.
 
@@ -106,7 +106,8 @@ def contact_field(
     ----------
     frame : (B, P, 3, 3) of each point, as columns, the outer normal first
     places : (B, 3, P)
-    apart : (P, P) added to squared distances: 0 for pairs that see each other, else 1
+    order : (O,) int32 points that may be felt, neighbours next to each other
+    apart : (P, O) added to squared distances: 0 for pairs that see each other, else 1
     reach : (2,) ascending, below 1
 
     Returns
@@ -121,14 +122,16 @@ def contact_field(
     if len(reach) != len(REACHES):
         raise ShapeError(f"the field has {len(REACHES)} reaches, got {len(reach)}")
     if frame.device.type == "cpu":
-        sums: torch.Tensor = _ContactField.apply(frame, places, apart, reach)  # type: ignore[no-untyped-call]
+        sums: torch.Tensor = _ContactField.apply(frame, places, order, apart, reach)  # type: ignore[no-untyped-call]
         return sums
     frame = frame[:, : places.shape[2]]
-    offset = places[:, :, None, :] - places[..., None]
+    index = order.long()
+    offset = places[:, :, None, index] - places[..., None]
     squared = offset.square().sum(dim=1) + apart
     normal = frame[..., 0]
     step = ((torch.einsum("bipq,bpi->bpq", offset, normal) + BEHIND) / FADE).clamp(0.0, 1.0)
     facing = step.square() * (3.0 - 2.0 * step)
+    normal = normal[:, index]
     above = -torch.einsum("bipq,bqi->bpq", offset, normal)
     parts = []
     for one in reach:
@@ -211,7 +214,7 @@ class _Features(torch.autograd.Function):
             return features.index_add_(1, decoding.target, grouped * decoding.scale)
         features = latent.new_empty((len(latent), *decoding.offset.shape))
         given = grouped, decoding.target, decoding.offset, decoding.scale, features
-        field_kernels.add_features(*_arrays(*given))
+        skin_kernels.add_features(*_arrays(*given))
         return features
 
     @staticmethod
@@ -226,7 +229,7 @@ class _Features(torch.autograd.Function):
         else:
             by_inputs = torch.empty_like(grouped)
             given = grouped, decoding.target, decoding.scale, by_features, by_inputs
-            field_kernels.add_features_backward(*_arrays(*given))
+            skin_kernels.add_features_backward(*_arrays(*given))
         return decoding.products_backward(by_inputs.flatten(1)), None
 
 
@@ -239,7 +242,7 @@ class _Deform(torch.autograd.Function):
         n_rows, n_points, _ = features.shape
         frame = features.new_empty((n_rows, len(rest_frame), 3, 3))
         rows = features.new_empty((n_rows, 3, n_points, 3))
-        field_kernels.deform(*_arrays(features, rest_frame, frame, rows))
+        skin_kernels.deform(*_arrays(features, rest_frame, frame, rows))
         return frame, rows
 
     @staticmethod
@@ -249,9 +252,7 @@ class _Deform(torch.autograd.Function):
     ) -> tuple[torch.Tensor, None]:
         features, rest_frame = ctx.saved_tensors
         by_features = torch.empty_like(features, memory_format=torch.contiguous_format)
-        field_kernels.deform_backward(
-            *_arrays(features, rest_frame, by_frame, by_rows, by_features)
-        )
+        skin_kernels.deform_backward(*_arrays(features, rest_frame, by_frame, by_rows, by_features))
         return by_features, None
 
 
@@ -261,23 +262,26 @@ class _ContactField(torch.autograd.Function):
         ctx: Any,
         frame: torch.Tensor,
         places: torch.Tensor,
+        order: torch.Tensor,
         apart: torch.Tensor,
         reach: torch.Tensor,
     ) -> torch.Tensor:
-        ctx.save_for_backward(frame, places, apart, reach)
+        ctx.save_for_backward(frame, places, order, apart, reach)
         sums = frame.new_empty((places.shape[2], len(frame), len(reach), 8))
-        field_kernels.contact_field(*_arrays(frame, places, apart, reach, sums))
+        field_kernels.contact_field(*_arrays(frame, places, order, apart, reach, sums))
         return sums
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_sums: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None, None]:
-        frame, places, apart, reach = ctx.saved_tensors
+    def backward(
+        ctx: Any, by_sums: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, None, None, None]:
+        frame, places, order, apart, reach = ctx.saved_tensors
         by_frame, by_places = _zeros_like(frame), _zeros_like(places)
         field_kernels.contact_field_backward(
-            *_arrays(frame, places, apart, reach, by_sums, by_frame, by_places)
+            *_arrays(frame, places, order, apart, reach, by_sums, by_frame, by_places)
         )
-        return by_frame, by_places, None, None
+        return by_frame, by_places, None, None, None
 
 
 class _Normalised(torch.autograd.Function):
@@ -312,7 +316,7 @@ class _FoldView(torch.autograd.Function):
     ) -> torch.Tensor:
         ctx.save_for_backward(frame, rows, members)
         inputs = frame.new_empty((len(members), len(frame), 9 * members.shape[1]))
-        field_kernels.fold_view(*_arrays(frame, _gradients(rows), members, inputs))
+        skin_kernels.fold_view(*_arrays(frame, _gradients(rows), members, inputs))
         return inputs
 
     @staticmethod
@@ -320,7 +324,7 @@ class _FoldView(torch.autograd.Function):
     def backward(ctx: Any, by_inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None]:
         frame, rows, members = ctx.saved_tensors
         by_frame, by_rows = _zeros_like(frame), _zeros_like(rows)
-        field_kernels.fold_view_backward(
+        skin_kernels.fold_view_backward(
             *_arrays(
                 frame,
                 _gradients(rows),

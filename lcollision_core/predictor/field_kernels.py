@@ -1,12 +1,11 @@
-"""The compiled loops of `field`: forward and backward passes over every point of the body.
+"""The compiled loops of `field`: what points feel of each other, forward and backward.
 
-Array operations spend most of their time on passing temporary arrays through memory; these keep
-a point's few numbers at hand. Sums over points run in a fixed order.
+Several points are taken at a time, without branches: far ones weigh 0. Those are mostly left out
+all the same, `BLOCK` neighbours at a time. Sums over points run in a fixed order.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -21,8 +20,6 @@ BEHIND, FADE = 0.07, 0.04
 """Heights behind a point's tangent plane at which others are not seen any more, so that the far
 side of a limb is not, and over which they fade in."""
 
-SMALLEST_SQUARED_ANGLE = 1e-12
-
 REACHES = (0.07, 0.14)
 """Heights within which distant skin is felt."""
 
@@ -30,212 +27,44 @@ SUMS_A_REACH = 8
 FULL, SOME = 0.3, 0.05
 """Sums of weights: one that fills half of the scale, and one that keeps means of nothing at 0."""
 
-_COLUMNS_AT_ONCE = 512
-"""Of a table, whose rows then stay in the first cache."""
-
-
-@compiled
-def products(latent: Array, tables: Array, blocks: npt.NDArray[np.int64], outputs: Array) -> None:
-    """Fill in every group's codes times its table: (B, n)."""
-    table = 0
-    for group in range(len(blocks)):
-        first, last, left, right = blocks[group]
-        width = right - left
-        for start in range(0, width, _COLUMNS_AT_ONCE):
-            stop = min(start + _COLUMNS_AT_ONCE, width)
-            for b in range(latent.shape[0]):
-                out = outputs[b, left + start : left + stop]
-                out[:] = 0.0
-                for k in range(last - first):
-                    code = latent[b, first + k]
-                    row = tables[table + k * width + start : table + k * width + stop]
-                    for n in range(len(out)):
-                        out[n] += code * row[n]
-        table += (last - first) * width
+BLOCK = 8
+"""Points that are left out together."""
 
 
 @compiled_sums
-def products_backward(
-    by_outputs: Array, tables: Array, blocks: npt.NDArray[np.int64], by_latent: Array
+def contact_field(
+    frame: Array,
+    places: Array,
+    order: npt.NDArray[np.int32],
+    apart: Array,
+    reach: Array,
+    sums: Array,
 ) -> None:
-    """Pull derivatives by `products`' outputs back to the codes (B, D)."""
-    table = 0
-    for group in range(len(blocks)):
-        first, last, left, right = blocks[group]
-        width = right - left
-        for k in range(last - first):
-            row = tables[table + k * width : table + (k + 1) * width]
-            for b in range(by_outputs.shape[0]):
-                given = by_outputs[b, left:right]
-                total = by_outputs.dtype.type(0.0)
-                for n in range(width):
-                    total += given[n] * row[n]
-                by_latent[b, first + k] = total
-        table += (last - first) * width
-
-
-@compiled
-def add_features(
-    outputs: Array, target: npt.NDArray[np.int32], offset: Array, scale: Array, features: Array
-) -> None:
-    """Sum up each point's scaled outputs (B, n, 9) over the groups that move it: (B, P, 9)."""
-    for b in range(outputs.shape[0]):
-        features[b] = offset
-        for n in range(outputs.shape[1]):
-            given, out = outputs[b, n], features[b, target[n]]
-            for c in range(9):
-                out[c] += given[c] * scale[c]
-
-
-@compiled
-def add_features_backward(
-    outputs: Array,
-    target: npt.NDArray[np.int32],
-    scale: Array,
-    by_features: Array,
-    by_inputs: Array,
-) -> None:
-    """Pull derivatives by `add_features`' features back to what the tanh was taken of."""
-    one = outputs.dtype.type(1.0)
-    for b in range(outputs.shape[0]):
-        for n in range(outputs.shape[1]):
-            for c in range(outputs.shape[2]):
-                slope = one - outputs[b, n, c] * outputs[b, n, c]
-                by_inputs[b, n, c] = by_features[b, target[n], c] * scale[c] * slope
-
-
-@compiled
-def deform(features: Array, rest_frame: Array, frame: Array, rows: Array) -> None:
-    """Fill in gradients R S as rows (B, 3, Q, 3), and frames R F of the first points."""
-    rotation = np.empty((3, 3), dtype=features.dtype)
-    for b in range(features.shape[0]):
-        for p in range(features.shape[1]):
-            given = features[b, p]
-            _rotate(given, rotation)
-            if p < len(rest_frame):
-                rest = rest_frame[p]
-                for i in range(3):
-                    x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2]
-                    for j in range(3):
-                        frame[b, p, i, j] = x * rest[0, j] + y * rest[1, j] + z * rest[2, j]
-            for i in range(3):
-                x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2]
-                out = rows[b, i, p]
-                out[0] = x * given[3] + y * given[4] + z * given[5]
-                out[1] = x * given[4] + y * given[6] + z * given[7]
-                out[2] = x * given[5] + y * given[7] + z * given[8]
-
-
-@compiled
-def deform_backward(
-    features: Array, rest_frame: Array, by_frame: Array, by_rows: Array, by_features: Array
-) -> None:
-    """Pull derivatives by `deform`'s results back to its (B, Q, 9) features."""
-    rotation = np.empty((3, 3), dtype=features.dtype)
-    stretch = np.empty((3, 3), dtype=features.dtype)
-    by_rotation = np.empty((3, 3), dtype=features.dtype)
-    by_stretch = np.empty((3, 3), dtype=features.dtype)
-    for b in range(features.shape[0]):
-        for p in range(features.shape[1]):
-            _rotate(features[b, p], rotation)
-            _stretch(features[b, p], stretch)
-            for i in range(3):
-                for j in range(3):
-                    turned = features.dtype.type(0.0)
-                    stretched = features.dtype.type(0.0)
-                    for k in range(3):
-                        if p < len(rest_frame):
-                            turned += by_frame[b, p, i, k] * rest_frame[p, j, k]
-                        turned += by_rows[b, i, p, k] * stretch[j, k]
-                        stretched += rotation[k, i] * by_rows[b, k, p, j]
-                    by_rotation[i, j] = turned
-                    by_stretch[i, j] = stretched
-            _pull_rotation(features[b, p], by_rotation, by_features[b, p])
-            by_features[b, p, 3] = by_stretch[0, 0]
-            by_features[b, p, 4] = by_stretch[0, 1] + by_stretch[1, 0]
-            by_features[b, p, 5] = by_stretch[0, 2] + by_stretch[2, 0]
-            by_features[b, p, 6] = by_stretch[1, 1]
-            by_features[b, p, 7] = by_stretch[1, 2] + by_stretch[2, 1]
-            by_features[b, p, 8] = by_stretch[2, 2]
-
-
-@compiled
-def _rotate(w: Array, rotation: Array) -> None:
-    """Write exp of a rotation vector, by Rodrigues' formula."""
-    kind = w.dtype.type
-    x, y, z = w[0], w[1], w[2]
-    squared = x * x + y * y + z * z + kind(SMALLEST_SQUARED_ANGLE)
-    angle = math.sqrt(squared)
-    half = math.sin(kind(0.5) * angle)
-    versine = kind(2.0) * half * half
-    s, v, c = math.sin(angle) / angle, versine / squared, kind(1.0) - versine
-    rotation[0, 0], rotation[1, 1], rotation[2, 2] = c + v * x * x, c + v * y * y, c + v * z * z
-    rotation[0, 1], rotation[1, 0] = v * x * y - s * z, v * x * y + s * z
-    rotation[0, 2], rotation[2, 0] = v * z * x + s * y, v * z * x - s * y
-    rotation[1, 2], rotation[2, 1] = v * y * z - s * x, v * y * z + s * x
-
-
-@compiled
-def _stretch(features: Array, stretch: Array) -> None:
-    """Write S of nine features."""
-    stretch[0, 0], stretch[0, 1], stretch[0, 2] = features[3], features[4], features[5]
-    stretch[1, 0], stretch[1, 1], stretch[1, 2] = features[4], features[6], features[7]
-    stretch[2, 0], stretch[2, 1], stretch[2, 2] = features[5], features[7], features[8]
-
-
-@compiled
-def _pull_rotation(w: Array, by_rotation: Array, by_w: Array) -> None:
-    """Pull a derivative by R = cos I + s [w] + v w w^T back to the rotation vector w."""
-    squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2] + SMALLEST_SQUARED_ANGLE
-    angle = math.sqrt(squared)
-    sine, half = math.sin(angle), math.sin(0.5 * angle)
-    versine = 2.0 * half * half
-    s, v = sine / angle, versine / squared
-    # Derivatives of s and v by the angle.
-    by_s = ((1.0 - versine) - s) / angle
-    by_v = (sine - 2.0 * versine / angle) / squared
-    trace, along, twice = 0.0, 0.0, 0.0
-    for i in range(3):
-        trace += by_rotation[i, i]
-        j, k = (i + 1) % 3, (i + 2) % 3
-        along += (by_rotation[k, j] - by_rotation[j, k]) * w[i]
-        for m in range(3):
-            twice += w[i] * by_rotation[i, m] * w[m]
-    radial = (by_s * along + by_v * twice - sine * trace) / angle
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        total = radial * w[i] + s * (by_rotation[k, j] - by_rotation[j, k])
-        for m in range(3):
-            total += v * (by_rotation[i, m] + by_rotation[m, i]) * w[m]
-        by_w[i] = total
-
-
-@compiled_sums
-def contact_field(frame: Array, places: Array, apart: Array, reach: Array, sums: Array) -> None:
-    """Fill in the sums (P, B, 2, 8) of `field.contact_field`, for two reaches.
-
-    Far points weigh 0 rather than being left out, and both reaches are summed up in one pass:
-    without branches and lists, several points are added at a time, which is faster.
-    """
-    n_points = places.shape[2]
+    """Fill in the sums (P, B, 2, 8) of `field.contact_field`, for two reaches."""
+    n_points, n_ordered = places.shape[2], len(order)
     kind = frame.dtype.type
     zero, one, two, three = kind(0.0), kind(1.0), kind(2.0), kind(3.0)
     behind, sharpness = kind(BEHIND), kind(1.0 / FADE)
     inner, outer = one / (reach[0] * reach[0]), one / (reach[1] * reach[1])
-    normal = np.empty((3, n_points), dtype=frame.dtype)
-    nx, ny, nz = normal[0], normal[1], normal[2]
+    ordered = np.empty((6, n_ordered), dtype=frame.dtype)
+    boxes = np.empty((6, n_ordered // BLOCK), dtype=frame.dtype)
+    near = np.empty(n_ordered // BLOCK, dtype=np.uintp)
+    seen = np.empty((7, n_ordered), dtype=frame.dtype)
+    x, y, z, nx, ny, nz, away = seen[0], seen[1], seen[2], seen[3], seen[4], seen[5], seen[6]
     for b in range(frame.shape[0]):
-        x, y, z = places[b, 0], places[b, 1], places[b, 2]
-        for p in range(n_points):
-            nx[p], ny[p], nz[p] = frame[b, p, 0, 0], frame[b, p, 1, 0], frame[b, p, 2, 0]
-        for p in range(n_points):
-            px, py, pz, own_x, own_y, own_z = x[p], y[p], z[p], nx[p], ny[p], nz[p]
-            away = apart[p]
+        _order(frame[b], places[b], order, ordered, boxes)
+        for place in range(n_points):
+            if place % BLOCK == 0:
+                n_seen = _see(place // BLOCK, ordered, boxes, reach[1], near, seen)
+            p = order[place]
+            _copy_blocks(apart[p], near, n_seen, away)
+            px, py, pz = ordered[0, place], ordered[1, place], ordered[2, place]
+            own_x, own_y, own_z = ordered[3, place], ordered[4, place], ordered[5, place]
             # Sums with the inner reach, then with the outer one: of weights, heights, offsets and
             # normals. Local numbers, as only those stay in registers.
             w0, h0, x0, y0, z0, a0, b0, c0 = zero, zero, zero, zero, zero, zero, zero, zero
             w1, h1, x1, y1, z1, a1, b1, c1 = zero, zero, zero, zero, zero, zero, zero, zero
-            for q in range(n_points):
+            for q in range(n_seen):
                 dx, dy, dz = x[q] - px, y[q] - py, z[q] - pz
                 squared = dx * dx + dy * dy + dz * dz + away[q]
                 s = (dx * own_x + dy * own_y + dz * own_z + behind) * sharpness
@@ -265,29 +94,241 @@ def contact_field(frame: Array, places: Array, apart: Array, reach: Array, sums:
                 a1 += weight * nx[q]
                 b1 += weight * ny[q]
                 c1 += weight * nz[q]
-            f = frame[b, p]
-            _write_sums(f, w0, h0, x0, y0, z0, a0, b0, c0, sums[p, b, 0])
-            _write_sums(f, w1, h1, x1, y1, z1, a1, b1, c1, sums[p, b, 1])
+            # Offsets and normals turned into the point's frame.
+            sums[p, b, 0, 0], sums[p, b, 0, 1] = w0, h0
+            sums[p, b, 1, 0], sums[p, b, 1, 1] = w1, h1
+            for c in range(3):
+                f0, f1, f2 = frame[b, p, 0, c], frame[b, p, 1, c], frame[b, p, 2, c]
+                sums[p, b, 0, 2 + c] = f0 * x0 + f1 * y0 + f2 * z0
+                sums[p, b, 0, 5 + c] = f0 * a0 + f1 * b0 + f2 * c0
+                sums[p, b, 1, 2 + c] = f0 * x1 + f1 * y1 + f2 * z1
+                sums[p, b, 1, 5 + c] = f0 * a1 + f1 * b1 + f2 * c1
+
+
+@compiled_sums
+def contact_field_backward(
+    frame: Array,
+    places: Array,
+    order: npt.NDArray[np.int32],
+    apart: Array,
+    reach: Array,
+    by_sums: Array,
+    by_frame: Array,
+    by_places: Array,
+) -> None:
+    """Pull derivatives by `contact_field`'s sums back, adding to frames and places."""
+    n_points, n_ordered = places.shape[2], len(order)
+    kind = frame.dtype.type
+    zero, one, two, three, six = kind(0.0), kind(1.0), kind(2.0), kind(3.0), kind(6.0)
+    behind, sharpness = kind(BEHIND), kind(1.0 / FADE)
+    inner, outer = one / (reach[0] * reach[0]), one / (reach[1] * reach[1])
+    ordered = np.empty((6, n_ordered), dtype=frame.dtype)
+    by_ordered = np.empty((6, n_ordered), dtype=frame.dtype)
+    boxes = np.empty((6, n_ordered // BLOCK), dtype=frame.dtype)
+    near = np.empty(n_ordered // BLOCK, dtype=np.uintp)
+    seen = np.empty((7, n_ordered), dtype=frame.dtype)
+    by_seen = np.empty((6, n_ordered), dtype=frame.dtype)
+    x, y, z, nx, ny, nz, away = seen[0], seen[1], seen[2], seen[3], seen[4], seen[5], seen[6]
+    by_x, by_y, by_z = by_seen[0], by_seen[1], by_seen[2]
+    by_nx, by_ny, by_nz = by_seen[3], by_seen[4], by_seen[5]
+    given = np.empty((2, 8), dtype=frame.dtype)
+    for b in range(frame.shape[0]):
+        _order(frame[b], places[b], order, ordered, boxes)
+        by_ordered[:] = zero
+        for place in range(n_points):
+            if place % BLOCK == 0:
+                n_seen = _see(place // BLOCK, ordered, boxes, reach[1], near, seen)
+                by_seen[:, :n_seen] = zero
+            p = order[place]
+            _copy_blocks(apart[p], near, n_seen, away)
+            px, py, pz = ordered[0, place], ordered[1, place], ordered[2, place]
+            own_x, own_y, own_z = ordered[3, place], ordered[4, place], ordered[5, place]
+            _turn_back(frame[b, p], by_sums[p, b], given)
+            w0, h0, x0, y0 = given[0, 0], given[0, 1], given[0, 2], given[0, 3]
+            z0, a0, b0, c0 = given[0, 4], given[0, 5], given[0, 6], given[0, 7]
+            w1, h1, x1, y1 = given[1, 0], given[1, 1], given[1, 2], given[1, 3]
+            z1, a1, b1, c1 = given[1, 4], given[1, 5], given[1, 6], given[1, 7]
+            # By the point's place and normal, and the sums that its frame turned.
+            at_x, at_y, at_z, own_a, own_b, own_c = zero, zero, zero, zero, zero, zero
+            dx0, dy0, dz0, nx0, ny0, nz0 = zero, zero, zero, zero, zero, zero
+            dx1, dy1, dz1, nx1, ny1, nz1 = zero, zero, zero, zero, zero, zero
+            for q in range(n_seen):
+                dx, dy, dz = x[q] - px, y[q] - py, z[q] - pz
+                qx, qy, qz = nx[q], ny[q], nz[q]
+                squared = dx * dx + dy * dy + dz * dz + away[q]
+                s = (dx * own_x + dy * own_y + dz * own_z + behind) * sharpness
+                s = s if s > zero else zero
+                s = s if s < one else one
+                facing = s * s * (three - two * s)
+                above = dx * qx + dy * qy + dz * qz
+                t = one - squared * inner
+                t = t if t > zero else zero
+                cube = t * t * t
+                weight = facing * cube
+                by_weight = w0 - h0 * above + x0 * dx + y0 * dy + z0 * dz
+                by_weight += a0 * qx + b0 * qy + c0 * qz
+                by_facing = by_weight * cube
+                by_squared = by_weight * t * t * inner
+                by_above = weight * h0
+                by_dx, by_dy, by_dz = weight * x0, weight * y0, weight * z0
+                by_qx, by_qy, by_qz = weight * a0, weight * b0, weight * c0
+                dx0 += weight * dx
+                dy0 += weight * dy
+                dz0 += weight * dz
+                nx0 += weight * qx
+                ny0 += weight * qy
+                nz0 += weight * qz
+                t = one - squared * outer
+                t = t if t > zero else zero
+                cube = t * t * t
+                weight = facing * cube
+                by_weight = w1 - h1 * above + x1 * dx + y1 * dy + z1 * dz
+                by_weight += a1 * qx + b1 * qy + c1 * qz
+                by_facing += by_weight * cube
+                by_squared += by_weight * t * t * outer
+                by_above += weight * h1
+                by_dx += weight * x1
+                by_dy += weight * y1
+                by_dz += weight * z1
+                by_qx += weight * a1
+                by_qy += weight * b1
+                by_qz += weight * c1
+                dx1 += weight * dx
+                dy1 += weight * dy
+                dz1 += weight * dz
+                nx1 += weight * qx
+                ny1 += weight * qy
+                nz1 += weight * qz
+                # Of t cubed; and the slope of the smooth step.
+                twice = -six * facing * by_squared
+                by_ahead = by_facing * six * s * (one - s) * sharpness
+                by_dx += twice * dx - by_above * qx + by_ahead * own_x
+                by_dy += twice * dy - by_above * qy + by_ahead * own_y
+                by_dz += twice * dz - by_above * qz + by_ahead * own_z
+                at_x -= by_dx
+                at_y -= by_dy
+                at_z -= by_dz
+                own_a += by_ahead * dx
+                own_b += by_ahead * dy
+                own_c += by_ahead * dz
+                by_x[q] += by_dx
+                by_y[q] += by_dy
+                by_z[q] += by_dz
+                by_nx[q] += by_qx - by_above * dx
+                by_ny[q] += by_qy - by_above * dy
+                by_nz[q] += by_qz - by_above * dz
+            if place % BLOCK == BLOCK - 1 or place == n_points - 1:
+                for n in range(n_seen // BLOCK):
+                    start = np.intp(near[n])
+                    for c in range(6):
+                        for i in range(BLOCK):
+                            by_ordered[c, start + i] += by_seen[c, BLOCK * n + i]
+            by_places[b, 0, p] += at_x
+            by_places[b, 1, p] += at_y
+            by_places[b, 2, p] += at_z
+            by = by_frame[b, p]
+            by[0, 0] += own_a
+            by[1, 0] += own_b
+            by[2, 0] += own_c
+            _add_turn(by_sums[p, b, 0], dx0, dy0, dz0, nx0, ny0, nz0, by)
+            _add_turn(by_sums[p, b, 1], dx1, dy1, dz1, nx1, ny1, nz1, by)
+        for i in range(n_ordered):
+            q = order[i]
+            for c in range(3):
+                by_places[b, c, q] += by_ordered[c, i]
+                by_frame[b, q, c, 0] += by_ordered[3 + c, i]
 
 
 @compiled
-def _write_sums(
-    frame: Array,
-    weight: Number,
-    height: Number,
+def _order(
+    frame: Array, places: Array, order: npt.NDArray[np.int32], ordered: Array, boxes: Array
+) -> None:
+    """Fill in places and normals in their order, and the box round each block: low and high."""
+    for i in range(len(order)):
+        q = order[i]
+        for c in range(3):
+            ordered[c, i] = places[c, q]
+            ordered[3 + c, i] = frame[q, c, 0]
+    for c in range(3):
+        for k in range(boxes.shape[1]):
+            low = high = ordered[c, BLOCK * k]
+            for i in range(BLOCK * k + 1, BLOCK * k + BLOCK):
+                low, high = min(low, ordered[c, i]), max(high, ordered[c, i])
+            boxes[c, k], boxes[3 + c, k] = low, high
+
+
+@compiled
+def _see(
+    own: int,
+    ordered: Array,
+    boxes: Array,
+    reach: Number,
+    near: npt.NDArray[np.uintp],
+    seen: Array,
+) -> int:
+    """List where the blocks start that a block's points may feel, and copy them side by side.
+
+    Returns how many points they have.
+    """
+    zero = ordered.dtype.type(0.0)
+    n_near = 0
+    for k in range(boxes.shape[1]):
+        x = max(boxes[0, own] - boxes[3, k], boxes[0, k] - boxes[3, own], zero)
+        y = max(boxes[1, own] - boxes[4, k], boxes[1, k] - boxes[4, own], zero)
+        z = max(boxes[2, own] - boxes[5, k], boxes[2, k] - boxes[5, own], zero)
+        # Without a branch, which would be mispredicted.
+        near[n_near] = BLOCK * k
+        n_near += x * x + y * y + z * z < reach * reach
+    for c in range(6):
+        _copy_blocks(ordered[c], near, BLOCK * n_near, seen[c])
+    return BLOCK * n_near
+
+
+@compiled
+def _copy_blocks(given: Array, near: npt.NDArray[np.uintp], n_seen: int, copy: Array) -> None:
+    """Copy blocks side by side, each in one piece, as a loop over its points would not."""
+    i1, i2, i3, i4 = np.uintp(1), np.uintp(2), np.uintp(3), np.uintp(4)
+    i5, i6, i7 = np.uintp(5), np.uintp(6), np.uintp(7)
+    for n in range(n_seen // BLOCK):
+        i, j = near[n], np.uintp(BLOCK * n)
+        # All are read before any is written.
+        v0, v1, v2, v3 = given[i], given[i + i1], given[i + i2], given[i + i3]
+        v4, v5, v6, v7 = given[i + i4], given[i + i5], given[i + i6], given[i + i7]
+        copy[j], copy[j + i1], copy[j + i2], copy[j + i3] = v0, v1, v2, v3
+        copy[j + i4], copy[j + i5], copy[j + i6], copy[j + i7] = v4, v5, v6, v7
+
+
+@compiled
+def _turn_back(frame: Array, by_sums: Array, given: Array) -> None:
+    """Turn the derivatives by a point's sums (2, 8) from its frame into the world."""
+    for k in range(2):
+        given[k, 0], given[k, 1] = by_sums[k, 0], by_sums[k, 1]
+        for i in range(3):
+            for start in (2, 5):
+                given[k, start + i] = (
+                    frame[i, 0] * by_sums[k, start]
+                    + frame[i, 1] * by_sums[k, start + 1]
+                    + frame[i, 2] * by_sums[k, start + 2]
+                )
+
+
+@compiled
+def _add_turn(
+    by_sums: Array,
     x: Number,
     y: Number,
     z: Number,
     normal_x: Number,
     normal_y: Number,
     normal_z: Number,
-    out: Array,
+    by_frame: Array,
 ) -> None:
-    """Write a point's eight sums, vectors among them turned into its frame."""
-    out[0], out[1] = weight, height
+    """Add derivatives by the frame that turned a point's offsets and normals."""
     for c in range(3):
-        out[2 + c] = frame[0, c] * x + frame[1, c] * y + frame[2, c] * z
-        out[5 + c] = frame[0, c] * normal_x + frame[1, c] * normal_y + frame[2, c] * normal_z
+        by_offset, by_normal = by_sums[2 + c], by_sums[5 + c]
+        by_frame[0, c] += x * by_offset + normal_x * by_normal
+        by_frame[1, c] += y * by_offset + normal_y * by_normal
+        by_frame[2, c] += z * by_offset + normal_z * by_normal
 
 
 @compiled
@@ -323,172 +364,3 @@ def normalised_backward(
                     out[c] = given[c] * share / unit
                     by_weight -= out[c] * own[c] * share
                 out[0] = by_weight
-
-
-@compiled
-def contact_field_backward(
-    frame: Array,
-    places: Array,
-    apart: Array,
-    reach: Array,
-    by_sums: Array,
-    by_frame: Array,
-    by_places: Array,
-) -> None:
-    """Pull derivatives by `contact_field`'s sums back, adding to frames and places."""
-    n_points, n_reaches = places.shape[2], len(reach)
-    largest, inverse = reach[-1] * reach[-1], 1.0 / (reach * reach)
-    squared = np.empty(n_points, dtype=frame.dtype)
-    near = np.empty(n_points, dtype=np.int32)
-    given = np.empty((n_reaches, 8), dtype=frame.dtype)
-    total = np.empty((n_reaches, 6), dtype=frame.dtype)
-    for b in range(frame.shape[0]):
-        x, y, z = places[b, 0], places[b, 1], places[b, 2]
-        for p in range(n_points):
-            n_near = _near(places[b], apart[p], p, largest, squared, near)
-            f, by_f = frame[b, p], by_frame[b, p]
-            for k in range(n_reaches):
-                # The offsets' and normals' derivatives, turned from the point's frame.
-                by = by_sums[p, b, k]
-                given[k, 0], given[k, 1] = by[0], by[1]
-                for i in range(3):
-                    given[k, 2 + i] = f[i, 0] * by[2] + f[i, 1] * by[3] + f[i, 2] * by[4]
-                    given[k, 5 + i] = f[i, 0] * by[5] + f[i, 1] * by[6] + f[i, 2] * by[7]
-            total[:] = 0.0
-            for place in range(n_near):
-                q = near[place]
-                dx, dy, dz = x[q] - x[p], y[q] - y[p], z[q] - z[p]
-                ahead = dx * f[0, 0] + dy * f[1, 0] + dz * f[2, 0]
-                facing = _facing(ahead)
-                if facing == 0.0:
-                    continue
-                qx, qy, qz = frame[b, q, 0, 0], frame[b, q, 1, 0], frame[b, q, 2, 0]
-                above = -(dx * qx + dy * qy + dz * qz)
-                by_facing, by_squared, by_above = 0.0, 0.0, 0.0
-                by_x, by_y, by_z, by_qx, by_qy, by_qz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-                for k in range(n_reaches):
-                    t = 1.0 - squared[q] * inverse[k]
-                    if t <= 0.0:
-                        continue
-                    g, own = given[k], total[k]
-                    cube = t * t * t
-                    weight = facing * cube
-                    by_weight = g[0] + g[1] * above + g[2] * dx + g[3] * dy + g[4] * dz
-                    by_weight += g[5] * qx + g[6] * qy + g[7] * qz
-                    by_x += weight * g[2]
-                    by_y += weight * g[3]
-                    by_z += weight * g[4]
-                    by_qx += weight * g[5]
-                    by_qy += weight * g[6]
-                    by_qz += weight * g[7]
-                    own[0] += weight * dx
-                    own[1] += weight * dy
-                    own[2] += weight * dz
-                    own[3] += weight * qx
-                    own[4] += weight * qy
-                    own[5] += weight * qz
-                    by_above += weight * g[1]
-                    by_facing += by_weight * cube
-                    by_squared -= by_weight * facing * 3.0 * t * t * inverse[k]
-                by_ahead = by_facing * _facing_slope(ahead)
-                by_frame[b, q, 0, 0] += by_qx - by_above * dx
-                by_frame[b, q, 1, 0] += by_qy - by_above * dy
-                by_frame[b, q, 2, 0] += by_qz - by_above * dz
-                by_f[0, 0] += by_ahead * dx
-                by_f[1, 0] += by_ahead * dy
-                by_f[2, 0] += by_ahead * dz
-                twice = 2.0 * by_squared
-                by_x += twice * dx - by_above * qx + by_ahead * f[0, 0]
-                by_y += twice * dy - by_above * qy + by_ahead * f[1, 0]
-                by_z += twice * dz - by_above * qz + by_ahead * f[2, 0]
-                by_places[b, 0, q] += by_x
-                by_places[b, 1, q] += by_y
-                by_places[b, 2, q] += by_z
-                by_places[b, 0, p] -= by_x
-                by_places[b, 1, p] -= by_y
-                by_places[b, 2, p] -= by_z
-            for k in range(n_reaches):
-                # Of the turned sums by the rotation.
-                by, own = by_sums[p, b, k], total[k]
-                for i in range(3):
-                    for c in range(3):
-                        by_f[i, c] += own[i] * by[2 + c] + own[3 + i] * by[5 + c]
-
-
-@compiled
-def _near(
-    places: Array,
-    apart: Array,
-    p: int,
-    largest: float,
-    squared: Array,
-    near: npt.NDArray[np.int32],
-) -> int:
-    """Fill in p's squared distances to all points, and list those near it; return how many."""
-    x, y, z = places[0], places[1], places[2]
-    px, py, pz = x[p], y[p], z[p]
-    for q in range(len(x)):
-        dx, dy, dz = x[q] - px, y[q] - py, z[q] - pz
-        squared[q] = dx * dx + dy * dy + dz * dz + apart[q]
-    n_near = 0
-    for q in range(len(x)):
-        # Without a branch, which would be mispredicted.
-        near[n_near] = q
-        n_near += squared[q] < largest
-    return n_near
-
-
-@compiled
-def _facing(ahead: float) -> float:
-    """Return a smooth step of how far ahead along the normal another point is."""
-    s = min(max((ahead + BEHIND) / FADE, 0.0), 1.0)
-    return s * s * (3.0 - 2.0 * s)
-
-
-@compiled
-def _facing_slope(ahead: float) -> float:
-    """Return the derivative of `_facing`."""
-    s = min(max((ahead + BEHIND) / FADE, 0.0), 1.0)
-    return 6.0 * s * (1.0 - s) / FADE
-
-
-@compiled
-def fold_view(frame: Array, rows: Array, members: npt.NDArray[np.int32], inputs: Array) -> None:
-    """Fill in (S, B, 9 M): the members' gradients in the frame of each site's first member."""
-    for b in range(frame.shape[0]):
-        for s in range(members.shape[0]):
-            f, out = frame[b, members[s, 0]], inputs[s, b]
-            for m in range(members.shape[1]):
-                vertex = members[s, m]
-                for k in range(3):
-                    for j in range(3):
-                        out[9 * m + 3 * k + j] = (
-                            f[0, k] * rows[b, 0, vertex, j]
-                            + f[1, k] * rows[b, 1, vertex, j]
-                            + f[2, k] * rows[b, 2, vertex, j]
-                        )
-
-
-@compiled
-def fold_view_backward(
-    frame: Array,
-    rows: Array,
-    members: npt.NDArray[np.int32],
-    by_inputs: Array,
-    by_frame: Array,
-    by_rows: Array,
-) -> None:
-    """Pull derivatives by `fold_view`'s inputs back, adding to frames and gradients."""
-    for b in range(frame.shape[0]):
-        for s in range(members.shape[0]):
-            centre, given = members[s, 0], by_inputs[s, b]
-            f, by_f = frame[b, centre], by_frame[b, centre]
-            for m in range(members.shape[1]):
-                vertex = members[s, m]
-                for i in range(3):
-                    row, by_row = rows[b, i, vertex], by_rows[b, i, vertex]
-                    for k in range(3):
-                        g = given[9 * m + 3 * k : 9 * m + 3 * k + 3]
-                        by_f[i, k] += g[0] * row[0] + g[1] * row[1] + g[2] * row[2]
-                        for j in range(3):
-                            by_row[j] += f[i, k] * g[j]

@@ -120,6 +120,7 @@ class GeometricNetwork(PredictorNetwork):
     skin : what it looks at
     """
 
+    order: torch.Tensor
     apart: torch.Tensor
     reach: torch.Tensor
     site_vertices: torch.Tensor
@@ -137,6 +138,7 @@ class GeometricNetwork(PredictorNetwork):
         generator = torch.Generator().manual_seed(seed)
         self.skin = skin = SkinGeometry.of(embedding, sites, n_points)
         self.body = ReducedBody(skin)
+        self.register_buffer("order", torch.tensor(skin.order), persistent=False)
         self.register_buffer("apart", torch.tensor(skin.apart), persistent=False)
         self.register_buffer("reach", torch.tensor(REACHES), persistent=False)
         # Of the model file: found in labelled poses.
@@ -224,7 +226,7 @@ class GeometricNetwork(PredictorNetwork):
     def _inputs(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (P, B, n) what each point feels, and (S, B, n) how each site is deformed."""
         frame, rows, places = self.body(latent)
-        sums = contact_field(frame, places, self.apart, self.reach)
+        sums = contact_field(frame, places, self.order, self.apart, self.reach)
         return normalised(sums, self.reach, FULL, SOME), fold_view(frame, rows, self.members)
 
     def forward(self, latent: torch.Tensor) -> NetworkOutput:

@@ -17,8 +17,8 @@ from lcollision_core.jobs import CancelToken, Progress, available_cores, no_prog
 from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
+from lcollision_core.predictor.compiled_network import CompiledNetwork
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
-from lcollision_core.predictor.few_poses import FewPosesNetwork
 from lcollision_core.predictor.metrics import EnergyScores, PredictorMetrics, measure
 
 if TYPE_CHECKING:
@@ -234,9 +234,11 @@ class CollisionPredictor:
         """Fill in what torch says, on all cores or on the GPU."""
         import torch
 
-        network = self._network
-
         def fill(start: int, stop: int) -> None:
+            if self._many is not None:
+                domain_energy[start:stop], logit[start:stop] = self._many.outputs(codes[start:stop])
+                return
+            network = self._network
             with torch.inference_mode():
                 for first in range(start, stop, BATCH_ROWS):
                     rows = slice(first, min(first + BATCH_ROWS, stop))
@@ -348,15 +350,22 @@ class CollisionPredictor:
         return predictor
 
     def __getstate__(self) -> dict[str, Any]:
-        networks = ("_few", "_network", "_exact_network")
+        networks = ("_few", "_many", "_network", "_exact_network")
         return {name: value for name, value in vars(self).items() if name not in networks}
 
     @cached_property
-    def _few(self) -> FewPosesNetwork | None:
+    def _few(self) -> CompiledNetwork | None:
         """What computes a few poses without torch, if that is possible."""
         if self.preset != "default" or self.device != "cpu":
             return None
-        return FewPosesNetwork(self._embedding, self._arrays)
+        return CompiledNetwork(self._embedding, self._arrays)
+
+    @cached_property
+    def _many(self) -> CompiledNetwork | None:
+        """What computes many poses, on the CPU faster than the network itself."""
+        if self._few is None:
+            return None
+        return CompiledNetwork(self._embedding, self._arrays, np.float32)
 
     @cached_property
     def _network(self) -> PredictorNetwork:

@@ -13,10 +13,12 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.body_points import (
     N_POINTS,
     body_points,
+    neighbour_order,
     skin_distances,
     skin_graph,
     tangent_frames,
 )
+from lcollision_core.predictor.field_kernels import BLOCK
 
 DISTANT = 0.10
 """Heights along the surface beyond which two points feel each other."""
@@ -32,8 +34,11 @@ class SkinGeometry:
     ----------
     point_vertices : (P,) int64 array, ascending, the vertices that are points of the body
     members : (S, M) int32 array, each site's vertices as numbers of the skin
-    apart : (P, P) float32 array, added to squared distances: 1 for pairs so near along the surface
-        that they do not feel each other, else 0
+    order : (O,) int32 array, all points of the body, neighbours near each other, and some of them
+        again to fill the last block
+    apart : (P, O) float32 array, added to squared distances to the points in that order: 1 for
+        pairs so near along the surface that they do not feel each other and for those that are
+        there again, else 0
     rest_frame : (N, 3, 3) array: of the first N points of the skin, on the reference, as columns,
         the outer normal first; the skin is the P points, then the sites' centres that are none,
         and last their other vertices, which need no frame
@@ -47,6 +52,7 @@ class SkinGeometry:
 
     point_vertices: npt.NDArray[np.int64]
     members: npt.NDArray[np.int32]
+    order: npt.NDArray[np.int32]
     apart: Float32Array
     rest_frame: FloatArray
     blocks: npt.NDArray[np.int64]
@@ -84,6 +90,9 @@ class SkinGeometry:
         framed = np.append(vertex, np.setdiff1d(sites[:, 0], vertex))
         skin = np.append(framed, np.setdiff1d(sites, framed))
         between = skin_distances(skin_graph(embedding), vertex, limit=DISTANT)[:, vertex]
+        order = neighbour_order(embedding.rest_vertices[vertex], BLOCK)
+        apart = np.isfinite(between)[:, order]
+        apart[:, len(vertex) :] = True
         place = np.zeros(n_vertices, dtype=np.int32)
         place[skin] = np.arange(len(skin))
         decoder = embedding.decoder
@@ -101,7 +110,8 @@ class SkinGeometry:
         return cls(
             point_vertices=vertex,
             members=place[sites],
-            apart=np.isfinite(between, order="C").astype(np.float32),
+            order=order,
+            apart=np.ascontiguousarray(apart, dtype=np.float32),
             rest_frame=tangent_frames(embedding, framed),
             blocks=np.array(blocks),
             tables=np.concatenate(tables),

@@ -15,6 +15,7 @@ from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS
 from lcollision_core.predictor.body_points import (
     body_points,
+    neighbour_order,
     skin_cells,
     skin_distances,
     skin_graph,
@@ -28,7 +29,7 @@ from lcollision_core.predictor.field import (
     fold_view,
     normalised,
 )
-from lcollision_core.predictor.field_kernels import REACHES
+from lcollision_core.predictor.field_kernels import BLOCK, REACHES
 from lcollision_core.predictor.folds import (
     _MEMBER_REACH,
     FOLD_REACH,
@@ -106,7 +107,7 @@ def test_frames_and_gradients_are_those_of_the_embedding(
 
 @pytest.fixture
 def made_up() -> tuple[torch.Tensor, ...]:
-    """Features, rest frames, places, which pairs are apart, and reaches, in double precision."""
+    """Features, rest frames, places, an order, which are apart, reaches; in double precision."""
     generator = torch.Generator().manual_seed(1)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -114,10 +115,21 @@ def made_up() -> tuple[torch.Tensor, ...]:
 
     features = normal(2, 7, 9)
     features[0, 0, :3] = 0.0
+    # The last place of the block is the first one's once more, which nothing feels.
+    order = torch.tensor([3, 1, 0, 2, 6, 5, 4, 3], dtype=torch.int32)
     apart = torch.eye(7, dtype=torch.float64)
     apart[0, 1] = apart[1, 0] = 1.0
+    apart = apart[:, order.long()]
+    apart[:, 7] = 1.0
     reach = torch.tensor(REACHES, dtype=torch.float64)
-    return features, torch.linalg.qr(normal(7, 3, 3))[0], 0.05 * normal(2, 3, 7), apart, reach
+    return (
+        features,
+        torch.linalg.qr(normal(7, 3, 3))[0],
+        0.05 * normal(2, 3, 7),
+        order,
+        apart,
+        reach,
+    )
 
 
 def test_field_by_hand() -> None:
@@ -127,9 +139,11 @@ def test_field_by_hand() -> None:
     places = torch.zeros((1, 3, 3), dtype=torch.float64)
     places[0, :, 1] = torch.tensor([0.05, 0.01, 0.0], dtype=torch.float64)
     places[0, 0, 2] = -0.08
-    apart = torch.eye(3, dtype=torch.float64)
+    order = torch.tensor([2, 1, 0, 0, 0, 0, 0, 0], dtype=torch.int32)
+    apart = torch.eye(3, dtype=torch.float64)[:, order.long()]
+    apart[:, 3:] = 1.0
     reach = torch.tensor([0.06, 0.1], dtype=torch.float64)
-    (first, second, _) = contact_field(frame, places, apart, reach)[:, 0].numpy()
+    (first, second, _) = contact_field(frame, places, order, apart, reach)[:, 0].numpy()
     for k in range(2):
         weight = (1.0 - (0.05**2 + 0.01**2) / reach[k].item() ** 2) ** 3
         # The first is 0.05 above the second's plane, whose normal points back at it.
@@ -143,20 +157,21 @@ def test_field_by_hand() -> None:
 
 
 def test_pairs_that_are_apart_do_not_feel_each_other(made_up: tuple[torch.Tensor, ...]) -> None:
-    features, rest_frame, places, apart, reach = made_up
+    features, rest_frame, places, order, apart, reach = made_up
     frame, _ = deform(features, rest_frame)
     blind = torch.ones_like(apart)
-    assert contact_field(frame, places, blind, reach).abs().max() == 0.0
+    assert contact_field(frame, places, order, blind, reach).abs().max() == 0.0
     one = blind.clone()
-    one[2, 3] = one[3, 2] = 0.0
-    felt = contact_field(frame, 0.3 * places, one, reach)
+    # Of points 2 and 3.
+    one[2, 0] = one[3, 3] = 0.0
+    felt = contact_field(frame, 0.3 * places, order, one, reach)
     assert felt[[0, 1, 4, 5, 6]].abs().max() == 0.0
     assert felt[[2, 3]].abs().max() > 0.0
 
 
 def test_compiled_and_torch_paths_agree(made_up: tuple[torch.Tensor, ...]) -> None:
     """On a GPU torch does what the compiled loops do on the CPU; `meta` hides where it runs."""
-    features, rest_frame, places, apart, reach = made_up
+    features, rest_frame, places, order, apart, reach = made_up
     frame, rows = deform(features, rest_frame)
     frame_torch, rows_torch = deform(_elsewhere(features), rest_frame)
     assert torch.allclose(frame, frame_torch, atol=1e-12)
@@ -164,8 +179,8 @@ def test_compiled_and_torch_paths_agree(made_up: tuple[torch.Tensor, ...]) -> No
         assert torch.allclose(some[0], frame[:, :4], atol=1e-12)
         assert torch.allclose(some[1], rows, atol=1e-12)
     assert torch.allclose(rows, rows_torch, atol=1e-12)
-    sums = contact_field(frame, places, apart, reach)
-    sums_torch = contact_field(_elsewhere(frame), places, apart, reach)
+    sums = contact_field(frame, places, order, apart, reach)
+    sums_torch = contact_field(_elsewhere(frame), places, order, apart, reach)
     assert torch.allclose(sums, sums_torch, atol=1e-12)
     assert sums.abs().max() > 0.1
     inputs = normalised(sums, reach, 0.3, 0.05)
@@ -173,6 +188,40 @@ def test_compiled_and_torch_paths_agree(made_up: tuple[torch.Tensor, ...]) -> No
     members = torch.tensor([[0, 1, 2], [6, 0, 3]], dtype=torch.int32)
     view = fold_view(frame, rows, members)
     assert torch.allclose(view, fold_view(_elsewhere(frame), rows, members), atol=1e-12)
+
+
+def test_what_is_left_out_as_too_far_would_have_weighed_nothing() -> None:
+    generator = torch.Generator().manual_seed(4)
+    places = 0.12 * torch.randn((3, 3, 45), generator=generator, dtype=torch.float64)
+    order = torch.tensor(neighbour_order(places[0].T.numpy(), BLOCK))
+    assert len(order) == 48
+    apart = (torch.rand((45, 48), generator=generator) < 0.2).double()
+    apart[:, 45:] = 1.0
+    frame = torch.linalg.qr(torch.randn((3, 45, 3, 3), generator=generator, dtype=torch.float64))[0]
+    reach = torch.tensor(REACHES, dtype=torch.float64)
+    sums = contact_field(frame, places, order, apart, reach)
+    assert sums.abs().max() > 0.1
+    without = contact_field(_elsewhere(frame), places, order, apart, reach)
+    assert torch.allclose(sums, without, atol=1e-12)
+    far = torch.cdist(places.transpose(1, 2), places.transpose(1, 2)) > REACHES[-1]
+    assert 0.5 < far.double().mean() < 0.95
+    assert torch.autograd.gradcheck(
+        lambda turned, placed: contact_field(turned, placed, order, apart, reach),
+        (frame[:1].requires_grad_(), places[:1].requires_grad_()),
+    )
+
+
+def test_neighbours_are_in_one_block() -> None:
+    """Two clusters of 8 and one of 3 places, in any order, come out as three blocks."""
+    rng = np.random.default_rng(3)
+    cluster = rng.permutation(np.repeat([0, 1, 2], [8, 8, 3]))
+    places = 10.0 * cluster[:, None] + rng.random((19, 3))
+    order = neighbour_order(places, 8)
+    assert order.dtype == np.int32
+    assert np.array_equal(np.sort(order[:19]), np.arange(19))
+    assert np.array_equal(cluster[order[:19]], np.repeat([0, 1, 2], [8, 8, 3]))
+    assert len(order) == 24
+    assert len(neighbour_order(places[:3], 8)) == 8
 
 
 def _elsewhere(values: torch.Tensor) -> torch.Tensor:
@@ -191,16 +240,16 @@ class _Elsewhere(torch.Tensor):
 
 
 def test_derivatives_are_those_of_finite_differences(made_up: tuple[torch.Tensor, ...]) -> None:
-    features, rest_frame, places, apart, reach = made_up
+    features, rest_frame, places, order, apart, reach = made_up
     moving = features.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda values: deform(values, rest_frame), moving)
     assert torch.autograd.gradcheck(lambda values: deform(values, rest_frame[:4]), moving)
     frame, rows = (values.requires_grad_() for values in deform(features, rest_frame))
     places.requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda turned, placed: contact_field(turned, placed, apart, reach), (frame, places)
+        lambda turned, placed: contact_field(turned, placed, order, apart, reach), (frame, places)
     )
-    sums = contact_field(frame, places, apart, reach).detach().requires_grad_()
+    sums = contact_field(frame, places, order, apart, reach).detach().requires_grad_()
     assert torch.autograd.gradcheck(lambda values: normalised(values, reach, 0.3, 0.05), sums)
     members = torch.tensor([[0, 1, 2], [6, 0, 3]], dtype=torch.int32)
     assert torch.autograd.gradcheck(

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lcollision_core.model import PoseModel
-from lcollision_core.predictor.few_poses import FewPosesNetwork
+from lcollision_core.predictor.compiled_network import CompiledNetwork
 from lcollision_core.predictor.geometric import GeometricNetwork
 
 
@@ -38,7 +38,7 @@ def _arrays(network: GeometricNetwork) -> dict[str, np.ndarray]:
 def test_it_says_what_the_torch_network_says(
     tube_model: PoseModel, network: GeometricNetwork, n_poses: int
 ) -> None:
-    few = FewPosesNetwork(tube_model.embedding, _arrays(network))
+    few = CompiledNetwork(tube_model.embedding, _arrays(network))
     latent = tube_model.latent_space.sample(n_poses, np.random.default_rng(2))
     codes = torch.tensor(latent, requires_grad=True)
     exact = GeometricNetwork.restore(tube_model.embedding, None, network.state_dict()).double()  # type: ignore[arg-type]
@@ -61,7 +61,7 @@ def test_it_says_what_the_torch_network_says(
 def test_a_pose_gets_the_same_numbers_alone_and_with_others(
     tube_model: PoseModel, network: GeometricNetwork
 ) -> None:
-    few = FewPosesNetwork(tube_model.embedding, _arrays(network))
+    few = CompiledNetwork(tube_model.embedding, _arrays(network))
     latent = tube_model.latent_space.sample(4, np.random.default_rng(2))
     logit, slope = few.logit_and_gradient(latent)
     for row in range(4):
@@ -81,9 +81,9 @@ def test_arrays_of_another_network_are_refused(
             if not arrays[name].size:
                 continue
         with pytest.raises(ValueError, match=r"."):
-            FewPosesNetwork(tube_model.embedding, wrong)
+            CompiledNetwork(tube_model.embedding, wrong)
         with pytest.raises((KeyError, ValueError)):
-            FewPosesNetwork(
+            CompiledNetwork(
                 tube_model.embedding, {key: array for key, array in arrays.items() if key != name}
             )
 
@@ -93,7 +93,7 @@ def test_sites_without_vertices_are_refused(
 ) -> None:
     arrays = {**_arrays(network), "site_vertices": np.zeros((3, 0), dtype=np.int32)}
     with pytest.raises(ValueError, match="fold sites"):
-        FewPosesNetwork(tube_model.embedding, arrays)
+        CompiledNetwork(tube_model.embedding, arrays)
 
 
 def test_predicting_and_resolving_a_pose_need_no_torch() -> None:

@@ -1,0 +1,392 @@
+"""The default network on the CPU without torch: for a few poses with their gradients, or for many.
+
+`GeometricNetwork` spends most of a single pose's time on passing from one operation of torch to the
+next, of a batch's on new memory, and a program that only drags sliders would spend seconds on
+importing it. Here the same compiled loops are called one after the other on arrays that are used
+again, and back again for the gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.acap.features import N_FEATURES
+from lcollision_core.embedding import Embedding
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.predictor import field_kernels, network_kernels, skin_kernels
+from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
+from lcollision_core.predictor.skin_geometry import SkinGeometry
+
+State = Mapping[str, npt.NDArray[Any]]
+Array = npt.NDArray[np.floating[Any]]
+Float32Array = npt.NDArray[np.float32]
+
+_ROWS_AT_ONCE = 64
+"""Poses whose intermediate arrays stay in the caches."""
+
+
+class CompiledNetwork:
+    """A trained default network.
+
+    Immutable, and safe to share between threads.
+
+    Parameters
+    ----------
+    embedding : of the body
+    state : the state dict of a `GeometricNetwork`, as arrays
+    kind : what it computes in: double precision, or float32 for many poses in half the time
+
+    Raises
+    ------
+    KeyError, ValueError : the state does not fit the embedding.
+    """
+
+    def __init__(
+        self, embedding: Embedding, state: State, kind: type[np.floating[Any]] = np.float64
+    ) -> None:
+        sites = state["site_vertices"].astype(np.int64)
+        _, n_points = state["body.points"].shape
+        self._kind = kind
+        self._skin = skin = SkinGeometry.of(embedding, sites, n_points)
+        n_points, n_sites = skin.n_points, len(sites)
+        self._place = _Layer(
+            _shaped(state["body.points"], (3 * n_points, n_points), np.float32)[None],
+            np.zeros((1, n_points), dtype=kind),
+        )
+        self._origin = _shaped(state["body.origin"], (3, n_points), kind)
+        self._reach = np.array(REACHES, dtype=kind)
+        # Loops over numbers of two sizes are slow.
+        self._apart = skin.apart.astype(kind)
+        self._offset, self._scale = skin.offset.astype(kind), skin.scale.astype(kind)
+        self._rest_frame = skin.rest_frame.astype(kind)
+        n_members = sites.shape[1]
+        n_sums = SUMS_A_REACH * len(REACHES)
+        self._patch = _Network.read(state, "patch", n_points, n_sums, 2, kind)
+        self._fold = _Network.read(state, "fold", n_sites, 9 * n_members, 2, kind)
+        sizes = 2 * (n_points + n_sites), embedding.n_domains + 2
+        self._head = _Network(list(_read_layers(state, "head", None, *sizes, kind)))
+        self._any_hit = _shaped(state["any_hit"], (2,), kind)
+        # Of earlier calls: new memory costs as much as filling it.
+        self._rooms: list[_Trace] = []
+
+    def outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        """Return (B, K) scaled energies of the domains, and (B,) logits, of (B, D) poses."""
+        n_rows = len(latent)
+        energy = np.empty((n_rows, self._head.n_out - 2))
+        logit = np.empty(n_rows)
+        if not n_rows:
+            return energy, logit
+        codes = latent.astype(self._kind)
+        n_parts = -(-n_rows // _ROWS_AT_ONCE)
+        size = -(-n_rows // n_parts)
+        trace = self._take_room(size)
+        for part in range(n_parts):
+            # The last part has some rows of the one before, so that all are of one size.
+            start = min(part * size, n_rows - size)
+            rows = slice(start, start + size)
+            logit[rows] = self._forward(codes[rows], trace)
+            energy[rows] = np.square(np.maximum(trace.head.outputs[0, :, 1:-1], 0.0))
+        self._rooms.append(trace)
+        return energy, logit
+
+    def logit_and_gradient(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return (B,) logits of (B, D) poses, and each one's (B, D) derivative by its codes."""
+        codes = latent.astype(self._kind)
+        trace = self._take_room(len(codes))
+        logit = self._forward(codes, trace)
+        gradient = self._backward(trace)
+        self._rooms.append(trace)
+        return logit.astype(np.float64, copy=False), gradient.astype(np.float64, copy=False)
+
+    def _take_room(self, n_rows: int) -> _Trace:
+        """Take what another call has left, if that was of as many rows: each thread its own."""
+        try:
+            trace = self._rooms.pop()
+        except IndexError:
+            return self._room(n_rows)
+        return trace if len(trace.hits) == n_rows else self._room(n_rows)
+
+    def _room(self, n_rows: int) -> _Trace:
+        skin = self._skin
+        n_skin, n_sites = len(skin.offset), len(skin.members)
+
+        def empty(*shape: int) -> Array:
+            return np.empty(shape, dtype=self._kind)
+
+        n_hits = skin.n_points + n_sites
+        return _Trace(
+            outputs=empty(n_rows, len(skin.target), N_FEATURES),
+            features=empty(n_rows, n_skin, N_FEATURES),
+            frame=empty(n_rows, len(skin.rest_frame), 3, 3),
+            rows=empty(n_rows, 3, n_skin, 3),
+            places=empty(n_rows, 3, skin.n_points),
+            sums=empty(skin.n_points, n_rows, len(REACHES), SUMS_A_REACH),
+            field=empty(skin.n_points, n_rows, len(REACHES), SUMS_A_REACH),
+            view=empty(n_sites, n_rows, self._fold.n_in),
+            patch=self._patch.room(n_rows),
+            fold=self._fold.room(n_rows),
+            hits=empty(n_rows, n_hits),
+            share=empty(n_rows, n_hits),
+            values=empty(1, n_rows, 2 * n_hits),
+            head=self._head.room(n_rows),
+        )
+
+    def _forward(self, latent: Array, trace: _Trace) -> Array:
+        """Fill in all of the trace, and return (B,) logits of (B, D) codes."""
+        skin, n_rows = self._skin, len(latent)
+        products = trace.outputs.reshape(n_rows, N_FEATURES * len(skin.target))
+        skin_kernels.products(latent, skin.tables, skin.blocks, products)
+        np.tanh(products, out=products)
+        skin_kernels.add_features(
+            trace.outputs, skin.target, self._offset, self._scale, trace.features
+        )
+        skin_kernels.deform(trace.features, self._rest_frame, trace.frame, trace.rows)
+        self._place.multiply(_flat_rows(trace.rows), _flat_rows(trace.places[..., None]))
+        trace.places[:] += self._origin
+        given = trace.frame, trace.places, skin.order, self._apart, self._reach
+        field_kernels.contact_field(*given, trace.sums)
+        field_kernels.normalised(trace.sums, self._reach, FULL, SOME, trace.field)
+        skin_kernels.fold_view(trace.frame, trace.rows, skin.members, trace.view)
+        n_points = skin.n_points
+        field = trace.field.reshape(n_points, n_rows, self._patch.n_in)
+        patch = self._patch.forward(field, trace.patch)
+        fold = self._fold.forward(trace.view, trace.fold)
+        hits, values = trace.hits, trace.values[0]
+        n_hits = hits.shape[1]
+        for found, start, stop in ((patch, 0, n_points), (fold, n_points, n_hits)):
+            hits[:, start:stop] = found[..., 0].T
+            values[:, n_hits + start : n_hits + stop] = found[..., 1].T
+        np.tanh(hits * 0.25, out=values[:, :n_hits])
+        head = self._head.forward(trace.values, trace.head)
+        # The logarithm of the summed exponentials, and its derivative, the softmax.
+        largest = hits.max(axis=1, keepdims=True)
+        share = np.exp(hits - largest, out=trace.share)
+        total = share.sum(axis=1, keepdims=True)
+        share /= total
+        any_logit = (largest + np.log(total))[:, 0] * self._any_hit[0] + self._any_hit[1]
+        logit: Array = head[0, :, 0] + any_logit
+        return logit
+
+    def _backward(self, trace: _Trace) -> Array:
+        skin, n_rows = self._skin, len(trace.hits)
+        n_points, n_hits = skin.n_points, trace.hits.shape[1]
+        by_head = np.zeros_like(trace.head.outputs)
+        by_head[..., 0] = 1.0
+        by_values = self._head.backward(trace.head, by_head)[0]
+        by_hits = by_values[:, :n_hits] * (0.25 * (1.0 - np.square(trace.values[0, :, :n_hits])))
+        by_hits += self._any_hit[0] * trace.share
+        by_both = np.stack([by_hits, by_values[:, n_hits:]], axis=2).transpose(1, 0, 2)
+        by_patch, by_fold = map(np.ascontiguousarray, np.split(by_both, [n_points]))
+        by_field = self._patch.backward(trace.patch, by_patch).reshape(trace.sums.shape)
+        by_view = self._fold.backward(trace.fold, by_fold)
+        by_sums, by_features, by_outputs = map(
+            np.empty_like, (trace.sums, trace.features, trace.outputs)
+        )
+        by_frame, by_places, by_rows = map(np.zeros_like, (trace.frame, trace.places, trace.rows))
+        field_kernels.normalised_backward(trace.sums, self._reach, by_field, FULL, SOME, by_sums)
+        given = trace.frame, trace.places, skin.order, self._apart, self._reach, by_sums
+        field_kernels.contact_field_backward(*given, by_frame, by_places)
+        self._place.multiply_back(_flat_rows(by_places[..., None]), _flat_rows(by_rows))
+        skin_kernels.fold_view_backward(
+            trace.frame, trace.rows, skin.members, by_view, by_frame, by_rows
+        )
+        skin_kernels.deform_backward(
+            trace.features, self._rest_frame, by_frame, by_rows, by_features
+        )
+        given_outputs = trace.outputs, skin.target, self._scale
+        skin_kernels.add_features_backward(*given_outputs, by_features, by_outputs)
+        by_latent = np.empty((n_rows, int(skin.blocks[-1, 1])), dtype=self._kind)
+        by_products = by_outputs.reshape(n_rows, N_FEATURES * len(skin.target))
+        skin_kernels.products_backward(by_products, skin.tables, skin.blocks, by_latent)
+        return by_latent
+
+
+@dataclass(frozen=True, eq=False)
+class _Trace:
+    """All of a forward pass that the way back needs, see `GeometricNetwork`.
+
+    Attributes
+    ----------
+    hits : (B, P + S) logits of patches and folds being hit
+    share : likewise, their softmax
+    values : (1, B, 2 (P + S)) the squashed logits, then the roots of the energies
+    """
+
+    outputs: Array
+    features: Array
+    frame: Array
+    rows: Array
+    places: Array
+    sums: Array
+    field: Array
+    view: Array
+    patch: _Activations
+    fold: _Activations
+    hits: Array
+    share: Array
+    values: Array
+    head: _Activations
+
+
+class _Layer:
+    """The same layer of n networks side by side.
+
+    Parameters
+    ----------
+    weight : (n, n_in, n_out) float32 array
+    bias : (n, n_out) array
+    """
+
+    def __init__(self, weight: Float32Array, bias: Array) -> None:
+        self.weight, self.bias = weight, bias
+        # Both ways read rows.
+        self._back = np.ascontiguousarray(weight.transpose(0, 2, 1))
+
+    def multiply(self, inputs: Array, outputs: Array) -> None:
+        """Fill in (n, B, n_out) outputs of (n, B, n_in) inputs, without the bias.
+
+        Both may be wider; what is beyond is left alone.
+        """
+        if inputs.dtype == np.float32:
+            _multiply_many(inputs, self.weight, outputs)
+        else:
+            network_kernels.stacked_products(inputs, self.weight, outputs)
+
+    def multiply_back(self, by_outputs: Array, by_inputs: Array) -> None:
+        """Fill in derivatives by the inputs."""
+        network_kernels.stacked_products(by_outputs, self._back, by_inputs)
+
+
+def _multiply_many(inputs: Array, weight: Float32Array, outputs: Array) -> None:
+    """Do what `stacked_products` does, for many rows twice as fast."""
+    import torch
+
+    _, n_in, n_out = weight.shape
+    given, table, filled = map(torch.from_numpy, (inputs, weight, outputs))
+    torch.bmm(given[..., :n_in], table, out=filled[..., :n_out])
+
+
+@dataclass(frozen=True, eq=False)
+class _Activations:
+    """What n networks made of their inputs.
+
+    Attributes
+    ----------
+    inputs : (n, B, n_in) standardised, where a network does that
+    before, after : (n, B, width) of each hidden layer, before and after the silu
+    outputs : (n, B, n_out)
+    """
+
+    inputs: Array
+    before: list[Array]
+    after: list[Array]
+    outputs: Array
+
+
+class _Network:
+    """n networks of one size side by side, each with inputs of its own.
+
+    Parameters
+    ----------
+    layers : one after the other, with silu between them
+    mean, inverse : (n, 1, n_in) of the inputs, and of their deviations; None to take inputs as they
+        come
+    """
+
+    def __init__(
+        self, layers: list[_Layer], mean: Array | None = None, inverse: Array | None = None
+    ) -> None:
+        self._layers, self._mean, self._inverse = layers, mean, inverse
+        self._terms = network_kernels.power_terms(layers[0].bias.dtype.type)
+        self.n_in, self.n_out = layers[0].weight.shape[1], layers[-1].weight.shape[2]
+
+    @classmethod
+    def read(
+        cls, state: State, name: str, n: int, n_in: int, n_out: int, kind: type[np.floating[Any]]
+    ) -> _Network:
+        """Take n networks, with the means and deviations of their inputs, from a state dict."""
+        layers = list(_read_layers(state, f"{name}.layers", n, n_in, n_out, kind))
+        mean, deviation = (
+            _shaped(state[f"{name}.{what}"], (n, 1, n_in), np.float64)
+            for what in ("mean", "deviation")
+        )
+        if kind != np.float32:
+            return cls(layers, mean, 1.0 / deviation)
+        # Single precision has no more to lose: the first layer does it, which saves a pass.
+        weight = layers[0].weight / deviation.transpose(0, 2, 1)
+        bias = layers[0].bias - (mean @ weight)[:, 0]
+        return cls([_Layer(weight.astype(kind), bias.astype(kind)), *layers[1:]])
+
+    def room(self, n_rows: int) -> _Activations:
+        """Return room for what B poses need."""
+        n, kind = len(self._layers[0].weight), self._layers[0].bias.dtype
+        widths = [layer.weight.shape[2] for layer in self._layers[:-1]]
+        before, after = ([np.empty((n, n_rows, w), dtype=kind) for w in widths] for _ in range(2))
+        inputs, outputs = (np.empty((n, n_rows, w), dtype=kind) for w in (self.n_in, self.n_out))
+        return _Activations(inputs, before, after, outputs)
+
+    def forward(self, inputs: Array, room: _Activations) -> Array:
+        """Apply to (n, B, n_in) inputs, and return the (n, B, n_out) outputs."""
+        if self._mean is not None and self._inverse is not None:
+            inputs = np.subtract(inputs, self._mean, out=room.inputs)
+            inputs *= self._inverse
+        for layer, before, after in zip(self._layers, room.before, room.after, strict=False):
+            layer.multiply(inputs, before)
+            network_kernels.add_and_silu(before, layer.bias, self._terms, after)
+            inputs = after
+        last = self._layers[-1]
+        last.multiply(inputs, room.outputs)
+        room.outputs[:] += last.bias[:, None]
+        return room.outputs
+
+    def backward(self, room: _Activations, by_outputs: Array) -> Array:
+        """Pull derivatives by the outputs back to the inputs."""
+        by = by_outputs
+        for layer, before in zip(self._layers[:0:-1], room.before[::-1], strict=True):
+            by_hidden = np.empty_like(before)
+            layer.multiply_back(by, by_hidden)
+            network_kernels.silu_backward(before.reshape(-1), self._terms, by_hidden.reshape(-1))
+            by = by_hidden
+        by_inputs = np.empty_like(room.inputs)
+        self._layers[0].multiply_back(by, by_inputs)
+        if self._inverse is not None:
+            by_inputs *= self._inverse
+        return by_inputs
+
+
+def _read_layers(
+    state: State, name: str, n: int | None, n_in: int, n_out: int, kind: type[np.floating[Any]]
+) -> Iterator[_Layer]:
+    """Yield the layers of n networks, or of one that is not stacked."""
+    stacked, of_bias = ((), ()) if n is None else ((n,), (n, 1))
+    n_layers = sum(key.startswith(name) for key in state) // 2
+    for number in range(n_layers):
+        weight, bias = (state[f"{name}.{number}.{what}"] for what in ("weight", "bias"))
+        width = n_out if number == n_layers - 1 else weight.shape[-1]
+        yield _Layer(
+            _shaped(weight, (*stacked, n_in, width), np.float32).reshape(-1, n_in, width),
+            _shaped(bias, (*of_bias, width), kind).reshape(-1, width),
+        )
+        n_in = width
+
+
+def _flat_rows(values: Array) -> Array:
+    """View (B, 3, n, m) values as (1, 3 B, n m)."""
+    return values.reshape(1, 3 * len(values), values.shape[2] * values.shape[3])
+
+
+def _shaped(
+    values: npt.NDArray[Any], shape: tuple[int, ...], kind: npt.DTypeLike
+) -> npt.NDArray[Any]:
+    """Copy an array to a type, or raise ValueError where its shape is another.
+
+    Never read-only, which a model file's arrays are: loops would be compiled for both.
+    """
+    if values.shape != shape:
+        raise ValueError(f"expected an array of shape {shape}, got {values.shape}")
+    return np.array(values, dtype=kind, order="C")
