@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -96,6 +97,7 @@ class PoseShower:
     def __init__(self, model: PoseModel) -> None:
         self.model = model
         self.predicts = True
+        self._beside = ThreadPoolExecutor(1, "prediction")
 
     def frame(self, latent: FloatArray, request_id: int) -> LiveFrame:
         """Decode, shade and predict one pose.
@@ -106,17 +108,16 @@ class PoseShower:
         request_id : is handed on
         """
         start = time.perf_counter()
+        predictor = self.model.predictor if self.predicts else None
+        ahead = None
+        if predictor is not None and not predictor.needs_torch:
+            # On another core, while this one decodes.
+            ahead = self._beside.submit(self._predict, latent)
         vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
         normals = self.normals(vertices)
         prediction = None
-        if self.predicts and self.model.has_predictor:
-            predicted = self.model.predict(latent[None])
-            prediction = PosePrediction(
-                domain_energy=_frozen(predicted.domain_energy[0]),
-                energy=float(predicted.energy[0]),
-                collision_logit=float(predicted.collision_logit[0]),
-                collision_probability=float(predicted.collision_probability[0]),
-            )
+        if predictor is not None:
+            prediction = self._predict(latent) if ahead is None else ahead.result()
         return LiveFrame(
             request_id=request_id,
             latent=latent,
@@ -124,6 +125,15 @@ class PoseShower:
             normals=_frozen(normals),
             prediction=prediction,
             seconds=time.perf_counter() - start,
+        )
+
+    def _predict(self, latent: FloatArray) -> PosePrediction:
+        predicted = self.model.predict(latent[None])
+        return PosePrediction(
+            domain_energy=_frozen(predicted.domain_energy[0]),
+            energy=float(predicted.energy[0]),
+            collision_logit=float(predicted.collision_logit[0]),
+            collision_probability=float(predicted.collision_probability[0]),
         )
 
     def verdict(self, frame: LiveFrame) -> ExactVerdict:
