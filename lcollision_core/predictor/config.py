@@ -9,6 +9,7 @@ from lcollision_core.errors import LCollisionError
 
 Loss = Literal["full", "no-rank", "no-depth", "entropy"]
 Schedule = Literal["constant", "one-cycle"]
+Kept = Literal["last", "best"]
 
 LOSSES: tuple[Loss, ...] = ("full", "no-rank", "no-depth", "entropy")
 """Table 1 of Tan et al. 2021: Ours, entropy+PD, entropy+rank, entropy."""
@@ -16,6 +17,9 @@ LOSSES: tuple[Loss, ...] = ("full", "no-rank", "no-depth", "entropy")
 
 LEAST_PASSES = 4
 """Over any number of rows, where `shown_rows` shortens a training."""
+
+VALIDATION_SHARE = 0.1
+"""Of the rows that are not held out, where the best pass is looked for."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,8 @@ class PredictorConfig:
     batch_rows : rows per step, of all processes together; even, for the ranking loss's pairs
     epochs : passes over the training rows, see `passes`
     shown_rows : where not None, passes over many rows end when so many have been shown
+    kept : the weights after the last pass, or after the one that is right about most of
+        `VALIDATION_SHARE` of the training rows, which are then not trained on
 
     Raises
     ------
@@ -50,6 +56,7 @@ class PredictorConfig:
     batch_rows: int = 32
     epochs: int = 30
     shown_rows: int | None = None
+    kept: Kept = "last"
 
     def __post_init__(self) -> None:
         for name, low in (("batch_rows", 2), ("epochs", 1)):
@@ -103,6 +110,7 @@ PRESETS = {
         epochs=10,
         shown_rows=2_800_000,
     ),
-    "paper": PredictorConfig("paper"),
+    # It knows its rows by heart long before the last pass; the paper does not say which it kept.
+    "paper": PredictorConfig("paper", kept="best"),
 }
 """The presets by name: what measures best, and Tan et al. 2021, section Evaluation."""

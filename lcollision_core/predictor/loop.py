@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from lcollision_core.embedding.checkpoint import Checkpoint, run_key
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, is_held_out
-from lcollision_core.predictor.config import PredictorConfig
+from lcollision_core.predictor.config import VALIDATION_SHARE, PredictorConfig
 from lcollision_core.predictor.networks import PredictorNetwork, Targets
 from lcollision_core.predictor.patch_labels import patch_roots
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
@@ -27,7 +29,7 @@ from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.processes import Processes, joined_processes
 from lcollision_core.predictor.training import PredictorStatus, StatusCallback
 
-_RUN_VERSION = 2
+_RUN_VERSION = 3
 """Goes up when training changes, so that no checkpoint is continued by other rules."""
 
 _WATCHED_ROWS = 4000
@@ -45,7 +47,7 @@ _LEAST_RATE = 1e-2
 """Where the one-cycle schedule begins, in its largest rate."""
 
 _PART = "training"
-_NETWORK, _OPTIMISER = "network:", "optimiser:"
+_NETWORK, _BEST, _OPTIMISER = "network:", "best:", "optimiser:"
 
 
 class TrainingLoop:
@@ -78,12 +80,19 @@ class TrainingLoop:
         self._near_exclusion = 0.0 if facts.store is None else facts.store.near_exclusion
         held_out = is_held_out(np.arange(len(rows)))
         self._training_index = np.flatnonzero(~held_out)
+        self._validation: LabelRows | None = None
+        if config.kept == "best":
+            n_kept_back = max(1, int(VALIDATION_SHARE * len(self._training_index)))
+            self._validation = rows.taken(self._training_index[-n_kept_back:])
+            self._training_index = self._training_index[:-n_kept_back]
         self._watched = rows.taken(np.flatnonzero(held_out)[:_WATCHED_ROWS])
         self._steps_an_epoch = -(-len(self._training_index) // config.batch_rows)
         self._epochs = config.passes(len(self._training_index))
         self._total = self._epochs * self._steps_an_epoch
         self._losses: list[float] = []
         self._accuracy: float | None = None
+        self._best: dict[str, torch.Tensor] = {}
+        self._best_accuracy = -1.0
         self._reported = -math.inf
         self._preparing: float | None = None
 
@@ -96,8 +105,11 @@ class TrainingLoop:
             training diverges.
         CancelledError : the cancel token was set; the checkpoint holds the last step.
         """
-        with joined_processes(self._device_name) as processes:
-            return self._run(processes)
+        with joined_processes(self._device_name) as processes, flushed_denormals():
+            network = self._run(processes)
+        if self._best:
+            network.load_state_dict(self._best)
+        return network
 
     def _run(self, processes: Processes) -> PredictorNetwork:
         config = self._config
@@ -180,6 +192,9 @@ class TrainingLoop:
         if processes.count > 1:
             talk = step % _STEPS_BETWEEN_TALKS == 0
             stop = talk and processes.any_of(stop)
+        if step % self._steps_an_epoch == 0:
+            self._accuracy = _accuracy(network, self._watched)
+            self._keep_best(network)
         if processes.rank == 0 and (stop or due):
             self._save(step, network, optimiser, checkpoint)
         if stop:
@@ -187,7 +202,6 @@ class TrainingLoop:
             self._cancel.cancel()
             self._cancel.raise_if_cancelled()
         if step % self._steps_an_epoch == 0:
-            self._accuracy = self._watched_accuracy(network)
             self._report(step)
             self._losses.clear()
         elif time.monotonic() - self._reported > _SECONDS_BETWEEN_REPORTS:
@@ -207,14 +221,13 @@ class TrainingLoop:
             )
         )
 
-    def _watched_accuracy(self, network: PredictorNetwork) -> float:
-        device = next(network.parameters()).device
-        parts = torch.split(torch.from_numpy(self._watched.latent), BATCH_ROWS)
-        network.eval()
-        with torch.inference_mode():
-            logit = torch.cat([network(part.to(device)).logit for part in parts])
-        network.train()
-        return float(((logit > 0.0).cpu().numpy() == self._watched.colliding).mean())
+    def _keep_best(self, network: PredictorNetwork) -> None:
+        if self._validation is None:
+            return
+        accuracy = _accuracy(network, self._validation)
+        if accuracy > self._best_accuracy:
+            self._best_accuracy = accuracy
+            self._best = {name: values.clone() for name, values in network.state_dict().items()}
 
     def _key(self) -> str:
         """Return a digest of all that decides how this run ends."""
@@ -238,12 +251,19 @@ class TrainingLoop:
         checkpoint: Checkpoint,
     ) -> None:
         state = {
-            _NETWORK + name: values.cpu().numpy() for name, values in network.state_dict().items()
+            prefix + name: values.cpu().numpy()
+            for prefix, weights in ((_NETWORK, network.state_dict()), (_BEST, self._best))
+            for name, values in weights.items()
         }
         for number, moments in optimiser.state_dict()["state"].items():
             for name, values in moments.items():
                 state[f"{_OPTIMISER}{number}:{name}"] = values.cpu().numpy()
-        facts = {"step": step, "losses": self._losses, "accuracy": self._accuracy}
+        facts = {
+            "step": step,
+            "losses": self._losses,
+            "accuracy": self._accuracy,
+            "best_accuracy": self._best_accuracy,
+        }
         checkpoint.put(_PART, state, facts, now=True)
 
     def _restore(
@@ -258,6 +278,8 @@ class TrainingLoop:
             values = torch.tensor(array)
             if name.startswith(_NETWORK):
                 weights[name.removeprefix(_NETWORK)] = values
+            elif name.startswith(_BEST):
+                self._best[name.removeprefix(_BEST)] = values
             else:
                 _, number, what = name.split(":")
                 state["state"].setdefault(int(number), {})[what] = values
@@ -265,6 +287,7 @@ class TrainingLoop:
         optimiser.load_state_dict(state)
         self._losses = list(stored.metadata["losses"])
         self._accuracy = stored.metadata["accuracy"]
+        self._best_accuracy = stored.metadata["best_accuracy"]
         return int(stored.metadata["step"])
 
 
@@ -306,6 +329,29 @@ class _Batches:
     def _tensor(self, values: npt.NDArray[Any]) -> torch.Tensor:
         tensor = torch.from_numpy(values.astype(np.float32, copy=False))
         return tensor.to(self._device, non_blocking=True)
+
+
+def _accuracy(network: PredictorNetwork, rows: LabelRows) -> float:
+    device = next(network.parameters()).device
+    parts = torch.split(torch.from_numpy(rows.latent), BATCH_ROWS)
+    network.eval()
+    with torch.inference_mode():
+        logit = torch.cat([network(part.to(device)).logit for part in parts])
+    network.train()
+    return float(((logit > 0.0).cpu().numpy() == rows.colliding).mean())
+
+
+@contextmanager
+def flushed_denormals() -> Iterator[None]:
+    """Take numbers too small for normal form as 0: Adam's averages of what has no slope any more.
+
+    Of the paper's network two thirds come to that, and processors take 16 times as long for them.
+    """
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
 
 
 def rate_at(step: int, total: int, config: PredictorConfig) -> float:
