@@ -19,8 +19,10 @@ from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionEr
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.model import PoseModel
-from lcollision_core.predictor import LOSSES, PRESETS, Loss, PredictorStatus, train_predictor
+from lcollision_core.predictor import LOSSES, PRESETS, Loss, PredictorStatus, loop, train_predictor
+from lcollision_core.predictor.config import VALIDATION_SHARE
 from lcollision_core.predictor.loop import rate_at
+from lcollision_core.predictor.networks import PredictorNetwork
 from lcollision_core.predictor.predictor import BATCH_ROWS
 from tests.core.predictor_rows import PAPER, config, made_up_rows, weights_of
 
@@ -185,10 +187,51 @@ def _written(path: Path, *parts: object) -> Path:
     return path
 
 
+def test_the_best_pass_is_kept_by_rows_that_do_not_train(
+    tube_model: PoseModel, rows: LabelRows, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    embedding = tube_model.embedding
+    accuracies: list[float] = []
+    kept_back: list[LabelRows] = []
+
+    def remembered(network: PredictorNetwork, measured: LabelRows) -> float:
+        accuracy = measure(network, measured)
+        if len(measured) == n_kept_back:
+            accuracies.append(accuracy)
+            kept_back.append(measured)
+        return accuracy
+
+    measure = loop._accuracy
+    monkeypatch.setattr(loop, "_accuracy", remembered)
+    held_out = is_held_out(np.arange(len(rows)))
+    n_kept_back = int(VALIDATION_SHARE * (~held_out).sum())
+    chosen = config(epochs=12, kept="best", rate=5e-3)
+    seen: list[PredictorStatus] = []
+    trained = train_predictor(rows, embedding, chosen, progress=seen.append)
+    assert len(accuracies) == 12
+    assert max(accuracies) > accuracies[-1]
+    codes = kept_back[0].latent
+    found = trained.predict(codes).collision_logit > 0.0
+    assert (found == kept_back[0].colliding).mean() == max(accuracies)
+    # They are neither among those held out nor among those trained on.
+    is_kept_back = (rows.latent[:, None] == codes[None]).all(axis=2).any(axis=1)
+    assert is_kept_back.sum() == n_kept_back
+    assert not (is_kept_back & held_out).any()
+    n_trained_on = len(rows) - held_out.sum() - n_kept_back
+    assert seen[-1].total == 12 * -(-n_trained_on // chosen.batch_rows)
+
+
+def test_numbers_too_small_for_normal_form_are_0_in_training_only() -> None:
+    tiny = torch.full((4,), 1e-40)
+    with loop.flushed_denormals():
+        assert (tiny * 0.5 == 0.0).all()
+    assert (tiny * 0.5 > 0.0).all()
+
+
 def test_a_killed_run_goes_on_to_the_same_bits(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path
 ) -> None:
-    embedding, chosen = tube_model.embedding, config(epochs=12)
+    embedding, chosen = tube_model.embedding, config(epochs=12, kept="best")
     checkpoint = tmp_path / "checkpoint"
     job = _written(tmp_path / "job", rows, embedding, chosen, checkpoint)
     write_always = (
