@@ -72,7 +72,7 @@ def embedding(
     from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
     from lcollision_core.meshes import read_pose_set, require_writable
-    from lcollision_core.model import PoseModel, model_destination
+    from lcollision_core.model import PoseModel, checkpoint_path, model_destination
 
     destination = model_destination(output)
     require_writable(destination)
@@ -82,7 +82,7 @@ def embedding(
     if near_exclusion is not None:
         poses = replace(poses, near_exclusion=near_exclusion)
     config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)
-    checkpoint = destination.with_name(destination.name + ".checkpoint")
+    checkpoint = checkpoint_path(destination)
     if checkpoint.exists():
         note(f"going on from {checkpoint}")
     try:

@@ -88,7 +88,7 @@ def predictor(
     """
     from lcollision_core.labels import LabelStore
     from lcollision_core.meshes import require_writable
-    from lcollision_core.model import PoseModel, model_destination
+    from lcollision_core.model import PoseModel, checkpoint_path, model_destination
     from lcollision_core.predictor import PRESETS, train_predictor
     from lcollision_core.resolve import find_free_poses
 
@@ -100,7 +100,7 @@ def predictor(
     config = PRESETS[preset.value].with_loss(loss.value)
     # torchrun starts this command many times; the first process writes for all.
     leads = os.environ.get("RANK", "0") == "0"
-    checkpoint = destination.with_name(destination.name + ".checkpoint")
+    checkpoint = checkpoint_path(destination)
     if leads and checkpoint.exists():
         note(f"going on from {checkpoint}")
     try:

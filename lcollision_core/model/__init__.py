@@ -6,6 +6,7 @@ from lcollision_core.model.latent_space import LatentGroup, LatentSpace
 from lcollision_core.model.library import (
     MODEL_SUFFIX,
     ListedModel,
+    checkpoint_path,
     find_model,
     list_models,
     model_destination,
@@ -30,6 +31,7 @@ __all__ = [
     "ModelCard",
     "NamedPose",
     "PoseModel",
+    "checkpoint_path",
     "find_model",
     "list_models",
     "model_destination",

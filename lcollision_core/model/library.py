@@ -54,17 +54,35 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
 
     Raises
     ------
-    ModelFileError : it is neither; the sentence lists the names that there are.
+    ModelFileError : it is neither, or its training has not come to its end; the sentence says
+        how to go on, or lists the names that there are.
     """
     path = Path(name_or_path)
-    if len(path.parts) == 1 and not path.is_file():
+    if path.is_file():
+        return path
+    destination = path
+    if len(path.parts) == 1:
         listed = list_models()
         for model in listed:
             if model.name == path.name:
                 return model.path
+        if not path.suffix:
+            destination = user_models_folder() / f"{path}{MODEL_SUFFIX}"
+    unfinished = checkpoint_path(destination)
+    if unfinished.is_file():
+        raise ModelFileError(
+            f"the training of {str(path)!r} is not finished; run its command again, which goes on "
+            f"from {unfinished}"
+        )
+    if len(path.parts) == 1:
         names = ", ".join(model.name for model in listed) or "none yet"
         raise ModelFileError(f"there is no model or file {path.name!r}; the models are: {names}")
     return path
+
+
+def checkpoint_path(destination: Path) -> Path:
+    """Return the file that a training to a destination goes on from."""
+    return destination.with_name(destination.name + ".checkpoint")
 
 
 def model_destination(name_or_path: str | os.PathLike[str]) -> Path:

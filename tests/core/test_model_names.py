@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.model import find_model, list_models, model_destination, user_models_folder
+from lcollision_core.model import (
+    checkpoint_path,
+    find_model,
+    list_models,
+    model_destination,
+    user_models_folder,
+)
 from lcollision_core.model.colours import PALETTE, cielab, domain_colours
 from lcollision_core.model.naming import join_names, names_from_labels
 
@@ -201,6 +207,17 @@ def test_an_unknown_name_lists_those_that_there_are(folder: Path) -> None:
     (folder / "tail.safetensors").write_bytes(b"")
     with pytest.raises(ModelFileError, match=r"no model or file 'trunk'; .*\btail\b"):
         find_model("trunk")
+
+
+def test_an_unfinished_training_says_how_to_go_on(folder: Path, tmp_path: Path) -> None:
+    for named in ("dancer", tmp_path / "dancer.safetensors"):
+        checkpoint = checkpoint_path(model_destination(named))
+        checkpoint.touch()
+        with pytest.raises(ModelFileError, match=rf"is not finished; .* from {checkpoint}$"):
+            find_model(named)
+    # A model that is trained further can be used meanwhile.
+    (folder / "dancer.safetensors").touch()
+    assert find_model("dancer") == folder / "dancer.safetensors"
 
 
 def test_a_file_needs_no_folder_of_models(folder: Path, tmp_path: Path) -> None:
