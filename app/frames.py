@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -97,7 +98,6 @@ class PoseShower:
     def __init__(self, model: PoseModel) -> None:
         self.model = model
         self.predicts = True
-        self._beside = ThreadPoolExecutor(1, "prediction")
 
     def frame(self, latent: FloatArray, request_id: int) -> LiveFrame:
         """Decode, shade and predict one pose.
@@ -112,9 +112,13 @@ class PoseShower:
         ahead = None
         if predictor is not None and not predictor.needs_torch:
             # On another core, while this one decodes.
-            ahead = self._beside.submit(self._predict, latent)
-        vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
-        normals = self.normals(vertices)
+            ahead = _beside().submit(self._predict, latent)
+        try:
+            vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
+            normals = self.normals(vertices)
+        finally:
+            if ahead is not None:
+                wait([ahead])
         prediction = None
         if predictor is not None:
             prediction = self._predict(latent) if ahead is None else ahead.result()
@@ -159,6 +163,12 @@ class PoseShower:
         from lcollision_core.meshes.normals import vertex_normals
 
         return vertex_normals(vertices, self.model.faces)
+
+
+@cache
+def _beside() -> ThreadPoolExecutor:
+    """Return the process's one thread that predicts while another decodes."""
+    return ThreadPoolExecutor(1, "prediction")
 
 
 def keep_torch_to_one_thread(model: PoseModel) -> None:

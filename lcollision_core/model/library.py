@@ -68,11 +68,10 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
                 return model.path
         if not path.suffix:
             destination = user_models_folder() / f"{path}{MODEL_SUFFIX}"
-    unfinished = checkpoint_path(destination)
-    if unfinished.is_file():
+    if destination.name and checkpoint_path(destination).is_file():
         raise ModelFileError(
             f"the training of {str(path)!r} is not finished; run its command again, which goes on "
-            f"from {unfinished}"
+            f"from {checkpoint_path(destination)}"
         )
     if len(path.parts) == 1:
         names = ", ".join(model.name for model in listed) or "none yet"

@@ -50,8 +50,8 @@ def farthest_points(places: FloatArray, first: int, n_points: int) -> npt.NDArra
 def neighbour_order(places: FloatArray, block: int) -> npt.NDArray[np.int32]:
     """Order (n, 3) places so that each block of so many in turn lies close together.
 
-    They are halved across their longest extent, and the halves likewise. The order ends with some
-    places again, as many as fill the last block.
+    They are halved across their longest extent, and the halves likewise. The last place is there
+    again as often as fills its block.
     """
 
     def ordered(index: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:
@@ -64,7 +64,7 @@ def neighbour_order(places: FloatArray, block: int) -> npt.NDArray[np.int32]:
         return ordered(index[along[:half]]) + ordered(index[along[half:]])
 
     order = np.concatenate(ordered(np.arange(len(places))))
-    return np.resize(order, -(-len(order) // block) * block).astype(np.int32)
+    return np.append(order, np.repeat(order[-1], -len(order) % block)).astype(np.int32)
 
 
 def skin_graph(embedding: Embedding) -> sparse.csr_matrix:

@@ -1,15 +1,18 @@
-"""The default network on the CPU without torch: for a few poses with their gradients, or for many.
+"""The default network on the CPU by compiled loops: a few poses without torch, or many with it.
 
 `GeometricNetwork` spends most of a single pose's time on passing from one operation of torch to the
-next, of a batch's on new memory, and a program that only drags sliders would spend seconds on
-importing it. Here the same compiled loops are called one after the other on arrays that are used
-again, and back again for the gradients.
+next, a third of a batch's on new memory, and a program that only drags sliders would spend seconds
+on importing it. Here the same loops are called one after the other on arrays that are used again,
+and back again for the gradients. Of many poses the small networks' products are torch's, which take
+a third of the time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -20,39 +23,49 @@ from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor import field_kernels, network_kernels, skin_kernels
 from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
+from lcollision_core.predictor.network_kernels import ROWS_AT_ONCE, SQUASHED
 from lcollision_core.predictor.skin_geometry import SkinGeometry
 
 State = Mapping[str, npt.NDArray[Any]]
 Array = npt.NDArray[np.floating[Any]]
 Float32Array = npt.NDArray[np.float32]
 
-_ROWS_AT_ONCE = 64
-"""Poses whose intermediate arrays stay in the caches."""
+_SPARE_ROOMS = 2
+"""Kept for later calls: of the editor's one pose and the solver's few, or of two threads."""
 
 
 class CompiledNetwork:
     """A trained default network.
 
-    Immutable, and safe to share between threads.
+    Immutable but for scratch memory, and safe to share between threads.
 
     Parameters
     ----------
     embedding : of the body
     state : the state dict of a `GeometricNetwork`, as arrays
-    kind : what it computes in: double precision, or float32 for many poses in half the time
+    kind : what it computes in: double precision for a few poses, or float32 for many
+    skin : of the embedding and the state's sites, where that is known already
 
     Raises
     ------
     KeyError, ValueError : the state does not fit the embedding.
+
+    Attributes
+    ----------
+    skin : what it looks at
     """
 
     def __init__(
-        self, embedding: Embedding, state: State, kind: type[np.floating[Any]] = np.float64
+        self,
+        embedding: Embedding,
+        state: State,
+        kind: type[np.floating[Any]] = np.float64,
+        skin: SkinGeometry | None = None,
     ) -> None:
         sites = state["site_vertices"].astype(np.int64)
         _, n_points = state["body.points"].shape
         self._kind = kind
-        self._skin = skin = SkinGeometry.of(embedding, sites, n_points)
+        self.skin = skin = skin or SkinGeometry.of(embedding, sites, n_points)
         n_points, n_sites = skin.n_points, len(sites)
         self._place = _Layer(
             _shaped(state["body.points"], (3 * n_points, n_points), np.float32)[None],
@@ -71,48 +84,54 @@ class CompiledNetwork:
         sizes = 2 * (n_points + n_sites), embedding.n_domains + 2
         self._head = _Network(list(_read_layers(state, "head", None, *sizes, kind)))
         self._any_hit = _shaped(state["any_hit"], (2,), kind)
-        # Of earlier calls: new memory costs as much as filling it.
-        self._rooms: list[_Trace] = []
+        self._spare_rooms: list[_Trace] = []
+        self._guard = Lock()
 
     def outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Return (B, K) scaled energies of the domains, and (B,) logits, of (B, D) poses."""
         n_rows = len(latent)
         energy = np.empty((n_rows, self._head.n_out - 2))
         logit = np.empty(n_rows)
-        if not n_rows:
-            return energy, logit
-        codes = latent.astype(self._kind)
-        n_parts = -(-n_rows // _ROWS_AT_ONCE)
-        size = -(-n_rows // n_parts)
-        trace = self._take_room(size)
-        for part in range(n_parts):
-            # The last part has some rows of the one before, so that all are of one size.
-            start = min(part * size, n_rows - size)
-            rows = slice(start, start + size)
-            logit[rows] = self._forward(codes[rows], trace)
+        for rows, codes, trace in self._parts(latent):
+            logit[rows] = self._forward(codes, trace)
             energy[rows] = np.square(np.maximum(trace.head.outputs[0, :, 1:-1], 0.0))
-        self._rooms.append(trace)
         return energy, logit
 
     def logit_and_gradient(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (B,) logits of (B, D) poses, and each one's (B, D) derivative by its codes."""
+        logit, gradient = np.empty(len(latent)), np.empty(latent.shape)
+        for rows, codes, trace in self._parts(latent):
+            logit[rows] = self._forward(codes, trace)
+            gradient[rows] = self._backward(trace)
+        return logit, gradient
+
+    def _parts(self, latent: npt.NDArray[Any]) -> Iterator[tuple[slice, Array, _Trace]]:
+        """Yield parts of some poses, all of one size, their codes, and room that all share."""
+        n_rows = len(latent)
+        if not n_rows:
+            return
         codes = latent.astype(self._kind)
-        trace = self._take_room(len(codes))
-        logit = self._forward(codes, trace)
-        gradient = self._backward(trace)
-        self._rooms.append(trace)
-        return logit.astype(np.float64, copy=False), gradient.astype(np.float64, copy=False)
+        n_parts = -(-n_rows // ROWS_AT_ONCE)
+        size = -(-n_rows // n_parts)
+        trace = self._take_room(size)
+        for part in range(n_parts):
+            # The last part has some rows of the one before.
+            start = min(part * size, n_rows - size)
+            rows = slice(start, start + size)
+            yield rows, codes[rows], trace
+        with self._guard:
+            self._spare_rooms = [trace, *self._spare_rooms[: _SPARE_ROOMS - 1]]
 
     def _take_room(self, n_rows: int) -> _Trace:
-        """Take what another call has left, if that was of as many rows: each thread its own."""
-        try:
-            trace = self._rooms.pop()
-        except IndexError:
-            return self._room(n_rows)
-        return trace if len(trace.hits) == n_rows else self._room(n_rows)
+        """Take what an earlier call left, as new memory costs as much as filling it, or make it."""
+        with self._guard:
+            for place, trace in enumerate(self._spare_rooms):
+                if len(trace.hits) == n_rows:
+                    return self._spare_rooms.pop(place)
+        return self._room(n_rows)
 
     def _room(self, n_rows: int) -> _Trace:
-        skin = self._skin
+        skin = self.skin
         n_skin, n_sites = len(skin.offset), len(skin.members)
 
         def empty(*shape: int) -> Array:
@@ -138,7 +157,7 @@ class CompiledNetwork:
 
     def _forward(self, latent: Array, trace: _Trace) -> Array:
         """Fill in all of the trace, and return (B,) logits of (B, D) codes."""
-        skin, n_rows = self._skin, len(latent)
+        skin, n_rows = self.skin, len(latent)
         products = trace.outputs.reshape(n_rows, N_FEATURES * len(skin.target))
         skin_kernels.products(latent, skin.tables, skin.blocks, products)
         np.tanh(products, out=products)
@@ -161,7 +180,7 @@ class CompiledNetwork:
         for found, start, stop in ((patch, 0, n_points), (fold, n_points, n_hits)):
             hits[:, start:stop] = found[..., 0].T
             values[:, n_hits + start : n_hits + stop] = found[..., 1].T
-        np.tanh(hits * 0.25, out=values[:, :n_hits])
+        np.tanh(hits / SQUASHED, out=values[:, :n_hits])
         head = self._head.forward(trace.values, trace.head)
         # The logarithm of the summed exponentials, and its derivative, the softmax.
         largest = hits.max(axis=1, keepdims=True)
@@ -173,12 +192,14 @@ class CompiledNetwork:
         return logit
 
     def _backward(self, trace: _Trace) -> Array:
-        skin, n_rows = self._skin, len(trace.hits)
+        skin, n_rows = self.skin, len(trace.hits)
         n_points, n_hits = skin.n_points, trace.hits.shape[1]
         by_head = np.zeros_like(trace.head.outputs)
         by_head[..., 0] = 1.0
         by_values = self._head.backward(trace.head, by_head)[0]
-        by_hits = by_values[:, :n_hits] * (0.25 * (1.0 - np.square(trace.values[0, :, :n_hits])))
+        by_hits = by_values[:, :n_hits] * (
+            (1.0 - np.square(trace.values[0, :, :n_hits])) / SQUASHED
+        )
         by_hits += self._any_hit[0] * trace.share
         by_both = np.stack([by_hits, by_values[:, n_hits:]], axis=2).transpose(1, 0, 2)
         by_patch, by_fold = map(np.ascontiguousarray, np.split(by_both, [n_points]))
@@ -208,10 +229,18 @@ class CompiledNetwork:
 
 @dataclass(frozen=True, eq=False)
 class _Trace:
-    """All of a forward pass that the way back needs, see `GeometricNetwork`.
+    """All that a forward pass of B poses makes, and the way back needs.
 
     Attributes
     ----------
+    outputs : (B, T, 9) tanh of the codes' products with the tables, see `SkinGeometry`
+    features : (B, Q, 9) deformation features of the skin
+    frame : (B, N, 3, 3) of the first N points, as columns
+    rows : (B, 3, Q, 3) deformation gradients
+    places : (B, 3, P) of the points, in heights
+    sums, field : (P, B, 2, 8) what the points feel, before and after `normalised`
+    view : (S, B, 9 M) the deformation about the fold sites
+    patch, fold, head : the small networks'
     hits : (B, P + S) logits of patches and folds being hit
     share : likewise, their softmax
     values : (1, B, 2 (P + S)) the squashed logits, then the roots of the energies
@@ -244,26 +273,28 @@ class _Layer:
 
     def __init__(self, weight: Float32Array, bias: Array) -> None:
         self.weight, self.bias = weight, bias
-        # Both ways read rows.
-        self._back = np.ascontiguousarray(weight.transpose(0, 2, 1))
+        of_many = bias.dtype == np.float32
+        self._product = _products_of_many if of_many else network_kernels.stacked_products
 
     def multiply(self, inputs: Array, outputs: Array) -> None:
         """Fill in (n, B, n_out) outputs of (n, B, n_in) inputs, without the bias.
 
         Both may be wider; what is beyond is left alone.
         """
-        if inputs.dtype == np.float32:
-            _multiply_many(inputs, self.weight, outputs)
-        else:
-            network_kernels.stacked_products(inputs, self.weight, outputs)
+        self._product(inputs, self.weight, outputs)
 
     def multiply_back(self, by_outputs: Array, by_inputs: Array) -> None:
         """Fill in derivatives by the inputs."""
-        network_kernels.stacked_products(by_outputs, self._back, by_inputs)
+        self._product(by_outputs, self._transposed, by_inputs)
+
+    @cached_property
+    def _transposed(self) -> Float32Array:
+        """Of which the way back reads rows, too."""
+        return np.ascontiguousarray(self.weight.transpose(0, 2, 1))
 
 
-def _multiply_many(inputs: Array, weight: Float32Array, outputs: Array) -> None:
-    """Do what `stacked_products` does, for many rows twice as fast."""
+def _products_of_many(inputs: Array, weight: Float32Array, outputs: Array) -> None:
+    """Do what `stacked_products` does, of many rows in a third of the time."""
     import torch
 
     _, n_in, n_out = weight.shape
@@ -277,12 +308,12 @@ class _Activations:
 
     Attributes
     ----------
-    inputs : (n, B, n_in) standardised, where a network does that
+    inputs : (n, B, n_in) standardised; None of networks that take them as they come
     before, after : (n, B, width) of each hidden layer, before and after the silu
     outputs : (n, B, n_out)
     """
 
-    inputs: Array
+    inputs: Array | None
     before: list[Array]
     after: list[Array]
     outputs: Array
@@ -328,14 +359,14 @@ class _Network:
         widths = [layer.weight.shape[2] for layer in self._layers[:-1]]
         before, after = ([np.empty((n, n_rows, w), dtype=kind) for w in widths] for _ in range(2))
         inputs, outputs = (np.empty((n, n_rows, w), dtype=kind) for w in (self.n_in, self.n_out))
-        return _Activations(inputs, before, after, outputs)
+        return _Activations(None if self._mean is None else inputs, before, after, outputs)
 
     def forward(self, inputs: Array, room: _Activations) -> Array:
         """Apply to (n, B, n_in) inputs, and return the (n, B, n_out) outputs."""
         if self._mean is not None and self._inverse is not None:
             inputs = np.subtract(inputs, self._mean, out=room.inputs)
             inputs *= self._inverse
-        for layer, before, after in zip(self._layers, room.before, room.after, strict=False):
+        for layer, before, after in zip(self._layers[:-1], room.before, room.after, strict=True):
             layer.multiply(inputs, before)
             network_kernels.add_and_silu(before, layer.bias, self._terms, after)
             inputs = after
@@ -352,7 +383,7 @@ class _Network:
             layer.multiply_back(by, by_hidden)
             network_kernels.silu_backward(before.reshape(-1), self._terms, by_hidden.reshape(-1))
             by = by_hidden
-        by_inputs = np.empty_like(room.inputs)
+        by_inputs = np.empty((*by.shape[:2], self.n_in), dtype=by.dtype)
         self._layers[0].multiply_back(by, by_inputs)
         if self._inverse is not None:
             by_inputs *= self._inverse

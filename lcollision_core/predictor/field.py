@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from lcollision_core.errors import ShapeError
 from lcollision_core.predictor import field_kernels, skin_kernels
-from lcollision_core.predictor.field_kernels import BEHIND, FADE, REACHES
+from lcollision_core.predictor.field_kernels import BEHIND, BLOCK, FADE, REACHES
 from lcollision_core.predictor.skin_kernels import SMALLEST_SQUARED_ANGLE
 
 _SYMMETRIC = [3, 4, 5, 4, 6, 7, 5, 7, 8]
@@ -106,8 +106,10 @@ def contact_field(
     ----------
     frame : (B, P, 3, 3) of each point, as columns, the outer normal first
     places : (B, 3, P)
-    order : (O,) int32 points that may be felt, neighbours next to each other
-    apart : (P, O) added to squared distances: 0 for pairs that see each other, else 1
+    order : (O,) int32, all P points, neighbours next to each other, and some again until O is a
+        multiple of `BLOCK`
+    apart : (P, O) added to squared distances to the points in that order: 0 for pairs that see
+        each other, else 1, as for all that are there again
     reach : (2,) ascending, below 1
 
     Returns
@@ -117,10 +119,16 @@ def contact_field(
 
     Raises
     ------
-    ShapeError : there are not two reaches.
+    ShapeError : there are not two reaches, or the order or `apart` has another size.
     """
     if len(reach) != len(REACHES):
         raise ShapeError(f"the field has {len(REACHES)} reaches, got {len(reach)}")
+    n_points, n_ordered = places.shape[2], len(order)
+    if n_ordered != -(-n_points // BLOCK) * BLOCK or apart.shape != (n_points, n_ordered):
+        raise ShapeError(
+            f"{n_points} points are ordered in blocks of {BLOCK}, got an order of {n_ordered} and "
+            f"pairs of shape {tuple(apart.shape)}"
+        )
     if frame.device.type == "cpu":
         sums: torch.Tensor = _ContactField.apply(frame, places, order, apart, reach)  # type: ignore[no-untyped-call]
         return sums

@@ -55,6 +55,7 @@ from lcollision_core.predictor.body_points import N_POINTS, skin_cells
 from lcollision_core.predictor.field import contact_field, fold_view, normalised
 from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
 from lcollision_core.predictor.folds import N_MEMBERS, find_fold_sites
+from lcollision_core.predictor.network_kernels import ROWS_AT_ONCE, SQUASHED
 from lcollision_core.predictor.networks import (
     NetworkOutput,
     PredictorNetwork,
@@ -81,8 +82,6 @@ _FOLD_WEIGHT, _FOLD_DEPTH_WEIGHT = 5.0, 1.25
 _FITTED_POSES = 4000
 _MEASURED_POSES = 2000
 _LEAST_DEVIATION, _LEAST_GRADIENT_DEVIATION = 2e-2, 1e-3
-_ROWS_AT_ONCE = 64
-"""Rows whose intermediate arrays stay in the caches."""
 
 
 class _Auxiliary(NamedTuple):
@@ -231,7 +230,7 @@ class GeometricNetwork(PredictorNetwork):
 
     def forward(self, latent: torch.Tensor) -> NetworkOutput:
         """Predict from (B, D) latent codes."""
-        if len(latent) <= _ROWS_AT_ONCE or latent.device.type != "cpu":
+        if len(latent) <= ROWS_AT_ONCE or latent.device.type != "cpu":
             return self._forward(latent)
         parts = [self._forward(part) for part in _parts(latent)]
         auxiliary = zip(*(part.auxiliary for part in parts), strict=True)
@@ -245,7 +244,7 @@ class GeometricNetwork(PredictorNetwork):
         field, folds = self._inputs(latent)
         outputs = torch.cat([self.patch(field), self.fold(folds)])
         patch_logit, patch_root = outputs[..., 0].T, outputs[..., 1].T
-        values = torch.cat([torch.tanh(patch_logit / 4.0), patch_root], dim=1)
+        values = torch.cat([torch.tanh(patch_logit / SQUASHED), patch_root], dim=1)
         for layer in self.head[:-1]:
             values = silu(layer(values))
         values = self.head[-1](values)
@@ -324,4 +323,4 @@ class _PatchNetworks(nn.Module):
 
 
 def _parts(rows: torch.Tensor) -> list[torch.Tensor]:
-    return [rows[start : start + _ROWS_AT_ONCE] for start in range(0, len(rows), _ROWS_AT_ONCE)]
+    return [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]

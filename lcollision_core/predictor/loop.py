@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,16 +18,16 @@ from lcollision_core.embedding import Embedding
 from lcollision_core.embedding.checkpoint import Checkpoint, run_key
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken
-from lcollision_core.labels import LabelRows, is_held_out
-from lcollision_core.predictor.config import VALIDATION_SHARE, PredictorConfig
+from lcollision_core.labels import LabelRows
+from lcollision_core.predictor.config import PredictorConfig
 from lcollision_core.predictor.networks import PredictorNetwork, Targets
 from lcollision_core.predictor.patch_labels import patch_roots
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
 from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.processes import Processes, joined_processes
-from lcollision_core.predictor.training import PredictorStatus, StatusCallback
+from lcollision_core.predictor.training import PredictorStatus, RowSplit, StatusCallback
 
-_RUN_VERSION = 3
+_RUN_VERSION = 4
 """Goes up when training changes, so that no checkpoint is continued by other rules."""
 
 _WATCHED_ROWS = 4000
@@ -42,6 +40,10 @@ _SECONDS_BETWEEN_REPORTS = 0.25
 _STEPS_BETWEEN_TALKS = 20
 """Processes agree this often on whether to stop or to save: each time costs a round trip."""
 
+_STEPS_BETWEEN_CLEARINGS = 100
+_TINY_MOMENT = 1e-30
+"""What falls by 0.9 a step, as Adam's mean does, is still in normal form so many steps later."""
+
 _WARM_UP = 0.2
 _LEAST_RATE = 1e-2
 """Where the one-cycle schedule begins, in its largest rate."""
@@ -51,11 +53,12 @@ _NETWORK, _BEST, _OPTIMISER = "network:", "best:", "optimiser:"
 
 
 class TrainingLoop:
-    """Trains a preset's network on the rows that are not held out.
+    """Trains a preset's network.
 
     Parameters
     ----------
     rows : samples 0, 1, 2, ...; the latent codes are read where they are and never copied whole
+    split : which of them train
     embedding, config, facts : see `training.train_predictor`
     device : "auto", "cpu" or "cuda"
     checkpoint : a file, or None
@@ -65,6 +68,7 @@ class TrainingLoop:
     def __init__(
         self,
         rows: LabelRows,
+        split: RowSplit,
         embedding: Embedding,
         config: PredictorConfig,
         facts: TrainingFacts,
@@ -78,14 +82,8 @@ class TrainingLoop:
         self._device_name, self._path = device, checkpoint
         self._progress, self._cancel = progress, cancel
         self._near_exclusion = 0.0 if facts.store is None else facts.store.near_exclusion
-        held_out = is_held_out(np.arange(len(rows)))
-        self._training_index = np.flatnonzero(~held_out)
-        self._validation: LabelRows | None = None
-        if config.kept == "best":
-            n_kept_back = max(1, int(VALIDATION_SHARE * len(self._training_index)))
-            self._validation = rows.taken(self._training_index[-n_kept_back:])
-            self._training_index = self._training_index[:-n_kept_back]
-        self._watched = rows.taken(np.flatnonzero(held_out)[:_WATCHED_ROWS])
+        self._training_index, self._validation_index = split.training, split.validation
+        self._watched = rows.taken(split.held_out[:_WATCHED_ROWS])
         self._steps_an_epoch = -(-len(self._training_index) // config.batch_rows)
         self._epochs = config.passes(len(self._training_index))
         self._total = self._epochs * self._steps_an_epoch
@@ -105,7 +103,7 @@ class TrainingLoop:
             training diverges.
         CancelledError : the cancel token was set; the checkpoint holds the last step.
         """
-        with joined_processes(self._device_name) as processes, flushed_denormals():
+        with joined_processes(self._device_name) as processes:
             network = self._run(processes)
         if self._best:
             network.load_state_dict(self._best)
@@ -152,6 +150,8 @@ class TrainingLoop:
             torch.autograd.backward(loss * processes.count + idle)
             optimiser.step()
             step += 1
+            if step % _STEPS_BETWEEN_CLEARINGS == 0:
+                _clear_tiny_moments(optimiser)
             self._losses.append(processes.sum_of(loss))
             if not math.isfinite(self._losses[-1]):
                 raise LCollisionError(
@@ -222,9 +222,9 @@ class TrainingLoop:
         )
 
     def _keep_best(self, network: PredictorNetwork) -> None:
-        if self._validation is None:
+        if not len(self._validation_index):
             return
-        accuracy = _accuracy(network, self._validation)
+        accuracy = _accuracy(network, self._rows.taken(self._validation_index))
         if accuracy > self._best_accuracy:
             self._best_accuracy = accuracy
             self._best = {name: values.clone() for name, values in network.state_dict().items()}
@@ -341,17 +341,16 @@ def _accuracy(network: PredictorNetwork, rows: LabelRows) -> float:
     return float(((logit > 0.0).cpu().numpy() == rows.colliding).mean())
 
 
-@contextmanager
-def flushed_denormals() -> Iterator[None]:
-    """Take numbers too small for normal form as 0: Adam's averages of what has no slope any more.
+def _clear_tiny_moments(optimiser: torch.optim.Optimizer) -> None:
+    """Set Adam's running means to 0 before they leave the normal form of numbers.
 
-    Of the paper's network two thirds come to that, and processors take 16 times as long for them.
+    Those of weights that have no slope any more, two thirds of the paper's network, would come to
+    that, and processors take 16 times as long for such numbers.
     """
-    torch.set_flush_denormal(True)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(False)
+    for moments in optimiser.state.values():
+        for name in ("exp_avg", "exp_avg_sq"):
+            values = moments[name]
+            values.masked_fill_(values.abs() < _TINY_MOMENT, 0.0)
 
 
 def rate_at(step: int, total: int, config: PredictorConfig) -> float:

@@ -8,10 +8,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.compiled import compiled_sums
+from lcollision_core.compiled import compiled, compiled_sums
 
 Array = npt.NDArray[np.floating[Any]]
 Number = np.floating[Any]
+
+ROWS_AT_ONCE = 64
+"""Poses whose intermediate arrays stay in the caches."""
+
+SQUASHED = 4.0
+"""A patch's logit is divided by this and squashed before the head sees it."""
 
 _AT_ONCE = 4
 """Inputs whose products are summed up before the outputs are touched again."""
@@ -26,7 +32,7 @@ def power_terms(kind: type[np.floating[Any]]) -> tuple[Number, ...]:
     return tuple(kind(term) for term in (_POWER[-7:] if kind == np.float32 else _POWER))
 
 
-@compiled_sums
+@compiled
 def stacked_products(inputs: Array, weight: npt.NDArray[np.float32], outputs: Array) -> None:
     """Fill in n products: (n, B, n_in) inputs times (n, n_in, n_out) weights.
 
@@ -91,7 +97,7 @@ def silu_backward(values: Array, terms: tuple[Number, ...], by: Array) -> None:
 
 @compiled_sums
 def _exponential(x: Number, terms: tuple[Number, ...]) -> Number:
-    """Return exp(x), for x beyond +-87 that of 87: several at a time, as the library's is not."""
+    """Return exp(x), between those of +-87.3: several at a time, as the library's is not."""
     kind = type(x)
     y = min(max(x * kind(_LOG2_E), kind(-126.0)), kind(126.0))
     whole = np.floor(y + kind(0.5))

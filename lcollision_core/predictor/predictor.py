@@ -64,7 +64,7 @@ class TrainingFacts:
     Attributes
     ----------
     rows : M, labelled rows given, those held out among them
-    training_rows : of them, that trained
+    training_rows : of them, that trained, without those that only chose among passes
     colliding_share : of all rows
     seed : of the initial weights and the order
     energy_scale : mean PDe-sum of the colliding training rows, in squared heights; energies are
@@ -231,14 +231,18 @@ class CollisionPredictor:
     def _predict_many(
         self, codes: npt.NDArray[np.float32], domain_energy: FloatArray, logit: FloatArray
     ) -> None:
-        """Fill in what torch says, on all cores or on the GPU."""
+        """Fill in what is predicted, on all cores or on the GPU."""
         import torch
 
+        # Made before several threads would each begin to.
+        many = self._many
+        network = self._network if many is None else None
+
         def fill(start: int, stop: int) -> None:
-            if self._many is not None:
-                domain_energy[start:stop], logit[start:stop] = self._many.outputs(codes[start:stop])
+            if many is not None:
+                domain_energy[start:stop], logit[start:stop] = many.outputs(codes[start:stop])
+            if network is None:
                 return
-            network = self._network
             with torch.inference_mode():
                 for first in range(start, stop, BATCH_ROWS):
                     rows = slice(first, min(first + BATCH_ROWS, stop))
@@ -365,7 +369,8 @@ class CollisionPredictor:
         """What computes many poses, on the CPU faster than the network itself."""
         if self._few is None:
             return None
-        return CompiledNetwork(self._embedding, self._arrays, np.float32)
+        skin = self._few.skin
+        return CompiledNetwork(self._embedding, self._arrays, np.float32, skin)
 
     @cached_property
     def _network(self) -> PredictorNetwork:

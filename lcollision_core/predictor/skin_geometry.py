@@ -34,8 +34,8 @@ class SkinGeometry:
     ----------
     point_vertices : (P,) int64 array, ascending, the vertices that are points of the body
     members : (S, M) int32 array, each site's vertices as numbers of the skin
-    order : (O,) int32 array, all points of the body, neighbours near each other, and some of them
-        again to fill the last block
+    order : (O,) int32 array, all points of the body, neighbours near each other, and the last
+        again until O is a multiple of `BLOCK`
     apart : (P, O) float32 array, added to squared distances to the points in that order: 1 for
         pairs so near along the surface that they do not feel each other and for those that are
         there again, else 0

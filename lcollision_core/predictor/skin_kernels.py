@@ -226,29 +226,30 @@ def _rodrigues(features: Array, turns: Array) -> None:
     """
     kind = features.dtype.type
     n_points = features.shape[0]
-    sine, rest, cosine, squared = turns[0], turns[1], turns[2], turns[3]
+    s, v, c, squared = turns[0], turns[1], turns[2], turns[3]
+    # First v is half the angle less multiples of pi, s the quotient of its sine, c its cosine:
+    # where that turns the sign of one, it turns the other's too.
     for p in range(n_points):
         x, y, z = features[p, 0], features[p, 1], features[p, 2]
         squared[p] = x * x + y * y + z * z + kind(SMALLEST_SQUARED_ANGLE)
         half = kind(0.5) * math.sqrt(squared[p])
-        # Of half the angle less multiples of pi; where that turns the signs, it turns both.
         times = np.floor(half * kind(1.0 / math.pi) + kind(0.5))
-        rest[p] = half - times * kind(_PI_HEAD) - times * kind(_PI_TAIL)
-        sine[p] = cosine[p] = kind(0.0)
+        v[p] = half - times * kind(_PI_HEAD) - times * kind(_PI_TAIL)
+        s[p] = c[p] = kind(0.0)
     for k in range(len(_SINE)):
         coefficient = kind(_SINE[k])
         for p in range(n_points):
-            sine[p] = sine[p] * (rest[p] * rest[p]) + coefficient
+            s[p] = s[p] * (v[p] * v[p]) + coefficient
     for k in range(len(_COSINE)):
         coefficient = kind(_COSINE[k])
         for p in range(n_points):
-            cosine[p] = cosine[p] * (rest[p] * rest[p]) + coefficient
+            c[p] = c[p] * (v[p] * v[p]) + coefficient
     for p in range(n_points):
-        half_sine, half_cosine = sine[p] * rest[p], cosine[p]
-        quotient = half_sine / (kind(0.5) * math.sqrt(squared[p]))
-        sine[p] = quotient * half_cosine
-        rest[p] = kind(0.5) * quotient * quotient
-        cosine[p] = kind(1.0) - kind(2.0) * half_sine * half_sine
+        sine, cosine = s[p] * v[p], c[p]
+        quotient = sine / (kind(0.5) * math.sqrt(squared[p]))
+        s[p] = quotient * cosine
+        v[p] = kind(0.5) * quotient * quotient
+        c[p] = kind(1.0) - kind(2.0) * sine * sine
 
 
 @compiled

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
-from lcollision_core.predictor.config import PRESETS, PredictorConfig
+from lcollision_core.predictor.config import PRESETS, VALIDATION_SHARE, PredictorConfig
 from lcollision_core.predictor.metrics import mean_difference
 from lcollision_core.predictor.predictor import (
     CollisionPredictor,
@@ -45,6 +46,31 @@ class PredictorStatus:
     preparing: float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class RowSplit:
+    """Which rows do what: three int64 arrays of indices, ascending, no row in two of them.
+
+    Attributes
+    ----------
+    training : rows that are learnt from
+    validation : rows that choose among passes; none where the last is kept
+    held_out : rows that measure the result
+    """
+
+    training: npt.NDArray[np.int64]
+    validation: npt.NDArray[np.int64]
+    held_out: npt.NDArray[np.int64]
+
+
+def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
+    """Share out the samples 0, 1, ... of a store."""
+    is_out = is_held_out(np.arange(n_rows))
+    rest = np.flatnonzero(~is_out)
+    n_validation = int(VALIDATION_SHARE * len(rest)) if config.kept == "best" else 0
+    n_training = len(rest) - n_validation
+    return RowSplit(rest[:n_training], rest[n_training:], np.flatnonzero(is_out))
+
+
 StatusCallback = Callable[[PredictorStatus], None]
 
 
@@ -73,7 +99,8 @@ def train_predictor(
 
     Parameters
     ----------
-    rows : samples 0, 1, 2, ... of a store; at least one free and one colliding one to train on
+    rows : samples 0, 1, 2, ... of a store; at least one free and one colliding one to train on.
+        Where the best pass is kept, a tenth of those not held out only chooses it.
     embedding : of the model that the rows label
     config : the choices, by default the preset "default"
     store : what the rows label, kept with the predictor
@@ -100,15 +127,16 @@ def train_predictor(
 
     config = PRESETS["default"] if config is None else config
     require_model(rows, embedding)
-    held_out = is_held_out(np.arange(len(rows)))
-    colliding = rows.colliding & ~held_out
-    n_training, n_colliding = int((~held_out).sum()), int(colliding.sum())
-    if not 0 < n_colliding < n_training or not held_out.any():
+    split = split_rows(len(rows), config)
+    energy = rows.energy[split.training]
+    colliding = rows.colliding[split.training]
+    n_training, n_colliding = len(colliding), int(colliding.sum())
+    if not 0 < n_colliding < n_training or not len(split.held_out):
         raise LabelStoreError(
             f"{n_colliding} of the {n_training} rows to train on collide and "
-            f"{int(held_out.sum())} are held out; training needs some of each: label more samples"
+            f"{len(split.held_out)} are held out; training needs some of each: label more samples"
         )
-    scale = float(rows.energy[colliding].mean())
+    scale = float(energy[colliding].mean())
     if not scale > 0.0:
         raise LabelStoreError("no colliding row has any depth to learn; label more samples")
     facts = TrainingFacts(
@@ -117,11 +145,11 @@ def train_predictor(
         colliding_share=float(rows.colliding.mean()),
         seed=seed,
         energy_scale=scale,
-        margin=mean_difference(rows.energy[~held_out]) / scale,
+        margin=mean_difference(energy) / scale,
         store=store,
     )
     loop = TrainingLoop(
-        rows, embedding, config, facts, device, checkpoint, progress, cancel or CancelToken()
+        rows, split, embedding, config, facts, device, checkpoint, progress, cancel or CancelToken()
     )
     state = loop.run().state_dict()
     arrays = {name: values.detach().cpu().numpy() for name, values in state.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import combinations
 from pathlib import Path
 
@@ -213,11 +214,18 @@ def test_an_unfinished_training_says_how_to_go_on(folder: Path, tmp_path: Path) 
     for named in ("dancer", tmp_path / "dancer.safetensors"):
         checkpoint = checkpoint_path(model_destination(named))
         checkpoint.touch()
-        with pytest.raises(ModelFileError, match=rf"is not finished; .* from {checkpoint}$"):
+        with pytest.raises(
+            ModelFileError, match=rf"is not finished; .* from {re.escape(str(checkpoint))}$"
+        ):
             find_model(named)
     # A model that is trained further can be used meanwhile.
     (folder / "dancer.safetensors").touch()
     assert find_model("dancer") == folder / "dancer.safetensors"
+
+
+@pytest.mark.parametrize("path", ["", "."])
+def test_what_cannot_be_a_file_is_left_to_the_reader(path: str) -> None:
+    assert find_model(path) == Path(path)
 
 
 def test_a_file_needs_no_folder_of_models(folder: Path, tmp_path: Path) -> None:

@@ -149,13 +149,32 @@ def test_gradient_is_the_logit_s_derivative(predictor: CollisionPredictor, rows:
 
 
 def test_threads_may_share_a_predictor(predictor: CollisionPredictor, rows: LabelRows) -> None:
-    latent = rows.latent[:8].astype(np.float64)
-    expected = predictor.logit_and_gradient(latent)
+    parts = [rows.latent[start : start + 1 + start % 9] for start in range(0, 400, 10)]
+    many = [rows.latent[start : start + 70 + start % 3] for start in range(0, 400, 10)]
+
+    def both(part: np.ndarray) -> tuple[np.ndarray, ...]:
+        return *predictor.scaled_outputs(part), *predictor.logit_and_gradient(part)
+
+    expected = [both(part) for part in parts]
+    expected_many = [predictor.scaled_outputs(part) for part in many]
     with ThreadPoolExecutor(4) as pool:
-        results = list(pool.map(predictor.logit_and_gradient, [latent] * 40))
-    for logit, gradient in results:
-        np.testing.assert_array_equal(logit, expected[0])
-        np.testing.assert_array_equal(gradient, expected[1])
+        found = list(pool.map(both, parts))
+        found_many = list(pool.map(predictor.scaled_outputs, many))
+    for results, truth in ((found, expected), (found_many, expected_many)):
+        for ours, theirs in zip(results, truth, strict=True):
+            for array, known in zip(ours, theirs, strict=True):
+                np.testing.assert_array_equal(array, known)
+
+
+def test_a_result_stays_when_there_is_another(
+    predictor: CollisionPredictor, rows: LabelRows
+) -> None:
+    for n_rows in (1, 100):
+        first = predictor.scaled_outputs(rows.latent[:n_rows])
+        kept = [array.copy() for array in first]
+        predictor.scaled_outputs(rows.latent[n_rows : 2 * n_rows])
+        for array, known in zip(first, kept, strict=True):
+            np.testing.assert_array_equal(array, known)
 
 
 def test_a_model_file_and_a_pickle_keep_all(

@@ -58,6 +58,24 @@ def test_it_says_what_the_torch_network_says(
     np.testing.assert_allclose(slope, gradient, atol=1e-5 * scale)
 
 
+@pytest.mark.parametrize("n_poses", [0, 1, 9, 64, 65, 150])
+def test_single_precision_says_nearly_the_same(
+    tube_model: PoseModel, network: GeometricNetwork, n_poses: int
+) -> None:
+    many = CompiledNetwork(tube_model.embedding, _arrays(network), np.float32)
+    exact = CompiledNetwork(tube_model.embedding, _arrays(network), skin=many.skin)
+    latent = tube_model.latent_space.sample(n_poses, np.random.default_rng(4))
+    for found, known in zip(many.outputs(latent), exact.outputs(latent), strict=True):
+        np.testing.assert_allclose(found, known, rtol=1e-3, atol=1e-3)
+    logit, slope = many.logit_and_gradient(latent)
+    np.testing.assert_allclose(logit, exact.outputs(latent)[1], rtol=1e-3, atol=1e-3)
+    known = exact.logit_and_gradient(latent)[1]
+    np.testing.assert_allclose(slope, known, atol=1e-3 * np.abs(known).max(initial=1.0))
+    with torch.no_grad():
+        output = network(torch.tensor(latent, dtype=torch.float32))
+    np.testing.assert_allclose(many.outputs(latent)[1], output.logit, rtol=1e-3, atol=1e-3)
+
+
 def test_a_pose_gets_the_same_numbers_alone_and_with_others(
     tube_model: PoseModel, network: GeometricNetwork
 ) -> None:

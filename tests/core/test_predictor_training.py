@@ -20,13 +20,15 @@ from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.model import PoseModel
 from lcollision_core.predictor import LOSSES, PRESETS, Loss, PredictorStatus, loop, train_predictor
-from lcollision_core.predictor.config import VALIDATION_SHARE
 from lcollision_core.predictor.loop import rate_at
 from lcollision_core.predictor.networks import PredictorNetwork
 from lcollision_core.predictor.predictor import BATCH_ROWS
+from lcollision_core.predictor.training import split_rows
 from tests.core.predictor_rows import PAPER, config, made_up_rows, weights_of
 
 SECONDS_TO_WAIT = 120.0
+
+_MEASURED = loop._accuracy
 
 TRAIN = """
 import pickle, sys
@@ -187,51 +189,98 @@ def _written(path: Path, *parts: object) -> Path:
     return path
 
 
+def _scripted(monkeypatch: pytest.MonkeyPatch, validation: LabelRows, passes: list[float]) -> None:
+    """Let the passes be right about so many of the validation rows, whatever they are."""
+    left = iter(passes)
+
+    def accuracy(network: PredictorNetwork, rows: LabelRows) -> float:
+        is_validation = np.array_equal(rows.latent, validation.latent)
+        return next(left) if is_validation else _MEASURED(network, rows)
+
+    monkeypatch.setattr(loop, "_accuracy", accuracy)
+
+
 def test_the_best_pass_is_kept_by_rows_that_do_not_train(
     tube_model: PoseModel, rows: LabelRows, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    embedding = tube_model.embedding
-    accuracies: list[float] = []
-    kept_back: list[LabelRows] = []
+    embedding, chosen = tube_model.embedding, config(epochs=3, kept="best")
+    split = split_rows(len(rows), chosen)
+    validation = rows.taken(split.validation)
+    assert len(validation) == int(0.1 * len(np.union1d(split.training, split.validation))) > 50
+    seen: list[np.ndarray] = []
+    hook = register_module_forward_pre_hook(
+        lambda module, given: (
+            seen.append(given[0].numpy())
+            if module.training and isinstance(module, PredictorNetwork)
+            else None
+        )
+    )
+    try:
+        _scripted(monkeypatch, validation, [0.6, 0.9, 0.7])
+        best = train_predictor(rows, embedding, chosen)
+    finally:
+        hook.remove()
+    trained_on = {row.tobytes() for part in seen for row in part}
+    assert trained_on == {row.tobytes() for row in rows.latent[split.training]}
+    assert not trained_on & {row.tobytes() for row in validation.latent}
+    assert best.facts.training_rows == len(split.training)
+    # The second of three passes is the last of two.
+    _scripted(monkeypatch, validation, [0.6, 0.9])
+    second = train_predictor(rows, embedding, replace(chosen, epochs=2))
+    assert weights_of(best.to_section().arrays) == weights_of(second.to_section().arrays)
+    _scripted(monkeypatch, validation, [0.6, 0.9, 0.95])
+    third = train_predictor(rows, embedding, chosen)
+    assert weights_of(best.to_section().arrays) != weights_of(third.to_section().arrays)
 
-    def remembered(network: PredictorNetwork, measured: LabelRows) -> float:
-        accuracy = measure(network, measured)
-        if len(measured) == n_kept_back:
-            accuracies.append(accuracy)
-            kept_back.append(measured)
-        return accuracy
 
-    measure = loop._accuracy
-    monkeypatch.setattr(loop, "_accuracy", remembered)
-    held_out = is_held_out(np.arange(len(rows)))
-    n_kept_back = int(VALIDATION_SHARE * (~held_out).sum())
-    chosen = config(epochs=12, kept="best", rate=5e-3)
-    seen: list[PredictorStatus] = []
-    trained = train_predictor(rows, embedding, chosen, progress=seen.append)
-    assert len(accuracies) == 12
-    assert max(accuracies) > accuracies[-1]
-    codes = kept_back[0].latent
-    found = trained.predict(codes).collision_logit > 0.0
-    assert (found == kept_back[0].colliding).mean() == max(accuracies)
-    # They are neither among those held out nor among those trained on.
-    is_kept_back = (rows.latent[:, None] == codes[None]).all(axis=2).any(axis=1)
-    assert is_kept_back.sum() == n_kept_back
-    assert not (is_kept_back & held_out).any()
-    n_trained_on = len(rows) - held_out.sum() - n_kept_back
-    assert seen[-1].total == 12 * -(-n_trained_on // chosen.batch_rows)
+def test_a_stopped_run_remembers_its_best_pass(
+    tube_model: PoseModel, rows: LabelRows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    embedding, chosen = tube_model.embedding, config(epochs=3, kept="best")
+    checkpoint, cancel = tmp_path / "checkpoint", CancelToken()
+    validation = rows.taken(split_rows(len(rows), chosen).validation)
+
+    def stop_in_the_third_pass(status: PredictorStatus) -> None:
+        if status.epoch == 2:
+            cancel.cancel()
+
+    _scripted(monkeypatch, validation, [0.6, 0.9, 0.7])
+    whole = train_predictor(rows, embedding, chosen)
+    _scripted(monkeypatch, validation, [0.6, 0.9])
+    with pytest.raises(CancelledError):
+        train_predictor(
+            rows,
+            embedding,
+            chosen,
+            checkpoint=checkpoint,
+            progress=stop_in_the_third_pass,
+            cancel=cancel,
+        )
+    _scripted(monkeypatch, validation, [0.7])
+    resumed = train_predictor(rows, embedding, chosen, checkpoint=checkpoint)
+    assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
 
 
-def test_numbers_too_small_for_normal_form_are_0_in_training_only() -> None:
-    tiny = torch.full((4,), 1e-40)
-    with loop.flushed_denormals():
-        assert (tiny * 0.5 == 0.0).all()
-    assert (tiny * 0.5 > 0.0).all()
+def test_running_means_never_leave_the_normal_form_of_numbers() -> None:
+    """Of a weight that has a slope in the first step only."""
+    weight = torch.nn.Parameter(torch.linspace(-1.0, 1.0, 1000))
+    optimiser = torch.optim.Adam([weight], lr=1e-3, fused=True)
+    smallest = torch.finfo(torch.float32).tiny
+    for step in range(1, 1200):
+        weight.grad = weight.detach().clone() if step == 1 else torch.zeros_like(weight)
+        optimiser.step()
+        if step % loop._STEPS_BETWEEN_CLEARINGS == 0:
+            loop._clear_tiny_moments(optimiser)
+        mean = optimiser.state[weight]["exp_avg"].abs()
+        assert not ((mean > 0.0) & (mean < smallest)).any()
+        assert step > 50 or mean.max() > 0.0
+    assert mean.max() == 0.0
 
 
 def test_a_killed_run_goes_on_to_the_same_bits(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path
 ) -> None:
-    embedding, chosen = tube_model.embedding, config(epochs=12, kept="best")
+    embedding, chosen = tube_model.embedding, config(epochs=12)
     checkpoint = tmp_path / "checkpoint"
     job = _written(tmp_path / "job", rows, embedding, chosen, checkpoint)
     write_always = (
@@ -294,16 +343,16 @@ def test_rows_that_cannot_teach_are_refused(tube_model: PoseModel, rows: LabelRo
     energy[11], latent[17, 2] = np.nan, np.inf
     for broken, row in ((replace(rows, energy=energy), 11), (replace(rows, latent=latent), 17)):
         with pytest.raises(ShapeError, match=rf"row {row} \(from 0\) has a number that is not fin"):
-            train_predictor(broken, embedding, PAPER)
+            train_predictor(broken, embedding, config())
     foreign = replace(rows, latent=rows.latent[:, :-1])
     size = embedding.latent_size
     with pytest.raises(ShapeError, match=f"have {size - 1} codes .* the model has {size}"):
-        train_predictor(foreign, embedding, PAPER)
+        train_predictor(foreign, embedding, config())
     none = replace(rows, n_pairs=0 * rows.n_pairs)
     with pytest.raises(LabelStoreError, match="0 of the 1050 rows to train on collide"):
-        train_predictor(none, embedding, PAPER)
+        train_predictor(none, embedding, config())
     with pytest.raises(LabelStoreError, match="0 are held out"):
-        train_predictor(rows.head(6), embedding, PAPER)
+        train_predictor(rows.head(6), embedding, config())
     with pytest.raises(LCollisionError, match="no device 'abacus'"):
         train_predictor(rows, embedding, PAPER, device="abacus")
 
