@@ -44,26 +44,16 @@ def products(latent: Array, tables: Array, blocks: npt.NDArray[np.int64], output
                 out[:] = latent.dtype.type(0.0)
                 # Four codes at a time, so that the outputs are touched less often.
                 for k in range(first, last - 3, 4):
-                    place = table + (k - first) * width
-                    row0, row1 = (
-                        tables[place + start : place + stop],
-                        tables[place + width + start :],
-                    )
-                    row2, row3 = (
-                        tables[place + 2 * width + start :],
-                        tables[place + 3 * width + start :],
-                    )
-                    c0, c1, c2, c3 = (
-                        latent[b, k],
-                        latent[b, k + 1],
-                        latent[b, k + 2],
-                        latent[b, k + 3],
-                    )
+                    place = table + (k - first) * width + start
+                    row0, row1 = tables[place:], tables[place + width :]
+                    row2, row3 = tables[place + 2 * width :], tables[place + 3 * width :]
+                    c0, c1 = latent[b, k], latent[b, k + 1]
+                    c2, c3 = latent[b, k + 2], latent[b, k + 3]
                     for n in range(len(out)):
                         out[n] += c0 * row0[n] + c1 * row1[n] + c2 * row2[n] + c3 * row3[n]
                 for k in range(last - (last - first) % 4, last):
-                    place = table + (k - first) * width
-                    code, row0 = latent[b, k], tables[place + start : place + stop]
+                    place = table + (k - first) * width + start
+                    code, row0 = latent[b, k], tables[place:]
                     for n in range(len(out)):
                         out[n] += code * row0[n]
         table += (last - first) * width

@@ -19,7 +19,6 @@ from lcollision_core.predictor.predictor import (
     CollisionPredictor,
     TrainingFacts,
     evaluate_predictor,
-    held_out_rows,
     require_model,
 )
 
@@ -154,4 +153,4 @@ def train_predictor(
     state = loop.run().state_dict()
     arrays = {name: values.detach().cpu().numpy() for name, values in state.items()}
     predictor = CollisionPredictor(embedding, arrays, config, facts)
-    return predictor.with_metrics(evaluate_predictor(predictor, held_out_rows(rows)))
+    return predictor.with_metrics(evaluate_predictor(predictor, rows.taken(split.held_out)))
