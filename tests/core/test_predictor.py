@@ -58,7 +58,8 @@ def test_the_paper_s_preset_is_the_paper_s() -> None:
             schedule="constant",
             batch_rows=32,
             epochs=30,
-            # The paper does not say which pass it kept.
+            # The paper does not say which weights it kept.
+            average_passes=1.0,
             kept="best",
         )
         == PAPER

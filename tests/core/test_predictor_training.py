@@ -233,10 +233,40 @@ def test_the_best_pass_is_kept_by_rows_that_do_not_train(
     assert weights_of(best.to_section().arrays) != weights_of(third.to_section().arrays)
 
 
-def test_a_stopped_run_remembers_its_best_pass(
+def test_the_mean_of_the_weights_is_kept(tube_model: PoseModel, rows: LabelRows) -> None:
+    """That of every tenth step: the newest count alike at first, then exponentially."""
+    chosen = config(epochs=1, batch_rows=16, average_passes=0.5)
+    n_steps = -(-len(split_rows(len(rows), chosen).training) // 16)
+    seen: list[dict[str, np.ndarray]] = []
+
+    def look(module: torch.nn.Module, given: object) -> None:  # noqa: ARG001
+        if module.training and isinstance(module, PredictorNetwork):
+            # Before a step, the weights are those after the one before.
+            seen.append({name: part.numpy().copy() for name, part in module.state_dict().items()})
+
+    hook = register_module_forward_pre_hook(look)
+    try:
+        averaged = train_predictor(rows, tube_model.embedding, chosen)
+    finally:
+        hook.remove()
+    assert len(seen) == n_steps > 60
+    share = 10 / (0.5 * n_steps)
+    assert 1 / 4 < share < 1 / 2
+    mean = seen[10]
+    for count, step in enumerate(range(20, n_steps, 10), start=2):
+        weight = max(share, 1 / count)
+        mean = {name: (1 - weight) * mean[name] + weight * seen[step][name] for name in mean}
+    arrays = averaged.to_section().arrays
+    for name, values in mean.items():
+        np.testing.assert_allclose(arrays[name], values, rtol=1e-4, atol=1e-6)
+    last = train_predictor(rows, tube_model.embedding, replace(chosen, average_passes=0.0))
+    assert weights_of(last.to_section().arrays) != weights_of(arrays)
+
+
+def test_a_stopped_run_remembers_its_best_pass_and_its_mean_weights(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    embedding, chosen = tube_model.embedding, config(epochs=3, kept="best")
+    embedding, chosen = tube_model.embedding, config(epochs=3, average_passes=1.0, kept="best")
     checkpoint, cancel = tmp_path / "checkpoint", CancelToken()
     validation = rows.taken(split_rows(len(rows), chosen).validation)
 
