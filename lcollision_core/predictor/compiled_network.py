@@ -3,8 +3,8 @@
 `GeometricNetwork` spends most of a single pose's time on passing from one operation of torch to the
 next, a third of a batch's on new memory, and a program that only drags sliders would spend seconds
 on importing it. Here the same loops are called one after the other on arrays that are used again,
-and back again for the gradients. Of many poses the small networks' products are torch's, which take
-a third of the time.
+and back again for the gradients. Of many poses the products are torch's, which take a third of the
+time, and the skin has loops of its own, see `compiled_skin`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.predictor import field_kernels, network_kernels, skin_kernels
+from lcollision_core.predictor import field_kernels, network_kernels
+from lcollision_core.predictor.compiled_skin import SkinMap, SkinOfFew, SkinOfMany, SkinOfPoses
 from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
 from lcollision_core.predictor.network_kernels import ROWS_AT_ONCE, SQUASHED
 from lcollision_core.predictor.skin_geometry import SkinGeometry
@@ -43,7 +43,8 @@ class CompiledNetwork:
     ----------
     embedding : of the body
     state : the state dict of a `GeometricNetwork`, as arrays
-    kind : what it computes in: double precision for a few poses, or float32 for many
+    kind : what it computes in: double precision for a few poses, or float32 for many, which has no
+        derivatives
     skin : of the embedding and the state's sites, where that is known already
 
     Raises
@@ -67,16 +68,13 @@ class CompiledNetwork:
         self._kind = kind
         self.skin = skin = skin or SkinGeometry.of(embedding, sites, n_points)
         n_points, n_sites = skin.n_points, len(sites)
-        self._place = _Layer(
-            _shaped(state["body.points"], (3 * n_points, n_points), np.float32)[None],
-            np.zeros((1, n_points), dtype=kind),
-        )
-        self._origin = _shaped(state["body.origin"], (3, n_points), kind)
+        weight = _shaped(state["body.points"], (3 * n_points, n_points), np.float32)
+        self._skin_map = SkinMap(skin, weight, _shaped(state["body.origin"], (3, n_points), kind))
+        self._skin_of: type[SkinOfFew | SkinOfMany]
+        self._skin_of = SkinOfMany if kind == np.float32 else SkinOfFew
         self._reach = np.array(REACHES, dtype=kind)
         # Loops over numbers of two sizes are slow.
         self._apart = skin.apart.astype(kind)
-        self._offset, self._scale = skin.offset.astype(kind), skin.scale.astype(kind)
-        self._rest_frame = skin.rest_frame.astype(kind)
         n_members = sites.shape[1]
         n_sums = SUMS_A_REACH * len(REACHES)
         self._patch = _Network.read(state, "patch", n_points, n_sums, 2, kind)
@@ -98,7 +96,12 @@ class CompiledNetwork:
         return energy, logit
 
     def logit_and_gradient(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (B,) logits of (B, D) poses, and each one's (B, D) derivative by its codes."""
+        """Return (B,) logits of (B, D) poses, and each one's (B, D) derivative by its codes.
+
+        Raises
+        ------
+        TypeError : it computes in single precision.
+        """
         logit, gradient = np.empty(len(latent)), np.empty(latent.shape)
         for rows, codes, trace in self._parts(latent):
             logit[rows] = self._forward(codes, trace)
@@ -132,21 +135,15 @@ class CompiledNetwork:
 
     def _room(self, n_rows: int) -> _Trace:
         skin = self.skin
-        n_skin, n_sites = len(skin.offset), len(skin.members)
 
         def empty(*shape: int) -> Array:
             return np.empty(shape, dtype=self._kind)
 
-        n_hits = skin.n_points + n_sites
+        n_hits = skin.n_points + len(skin.members)
         return _Trace(
-            outputs=empty(n_rows, len(skin.target), N_FEATURES),
-            features=empty(n_rows, n_skin, N_FEATURES),
-            frame=empty(n_rows, len(skin.rest_frame), 3, 3),
-            rows=empty(n_rows, 3, n_skin, 3),
-            places=empty(n_rows, 3, skin.n_points),
+            skin=self._skin_of(self._skin_map, n_rows),
             sums=empty(skin.n_points, n_rows, len(REACHES), SUMS_A_REACH),
             field=empty(skin.n_points, n_rows, len(REACHES), SUMS_A_REACH),
-            view=empty(n_sites, n_rows, self._fold.n_in),
             patch=self._patch.room(n_rows),
             fold=self._fold.room(n_rows),
             hits=empty(n_rows, n_hits),
@@ -157,24 +154,15 @@ class CompiledNetwork:
 
     def _forward(self, latent: Array, trace: _Trace) -> Array:
         """Fill in all of the trace, and return (B,) logits of (B, D) codes."""
-        skin, n_rows = self.skin, len(latent)
-        products = trace.outputs.reshape(n_rows, N_FEATURES * len(skin.target))
-        skin_kernels.products(latent, skin.tables, skin.blocks, products)
-        np.tanh(products, out=products)
-        skin_kernels.add_features(
-            trace.outputs, skin.target, self._offset, self._scale, trace.features
-        )
-        skin_kernels.deform(trace.features, self._rest_frame, trace.frame, trace.rows)
-        self._place.multiply(_flat_rows(trace.rows), _flat_rows(trace.places[..., None]))
-        trace.places[:] += self._origin
-        given = trace.frame, trace.places, skin.order, self._apart, self._reach
+        skin, n_rows, posed = self.skin, len(latent), trace.skin
+        posed.set_codes(latent)
+        given = posed.frame, posed.places, skin.order, self._apart, self._reach
         field_kernels.contact_field(*given, trace.sums)
         field_kernels.normalised(trace.sums, self._reach, FULL, SOME, trace.field)
-        skin_kernels.fold_view(trace.frame, trace.rows, skin.members, trace.view)
         n_points = skin.n_points
         field = trace.field.reshape(n_points, n_rows, self._patch.n_in)
         patch = self._patch.forward(field, trace.patch)
-        fold = self._fold.forward(trace.view, trace.fold)
+        fold = self._fold.forward(posed.view, trace.fold)
         hits, values = trace.hits, trace.values[0]
         n_hits = hits.shape[1]
         for found, start, stop in ((patch, 0, n_points), (fold, n_points, n_hits)):
@@ -192,7 +180,9 @@ class CompiledNetwork:
         return logit
 
     def _backward(self, trace: _Trace) -> Array:
-        skin, n_rows = self.skin, len(trace.hits)
+        skin, posed = self.skin, trace.skin
+        if not isinstance(posed, SkinOfFew):
+            raise TypeError("derivatives are taken in double precision")
         n_points, n_hits = skin.n_points, trace.hits.shape[1]
         by_head = np.zeros_like(trace.head.outputs)
         by_head[..., 0] = 1.0
@@ -205,26 +195,12 @@ class CompiledNetwork:
         by_patch, by_fold = map(np.ascontiguousarray, np.split(by_both, [n_points]))
         by_field = self._patch.backward(trace.patch, by_patch).reshape(trace.sums.shape)
         by_view = self._fold.backward(trace.fold, by_fold)
-        by_sums, by_features, by_outputs = map(
-            np.empty_like, (trace.sums, trace.features, trace.outputs)
-        )
-        by_frame, by_places, by_rows = map(np.zeros_like, (trace.frame, trace.places, trace.rows))
+        by_sums = np.empty_like(trace.sums)
+        by_frame, by_places = np.zeros_like(posed.frame), np.zeros_like(posed.places)
         field_kernels.normalised_backward(trace.sums, self._reach, by_field, FULL, SOME, by_sums)
-        given = trace.frame, trace.places, skin.order, self._apart, self._reach, by_sums
+        given = posed.frame, posed.places, skin.order, self._apart, self._reach, by_sums
         field_kernels.contact_field_backward(*given, by_frame, by_places)
-        self._place.multiply_back(_flat_rows(by_places[..., None]), _flat_rows(by_rows))
-        skin_kernels.fold_view_backward(
-            trace.frame, trace.rows, skin.members, by_view, by_frame, by_rows
-        )
-        skin_kernels.deform_backward(
-            trace.features, self._rest_frame, by_frame, by_rows, by_features
-        )
-        given_outputs = trace.outputs, skin.target, self._scale
-        skin_kernels.add_features_backward(*given_outputs, by_features, by_outputs)
-        by_latent = np.empty((n_rows, int(skin.blocks[-1, 1])), dtype=self._kind)
-        by_products = by_outputs.reshape(n_rows, N_FEATURES * len(skin.target))
-        skin_kernels.products_backward(by_products, skin.tables, skin.blocks, by_latent)
-        return by_latent
+        return posed.by_codes(by_frame, by_places, by_view)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,27 +209,17 @@ class _Trace:
 
     Attributes
     ----------
-    outputs : (B, T, 9) tanh of the codes' products with the tables, see `SkinGeometry`
-    features : (B, Q, 9) deformation features of the skin
-    frame : (B, N, 3, 3) of the first N points, as columns
-    rows : (B, 3, Q, 3) deformation gradients
-    places : (B, 3, P) of the points, in heights
+    skin : where it is and how it is deformed
     sums, field : (P, B, 2, 8) what the points feel, before and after `normalised`
-    view : (S, B, 9 M) the deformation about the fold sites
     patch, fold, head : the small networks'
     hits : (B, P + S) logits of patches and folds being hit
     share : likewise, their softmax
     values : (1, B, 2 (P + S)) the squashed logits, then the roots of the energies
     """
 
-    outputs: Array
-    features: Array
-    frame: Array
-    rows: Array
-    places: Array
+    skin: SkinOfPoses
     sums: Array
     field: Array
-    view: Array
     patch: _Activations
     fold: _Activations
     hits: Array
@@ -404,11 +370,6 @@ def _read_layers(
             _shaped(bias, (*of_bias, width), kind).reshape(-1, width),
         )
         n_in = width
-
-
-def _flat_rows(values: Array) -> Array:
-    """View (B, 3, n, m) values as (1, 3 B, n m)."""
-    return values.reshape(1, 3 * len(values), values.shape[2] * values.shape[3])
 
 
 def _shaped(
