@@ -372,7 +372,8 @@ def search_pose(
         return -1
     boxes = work.node_boxes
     stack = work.stack
-    n_found: int = 0
+    # Not a plain 0, for which the search of leaves would be compiled apart.
+    n_found: int = int(np.int64(0))
     stack[0, 0] = 0
     stack[0, 1] = 0
     height = 1

@@ -71,7 +71,9 @@ def build_decoder(
         components = part.components.astype(np.float64)
         around = _ring_mean(components, ring[part.support][:, part.support])
         table = components @ part.self_weight.T + around @ part.ring_weight.T
-        groups.append(DecoderGroup(table.reshape(len(table), -1).astype(np.float32), part.support))
+        # Never read-only, which a model file's arrays are: loops would be compiled for both.
+        support = np.array(part.support)
+        groups.append(DecoderGroup(table.reshape(len(table), -1).astype(np.float32), support))
     numbers = np.where(
         np.arange(N_FEATURES) < N_ROTATION, scaling.rotation_scale, scaling.stretch_scale
     )

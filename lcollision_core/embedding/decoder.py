@@ -92,7 +92,7 @@ class FeatureDecoder:
         start = 0
         for group in self.groups:
             stop = start + len(group.weights)
-            _add_group(rows[:, start:stop], group.blocks, group.support, self.scale, features)
+            _add_group(rows, start, group.blocks, group.support, self.scale, features)
             start = stop
         return features
 
@@ -130,29 +130,33 @@ class FeatureDecoder:
             raise ShapeError(
                 f"latent must have shape (B, {self.latent_size}), got {np.shape(latent)}"
             )
-        return np.ascontiguousarray(latent, dtype=np.float32)
+        return np.array(latent, dtype=np.float32, order="C")
 
 
 @compiled
 def _add_group(
-    codes: Float32Array,
+    latent: Float32Array,
+    start: int,
     blocks: Float32Array,
     support: IntArray,
     scale: FloatArray,
     features: FloatArray,
 ) -> None:
-    """Add scale * tanh(codes @ weights) to the (B, V, 9) features on the support."""
+    """Add scale * tanh(codes @ weights) to the (B, V, 9) features on the support.
+
+    The group's codes begin at number `start` of (B, D) latent ones.
+    """
     one = np.float32(1.0)
     total = np.empty(_BLOCK, dtype=np.float32)
     for block in range(len(blocks)):
         weights = blocks[block]
         first = block * _BLOCK // 9
         last = min(first + _BLOCK // 9, len(support))
-        for pose in range(len(codes)):
+        for pose in range(len(latent)):
             for i in range(_BLOCK):
-                total[i] = codes[pose, 0] * weights[0, i]
-            for k in range(1, codes.shape[1]):
-                code = codes[pose, k]
+                total[i] = latent[pose, start] * weights[0, i]
+            for k in range(1, len(weights)):
+                code = latent[pose, start + k]
                 for i in range(_BLOCK):
                     total[i] += code * weights[k, i]
             # tanh by its continued fraction at x / 4 and two double-angle steps: within 2e-7 of

@@ -87,7 +87,10 @@ def add_features(
     s0, s1, s2, s3, s4 = scale[0], scale[1], scale[2], scale[3], scale[4]
     s5, s6, s7, s8 = scale[5], scale[6], scale[7], scale[8]
     for b in range(outputs.shape[0]):
-        features[b] = offset
+        # Number by number: assigning arrays takes seconds to compile.
+        for q in range(features.shape[1]):
+            for c in range(9):
+                features[b, q, c] = offset[q, c]
         for n in range(outputs.shape[1]):
             p = target[n]
             # All are read before any is written, so that several are computed at a time.

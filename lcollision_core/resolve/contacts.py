@@ -111,18 +111,20 @@ def pull_to_latent(
     decoder, codec = embedding.decoder, embedding.codec
     codes = latent.astype(np.float32)
     features = decoder.features(codes[None])
-    at = np.broadcast_to(features, (len(by_vertices), *features.shape[1:]))
+    at = np.repeat(features, len(by_vertices), axis=0)
     by_features = codec.decode_vjp(at, by_vertices, n_threads=1)
     by_features *= decoder.scale
     scaled = by_features.astype(np.float32)
-    result = np.zeros((len(by_vertices), len(latent)))
+    result = np.empty((len(by_vertices), len(latent)))
     start = 0
     for group in decoder.groups:
         stop = start + len(group.weights)
         total = np.empty((len(group.blocks), group.blocks.shape[2]), dtype=np.float32)
         _weigh(codes[start:stop], group.blocks, total)
         slope = np.float32(1.0) - np.tanh(total) ** 2
-        _pull_group(group.blocks, group.support, slope, scaled, result[:, start:stop])
+        part = np.zeros((len(scaled), stop - start))
+        _pull_group(group.blocks, group.support, slope, scaled, part)
+        result[:, start:stop] = part
         start = stop
     return result
 
