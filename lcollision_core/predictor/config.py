@@ -15,7 +15,7 @@ LOSSES: tuple[Loss, ...] = ("full", "no-rank", "no-depth", "entropy")
 """Table 1 of Tan et al. 2021: Ours, entropy+PD, entropy+rank, entropy."""
 
 
-LEAST_PASSES = 4
+LEAST_PASSES = 6
 """Over any number of rows, where `shown_rows` shortens a training."""
 
 VALIDATION_SHARE = 0.1

@@ -410,6 +410,6 @@ def test_many_rows_are_gone_through_less_often() -> None:
         10,
         8,
         6,
-        4,
+        6,
     ]
     assert PRESETS["paper"].passes(10_000_000) == 30
