@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, note, print_json
+from app.cli.inputs import expanded
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
@@ -17,7 +18,11 @@ def check(
     meshes: Annotated[
         list[Path],
         # readable=False: read_mesh says in its own words what is wrong with which file.
-        typer.Argument(metavar="MESH...", readable=False, help="OBJ, PLY, OFF, STL or GLB files."),
+        typer.Argument(
+            metavar="MESH...",
+            readable=False,
+            help="OBJ, PLY, OFF, STL or GLB files, or folders of them.",
+        ),
     ],
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
     near_exclusion: Annotated[
@@ -36,7 +41,7 @@ def check(
     """
     reports: list[dict[str, Any]] = []
     failed = False
-    for path in meshes:
+    for path in expanded(meshes):
         try:
             report = check_mesh(path, near_exclusion)
         except LCollisionError as error:

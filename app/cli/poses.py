@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from app.cli.console import note, progress_bar
+from app.cli.inputs import expanded
 from app.cli.models import ModelArgument
 from app.cli.results import MeshFormat, output_form, require_output, write_result
 from app.wording import counted
@@ -22,7 +23,11 @@ def encode(
     model_name: ModelArgument,
     meshes: Annotated[
         list[Path],
-        typer.Argument(metavar="MESH...", readable=False, help="Meshes of the model's topology."),
+        typer.Argument(
+            metavar="MESH...",
+            readable=False,
+            help="Meshes of the model's topology, or folders of them.",
+        ),
     ],
     output: PosesOutput,
 ) -> None:
@@ -32,7 +37,7 @@ def encode(
 
     require_output(output, ".json")
     model = PoseModel.load(model_name)
-    files = [read_mesh(path, topology=model.topology) for path in meshes]
+    files = [read_mesh(path, topology=model.topology) for path in expanded(meshes)]
     for mesh in files:
         model.require_topology(mesh.topology, str(mesh.source))
     names = unique_names(name_of_file(mesh.source) for mesh in files)

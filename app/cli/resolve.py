@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, note, print_json, progress_bar
+from app.cli.inputs import expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import (
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
     from lcollision_core.model import NamedPose, PoseModel
     from lcollision_core.resolve import ResolveResult
+
+_Detailed = Mapping[int, "npt.NDArray[np.float32]"]
+"""Meshes with what encoding lost of them, (V, 3), by the place of their request."""
 
 _FIELDS = (
     "solver_status",
@@ -50,11 +54,15 @@ _FIELDS = (
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """One pose to resolve: where it came from, and the mesh that it was encoded from or None."""
+    """One pose to resolve: where it came from, and the mesh that it was encoded from or None.
+
+    `fit_error` is the mean distance of that mesh's vertices from the pose's, in heights.
+    """
 
     source: str
     pose: NamedPose
     mesh: npt.NDArray[np.float64] | None = None
+    fit_error: float = 0.0
 
 
 def resolve(
@@ -62,7 +70,9 @@ def resolve(
     inputs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="POSES|MESH...", readable=False, help="Files of poses, or meshes to encode."
+            metavar="POSES|MESH...",
+            readable=False,
+            help="Files of poses, or meshes to encode, or folders of meshes.",
         ),
     ],
     output: Annotated[
@@ -123,7 +133,8 @@ def resolve(
     """Move poses to the nearest ones that are free of self-collisions.
 
     Exits with 0 when every pose ends free by the exact check (with --no-verify: by the
-    prediction), with 1 when one does not. A pose that is free already comes back unchanged.
+    prediction), with 1 when one does not. A pose that is free already comes back unchanged. Of a
+    mesh, what comes back is its nearest pose; --keep-detail adds what that lacks.
     """
     import numpy as np
 
@@ -149,7 +160,10 @@ def resolve(
             f"{output} would hold codes, which have no room for --keep-detail; name a mesh or a "
             f"folder"
         )
-    requests, failed = _read(model, inputs)
+    files = expanded(inputs)
+    if len(files) > 1:
+        require_one_mesh(output, form, len(files))
+    requests, failed = _read(model, files)
     if not requests:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     require_one_mesh(output, form, len(requests))
@@ -168,13 +182,15 @@ def resolve(
             )
     except LCollisionError:
         if finished:
-            _write(output, form, model, requests, finished, mesh_format, keep_detail)
+            detailed = _detailed(model, requests, finished) if keep_detail else {}
+            _write(output, form, model, requests, finished, mesh_format, detailed)
             note(f"stopped; {output} has {len(finished)} of {counted(len(requests), 'pose')}")
         raise
-    _write(output, form, model, requests, finished, mesh_format, keep_detail)
+    detailed = _detailed(model, requests, finished) if keep_detail else {}
+    _write(output, form, model, requests, finished, mesh_format, detailed)
     note(f"wrote {counted(len(requests), 'pose')} to {output}")
     results = [finished[place] for place in range(len(requests))]
-    _report(model, requests, results, as_json)
+    _report(model, requests, results, detailed, as_json)
     if sequence:
         before = np.array([request.pose.latent for request in requests])
         change = largest_correction_change(model.embedding, before, results)
@@ -268,7 +284,7 @@ def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
         f"{path} is encoded with a fit error of {100.0 * encoded.fit_error_mean:.3f} % of the "
         f"height, at most {100.0 * encoded.fit_error_max:.2f} %"
     )
-    yield _Request(str(path), pose, mesh.vertices)
+    yield _Request(str(path), pose, mesh.vertices, encoded.fit_error_mean)
 
 
 def _write(
@@ -278,18 +294,24 @@ def _write(
     requests: Sequence[_Request],
     finished: dict[int, ResolveResult],
     mesh_format: MeshFormat,
-    keep_detail: bool,
+    detailed: _Detailed,
 ) -> None:
     """Write what is finished, in the order of the requests."""
     places = sorted(finished)
     poses = [replace(requests[place].pose, latent=finished[place].latent) for place in places]
-    detailed = None
-    if keep_detail:
-        detailed = [_detailed(model, requests[place], finished[place]) for place in places]
-    write_result(output, form, model, poses, mesh_format, detailed)
+    meshes = [detailed.get(place) for place in places]
+    write_result(output, form, model, poses, mesh_format, meshes)
 
 
 def _detailed(
+    model: PoseModel, requests: Sequence[_Request], finished: Mapping[int, ResolveResult]
+) -> _Detailed:
+    """Return the fixed meshes that are free with what encoding lost of them, by place."""
+    made = {place: _with_detail(model, requests[place], finished[place]) for place in finished}
+    return {place: mesh for place, mesh in made.items() if mesh is not None}
+
+
+def _with_detail(
     model: PoseModel, request: _Request, result: ResolveResult
 ) -> npt.NDArray[np.float32] | None:
     """Return the fixed mesh with what encoding lost of it, or None where that would collide."""
@@ -314,37 +336,47 @@ def _report(
     model: PoseModel,
     requests: Sequence[_Request],
     results: Sequence[ResolveResult],
+    detailed: _Detailed,
     as_json: bool,
 ) -> None:
     rows: list[dict[str, Any]] = []
-    for request, result in zip(requests, results, strict=True):
+    for place, (request, result) in enumerate(zip(requests, results, strict=True)):
         if result.note:
             note(f"{request.source}: {result.note}")
         facts = {name: getattr(result, name) for name in _FIELDS}
         rows.append({"source": request.source} | facts | {"near_exclusion": model.near_exclusion})
         if not as_json:
-            typer.echo(f"{request.source}: {_sentence(result)}")
+            typer.echo(f"{request.source}: {_sentence(request, result, place in detailed)}")
     if as_json:
         print_json(rows)
     else:
         note_near_exclusion(model)
 
 
-def _sentence(result: ResolveResult) -> str:
+def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str:
+    """Say what became of one pose; figures of a mesh are those of the pose nearest to it."""
     from lcollision_core.resolve import Step
 
     moved = (
         f"moved by {100.0 * result.vertex_distance_mean:.2f} % of the height, at most "
         f"{100.0 * result.vertex_distance_max:.1f} %"
     )
-    spent = f"({result.seconds:.2f} s)"
+    pairs = result.pairs_before if result.exactly_free else result.pairs_after
+    counted_pairs = counted(pairs or 0, "pair of faces", "pairs of faces")
     if result.exactly_free is None:
         verdict = "predicted free" if result.predicted_free else "still predicted to collide"
-        return f"{verdict}, not checked, {moved} {spent}"
-    if not result.exactly_free:
-        pairs = counted(result.pairs_after or 0, "pair of faces", "pairs of faces")
-        return f"still colliding, {pairs} {spent}"
-    if result.step == Step.UNCHANGED:
-        return f"free as it is, unchanged {spent}"
-    pairs = counted(result.pairs_before or 0, "pair of faces", "pairs of faces")
-    return f"exactly free of {pairs}, by the step {result.step!s}, {moved} {spent}"
+        said = [verdict, "not checked", moved]
+    elif not result.exactly_free:
+        said = ["still colliding", counted_pairs]
+    elif result.step == Step.UNCHANGED:
+        said = ["free as it is"]
+    else:
+        said = [f"exactly free of {counted_pairs}", f"by the step {result.step!s}", moved]
+    if has_detail:
+        said.append("with its detail")
+    elif request.mesh is not None:
+        fit = f"{100.0 * request.fit_error:.2f} % of the height off"
+        said.append(f"given back as its fit, {fit}")
+    elif result.step == Step.UNCHANGED:
+        said.append("unchanged")
+    return f"{', '.join(said)} ({result.seconds:.2f} s)"

@@ -18,6 +18,7 @@ from lcollision_core.meshes.files import (
 )
 from lcollision_core.meshes.pose_set import (
     PoseSet,
+    mesh_files,
     read_pose_set,
     write_pose_set,
 )
@@ -41,6 +42,7 @@ __all__ = [
     "fit_rigid",
     "height",
     "inspect_pose_set",
+    "mesh_files",
     "read_mesh",
     "read_pose_set",
     "require_writable",

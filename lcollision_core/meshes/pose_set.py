@@ -96,6 +96,24 @@ def natural_key(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if place % 2 else part for place, part in enumerate(parts)], path.name
 
 
+def mesh_files(folder: Path) -> tuple[list[Path], list[str]]:
+    """Return the mesh files of a folder in natural order, and the names of what else it holds.
+
+    What is hidden does not count.
+
+    Raises
+    ------
+    MeshFileError : it cannot be listed.
+    """
+    try:
+        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+    except OSError as error:
+        raise MeshFileError(f"{folder} cannot be listed: {error.strerror or error}") from error
+    files = [entry for entry in entries if entry.suffix.lower() in READABLE_SUFFIXES]
+    others = sorted({entry.name for entry in entries} - {file.name for file in files})
+    return sorted(files, key=natural_key), others
+
+
 def read_pose_set(
     path: str | os.PathLike[str],
     progress: Progress = no_progress,
@@ -218,12 +236,10 @@ def _collect_folder(
     cancel: CancelToken | None,
 ) -> Collected:
     try:
-        entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
-    except OSError as error:
-        report(MeshFileError(f"{path} cannot be listed: {error.strerror or error}"))
+        files, others = mesh_files(path)
+    except MeshFileError as error:
+        report(error)
         return Collected(None, 0, same_topology=False)
-    files = [entry for entry in entries if entry.suffix.lower() in READABLE_SUFFIXES]
-    files.sort(key=natural_key)
     formats = Counter(file.suffix.lower() for file in files)
     if len(formats) != 1:
         held = ", ".join(f"{count} {suffix}" for suffix, count in sorted(formats.items()))
@@ -270,10 +286,8 @@ def _collect_folder(
         note if times == len(names) else f"{note} (in {times} of {len(names)} files)"
         for note, times in notes.items()
     ]
-    n_ignored = len(entries) - len(files)
-    if n_ignored:
-        ignored = sorted(entry.name for entry in entries if entry not in set(files))
-        sentences.append(f"{n_ignored} other entries were ignored: {', '.join(ignored[:5])}")
+    if others:
+        sentences.append(f"{len(others)} other entries were ignored: {', '.join(others[:5])}")
     pose_set = PoseSet(vertices[: len(names)], topology, tuple(names), path, tuple(sentences))
     return Collected(pose_set, len(files), same_topology)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 from lcollision_core.bundled import bundled_folder
@@ -75,7 +76,11 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
         )
     if len(path.parts) == 1:
         names = ", ".join(model.name for model in listed) or "none yet"
-        raise ModelFileError(f"there is no model or file {path.name!r}; the models are: {names}")
+        close = get_close_matches(path.name, [model.name for model in listed], 1)
+        meant = f" (did you mean {close[0]}?)" if close else ""
+        raise ModelFileError(
+            f"there is no model or file {path.name!r}{meant}; the models are: {names}"
+        )
     return path
 
 

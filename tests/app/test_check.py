@@ -57,6 +57,23 @@ def test_one_face_is_no_faces(lcollision: Lcollision, tmp_path: Path) -> None:
     assert "(3 vertices, 1 face, " in lcollision("check", tmp_path / "one.obj").stdout
 
 
+def test_a_folder_stands_for_its_meshes(
+    lcollision: Lcollision, apart: Path, stabbed: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    assert lcollision("check", folder, apart).exit_code == 2
+    (folder / "a10.obj").write_text(stabbed.read_text())
+    (folder / "a9.obj").write_text(apart.read_text())
+    result = lcollision("check", "--json", apart, folder)
+    assert result.exit_code == 1
+    assert [(report["file"], report["colliding"]) for report in json.loads(result.stdout)] == [
+        (str(apart), False),
+        (str(folder / "a9.obj"), False),
+        (str(folder / "a10.obj"), True),
+    ]
+
+
 def test_several_files_come_in_order(lcollision: Lcollision, apart: Path, stabbed: Path) -> None:
     result = lcollision("check", "--json", apart, stabbed, apart)
     assert result.exit_code == 1

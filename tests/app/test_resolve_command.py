@@ -202,6 +202,49 @@ def test_a_folder_takes_several(
         assert n_pairs(model, read_mesh(file).vertices) == 0
 
 
+def test_a_folder_stands_for_its_meshes(
+    lcollision: Lcollision,
+    model: PoseModel,
+    model_file: Path,
+    colliding: np.ndarray,
+    tmp_path: Path,
+) -> None:
+    folder, out = tmp_path / "scans", tmp_path / "free"
+    folder.mkdir()
+    colliding_mesh(model, colliding[0], folder / "scan10.obj")
+    colliding_mesh(model, np.zeros(model.latent_size), folder / "scan2.obj")
+    (folder / "notes.txt").write_text("both of Monday")
+    result = lcollision("resolve", model_file, folder, "-o", out)
+    assert result.exit_code == 0, result.stderr
+    first, second = result.stdout.splitlines()
+    assert first.startswith(f"{folder / 'scan2.obj'}: free as it is, given back as its fit, ")
+    assert second.startswith(f"{folder / 'scan10.obj'}: exactly free of ")
+    assert ", given back as its fit, " in second
+    assert "unchanged" not in result.stdout
+    assert {file.name for file in out.iterdir()} == {"scan2.obj", "scan10.obj"}
+    result = lcollision("resolve", model_file, folder / "scan2.obj", "-o", out, "--keep-detail")
+    assert ": free as it is, with its detail (" in result.stdout
+    poses = tmp_path / "scans.json"
+    assert lcollision("encode", model_file, folder, "-o", poses).exit_code == 0
+    assert [pose.name for pose in read_poses(poses, model)] == ["scan2", "scan10"]
+
+
+def test_a_folder_of_nothing_and_one_mesh_for_several_are_refused_at_once(
+    lcollision: Lcollision, model: PoseModel, model_file: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    result = lcollision("resolve", model_file, folder, "-o", tmp_path / "free")
+    assert result.exit_code == 2
+    assert f"{folder} holds no mesh; name a folder of .obj" in result.stderr
+    for name in "ab":
+        colliding_mesh(model, np.zeros(model.latent_size), folder / f"{name}.obj")
+    result = lcollision("resolve", model_file, folder, "-o", tmp_path / "one.obj")
+    assert result.exit_code == 2
+    assert "one.obj is one mesh, but there are 2 poses; name a folder" in result.stderr
+    assert "encoded" not in result.stderr
+
+
 def test_the_near_exclusion_is_stated(
     lcollision: Lcollision, model: PoseModel, colliding: np.ndarray, tmp_path: Path
 ) -> None:

@@ -206,6 +206,8 @@ def test_users_models_are_found_by_name(folder: Path) -> None:
 def test_an_unknown_name_lists_those_that_there_are(folder: Path) -> None:
     folder.mkdir(parents=True)
     (folder / "tail.safetensors").write_bytes(b"")
+    with pytest.raises(ModelFileError, match=r"'tial' \(did you mean tail\?\); the models are: "):
+        find_model("tial")
     with pytest.raises(ModelFileError, match=r"no model or file 'trunk'; .*\btail\b"):
         find_model("trunk")
 
