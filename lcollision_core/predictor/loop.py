@@ -95,6 +95,7 @@ class TrainingLoop:
         self._losses: list[float] = []
         self._accuracy: float | None = None
         self._average: AveragedModel | None = None
+        self._averaged_every = min(_STEPS_BETWEEN_AVERAGES, self._steps_an_epoch)
         self._best: dict[str, torch.Tensor] = {}
         self._best_accuracy = -1.0
         self._reported = -math.inf
@@ -128,7 +129,7 @@ class TrainingLoop:
         optimiser = torch.optim.Adam(learnt, lr=config.rate, fused=True)
         if config.average_passes > 0.0:
             averaged_steps = config.average_passes * self._steps_an_epoch
-            self._average = _averaged(network, min(_STEPS_BETWEEN_AVERAGES / averaged_steps, 1.0))
+            self._average = _averaged(network, min(self._averaged_every / averaged_steps, 1.0))
         step = self._restore(checkpoint, network, optimiser)
         processes.require_same(step)
         shared: torch.nn.Module = network
@@ -162,7 +163,7 @@ class TrainingLoop:
             step += 1
             if step % _STEPS_BETWEEN_CLEARINGS == 0:
                 _clear_tiny_moments(optimiser)
-            if self._average is not None and step % _STEPS_BETWEEN_AVERAGES == 0:
+            if self._average is not None and step % self._averaged_every == 0:
                 self._average.update_parameters(network)
             self._losses.append(processes.sum_of(loss))
             if not math.isfinite(self._losses[-1]):

@@ -263,6 +263,13 @@ def test_the_mean_of_the_weights_is_kept(tube_model: PoseModel, rows: LabelRows)
     assert weights_of(last.to_section().arrays) != weights_of(arrays)
 
 
+def test_a_few_steps_are_in_the_mean_of_the_weights(tube_model: PoseModel, rows: LabelRows) -> None:
+    chosen = config(epochs=1, batch_rows=256)
+    last = train_predictor(rows, tube_model.embedding, chosen)
+    averaged = train_predictor(rows, tube_model.embedding, replace(chosen, average_passes=1.0))
+    assert weights_of(averaged.to_section().arrays) == weights_of(last.to_section().arrays)
+
+
 def test_a_stopped_run_remembers_its_best_pass_and_its_mean_weights(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
