@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -51,9 +52,9 @@ def test_the_frame_is_what_the_model_decodes_and_predicts(
     assert exact is not None
     assert frame.prediction is not None
     assert (frame.vertices == model.decode(colliding).astype(np.float32)).all()
-    # As the live thread does: torch's sums depend on how many threads share them.
-    keep_torch_to_one_thread(model)
-    predicted = model.predict(colliding)
+    # In a thread like the live one: torch's sums depend on how many share them.
+    with ThreadPoolExecutor(1, "one", keep_torch_to_one_thread, (model,)) as pool:
+        predicted = pool.submit(model.predict, colliding).result()
     assert frame.prediction.collision_probability == predicted.collision_probability[0]
     assert (frame.prediction.domain_energy == predicted.domain_energy[0]).all()
     found = model.detector.detect(frame.vertices)
