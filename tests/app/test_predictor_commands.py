@@ -61,8 +61,10 @@ def trained(model: Path, store: Path) -> Path:
         [*command, "--preset", "paper", "--seed", "3"], check=True, capture_output=True, text=True
     )
     assert result.stdout == ""
-    assert result.stderr.startswith(f"lcollision: wrote {path}: ")
-    assert f" of {3 * N_ROWS // 10} unseen samples right" in result.stderr
+    # On a slow machine there are lines before it that tell how far the training is.
+    said = result.stderr.splitlines()[-1]
+    assert said.startswith(f"lcollision: wrote {path}: ")
+    assert f" of {3 * N_ROWS // 10} unseen samples right" in said
     assert not path.with_name("trained.safetensors.checkpoint").exists()
     return path
 
