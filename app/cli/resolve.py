@@ -54,15 +54,11 @@ _FIELDS = (
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """One pose to resolve: where it came from, and the mesh that it was encoded from or None.
-
-    `fit_error` is the mean distance of that mesh's vertices from the pose's, in heights.
-    """
+    """One pose to resolve: where it came from, and the mesh that it was encoded from or None."""
 
     source: str
     pose: NamedPose
     mesh: npt.NDArray[np.float64] | None = None
-    fit_error: float = 0.0
 
 
 def resolve(
@@ -284,7 +280,7 @@ def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
         f"{path} is encoded with a fit error of {100.0 * encoded.fit_error_mean:.3f} % of the "
         f"height, at most {100.0 * encoded.fit_error_max:.2f} %"
     )
-    yield _Request(str(path), pose, mesh.vertices, encoded.fit_error_mean)
+    yield _Request(str(path), pose, mesh.vertices)
 
 
 def _write(
@@ -375,7 +371,7 @@ def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str
     if has_detail:
         said.append("with its detail")
     elif request.mesh is not None:
-        fit = f"{100.0 * request.fit_error:.2f} % of the height off"
+        fit = f"{100.0 * (request.pose.fit_error_mean or 0.0):.2f} % of the height off"
         said.append(f"given back as its fit, {fit}")
     elif result.step == Step.UNCHANGED:
         said.append("unchanged")
