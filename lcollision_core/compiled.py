@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import TypeVar, cast
 
 import numba
+from numba.core import event
 
 Function = TypeVar("Function", bound=Callable[..., object])
+
+_log = logging.getLogger(__name__)
 
 
 def compiled(function: Function) -> Function:
@@ -39,3 +43,20 @@ def _compiled(function: Function, fastmath: bool | set[str]) -> Function:
         # account without a home: slow at every start is better than not at all.
         dispatcher = numba.njit(**options)(function)
     return cast(Function, dispatcher)
+
+
+class _Compilations(event.Listener):  # type: ignore[misc]  # numba has no types
+    """Logs the first one of the process: what comes from the cache is none."""
+
+    _logged = False
+
+    def on_start(self, _: object) -> None:
+        if not self._logged:
+            self._logged = True
+            _log.info("compiling for this processor, which takes some seconds once")
+
+    def on_end(self, _: object) -> None:
+        pass
+
+
+event.register("numba:compile", _Compilations())

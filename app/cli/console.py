@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -45,6 +46,21 @@ def print_json(document: Any) -> None:
 def note(sentence: str) -> None:
     """Tell the user something beside the answer, on standard error."""
     typer.echo(f"lcollision: {sentence}", err=True)
+
+
+class _Notes(logging.Handler):
+    """Tells what is logged as notes."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        note(record.getMessage())
+
+
+def tell_what_takes_time() -> None:
+    """Show on a terminal what the core logs of work that nobody asked for, such as compiling."""
+    core = logging.getLogger("lcollision_core")
+    if sys.stderr.isatty() and not core.handlers:
+        core.addHandler(_Notes())
+        core.setLevel(logging.INFO)
 
 
 class _StatusLines:

@@ -86,6 +86,8 @@ def label(
         "near_exclusion": model.near_exclusion,
         "seconds": seconds,
     }
+    if store.n_rows > count:
+        note(f"{output} has more than the {count} asked for, and keeps them")
     if as_json:
         print_json(report)
         return

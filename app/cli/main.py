@@ -26,7 +26,7 @@ from app.cli import (
     resolve,
     train,
 )
-from app.cli.console import ExitStatus
+from app.cli.console import ExitStatus, tell_what_takes_time
 from lcollision_core.errors import CancelledError, LCollisionError
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -124,6 +124,7 @@ def _global_options(
         typer.Option("--version", callback=_print_version, is_eager=True, help="Say the version."),
     ] = False,
 ) -> None:
+    tell_what_takes_time()
     edit.edit_without_command(context)
 
 

@@ -7,11 +7,10 @@ from typing import Annotated
 
 import typer
 
-from app.cli.console import note, progress_bar
+from app.cli.console import progress_bar
 from app.cli.inputs import expanded
 from app.cli.models import ModelArgument
-from app.cli.results import MeshFormat, output_form, require_output, write_result
-from app.wording import counted
+from app.cli.results import MeshFormat, OutputForm, output_form, require_output, write_result
 from lcollision_core.errors import PoseSetError
 
 PosesOutput = Annotated[
@@ -33,7 +32,7 @@ def encode(
 ) -> None:
     """Turn meshes into latent poses, and say how well each fits."""
     from lcollision_core.meshes import read_mesh
-    from lcollision_core.model import NamedPose, PoseModel, name_of_file, unique_names, write_poses
+    from lcollision_core.model import NamedPose, PoseModel, name_of_file, unique_names
 
     require_output(output, ".json")
     model = PoseModel.load(model_name)
@@ -50,12 +49,13 @@ def encode(
                 raise PoseSetError(f"{mesh.source} cannot be encoded: {error}") from error
             poses.append(NamedPose.of_mesh(name, encoded))
             progress(len(poses), len(files))
-    write_poses(output, model, poses)
+    written = write_result(output, OutputForm.POSES, model, poses)
     for pose in poses:
         typer.echo(
             f"{pose.name}: fit error {100.0 * (pose.fit_error_mean or 0.0):.3f} % of the height, "
             f"at most {100.0 * (pose.fit_error_max or 0.0):.2f} %"
         )
+    written.note()
 
 
 def decode(
@@ -82,8 +82,7 @@ def decode(
     form = output_form(output)
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
-    write_result(output, form, model, named, mesh_format)
-    note(f"wrote {counted(len(named), 'pose')} to {output}")
+    write_result(output, form, model, named, mesh_format).note()
 
 
 def sample(
@@ -97,7 +96,7 @@ def sample(
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal poses.")] = 0,
 ) -> None:
     """Draw latent poses from the box of 1.2 times the training range."""
-    from lcollision_core.model import NamedPose, PoseModel, sample_poses, write_poses
+    from lcollision_core.model import NamedPose, PoseModel, sample_poses
 
     require_output(output, ".json")
     model = PoseModel.load(model_name)
@@ -105,5 +104,4 @@ def sample(
         latent = sample_poses(model, count, seed, colliding, progress)
     width = len(str(count))
     poses = [NamedPose(f"sample {place + 1:0{width}d}", row) for place, row in enumerate(latent)]
-    write_poses(output, model, poses)
-    note(f"wrote {counted(count, 'pose')} to {output}")
+    write_result(output, OutputForm.POSES, model, poses).note()

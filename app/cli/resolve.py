@@ -16,6 +16,7 @@ from app.cli.models import ModelArgument
 from app.cli.results import (
     MeshFormat,
     OutputForm,
+    WrittenPoses,
     note_near_exclusion,
     output_form,
     require_one_mesh,
@@ -183,10 +184,10 @@ def resolve(
             note(f"stopped; {output} has {len(finished)} of {counted(len(requests), 'pose')}")
         raise
     detailed = _detailed(model, requests, finished) if keep_detail else {}
-    _write(output, form, model, requests, finished, mesh_format, detailed)
-    note(f"wrote {counted(len(requests), 'pose')} to {output}")
+    written = _write(output, form, model, requests, finished, mesh_format, detailed)
+    written.note()
     results = [finished[place] for place in range(len(requests))]
-    _report(model, requests, results, detailed, as_json)
+    _report(model, requests, results, written.files, detailed, as_json)
     if sequence:
         before = np.array([request.pose.latent for request in requests])
         change = largest_correction_change(model.embedding, before, results)
@@ -291,12 +292,12 @@ def _write(
     finished: dict[int, ResolveResult],
     mesh_format: MeshFormat,
     detailed: _Detailed,
-) -> None:
+) -> WrittenPoses:
     """Write what is finished, in the order of the requests."""
     places = sorted(finished)
     poses = [replace(requests[place].pose, latent=finished[place].latent) for place in places]
     meshes = [detailed.get(place) for place in places]
-    write_result(output, form, model, poses, mesh_format, meshes)
+    return write_result(output, form, model, poses, mesh_format, meshes)
 
 
 def _detailed(
@@ -332,6 +333,7 @@ def _report(
     model: PoseModel,
     requests: Sequence[_Request],
     results: Sequence[ResolveResult],
+    files: Sequence[Path],
     detailed: _Detailed,
     as_json: bool,
 ) -> None:
@@ -340,7 +342,8 @@ def _report(
         if result.note:
             note(f"{request.source}: {result.note}")
         facts = {name: getattr(result, name) for name in _FIELDS}
-        rows.append({"source": request.source} | facts | {"near_exclusion": model.near_exclusion})
+        named = {"source": request.source, "output": str(files[place])}
+        rows.append(named | facts | {"near_exclusion": model.near_exclusion})
         if not as_json:
             typer.echo(f"{request.source}: {_sentence(request, result, place in detailed)}")
     if as_json:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli.console import note
+from app.wording import counted
 from lcollision_core.errors import LCollisionError, MeshFileError
 
 if TYPE_CHECKING:
@@ -38,6 +40,30 @@ class OutputForm(Enum):
     POSES = auto()
     MESH = auto()
     FOLDER = auto()
+
+
+@dataclass(frozen=True)
+class WrittenPoses:
+    """Where poses went.
+
+    Attributes
+    ----------
+    output : as it was named
+    files : of each pose; one file may have several
+    n_replaced : how many of the files were there before
+    """
+
+    output: Path
+    files: tuple[Path, ...]
+    n_replaced: int
+
+    def note(self) -> None:
+        """Say so on standard error."""
+        told = f"wrote {counted(len(self.files), 'pose')} to {self.output}"
+        if self.n_replaced:
+            replaced = counted(self.n_replaced, "file of the same name", "files of the same names")
+            told += f", in place of {replaced}"
+        note(told)
 
 
 def require_output(path: Path, suffix: str) -> None:
@@ -108,9 +134,9 @@ def write_result(
     form: OutputForm,
     model: PoseModel,
     poses: Sequence[NamedPose],
-    mesh_format: MeshFormat,
+    mesh_format: MeshFormat = MeshFormat.OBJ,
     vertices: Sequence[npt.NDArray[np.float32] | None] | None = None,
-) -> None:
+) -> WrittenPoses:
     """Write poses as a .json file, one pose as a mesh, or each as a mesh of a folder.
 
     Parameters
@@ -131,8 +157,9 @@ def write_result(
     from lcollision_core.resolve import exported_vertices
 
     if form is OutputForm.POSES:
+        written = WrittenPoses(output, (output,) * len(poses), int(output.exists()))
         write_poses(output, model, poses)
-        return
+        return written
     require_one_mesh(output, form, len(poses))
     files = [output]
     if form is OutputForm.FOLDER:
@@ -143,12 +170,14 @@ def write_result(
             raise MeshFileError(
                 f"the folder {output} cannot be made: {error.strerror or error}; name another"
             ) from error
+    n_replaced = sum(file.exists() for file in files)
     given = [None] * len(poses) if vertices is None else vertices
     for file, pose, mesh in zip(files, poses, given, strict=True):
         if mesh is None:
             mesh = exported_vertices(model.decode(pose.latent), pose.placement)
         # OBJ and OFF would get float32's short decimals, which float64 readers take for others.
         write_mesh(file, mesh.astype(float), model.faces)
+    return WrittenPoses(output, tuple(files), n_replaced)
 
 
 def _file_names(poses: Sequence[NamedPose]) -> list[str]:

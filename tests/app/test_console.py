@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -89,3 +92,37 @@ def test_in_a_pipe_a_line_comes_every_half_minute(name: str) -> None:
     assert line.startswith("lcollision: ")
     for words in told:
         assert words.replace("/200", " of 200").replace("%", " %").replace("  ", " ") in line
+
+
+LOOP = """\
+from lcollision_core.compiled import compiled
+
+@compiled
+def triangular(n):
+    return n * (n + 1) // 2
+"""
+
+
+def test_on_a_terminal_compiling_is_told_once_and_only_where_it_happens(tmp_path: Path) -> None:
+    (tmp_path / "loop.py").write_text(LOOP)
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "from app.cli.console import tell_what_takes_time\n"
+        "tell_what_takes_time()\n"
+        "import loop\n"
+        "assert (loop.triangular(4), loop.triangular(4.0)) == (10, 10.0)\n"
+    )
+
+    def said(opened: Callable[[], tuple[int, int]]) -> bytes:
+        ours, theirs = opened()
+        subprocess.run([sys.executable, "-c", code], stderr=theirs, check=True)
+        os.write(theirs, b".")
+        os.close(theirs)
+        text = os.read(ours, 100_000)
+        os.close(ours)
+        return text
+
+    assert said(pty.openpty).count(b"compiling") == 1
+    assert said(pty.openpty) == b"."
+    shutil.rmtree(tmp_path / "__pycache__")
+    assert said(os.pipe) == b"."

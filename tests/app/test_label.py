@@ -101,6 +101,18 @@ def test_json_is_one_document_and_a_second_run_has_nothing_to_do(
             "colliding_share": LabelStore.open(store).load().colliding.mean(),
             "near_exclusion": 0.0,
         }
+        assert result.stderr == ""
+
+
+def test_fewer_than_there_are_takes_none_away(
+    lcollision: Lcollision, model: Path, tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
+    assert lcollision("label", model, "-n", 300, "-o", store).exit_code == 0
+    result = lcollision("label", model, "-n", 200, "-o", store)
+    assert result.exit_code == 0
+    assert result.stderr == f"lcollision: {store} has more than the 200 asked for, and keeps them\n"
+    assert result.stdout.startswith(f"{store}: 300 rows of tube, ")
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_same_rows(

@@ -25,6 +25,7 @@ from tests.core.shapes import random_rotation
 
 FIELDS = [
     "source",
+    "output",
     "solver_status",
     "predicted_free",
     "exactly_free",
@@ -105,6 +106,7 @@ def test_poses_come_back_free_in_their_order(
         *(f"{poses}: pose {place}" for place in range(4)),
         f"{poses}: mean",
     ]
+    assert [row["output"] for row in rows] == [str(out)] * 5
     assert [row["exactly_free"] for row in rows] == [True] * 5
     assert [row["step"] == "unchanged" for row in rows] == [False] * 4 + [True]
     before, after = read_poses(poses, model), read_poses(out, model)
@@ -192,12 +194,17 @@ def test_a_folder_takes_several(
     lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    result = lcollision("resolve", model_file, poses, "-o", out, "--format", "off")
+    out.mkdir()
+    (out / "mean.off").write_text("an older one")
+    result = lcollision("resolve", model_file, poses, "-o", out, "--format", "off", "--json")
     assert result.exit_code == 0
-    assert sorted(file.name for file in out.iterdir()) == [
-        "mean.off",
-        *(f"pose {place}.off" for place in range(4)),
+    names = [*(f"pose {place}.off" for place in range(4)), "mean.off"]
+    assert [row["output"] for row in json.loads(result.stdout)] == [
+        str(out / name) for name in names
     ]
+    told = f"lcollision: wrote 5 poses to {out}, in place of 1 file of the same name"
+    assert told in result.stderr.splitlines()
+    assert {file.name for file in out.iterdir()} == set(names)
     for file in out.iterdir():
         assert n_pairs(model, read_mesh(file).vertices) == 0
 
