@@ -31,6 +31,7 @@ MAX_FILE_BYTES = 4 * 2**30
 
 _METADATA_KEY = "lcollision"
 _DTYPES = {
+    "F16": np.dtype(np.float16),
     "F32": np.dtype(np.float32),
     "F64": np.dtype(np.float64),
     "I32": np.dtype(np.int32),

@@ -29,7 +29,7 @@ from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.processes import Processes, joined_processes
 from lcollision_core.predictor.training import PredictorStatus, RowSplit, StatusCallback
 
-_RUN_VERSION = 5
+_RUN_VERSION = 6
 """Goes up when training changes, so that no checkpoint is continued by other rules."""
 
 _WATCHED_ROWS = 4000
@@ -53,7 +53,7 @@ _WARM_UP = 0.2
 _LEAST_RATE = 1e-2
 """Where the one-cycle schedule begins, in its largest rate."""
 
-_PART = "training"
+_PART, _PATCHES = "training", "patches"
 _NETWORK, _AVERAGE, _BEST, _OPTIMISER = "network:", "average:", "best:", "optimiser:"
 
 
@@ -85,6 +85,8 @@ class TrainingLoop:
         self._rows, self._embedding = rows, embedding
         self._config, self._facts = config, facts
         self._device_name, self._path = device, checkpoint
+        # A file of its own, for it is large, and written once.
+        self._patches_path = checkpoint and checkpoint.with_name(f"{checkpoint.name}.patches")
         self._progress, self._cancel = progress, cancel
         self._near_exclusion = 0.0 if facts.store is None else facts.store.near_exclusion
         self._training_index, self._validation_index = split.training, split.validation
@@ -112,6 +114,8 @@ class TrainingLoop:
         """
         with joined_processes(self._device_name) as processes:
             network = self._run(processes)
+        if self._patches_path is not None:
+            self._patches_path.unlink(missing_ok=True)
         judged = self._judged(network)
         if self._best:
             judged.load_state_dict(self._best)
@@ -119,7 +123,8 @@ class TrainingLoop:
 
     def _run(self, processes: Processes) -> PredictorNetwork:
         config = self._config
-        checkpoint = Checkpoint(self._path, self._key())
+        key = self._key()
+        checkpoint = Checkpoint(self._path, key)
         some = self._rows.taken(self._training_index[:_BUILDING_ROWS])
         network = NETWORKS[config.preset].build(
             self._embedding, config, some, self._facts.seed, self._near_exclusion
@@ -141,7 +146,7 @@ class TrainingLoop:
             config,
             self._facts,
             processes.device,
-            self._patch_roots(network),
+            self._patch_roots(network, key, processes),
         )
         self._preparing = None
         network.train()
@@ -173,18 +178,25 @@ class TrainingLoop:
             self._after_step(step, network, optimiser, checkpoint, processes)
         return network
 
-    def _patch_roots(self, network: PredictorNetwork) -> npt.NDArray[np.float16]:
+    def _patch_roots(
+        self, network: PredictorNetwork, key: str, processes: Processes
+    ) -> npt.NDArray[np.float16]:
+        """Label the patches, or read what an earlier run kept beside the checkpoint."""
         cells = network.skin_cells(self._embedding)
         if cells is None:
             return np.empty((len(self._training_index), 0), dtype=np.float16)
+        kept = Checkpoint(self._patches_path, key)
+        stored = kept.get(_PATCHES)
+        if stored is not None:
+            return stored.arrays["root"]
 
         def report(done: int, total: int) -> None:
             self._preparing = done / total
             self._report(0)
 
-        return patch_roots(
+        roots = patch_roots(
             self._embedding,
-            self._rows.latent,
+            self._rows,
             self._training_index,
             cells,
             self._near_exclusion,
@@ -192,6 +204,9 @@ class TrainingLoop:
             progress=report,
             cancel=self._cancel,
         )
+        if processes.rank == 0:
+            kept.put(_PATCHES, {"root": roots}, {}, now=True)
+        return roots
 
     def _after_step(
         self,

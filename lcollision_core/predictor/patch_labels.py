@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.labels import LabelRows
 from lcollision_core.predictor.folds import FoldDetector
 
 _ROWS_A_BLOCK = 256
@@ -46,7 +47,7 @@ class SkinCells:
 
 def patch_roots(
     embedding: Embedding,
-    latent: npt.NDArray[np.float32],
+    rows: LabelRows,
     index: npt.NDArray[np.int64],
     cells: SkinCells,
     near_exclusion: float,
@@ -56,15 +57,17 @@ def patch_roots(
 ) -> npt.NDArray[np.float16]:
     """Find the exact energy of each patch of skin in some poses, and of each fold.
 
+    Poses that are labelled free have none, and are not looked at again.
+
     Parameters
     ----------
     embedding : decodes
-    latent : (M, D) codes
-    index : (n,) the rows wanted
+    rows : labelled poses
+    index : (n,) those wanted
     cells : pairs within `FOLD_REACH` of each other along the surface go to the folds, if any
     near_exclusion : in heights
     energy_scale : the mean energy of a colliding pose, in squared heights
-    progress : in rows
+    progress : in rows that collide
     cancel : polled for every block of rows
 
     Returns
@@ -82,12 +85,14 @@ def patch_roots(
     roots = np.zeros((len(index), n_patches + n_folds), dtype=np.float16)
     unit = np.repeat([_PATCH_SHARE, _FOLD_SHARE], [n_patches, n_folds]) * energy_scale
 
+    places = np.flatnonzero(rows.colliding[index])
+
     def label(start: int) -> None:
         if cancel is not None:
             cancel.raise_if_cancelled()
-        part = slice(start, start + _ROWS_A_BLOCK)
-        poses = embedding.decode(latent[index[part]], n_threads=1).astype(np.float32)
-        for row, vertices in enumerate(poses, start):
+        block = places[start : start + _ROWS_A_BLOCK]
+        poses = embedding.decode(rows.latent[index[block]], n_threads=1).astype(np.float32)
+        for row, vertices in zip(block, poses, strict=True):
             contacts, pairs, depth = detector.detect(vertices)
             energy = np.zeros(n_patches + n_folds)
             energy[:n_patches] = np.bincount(cells.patch, contacts.vertex_energy, n_patches)
@@ -97,9 +102,9 @@ def patch_roots(
             hit = energy > 0.0
             roots[row, hit] = np.maximum(np.sqrt(energy[hit] / unit[hit]), _LEAST_ROOT)
 
-    starts = range(0, len(index), _ROWS_A_BLOCK)
+    starts = range(0, len(places), _ROWS_A_BLOCK)
     _ = embedding.codec, embedding.decoder
     with ThreadPoolExecutor(available_cores()) as pool:
         for done, _ in enumerate(pool.map(label, starts), start=1):
-            progress(min(done * _ROWS_A_BLOCK, len(index)), len(index))
+            progress(min(done * _ROWS_A_BLOCK, len(places)), len(places))
     return roots

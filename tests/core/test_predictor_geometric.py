@@ -40,6 +40,7 @@ from lcollision_core.predictor.folds import (
 from lcollision_core.predictor.geometric import GeometricNetwork
 from lcollision_core.predictor.networks import Targets
 from lcollision_core.predictor.patch_labels import SkinCells, patch_roots
+from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import colliding_latent, made_up_rows
 
 
@@ -343,7 +344,8 @@ def test_patches_and_folds_share_out_the_exact_energy(
         skin_cells(embedding, body_points(embedding, 25)), skin_cells(embedding, tube_folds[:, 0])
     )
     index = np.arange(0, 60, 2)
-    roots = patch_roots(embedding, latent, index, cells, 0.0, energy_scale=1e-4)
+    rows = labeller_of(tube_model).label(latent)
+    roots = patch_roots(embedding, rows, index, cells, 0.0, energy_scale=1e-4)
     assert roots.shape == (30, cells.n_patches + cells.n_folds)
     detector = CollisionDetector(embedding.topology, embedding.rest_vertices)
     vertices = embedding.decode(latent[index]).astype(np.float32)
@@ -367,13 +369,14 @@ def test_every_collision_that_counts_is_taught(
         embedding.topology, embedding.rest_vertices, near_exclusion=near_exclusion
     )
     found = detector.detect_batch(embedding.decode(latent).astype(np.float32))
+    rows = replace(labeller_of(tube_model), near_exclusion=near_exclusion).label(latent)
     patch = skin_cells(embedding, body_points(embedding, 25))
     sites = find_fold_sites(embedding, latent, near_exclusion)
     assert len(sites)
     for fold in (skin_cells(embedding, centres) for centres in (sites[:, 0], sites[:0, 0])):
         cells = SkinCells(patch, fold)
         roots = patch_roots(
-            embedding, latent, np.arange(60), cells, near_exclusion, energy_scale=1e-4
+            embedding, rows, np.arange(60), cells, near_exclusion, energy_scale=1e-4
         )
         assert ((roots > 0.0).any(axis=1) == found.colliding).all()
         shares = np.repeat([0.05, 0.005], [cells.n_patches, cells.n_folds])
@@ -389,7 +392,7 @@ def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
     with pytest.raises(CancelledError):
         patch_roots(
             tube_model.embedding,
-            _some_latent(tube_model, 4).astype(np.float32),
+            labeller_of(tube_model).label(colliding_latent(tube_model)),
             np.arange(4),
             SkinCells(zeros, zeros - 1),
             0.0,

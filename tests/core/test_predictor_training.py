@@ -23,7 +23,7 @@ from lcollision_core.predictor import LOSSES, PRESETS, Loss, PredictorStatus, lo
 from lcollision_core.predictor.loop import rate_at
 from lcollision_core.predictor.networks import PredictorNetwork
 from lcollision_core.predictor.predictor import BATCH_ROWS
-from lcollision_core.predictor.training import split_rows
+from lcollision_core.predictor.training import no_status, split_rows
 from tests.core.predictor_rows import PAPER, config, made_up_rows, weights_of
 
 SECONDS_TO_WAIT = 120.0
@@ -182,6 +182,37 @@ def test_a_cancelled_run_goes_on_to_the_same_bits(
     assert resumed.metrics == whole.metrics
     with pytest.raises(LCollisionError, match="checkpoint of another training run"):
         train_predictor(rows, embedding, config(), checkpoint=checkpoint, seed=9)
+
+
+def test_patches_are_not_labelled_again(
+    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+) -> None:
+    embedding, checkpoint, cancel = tube_model.embedding, tmp_path / "checkpoint", CancelToken()
+    chosen = replace(PRESETS["default"], epochs=1, batch_rows=256)
+
+    def stop_at_the_first_step(status: PredictorStatus) -> None:
+        if status.preparing is None:
+            cancel.cancel()
+
+    with pytest.raises(CancelledError):
+        train_predictor(
+            rows,
+            embedding,
+            chosen,
+            checkpoint=checkpoint,
+            progress=stop_at_the_first_step,
+            cancel=cancel,
+        )
+    patches = tmp_path / "checkpoint.patches"
+    assert patches.exists()
+    seen: list[PredictorStatus] = []
+    resumed, whole = (
+        train_predictor(rows, embedding, chosen, checkpoint=path, progress=progress)
+        for path, progress in ((checkpoint, seen.append), (None, no_status))
+    )
+    assert all(status.preparing is None for status in seen)
+    assert not patches.exists()
+    assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
 
 
 def _written(path: Path, *parts: object) -> Path:
