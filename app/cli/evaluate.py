@@ -28,6 +28,16 @@ def evaluate(
         int | None,
         typer.Option("--rows", min=1, metavar="N", help="Use the first N rows. Default: all."),
     ] = None,
+    threshold: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            metavar="P",
+            help="Probability above which a pose is called colliding: a higher one gives fewer "
+            "false alarms and misses more.",
+        ),
+    ] = 0.5,
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
 ) -> None:
     """Score a model's predictor against exact labels.
@@ -46,12 +56,15 @@ def evaluate(
     require_store_of(store, model)
     rows = _unseen(store, store.load(n_rows), trained)
     with cancel_on_interrupt() as cancel, progress_bar("Evaluating") as progress:
-        metrics = evaluate_predictor(trained, rows, progress=progress, cancel=cancel)
+        metrics = evaluate_predictor(
+            trained, rows, threshold=threshold, progress=progress, cancel=cancel
+        )
     if as_json:
-        print_json(metrics.to_metadata())
+        print_json({"threshold": threshold} | metrics.to_metadata())
         return
     near = store.identity.near_exclusion
-    typer.echo(f"{model.name}, preset {trained.preset}: {scores_sentence(metrics)}")
+    called = "" if threshold == 0.5 else f", called from a probability of {threshold:g} on"
+    typer.echo(f"{model.name}, preset {trained.preset}{called}: {scores_sentence(metrics)}")
     typer.echo(
         f"  {100.0 * rows.colliding.mean():.1f} % of these {counted(len(rows), 'sample')} collide"
         + (f", pairs within {near:g} heights along the surface left out" if near else "")

@@ -94,6 +94,7 @@ def measure(
     energy: FloatArray,
     margin: float,
     scores: EnergyScores,
+    threshold: float = 0.5,
 ) -> PredictorMetrics:
     """Score predictions against exact labels.
 
@@ -105,8 +106,9 @@ def measure(
     energy : (B,) PDe-sum, scaled
     margin : alpha, scaled
     scores : of the energies that are wanted
+    threshold : probability above which a pose is called colliding
     """
-    called = probability > 0.5
+    called = probability > threshold
     n_colliding = int(colliding.sum())
     n_free = len(colliding) - n_colliding
     both = scores.depth or scores.rank

@@ -402,6 +402,7 @@ def evaluate_predictor(
     predictor: CollisionPredictor,
     rows: LabelRows,
     *,
+    threshold: float = 0.5,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> PredictorMetrics:
@@ -411,6 +412,7 @@ def evaluate_predictor(
     ----------
     predictor : of the model that the rows label
     rows : at least one, none of which trained the predictor
+    threshold : probability above which a pose is called colliding
     progress : in rows
     cancel : polled every few thousand rows
 
@@ -441,6 +443,7 @@ def evaluate_predictor(
         rows.energy / scale,
         predictor.facts.margin,
         EnergyScores(depth=config.depth_weight > 0.0, rank=config.rank_weight > 0.0),
+        threshold,
     )
 
 

@@ -95,6 +95,7 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     report = json.loads(result.stdout)
     curve = report.pop("calibration")
     assert set(report) == {
+        "threshold",
         "samples",
         "accuracy",
         "false_positive_rate",
@@ -130,6 +131,12 @@ def test_all_rows_of_another_store_count(
     called = prediction.collision_probability > 0.5
     assert report["samples"] == 300
     assert report["accuracy"] == np.mean(called == rows.colliding)
+    later = json.loads(
+        lcollision("evaluate", trained, other, "--threshold", 0.9, "--json").stdout
+    )
+    assert later["threshold"] == 0.9
+    missed = (prediction.collision_probability <= 0.9)[rows.colliding]
+    assert later["false_negative_rate"] == missed.mean() > report["false_negative_rate"]
     text = lcollision("evaluate", trained, other, "--rows", 200).stdout
     assert text.startswith("trained, preset paper: ")
     assert " of 200 unseen samples right" in text

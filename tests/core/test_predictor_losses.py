@@ -91,6 +91,10 @@ def test_scores_of_eight_poses_worked_by_hand() -> None:
     assert bins[5].colliding_share == 0.5
     errors = 0.05 + 0.15 + (1.0 - 0.45) + 2 * abs(0.525 - 0.5) + 3 * (1.0 - 2.9 / 3)
     assert scores.calibration_error == pytest.approx(errors / 8)
+    later = measure(probability, predicted, colliding, energy, 0.25, BOTH, threshold=0.6)
+    assert (later.accuracy, later.false_positive_rate) == (6 / 8, 0.0)
+    assert later.false_negative_rate == 2 / 5
+    assert later.calibration == scores.calibration
 
 
 def test_ranking_score_is_the_mean_shortfall_over_random_pairs() -> None:
