@@ -67,6 +67,45 @@ def neighbour_order(places: FloatArray, block: int) -> npt.NDArray[np.int32]:
     return np.append(order, np.repeat(order[-1], -len(order) % block)).astype(np.int32)
 
 
+def with_tighter_blocks(
+    order: npt.NDArray[np.int32], between: FloatArray, block: int
+) -> npt.NDArray[np.int32]:
+    """Exchange places between blocks until no exchange brings those of a block closer together.
+
+    Neighbours in one pose, as two thighs, are none in others; neighbours along the surface stay so.
+
+    Parameters
+    ----------
+    order : as `neighbour_order` returns it, of n places
+    between : (n, n) distances along the surface, infinite where they are not known; longer ones
+        are taken for the shortest way from place to place
+    block : places in one
+    """
+    distance = csgraph.shortest_path(between, directed=False)
+    known = np.isfinite(distance)
+    squared = np.where(known, distance, 2.0 * distance[known].max()) ** 2
+    n_places = len(squared)
+    block_of = np.empty(n_places, dtype=np.int64)
+    block_of[order[:n_places]] = np.arange(n_places) // block
+    n_blocks = int(block_of.max()) + 1
+    # Of each place to all of each block.
+    total = squared @ np.eye(n_blocks)[block_of]
+    least = -1e-9 * squared.max()
+    while True:
+        to = total[:, block_of]
+        gain = to + to.T - 2.0 * squared - (np.diag(to)[:, None] + np.diag(to))
+        gain[block_of[:, None] == block_of] = 0.0
+        i, j = np.unravel_index(gain.argmin(), gain.shape)
+        if gain[i, j] >= least:
+            break
+        change = squared[:, j] - squared[:, i]
+        total[:, block_of[i]] += change
+        total[:, block_of[j]] -= change
+        block_of[i], block_of[j] = block_of[j], block_of[i]
+    better = block_of.argsort(kind="stable")
+    return np.append(better, np.repeat(better[-1], len(order) - n_places)).astype(np.int32)
+
+
 def skin_graph(embedding: Embedding) -> sparse.csr_matrix:
     """Return the (V, V) lengths of the reference's edges, in heights."""
     rest, topology = embedding.rest_vertices, embedding.topology

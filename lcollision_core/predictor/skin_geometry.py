@@ -18,6 +18,7 @@ from lcollision_core.predictor.body_points import (
     skin_distances,
     skin_graph,
     tangent_frames,
+    with_tighter_blocks,
 )
 from lcollision_core.predictor.field_kernels import BLOCK
 
@@ -101,6 +102,7 @@ class SkinGeometry:
         skin = np.append(framed, np.setdiff1d(sites, framed))
         between = skin_distances(skin_graph(embedding), vertex, limit=DISTANT)[:, vertex]
         order = neighbour_order(embedding.rest_vertices[vertex], BLOCK)
+        order = with_tighter_blocks(order, between, BLOCK)
         apart = np.isfinite(between)[:, order]
         apart[:, len(vertex) :] = True
         place = np.zeros(n_vertices, dtype=np.int32)

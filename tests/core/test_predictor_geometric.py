@@ -20,6 +20,7 @@ from lcollision_core.predictor.body_points import (
     skin_distances,
     skin_graph,
     tangent_frames,
+    with_tighter_blocks,
 )
 from lcollision_core.predictor.field import (
     Decoding,
@@ -235,6 +236,27 @@ def test_neighbours_are_in_one_block() -> None:
     assert np.array_equal(cluster[order[:19]], np.repeat([0, 1, 2], [8, 8, 3]))
     assert np.array_equal(cluster[order[19:]], [2] * 5)
     assert len(neighbour_order(places[:3], 8)) == 8
+
+
+def test_blocks_gather_what_lies_together_along_the_surface() -> None:
+    """Two lines side by side, as two thighs; one is shorter, and its block is not full."""
+    line = np.repeat([0, 1], [16, 11])
+    along = np.concatenate([np.arange(16.0), np.arange(11.0)])
+    places = np.stack([along, 0.2 * line, np.zeros(27)], axis=1)
+    steps = np.abs(along[:, None] - along)
+    between = np.where((line[:, None] == line) & (steps <= 1.0), steps, np.inf)
+    before = neighbour_order(places, 8)
+    assert len({tuple(line[block]) for block in before.reshape(4, 8)} - {(0,) * 8, (1,) * 8}) > 1
+    order = with_tighter_blocks(before, between, 8)
+    assert order.dtype == np.int32
+    assert np.array_equal(np.sort(order[:27]), np.arange(27))
+    assert np.array_equal(order[27:], np.repeat(order[26], 5))
+    blocks = order.reshape(4, 8)
+    assert sorted(tuple(line[block]) for block in blocks) == [(0,) * 8] * 2 + [(1,) * 8] * 2
+    assert max(np.ptp(along[block]) for block in blocks) <= 8.0
+    # What is known of nothing stays as it was.
+    unknown = np.where(np.eye(27) > 0.0, 0.0, np.inf)
+    assert np.array_equal(np.sort(with_tighter_blocks(before, unknown, 8)[:8]), np.sort(before[:8]))
 
 
 def _elsewhere(values: torch.Tensor) -> torch.Tensor:
