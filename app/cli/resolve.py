@@ -132,6 +132,10 @@ def resolve(
     Exits with 0 when every pose ends free by the exact check (with --no-verify: by the
     prediction), with 1 when one does not. A pose that is free already comes back unchanged. Of a
     mesh, what comes back is its nearest pose; --keep-detail adds what that lacks.
+
+    What freed a pose is told as a step: solver, the paper's problem; margin, the same with more
+    distance from collision; polish, of shallow contacts; start, from elsewhere; walk-back, towards
+    a pose known to be free; neighbour, the correction of the frame before (--sequence).
     """
     import numpy as np
 

@@ -93,7 +93,8 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
         _require_usable(vertices, faces)
         found = Topology(faces, len(vertices))
     except (MeshFileError, PoseSetError) as error:
-        raise MeshFileError(f"{path} cannot be read: {error}") from error
+        advice = "" if "; " in str(error) else "; export the mesh again"
+        raise MeshFileError(f"{path} cannot be read: {error}{advice}") from error
     vertices.flags.writeable = False
     if topology is not None and found == topology:
         found = topology

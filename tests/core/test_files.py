@@ -377,6 +377,7 @@ def test_bad_files_get_one_sentence_with_file_and_element(
     with pytest.raises(MeshFileError, match=message) as caught:
         read_mesh(path)
     assert str(caught.value).startswith(f"{path} cannot be read: ")
+    assert "; " in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
