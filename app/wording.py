@@ -31,3 +31,13 @@ def heading(name: str) -> str:
 def seconds_text(seconds: float) -> str:
     """Write a duration as in "90 ms" or "1.4 s"."""
     return f"{1000 * seconds:.0f} ms" if seconds < 0.95 else f"{seconds:.1f} s"
+
+
+_FAR = 0.03
+"""Heights by which a mesh is hardly ever off the pose nearest to it, unless it is another body."""
+
+
+def fit_error(mean: float, most: float) -> str:
+    """Say how far off the nearest pose of a mesh is, in heights."""
+    far = ", which is far: is it this body, in the model's vertex order?" if mean > _FAR else ""
+    return f"fit error of {100.0 * mean:.3f} % of the height, at most {100.0 * most:.2f} %{far}"

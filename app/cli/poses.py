@@ -11,6 +11,7 @@ from app.cli.console import progress_bar
 from app.cli.inputs import expanded
 from app.cli.models import ModelArgument
 from app.cli.results import MeshFormat, OutputForm, output_form, require_output, write_result
+from app.wording import fit_error
 from lcollision_core.errors import PoseSetError
 
 PosesOutput = Annotated[
@@ -51,10 +52,8 @@ def encode(
             progress(len(poses), len(files))
     written = write_result(output, OutputForm.POSES, model, poses)
     for pose in poses:
-        typer.echo(
-            f"{pose.name}: fit error {100.0 * (pose.fit_error_mean or 0.0):.3f} % of the height, "
-            f"at most {100.0 * (pose.fit_error_max or 0.0):.2f} %"
-        )
+        fit = fit_error(pose.fit_error_mean or 0.0, pose.fit_error_max or 0.0)
+        typer.echo(f"{pose.name}: {fit}")
     written.note()
 
 

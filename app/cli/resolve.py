@@ -22,7 +22,7 @@ from app.cli.results import (
     require_one_mesh,
     write_result,
 )
-from app.wording import counted
+from app.wording import counted, fit_error
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 
 if TYPE_CHECKING:
@@ -281,10 +281,8 @@ def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
     except LCollisionError as error:
         raise MeshFileError(f"{path} cannot be encoded: {error}") from error
     pose = NamedPose.of_mesh(name_of_file(path), encoded)
-    note(
-        f"{path} is encoded with a fit error of {100.0 * encoded.fit_error_mean:.3f} % of the "
-        f"height, at most {100.0 * encoded.fit_error_max:.2f} %"
-    )
+    fit = fit_error(encoded.fit_error_mean, encoded.fit_error_max)
+    note(f"{path} is encoded with a {fit}")
     yield _Request(str(path), pose, mesh.vertices)
 
 
@@ -374,7 +372,7 @@ def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str
     elif result.step == Step.UNCHANGED:
         said = ["free as it is"]
     else:
-        said = [f"exactly free of {counted_pairs}", f"by the step {result.step!s}", moved]
+        said = [f"freed of {counted_pairs}", f"exactly free, by the step {result.step!s}", moved]
     if has_detail:
         said.append("with its detail")
     elif request.mesh is not None:

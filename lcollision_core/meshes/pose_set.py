@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError,
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.files import READABLE_SUFFIXES, first_not_finite, read_mesh
+from lcollision_core.meshes.likeness import unlike_poses
 from lcollision_core.meshes.npz import MAX_ITEMS, read_npz, write_npz
 from lcollision_core.meshes.topology import Topology
 
@@ -135,8 +136,8 @@ def read_pose_set(
     Raises
     ------
     MeshFileError : the folder or a file cannot be read.
-    PoseSetError : a pose has another vertex count or other faces than the first, or a triangle
-        of the first has no area.
+    PoseSetError : a pose has another vertex count or other faces than the first, another size or
+        order of vertices than most, or a triangle of the first has no area.
     CancelledError : `cancel` was set.
     """
 
@@ -193,10 +194,10 @@ def collect_poses(
         report(MeshFileError(f"{path} cannot be read: {error.strerror or error}; check the name"))
         return Collected(None, 0, same_topology=False)
     if is_folder:
-        return _collect_folder(path, report, progress, cancel)
+        return _alike(_collect_folder(path, report, progress, cancel), report)
     suffix = path.suffix.lower()
     if exists and suffix == ".npz":
-        return _collect_npz(path, report, progress)
+        return _alike(_collect_npz(path, report, progress), report)
     if not exists:
         defect = f"{path} does not exist; name a folder of meshes or an .npz file"
     elif suffix in READABLE_SUFFIXES:
@@ -205,6 +206,20 @@ def collect_poses(
         defect = f"{path} is no pose set; name a folder of meshes or an .npz file"
     report(MeshFileError(defect))
     return Collected(None, 0, same_topology=False)
+
+
+def _alike(collected: Collected, report: Callable[[LCollisionError], None]) -> Collected:
+    """Leave out the poses that are another body, or the same in another unit."""
+    poses = collected.pose_set
+    unlike = {} if poses is None else unlike_poses(poses.topology, poses.vertices)
+    if poses is None or not unlike:
+        return collected
+    for pose, defect in unlike.items():
+        report(PoseSetError(f"pose {poses.names[pose]} of {poses.source} {defect}"))
+    kept = [pose for pose in range(len(poses)) if pose not in unlike]
+    names = tuple(poses.names[pose] for pose in kept)
+    alike = replace(poses, vertices=poses.vertices[kept], names=names) if kept else None
+    return replace(collected, pose_set=alike)
 
 
 def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDArray[np.int32]:

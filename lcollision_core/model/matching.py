@@ -7,13 +7,8 @@ import numpy.typing as npt
 
 from lcollision_core.errors import PoseSetError, ShapeError
 from lcollision_core.meshes import Topology, height
+from lcollision_core.meshes.likeness import LARGEST_SIZE, is_torn, scale_of
 from lcollision_core.meshes.topology import FloatArray
-
-_LARGEST_SIZE = 1.25
-"""Times larger or smaller that a body may be; poses stretch its edges by a few percent."""
-
-_UNIFORM = 1.5
-"""Between the edges that are scaled most and least, all but tenths: within it, it is the unit."""
 
 _MOST_SIZE = 20.0
 """Of meshes whose edges are not scaled alike."""
@@ -72,7 +67,8 @@ def checked_mesh(
     Raises
     ------
     ShapeError : another shape, or a coordinate that is not finite.
-    PoseSetError : larger or smaller than the reference, as in another unit.
+    PoseSetError : larger or smaller than the reference, as in another unit, or with its vertices
+        in another order.
     """
     mesh = np.asarray(vertices, dtype=np.float64)
     if mesh.shape != reference.shape:
@@ -81,15 +77,19 @@ def checked_mesh(
         vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
         raise ShapeError(f"vertex {vertex} (from 0) is not finite")
     lengths, known = (topology.edge_lengths(one) for one in (mesh, reference))
-    low, size, high = np.percentile(lengths[known > 0.0] / known[known > 0.0], (10, 50, 90))
-    limit = _LARGEST_SIZE
-    if high > _UNIFORM * low:
+    scale, limit = scale_of(lengths, known), LARGEST_SIZE
+    if scale is None:
         # Not scaled as a whole: not a pose perhaps, but no other unit unless it is far off.
-        size, limit = height(mesh) / height(reference), _MOST_SIZE
-    if not 1.0 / limit < size < limit:
-        advice = f"scale it by {1.0 / size:.3g}" if 0.0 < size < np.inf else "export it again"
+        scale, limit = height(mesh) / height(reference), _MOST_SIZE
+    if not 1.0 / limit < scale < limit:
+        advice = f"scale it by {1.0 / scale:.3g}" if 0.0 < scale < np.inf else "export it again"
         raise PoseSetError(
-            f"the mesh is {size:.3g} times as large as the body of {model!r}, which is "
+            f"the mesh is {scale:.3g} times as large as the body of {model!r}, which is "
             f"{height(reference):.3g} tall in its own unit; {advice}"
+        )
+    if is_torn(lengths, scale * known):
+        raise PoseSetError(
+            f"the mesh has other vertices joined than the body of {model!r}, as if they came in "
+            f"another order; export it with the model's vertex order"
         )
     return mesh

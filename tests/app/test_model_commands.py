@@ -253,7 +253,7 @@ def test_a_mesh_comes_back_to_its_place(lcollision: Lcollision, tube: Path, tmp_
     poses, folder = tmp_path / "poses.json", tmp_path / "back"
     result = lcollision("encode", tube, *meshes, "-o", poses)
     assert result.exit_code == 0
-    assert "mesh 1: fit error 0.000 % of the height" in result.stdout
+    assert "mesh 1: fit error of 0.000 % of the height" in result.stdout
     encoded = read_poses(poses, model)
     assert [pose.name for pose in encoded] == ["mesh 0", "mesh 1"]
     for pose, wanted in zip(encoded, latent, strict=True):
@@ -380,3 +380,18 @@ def test_an_interrupted_training_goes_on_and_ends_with_the_same_model(
     assert f"going on from {checkpoint}" in result.stderr
     assert list(tmp_path.iterdir()) == [output]
     assert output.read_bytes() == trained.read_bytes()
+
+
+def test_a_mesh_far_from_every_pose_is_doubted(
+    lcollision: Lcollision, tube: Path, tmp_path: Path
+) -> None:
+    """A flattened one, whose edges are the body's, near enough."""
+    model = PoseModel.load(tube)
+    mesh = tmp_path / "flat.obj"
+    write_mesh(mesh, model.reference * [1.0, 1.0, 0.02], model.faces)
+    out = tmp_path / "out.json"
+    result = lcollision("encode", tube, mesh, "-o", out)
+    assert result.exit_code == 0
+    assert result.stdout.rstrip().endswith("is it this body, in the model's vertex order?")
+    write_mesh(mesh, model.reference, model.faces)
+    assert "which is far" not in lcollision("encode", tube, mesh, "-o", out).stdout

@@ -131,9 +131,7 @@ def test_all_rows_of_another_store_count(
     called = prediction.collision_probability > 0.5
     assert report["samples"] == 300
     assert report["accuracy"] == np.mean(called == rows.colliding)
-    later = json.loads(
-        lcollision("evaluate", trained, other, "--threshold", 0.9, "--json").stdout
-    )
+    later = json.loads(lcollision("evaluate", trained, other, "--threshold", 0.9, "--json").stdout)
     assert later["threshold"] == 0.9
     missed = (prediction.collision_probability <= 0.9)[rows.colliding]
     assert later["false_negative_rate"] == missed.mean() > report["false_negative_rate"]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -28,13 +29,14 @@ from lcollision_core.meshes import (
     write_pose_set,
 )
 from lcollision_core.meshes.pose_set import natural_key
+from tests.bending_tube import bending_tube
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32)
 VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 1]])
 
 
 def _poses(n: int) -> np.ndarray:
-    return VERTICES * (1.0 + np.arange(n))[:, None, None]
+    return VERTICES + np.arange(n)[:, None, None]
 
 
 def _write_folder(folder: Path, n: int = 12, suffix: str = ".obj") -> Path:
@@ -100,7 +102,7 @@ def _reshape_one(folder: Path, kind: str) -> None:
             "vertex": text.replace("f", "v 5 5 5\nf", 1),
             "face": text + "f 1 2 4\n",
             "order": text.replace("f 1 3 2\n", "f 3 2 1\n"),
-            "nan": text.replace("v 0.0 16.0 0.0", "v 0.0 nan 0.0"),
+            "nan": text.replace("v 7.0 9.0 7.0", "v 7.0 nan 7.0"),
             "cut": text[: len(text) // 2],
             "empty": "",
             "index": text + "f 1 2 9\n",
@@ -148,6 +150,44 @@ def test_inspection_lists_every_defect(tmp_path: Path) -> None:
     assert found.n_found == 12
     assert found.pose_set is not None
     assert len(found.pose_set) == 9
+
+
+@pytest.mark.parametrize("n_poses", [2, 4, 12])
+def test_a_pose_in_another_unit_or_order_of_vertices_is_refused(
+    tmp_path: Path, n_poses: int
+) -> None:
+    tube = bending_tube(n_poses=n_poses)
+    others = [f"pose {pose}" for pose in range(n_poses) if pose != 1]
+    shuffled = np.random.default_rng(1).permutation(tube.vertices.shape[1])
+    for spoilt, defect in (
+        (tube.vertices[1] * 100.0, "is 100 times as large as the other poses; scale it by 0.01"),
+        (tube.vertices[1][shuffled], "has other vertices joined than the other poses"),
+        (tube.vertices[1] * 0.0, "has no size; remove it"),
+    ):
+        vertices = tube.vertices.copy()
+        vertices[1] = spoilt
+        path = tmp_path / "set.npz"
+        np.savez(path, vertices=vertices, faces=tube.faces)
+        with pytest.raises(PoseSetError, match=re.escape(f"pose 1 of {path} {defect}")) as caught:
+            read_pose_set(path)
+        found = inspect_pose_set(path)
+        assert found.problems == (str(caught.value),)
+        assert found.n_found == n_poses
+        assert found.pose_set is not None
+        assert list(found.pose_set.names) == others
+
+
+def test_two_wrong_poses_of_four_do_not_hide_each_other(tmp_path: Path) -> None:
+    """Of four poses one is too large and one shuffled: the two right ones say what is right."""
+    tube = bending_tube(n_poses=4)
+    vertices = tube.vertices.copy()
+    vertices[0] *= 100.0
+    vertices[2] = vertices[2][np.random.default_rng(1).permutation(vertices.shape[1])]
+    path = tmp_path / "set.npz"
+    np.savez(path, vertices=vertices, faces=tube.faces)
+    found = inspect_pose_set(path)
+    assert found.pose_set is not None
+    assert found.pose_set.names == ("pose 1", "pose 3")
 
 
 def test_triangle_without_area_is_refused_in_the_reference(tmp_path: Path) -> None:

@@ -1,0 +1,89 @@
+"""Whether meshes of one topology are poses of one body: of one size, in one order of vertices."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+LARGEST_SIZE = 1.25
+"""Times larger or smaller that a body may be; poses stretch its edges by a few percent."""
+
+_UNIFORM = 1.5
+"""Between the edges that are scaled most and least, all but tenths: within it, it is the unit."""
+
+_TORN = 3.0
+"""Times that half of the edges of a body are longer only where others are joined."""
+
+_COMPARED_POSES = 25
+
+
+def scale_of(lengths: FloatArray, known: FloatArray) -> float | None:
+    """Return how many times all edges are longer than they are known, None where each has its own.
+
+    Parameters
+    ----------
+    lengths, known : (E,) lengths of the same edges
+    """
+    low, middle, high = _spread(lengths, known)
+    return None if high > _UNIFORM * low else middle
+
+
+def is_torn(lengths: FloatArray, known: FloatArray) -> bool:
+    """Tell whether edges are so much longer than they are known that others must be meant.
+
+    Parameters
+    ----------
+    lengths, known : (E,) lengths of the same edges, of meshes about as tall
+    """
+    return scale_of(lengths, known) is None and _spread(lengths, known)[1] > _TORN
+
+
+def unlike_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, str]:
+    """Find the poses that are no poses of the body that most of them show.
+
+    Parameters
+    ----------
+    topology : of all
+    vertices : (N, V, 3) finite array
+
+    Returns
+    -------
+    What is wrong with each, by its place.
+    """
+    if len(vertices) < 2:
+        return {}
+    some = np.linspace(0, len(vertices) - 1, min(len(vertices), _COMPARED_POSES)).astype(int)
+    lengths = np.array([topology.edge_lengths(vertices[pose]) for pose in some])
+    # Of two, the first; of an even number never the mean of a right one and a wrong one.
+    middle = (len(some) - 1) // 2
+    known = lengths[0] if len(some) == 2 else np.partition(lengths, middle, axis=0)[middle]
+    found = {}
+    for pose, mesh in enumerate(vertices):
+        own = topology.edge_lengths(mesh)
+        scale = scale_of(own, known)
+        if scale is None:
+            if is_torn(own, known):
+                found[pose] = (
+                    "has other vertices joined than the other poses, as if they came in another "
+                    "order; export it with the set's vertex order"
+                )
+        elif not 1.0 / LARGEST_SIZE < scale < LARGEST_SIZE:
+            found[pose] = (
+                f"is {scale:.3g} times as large as the other poses; scale it by {1.0 / scale:.3g}"
+                if 0.0 < scale < np.inf
+                else "has no size; remove it"
+            )
+    return found
+
+
+def _spread(lengths: FloatArray, known: FloatArray) -> tuple[float, float, float]:
+    """Return the tenths and the median of how many times edges are longer than they are known."""
+    used = known > 0.0
+    if not used.any():
+        return 1.0, 1.0, 1.0
+    low, middle, high = np.percentile(lengths[used] / known[used], (10, 50, 90))
+    return float(low), float(middle), float(high)
