@@ -203,11 +203,11 @@ def exported(
     """Write the mesh that is drawn of a pose, moved back to where it came from, and check it."""
 
     def work(_: Progress, __: CancelToken) -> Exported:
-        from lcollision_core.meshes import write_mesh
+        from lcollision_core.model import export_mesh
         from lcollision_core.resolve import exported_vertices
 
         vertices = exported_vertices(model.decode(latent, n_threads=1), placement)
-        write_mesh(path, vertices, model.faces)
+        export_mesh(path, model, vertices, placement)
         return Exported(path, len(model.detector.detect(vertices).pairs))
 
     return work

@@ -152,8 +152,7 @@ def write_result(
     ------
     LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
-    from lcollision_core.meshes import write_mesh
-    from lcollision_core.model import write_poses
+    from lcollision_core.model import export_mesh, write_poses
     from lcollision_core.resolve import exported_vertices
 
     if form is OutputForm.POSES:
@@ -176,7 +175,7 @@ def write_result(
         if mesh is None:
             mesh = exported_vertices(model.decode(pose.latent), pose.placement)
         # OBJ and OFF would get float32's short decimals, which float64 readers take for others.
-        write_mesh(file, mesh.astype(float), model.faces)
+        export_mesh(file, model, mesh.astype(float), pose.placement)
     return WrittenPoses(output, tuple(files), n_replaced)
 
 

@@ -21,7 +21,7 @@ from lcollision_core.meshes.formats.polygons import (
     Polygons,
     triangulate,
 )
-from lcollision_core.meshes.topology import Topology
+from lcollision_core.meshes.topology import FloatArray, Topology
 
 READABLE_SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
 """Extensions that `read_mesh` reads, in lower case."""
@@ -72,8 +72,9 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
     Parameters
     ----------
     path : an .obj, .ply, .off, .stl, .glb or .gltf file
-    topology : the connectivity that an STL file is expected to have: when its triangles fit, they
-        are put back into this vertex order. A mesh with the same faces shares the object.
+    topology : the connectivity that an STL file, or a glTF file of other vertices, is expected to
+        have: when its triangles fit, they are put back into this vertex order. A mesh with the
+        same faces shares the object.
 
     Returns
     -------
@@ -125,7 +126,7 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
                 return off.read(file)
             if suffix == ".stl":
                 return stl.read(file, size, topology)
-            return gltf.read(file, path)
+            return gltf.read(file, path, topology)
     except FileNotFoundError as error:
         raise MeshFileError("there is no such file; check the name") from error
     except PermissionError as error:
@@ -164,7 +165,11 @@ def first_not_finite(vertices: npt.NDArray[Any]) -> int | None:
 
 
 def write_mesh(
-    path: str | os.PathLike[str], vertices: npt.NDArray[Any], faces: npt.NDArray[Any]
+    path: str | os.PathLike[str],
+    vertices: npt.NDArray[Any],
+    faces: npt.NDArray[Any],
+    *,
+    up: FloatArray | None = None,
 ) -> None:
     """Write one triangle mesh whole or not at all; the extension, in any case, says the format.
 
@@ -176,6 +181,8 @@ def write_mesh(
     path : an .obj, .ply, .off, .stl or .glb file in an existing folder
     vertices : (V, 3) array; float32 is written as such, anything else as float64
     faces : (F, 3) integer array, indices from 0
+    up : (3,) direction that is upwards, if it is known: formats that say what theirs is, as glTF
+        does, get the mesh turned by the right angles that bring the axis next to it there
 
     Raises
     ------
@@ -203,9 +210,24 @@ def write_mesh(
             f"{path} cannot be written: a coordinate exceeds float32, which {suffix} stores; "
             f"write .ply or .obj"
         )
+    if suffix == ".glb" and up is not None:
+        points = points @ _turn_to_y(up).astype(points.dtype).T
     data = _ENCODERS[suffix](points, Topology(faces, len(points)).faces)
     with atomic_write(path) as file:
         file.write(data)
+
+
+def _turn_to_y(up: FloatArray) -> FloatArray:
+    """Return the rotation by right angles that brings the axis next to a direction to +y."""
+    axis = int(np.abs(up).argmax())
+    towards = np.eye(3)[axis] * np.sign(up[axis])
+    y = np.array([0.0, 1.0, 0.0])
+    if axis == 1:
+        # Upside down: about x.
+        return np.eye(3) if up[1] > 0.0 else np.diag([1.0, -1.0, -1.0])
+    aside = np.cross(towards, y)
+    turn: FloatArray = np.outer(y, towards) - np.outer(towards, y) + np.outer(aside, aside)
+    return turn
 
 
 __all__ = [

@@ -2,6 +2,7 @@
 
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.encoded_pose import EncodedPose
+from lcollision_core.model.export import export_mesh
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace
 from lcollision_core.model.library import (
     MODEL_SUFFIX,
@@ -32,6 +33,7 @@ __all__ = [
     "NamedPose",
     "PoseModel",
     "checkpoint_path",
+    "export_mesh",
     "find_model",
     "list_models",
     "model_destination",

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -395,3 +396,22 @@ def test_a_mesh_far_from_every_pose_is_doubted(
     assert result.stdout.rstrip().endswith("is it this body, in the model's vertex order?")
     write_mesh(mesh, model.reference, model.faces)
     assert "which is far" not in lcollision("encode", tube, mesh, "-o", out).stdout
+
+
+def test_glb_is_upright_whatever_is_up_in_the_model(
+    lcollision: Lcollision, tube: Path, tmp_path: Path
+) -> None:
+    model = PoseModel.load(tube)
+    turned = tmp_path / "turned.safetensors"
+    PoseModel("turned", model.embedding, replace(model.card, up_axis=2), {}).save(turned)
+    poses, mesh = tmp_path / "pose.json", tmp_path / "pose.glb"
+    assert lcollision("sample", turned, "-n", 1, "-o", poses).exit_code == 0
+    assert lcollision("decode", turned, poses, "-o", mesh).exit_code == 0
+    decoded = model.decode(read_poses(poses, model)[0].latent).astype(np.float32)
+    written = read_mesh(mesh).vertices
+    assert np.array_equal(written, decoded[:, [0, 2, 1]] * [1.0, 1.0, -1.0])
+    # A mesh that came in upright goes out in its place.
+    placed, again = tmp_path / "placed.json", tmp_path / "again.glb"
+    assert lcollision("encode", turned, mesh, "-o", placed).exit_code == 0
+    assert lcollision("decode", turned, placed, "-o", again).exit_code == 0
+    assert read_mesh(again).vertices == pytest.approx(written, abs=1e-3 * model.height)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import struct
 import tracemalloc
@@ -274,6 +275,50 @@ def test_glb_node_places_the_mesh(tmp_path: Path) -> None:
     (tmp_path / "m.glb").write_bytes(scene.export(file_type="glb"))
     mesh = read_mesh(tmp_path / "m.glb")
     assert np.abs(mesh.vertices - VERTICES[[0, 1, 3, 5]] - [1, 2, 3]).max() < 1e-6
+
+
+def test_glb_whose_vertices_were_split_gets_the_order_of_its_topology(tmp_path: Path) -> None:
+    import trimesh
+
+    split = trimesh.Trimesh(
+        VERTICES[FACES.reshape(-1)], np.arange(3 * len(FACES)).reshape(-1, 3), process=False
+    )
+    path = tmp_path / "m.glb"
+    path.write_bytes(trimesh.Scene(split).export(file_type="glb"))
+    used = np.unique(FACES)
+    faces = np.searchsorted(used, FACES)
+    mesh = read_mesh(path, topology=Topology(faces, len(used)))
+    assert np.array_equal(mesh.faces, faces)
+    assert np.array_equal(mesh.vertices, VERTICES[used].astype(np.float32))
+    assert mesh.notes == ("vertices that had been split were put back into the set's vertex order",)
+    assert len(read_mesh(path).vertices) == 3 * len(FACES)
+    other = Topology(np.roll(faces, 1, axis=0), len(used))
+    assert len(read_mesh(path, topology=other).vertices) == 3 * len(FACES)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_glb_is_written_upright(tmp_path: Path, axis: int, sign: float) -> None:
+    """Turned by right angles only, to the bit; other formats do not say which way is up."""
+    up = sign * np.eye(3)[axis] + [0.1, 0.2, -0.3]
+    for suffix in (".glb", ".obj"):
+        write_mesh(tmp_path / f"m{suffix}", VERTICES, FACES, up=up)
+    turned = read_mesh(tmp_path / "m.glb").vertices
+    was = VERTICES.astype(np.float32).astype(np.float64)
+    assert np.array_equal(turned[:, 1], sign * was[:, axis])
+    assert np.array_equal(np.sort(np.abs(turned), axis=1), np.sort(np.abs(was), axis=1))
+    turn, *_ = np.linalg.lstsq(was - was.mean(axis=0), turned - turned.mean(axis=0), rcond=None)
+    assert np.linalg.det(turn) == pytest.approx(1.0)
+    assert np.array_equal(read_mesh(tmp_path / "m.obj").vertices, VERTICES)
+
+
+def test_glb_has_smooth_normals(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "m.glb", VERTICES, FACES)
+    data = (tmp_path / "m.glb").read_bytes()
+    held = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    attributes = held["meshes"][0]["primitives"][0]["attributes"]
+    accessors = held["accessors"]
+    assert accessors[attributes["NORMAL"]]["count"] == len(VERTICES)
 
 
 def test_gltf_finds_the_buffers_beside_it(tmp_path: Path) -> None:

@@ -15,22 +15,27 @@ from lcollision_core.meshes.formats.polygons import (
     Polygons,
     read_rest,
     require_plausible_count,
+    with_order_of,
 )
+from lcollision_core.meshes.topology import Topology
 
 _GLB_MAGIC = b"glTF"
+_REORDERED = "vertices that had been split were put back into the set's vertex order"
 
 
-def read(file: BinaryIO, path: Path) -> Polygons:
+def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygons:
     """Read the one triangle mesh of a scene, placed by its node.
 
     Parameters
     ----------
     file : open binary file at its start
     path : where it is; a .gltf may name a buffer file beside it
+    topology : the connectivity that the triangles are expected to have, in its order of faces;
+        programs that split vertices, for normals or texture coordinates, are undone by it
 
     Returns
     -------
-    the triangles, vertices in the file's order
+    the triangles, vertices in the file's order, or the topology's
 
     Raises
     ------
@@ -62,7 +67,12 @@ def read(file: BinaryIO, path: Path) -> Polygons:
     vertices = np.array(mesh.vertices, dtype=np.float64)
     if not np.array_equal(transform, np.eye(4)):
         vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
-    return Polygons.triangles(vertices, np.array(mesh.faces, dtype=np.int64))
+    faces = np.array(mesh.faces, dtype=np.int64)
+    if topology is not None and len(vertices) != topology.n_vertices:
+        joined = with_order_of(vertices[faces.reshape(-1)], topology, _REORDERED)
+        if joined is not None:
+            return joined
+    return Polygons.triangles(vertices, faces)
 
 
 def _require_one_mesh(data: bytes) -> None:
@@ -94,7 +104,7 @@ def _require_one_mesh(data: bytes) -> None:
 
 
 def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
-    """Write triangles as GLB, float32.
+    """Write triangles as GLB, float32, with smooth normals.
 
     Parameters
     ----------
@@ -104,4 +114,4 @@ def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
     import trimesh
 
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
-    return bytes(trimesh.Scene(mesh).export(file_type="glb", include_normals=False))
+    return bytes(trimesh.Scene(mesh).export(file_type="glb", include_normals=True))

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.topology import Topology
 
 MAX_FACES = 5_000_000
 """The most faces, and the most vertices, that a mesh file may hold.
@@ -50,6 +51,31 @@ class Polygons:
     ) -> Polygons:
         """Wrap (V, 3) vertices and (F, 3) faces."""
         return cls(vertices, np.full(len(faces), 3, dtype=np.int64), faces.reshape(-1), notes)
+
+
+def with_order_of(
+    corners: npt.NDArray[np.float64], topology: Topology | None, note: str
+) -> Polygons | None:
+    """Put the corners of triangles back into the vertex order of the mesh that they were cut from.
+
+    Parameters
+    ----------
+    corners : (3 F, 3) array, three in turn for each triangle
+    topology : of that mesh
+    note : what to say of it
+
+    Returns
+    -------
+    the triangles; None where corners that the topology calls one vertex lie apart
+    """
+    if topology is None or len(corners) != 3 * topology.n_faces or len(topology.unused_vertices):
+        return None
+    order = topology.faces.reshape(-1)
+    vertices = np.empty((topology.n_vertices, 3), dtype=np.float64)
+    vertices[order] = corners
+    if not np.array_equal(vertices[order], corners):
+        return None
+    return Polygons.triangles(vertices, topology.faces.astype(np.int64), (note,))
 
 
 def triangulate(polygons: Polygons) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:

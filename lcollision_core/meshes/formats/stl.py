@@ -14,6 +14,7 @@ from lcollision_core.meshes.formats.polygons import (
     read_rest,
     require_few,
     require_plausible_count,
+    with_order_of,
 )
 from lcollision_core.meshes.formats.text import numbers
 from lcollision_core.meshes.topology import Topology
@@ -65,7 +66,7 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
     else:
         raise MeshFileError(f"it has {size} bytes, too few for an STL file; export the mesh again")
     points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0: equal coordinates, equal bytes
-    return _with_order_of(points, topology) or _joined(points)
+    return with_order_of(points, topology, _REORDERED) or _joined(points)
 
 
 def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
@@ -85,17 +86,6 @@ def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
             f"{len(words[ragged])} coordinates, three are needed"
         )
     return numbers([word for row in words for word in row], "the corners")
-
-
-def _with_order_of(points: npt.NDArray[np.float64], topology: Topology | None) -> Polygons | None:
-    if topology is None or len(points) != 3 * topology.n_faces or len(topology.unused_vertices):
-        return None
-    order = topology.faces.reshape(-1)
-    vertices = np.empty((topology.n_vertices, 3), dtype=np.float64)
-    vertices[order] = points
-    if not np.array_equal(vertices[order], points):
-        return None
-    return Polygons.triangles(vertices, topology.faces.astype(np.int64), (_REORDERED,))
 
 
 def _joined(points: npt.NDArray[np.float64]) -> Polygons:
