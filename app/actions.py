@@ -33,7 +33,12 @@ class ActionSpec:
 
 
 ACTIONS: dict[str, ActionSpec] = {
-    "new": ActionSpec("&New pose", "Ctrl+N", "Start again from the body at rest", "new"),
+    "new": ActionSpec(
+        "&New pose",
+        "Ctrl+N",
+        "Start again from the first pose of those learnt",
+        "new",
+    ),
     "open": ActionSpec("&Open…", "Ctrl+O", "Open poses, a mesh or a model", "open"),
     "open_model": ActionSpec("Open &model…", "Ctrl+Shift+O", "Choose another body"),
     "save": ActionSpec("&Save", "Ctrl+S", "Save the pose and your library", "save"),

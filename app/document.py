@@ -272,7 +272,7 @@ class PoseDocument(PoseHistory):
         self._bring(f"Opening {name_or_path}", tasks.opened_model(name_or_path), self._on_model)
 
     def new_pose(self) -> None:
-        """Start anew: an unnamed pose, no library, no file, no history."""
+        """Start anew: the reference pose, unnamed, no library, no file, no history."""
         self._long.cancel(self._incoming)
         self._begin(self._blank(), None)
 
@@ -480,7 +480,7 @@ class PoseDocument(PoseHistory):
         self._incoming = self._long.start(label, work, arrive)
 
     def _blank(self) -> DocumentState:
-        return DocumentState(read_only(np.zeros(self.model.latent_size)), UNNAMED)
+        return DocumentState(read_only(self.model.training_latent[0]), UNNAMED)
 
     def _follow_latent(self) -> None:
         self.cancel_resolve()

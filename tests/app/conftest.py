@@ -51,9 +51,11 @@ def compiled_body() -> None:
 
 @pytest.fixture
 def document(qtbot: QtBot, editor_model: PoseModel) -> Iterator[PoseDocument]:
-    """Return a document, its first pose predicted and checked; its threads end with the test."""
+    """Return a document, its pose all zeros, predicted and checked; its threads end with it."""
     held = PoseDocument()
     held.set_model(editor_model)
+    held.reset_all()
+    held.undo_stack.clear()
 
     def settle() -> None:
         # The frame with the prediction comes after one without; either is checked.

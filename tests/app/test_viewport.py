@@ -585,6 +585,8 @@ def test_the_theme_changes_what_is_behind_and_not_the_pose(
 def test_another_model_takes_the_place_of_the_first(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport
 ) -> None:
+    document.set_model(document.model)
+    rest(qtbot, viewport)
     old, picture = viewport.scene, pixels(viewport)
     viewport.highlight_domain(1)
     document.set_model(document.model)
