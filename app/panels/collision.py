@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Signal
+from PySide6.QtCore import QTimer, Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
@@ -35,6 +35,7 @@ class CollisionPanel(QWidget):
 
     def __init__(self, document: PoseDocument, resolve_action: QAction) -> None:
         super().__init__()
+        self._document = document
         self.prediction = PredictionCard(document)
         self.exact = ExactCard(document)
         self.resolve = ResolveCard(document, resolve_action)
@@ -47,10 +48,26 @@ class CollisionPanel(QWidget):
         cards.addStretch()
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
-        column.addWidget(scrolling(page))
+        self._area = scrolling(page)
+        column.addWidget(self._area)
         self.prediction.domain_hovered.connect(self.domain_hovered)
+        # The exact check follows a moment after the result, and may make its card higher.
+        for changed in (document.outcome_changed, document.exact_changed):
+            changed.connect(self._on_outcome)
 
     def refresh_icons(self) -> None:
         """Draw all signs in the theme that has come."""
         for card in (self.prediction, self.exact, self.resolve):
             card.refresh_icons()
+
+    @Slot()
+    def _on_outcome(self) -> None:
+        if self._document.outcome is not None:
+            # Not before it has been laid out.
+            QTimer.singleShot(0, self, self._scroll_to_outcome)
+
+    @Slot()
+    def _scroll_to_outcome(self) -> None:
+        """Show all that came of Resolve, or how it begins where there is no room for all."""
+        self._area.ensureWidgetVisible(self.resolve, 0, CLOSE)
+        self._area.ensureWidgetVisible(self.resolve.exactly_free, 0, CLOSE)
