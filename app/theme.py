@@ -270,6 +270,7 @@ QLabel#headline {{ font-weight: 600; font-size: 20px; }}
 QLabel[verdict="free"] {{ color: {theme.free}; }}
 QLabel[verdict="colliding"] {{ color: {theme.colliding}; }}
 QLabel[verdict="waiting"] {{ color: {theme.waiting}; }}
+QLabel[verdict="overruled"] {{ color: {theme.muted}; }}
 QPushButton {{
     background: {theme.card}; border: 1px solid {theme.border}; border-radius: {RADIUS}px;
     padding: 5px {NORMAL}px; min-height: 18px;

@@ -269,7 +269,7 @@ def labelled(text: str, kind: str = "") -> QLabel:
 
 
 def show_verdict(widget: QWidget, verdict: str) -> None:
-    """Colour a widget as "free", "colliding" or "waiting"."""
+    """Colour a widget as "free", "colliding", "waiting" or "overruled"."""
     if widget.property("verdict") != verdict:
         widget.setProperty("verdict", verdict)
         widget.style().unpolish(widget)

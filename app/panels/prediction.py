@@ -22,6 +22,7 @@ EVEN_ODDS = 0.5
 """Probability above which a pose counts as predicted to collide."""
 
 _BAR_WIDTH = 54
+_SOURCE = "by the model, at once"
 
 
 class ProbabilityMeter(QWidget):
@@ -30,6 +31,7 @@ class ProbabilityMeter(QWidget):
     def __init__(self) -> None:
         super().__init__()
         self._probability: float | None = None
+        self._overruled = False
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
         self.setAccessibleName("Probability of a collision")
 
@@ -38,10 +40,10 @@ class ProbabilityMeter(QWidget):
         """What is shown; None for nothing."""
         return self._probability
 
-    def show_probability(self, probability: float | None) -> None:
-        """Move the mark."""
-        if probability != self._probability:
-            self._probability = probability
+    def show_probability(self, probability: float | None, overruled: bool = False) -> None:
+        """Move the mark; one that the exact check has overruled is no alarm."""
+        if (probability, overruled) != (self._probability, self._overruled):
+            self._probability, self._overruled = probability, overruled
             self.update()
 
     def sizeHint(self) -> QSize:  # noqa: N802
@@ -59,8 +61,8 @@ class ProbabilityMeter(QWidget):
         painter.drawRoundedRect(bar, 4, 4)
         middle = bar.left() + EVEN_ODDS * bar.width()
         if self._probability is not None:
-            collides = self._probability > EVEN_ODDS
-            ink = QColor(theme.colliding if collides else theme.free)
+            verdict = theme.colliding if self._probability > EVEN_ODDS else theme.free
+            ink = QColor(theme.muted if self._overruled else verdict)
             place = bar.left() + self._probability * bar.width()
             filled = QColor(ink)
             filled.setAlpha(130)
@@ -225,7 +227,7 @@ class PredictionCard(Card):
         title = QHBoxLayout()
         title.addWidget(labelled("Prediction", "title"))
         title.addStretch()
-        self._source = labelled("by the model, at once", "caption")
+        self._source = labelled(_SOURCE, "caption")
         title.addWidget(self._source)
         self.verdict = labelled("", "verdict")
         self.percent = labelled("", "headline")
@@ -250,6 +252,7 @@ class PredictionCard(Card):
         self.column.addLayout(self._rows)
         document.model_changed.connect(self._on_model)
         document.frame_changed.connect(self._on_frame)
+        document.exact_changed.connect(self._on_frame)
         document.locks_changed.connect(self._on_locks)
         if document.has_model:
             self._on_model()
@@ -293,19 +296,23 @@ class PredictionCard(Card):
             self.meter.show_probability(None)
             self.verdict.setText("…")
             self.percent.setText("")
+            self._source.setText(_SOURCE)
             show_verdict(self.verdict, "waiting")
             for row in self.rows:
                 row.show_energy(0.0 if self._document.can_resolve else None)
             return
         probability = prediction.collision_probability
         collides = probability > EVEN_ODDS
-        kind = "colliding" if collides else "free"
-        self.meter.show_probability(probability)
-        self.verdict.setText("Probably colliding" if collides else "Probably free")
+        word = "colliding" if collides else "free"
+        exact = self._document.exact
+        overruled = exact is not None and exact.colliding != collides
+        self.meter.show_probability(probability, overruled)
+        self.verdict.setText(f"{'Predicted' if overruled else 'Probably'} {word}")
         self.percent.setText(f"{100 * probability:.0f} %")
         self.percent.setToolTip("How likely this pose collides with itself, as predicted")
-        show_verdict(self.verdict, kind)
-        show_verdict(self.percent, kind)
+        self._source.setText("overruled by the exact check" if overruled else _SOURCE)
+        for label in (self.verdict, self.percent):
+            show_verdict(label, "overruled" if overruled else word)
         for row, energy in zip(self.rows, prediction.domain_energy, strict=True):
             row.show_energy(float(energy))
 

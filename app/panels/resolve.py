@@ -27,39 +27,59 @@ if TYPE_CHECKING:
     from app.document import PoseDocument
     from lcollision_core.resolve import ResolveResult
 
-_SIGNS = {True: "check", False: "error", None: "unknown"}
+_SIGNS = {True: "check", False: "error", None: "info"}
+_INKS = {"check": "free", "error": "colliding", "info": "muted"}
 
 
 class Fact(QWidget):
-    """One of the three facts of an outcome: yes, no or not known."""
+    """One of the three facts of an outcome: yes, no or not known.
 
-    def __init__(self, sentences: dict[bool | None, str]) -> None:
+    Parameters
+    ----------
+    sentences : for each of the three
+    tip : what the fact means
+    """
+
+    def __init__(self, sentences: dict[bool | None, str], tip: str) -> None:
         super().__init__()
         self._sentences = sentences
         self._truth: bool | None = None
-        self._sign = QLabel()
-        self._sign.setFixedSize(18, 18)
+        self._sign = "info"
+        self._picture = QLabel()
+        self._picture.setFixedSize(18, 18)
         self._text = QLabel()
+        self._text.setWordWrap(True)
+        self.setToolTip(tip)
         row = QHBoxLayout(self)
         row.setContentsMargins(0, 0, 0, 0)
         row.setSpacing(CLOSE)
-        row.addWidget(self._sign)
+        row.addWidget(self._picture)
         row.addWidget(self._text, 1)
 
     @property
     def truth(self) -> bool | None:
-        """What is shown."""
+        """What is known."""
         return self._truth
 
-    def show_truth(self, truth: bool | None, excuse: str = "") -> None:
-        """Say yes, no, or that it is not known; with an excuse, no is nothing to worry about."""
+    @property
+    def sign(self) -> str:
+        """The icon that is shown: "check", "error" or "info"."""
+        return self._sign
+
+    def show_truth(self, truth: bool | None, instead: str = "", sign: str = "info") -> None:
+        """Say yes, no, or that it is not known.
+
+        Parameters
+        ----------
+        truth : what is known
+        instead : said in place of the fact's own sentence, where another fact outweighs this one
+        sign : beside `instead`
+        """
         self._truth = truth
-        excused = truth is False and bool(excuse)
-        shown = None if excused else truth
-        theme = current_theme()
-        ink = {True: theme.free, False: theme.colliding, None: theme.muted}[shown]
-        self._sign.setPixmap(pixmap(_SIGNS[shown], ink, 18, self.devicePixelRatioF()))
-        self._text.setText(excuse if excused else self._sentences[truth])
+        self._sign = sign if instead else _SIGNS[truth]
+        ink = getattr(current_theme(), _INKS[self._sign])
+        self._picture.setPixmap(pixmap(self._sign, ink, 18, self.devicePixelRatioF()))
+        self._text.setText(instead or self._sentences[truth])
 
 
 class ResolveCard(Card):
@@ -135,13 +155,18 @@ class ResolveCard(Card):
                 True: "The search finished",
                 False: "The search stopped early",
                 None: "No search was needed",
-            }
+            },
+            "Whether the search came to an end by itself: the exact check, not this, tells whether "
+            "the pose is free",
         )
         self.predicted_free = Fact(
-            {True: "Predicted free", False: "Predicted colliding", None: "Not predicted"}
+            {True: "Predicted free", False: "Predicted colliding", None: "Not predicted"},
+            "What the model believes of the pose: where the exact check finds otherwise, the check "
+            "is right",
         )
         self.exactly_free = Fact(
-            {True: "Exactly free", False: "Not exactly free", None: "Not checked exactly"}
+            {True: "Exactly free", False: "Not exactly free", None: "Not checked exactly"},
+            "The exact check of the mesh: this alone tells whether the pose is free",
         )
         self._energy, self._moved, self._took = (QLabel() for _ in range(3))
         self._note = labelled("", "caption")
@@ -205,13 +230,18 @@ class ResolveCard(Card):
 
     def _show(self, result: ResolveResult) -> None:
         ran = result.solver_status != "not run"
-        proved = bool(result.exactly_free)
-        self.exactly_free.show_truth(result.exactly_free)
+        exactly_free, predicted_free = result.exactly_free, result.predicted_free
+        self.exactly_free.show_truth(exactly_free)
+        # A search that was cut short has done its work where its pose is free.
         self.converged.show_truth(
-            result.converged if ran else None, "The search ended at a free pose" if proved else ""
+            result.converged if ran else None,
+            "The search ended at a free pose" if ran and exactly_free else "",
+            sign="check",
         )
+        overruled = exactly_free is not None and exactly_free != predicted_free
+        word = "free" if predicted_free else "colliding"
         self.predicted_free.show_truth(
-            result.predicted_free, "Predicted colliding, wrongly" if proved else ""
+            predicted_free, f"Predicted {word}, overruled" if overruled else ""
         )
         if result.energy_before is None or result.energy_after is None:
             self._energy.setText("not measured")

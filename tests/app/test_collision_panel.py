@@ -1,15 +1,20 @@
-"""The right panel: what came of Resolve is seen whole."""
+"""The right panel: a result is seen whole, and prediction and truth are told apart."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from PySide6.QtCore import QPoint, QRect
-from PySide6.QtWidgets import QScrollArea, QWidget
+from PySide6.QtWidgets import QLabel, QScrollArea, QWidget
 from pytestqt.qtbot import QtBot
 
+from app.document import PosePrediction
+from app.frames import PoseShower
 from app.main_window import MainWindow
+from app.theme import current_theme
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult
 from tests.app.windows import PATIENCE, rest
@@ -55,3 +60,96 @@ def test_the_result_of_resolve_scrolls_into_sight(
     resolve(qtbot, window)
     assert scrolled(window).verticalScrollBar().maximum() > 0
     qtbot.waitUntil(lambda: is_seen_whole(window, card.outcome), timeout=PATIENCE)
+
+
+def texts(widget: QWidget) -> list[str]:
+    return [label.text() for label in widget.findChildren(QLabel) if label.text()]
+
+
+def ink(label: QLabel) -> str:
+    return label.palette().color(label.foregroundRole()).name()
+
+
+@pytest.mark.parametrize("collides", [False, True], ids=["free", "colliding"])
+def test_a_prediction_steps_back_where_the_exact_check_finds_otherwise(
+    qtbot: QtBot,
+    window: MainWindow,
+    colliding: FloatArray,
+    monkeypatch: pytest.MonkeyPatch,
+    collides: bool,
+) -> None:
+    document, card = window.document, window.collision.prediction
+
+    def predict(right: bool) -> None:
+        probability = 0.99 if collides == right else 0.01
+        told = PosePrediction(np.zeros(2), 0.0, 0.0, probability)
+        monkeypatch.setattr(PoseShower, "_predict", lambda *_: told)
+
+    pose = colliding if collides else np.zeros_like(colliding)
+    word, wrong = ("colliding", "free") if collides else ("free", "colliding")
+    predict(right=False)
+    document.set_latent(0.9 * pose + 0.01, "Elsewhere")
+    rest(qtbot, window)
+    document.set_latent(pose, "Test")
+    qtbot.waitUntil(lambda: card.verdict.text() == f"Probably {wrong}", timeout=PATIENCE)
+    alarm = getattr(current_theme(), wrong)
+    assert ink(card.verdict) == ink(card.percent) == alarm
+    rest(qtbot, window)
+    assert document.exact is not None
+    assert document.exact.colliding == collides
+    assert card.verdict.text() == f"Predicted {wrong}"
+    assert ink(card.verdict) == ink(card.percent) == current_theme().muted
+    assert "overruled by the exact check" in texts(card)
+    assert alarm not in colours_of(card.meter)
+    assert ink(window.collision.exact.verdict) == getattr(current_theme(), word)
+    # It does not outlive the pose, nor a prediction that is right.
+    predict(right=True)
+    document.set_latent(pose + 1e-6, "Test")
+    rest(qtbot, window)
+    assert card.verdict.text() == f"Probably {word}"
+    assert ink(card.verdict) == getattr(current_theme(), word)
+    assert "overruled by the exact check" not in texts(card)
+
+
+def colours_of(widget: QWidget) -> set[str]:
+    picture = widget.grab().toImage()
+    places = ((x, y) for x in range(picture.width()) for y in range(picture.height()))
+    return {picture.pixelColor(x, y).name() for x, y in places}
+
+
+def test_a_free_pose_reads_as_success_whatever_was_predicted(
+    qtbot: QtBot, window: MainWindow, colliding: FloatArray
+) -> None:
+    document, card = window.document, window.collision.resolve
+    facts = (card.exactly_free, card.converged, card.predicted_free)
+    document.set_latent(colliding, "Test")
+    rest(qtbot, window)
+    found = resolve(qtbot, window)
+    for changes, signs, words in (
+        (
+            {"converged": False, "predicted_free": False},
+            ["check", "check", "info"],
+            ["Exactly free", "The search ended at a free pose", "Predicted colliding, overruled"],
+        ),
+        (
+            {"exactly_free": False, "converged": False},
+            ["error", "error", "info"],
+            ["Not exactly free", "The search stopped early", "Predicted free, overruled"],
+        ),
+        (
+            {"exactly_free": False, "predicted_free": False},
+            ["error", "check", "error"],
+            ["Not exactly free", "The search finished", "Predicted colliding"],
+        ),
+    ):
+        known = {"solver_status": "known", "exactly_free": True, "converged": True}
+        outcome = replace(found, **(known | {"predicted_free": True} | changes))
+        document._amend(replace(document._state, outcome=outcome))
+        assert [fact.sign for fact in facts] == signs
+        assert [text for fact in facts for text in texts(fact)] == words
+        assert [fact.truth for fact in facts] == [
+            outcome.exactly_free,
+            outcome.converged,
+            outcome.predicted_free,
+        ]
+    assert len({fact.toolTip() for fact in facts} - {""}) == 3
