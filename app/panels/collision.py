@@ -17,6 +17,9 @@ from app.theme import CLOSE, NORMAL, TIGHT
 if TYPE_CHECKING:
     from app.document import PoseDocument
 
+_MIN_WIDTH = 288
+"""In which every card is seen whole, beside a scroll bar."""
+
 
 class CollisionPanel(QWidget):
     """Three cards, one below the other.
@@ -36,6 +39,7 @@ class CollisionPanel(QWidget):
     def __init__(self, document: PoseDocument, resolve_action: QAction) -> None:
         super().__init__()
         self._document = document
+        self.setMinimumWidth(_MIN_WIDTH)
         self.prediction = PredictionCard(document)
         self.exact = ExactCard(document)
         self.resolve = ResolveCard(document, resolve_action)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtWidgets import QHBoxLayout, QLabel
 
 from app.icons import pixmap
-from app.panels.parts import Card, labelled, show_verdict
+from app.panels.parts import Card, ElidedLabel, labelled, show_verdict, title_row
 from app.theme import CLOSE, current_theme
 from app.wording import counted, overlap_text
 
@@ -29,10 +29,6 @@ class ExactCard(Card):
         super().__init__("", "truth")
         self._document = document
         self._kind = "waiting"
-        title = QHBoxLayout()
-        title.addWidget(labelled("Exact check", "title"))
-        title.addStretch()
-        title.addWidget(labelled("computed on the mesh", "caption"))
         self._sign = QLabel()
         self._sign.setFixedSize(22, 22)
         self.verdict = labelled("", "verdict")
@@ -43,7 +39,7 @@ class ExactCard(Card):
         line.setSpacing(CLOSE)
         line.addWidget(self._sign)
         line.addWidget(self.verdict, 1)
-        self.column.addLayout(title)
+        self.column.addLayout(title_row("Exact check", ElidedLabel("computed on the mesh")))
         self.column.addLayout(line)
         self.column.addWidget(self.details)
         document.exact_changed.connect(self._on_exact)

@@ -326,7 +326,6 @@ class LibraryPanel(QWidget):
         self.blend.setEnabled(chosen)
         name = f"Blend towards {self._poses[row].name}" if chosen else "Choose a pose to blend"
         self._target.setText(name)
-        self._target.setToolTip(name)
         self.chosen_changed.emit()
 
     @Slot()

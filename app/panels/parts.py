@@ -15,11 +15,13 @@ from PySide6.QtGui import (
     QPainter,
     QPaintEvent,
     QPen,
+    QResizeEvent,
     QWheelEvent,
 )
 from PySide6.QtWidgets import (
     QDoubleSpinBox,
     QFrame,
+    QHBoxLayout,
     QLabel,
     QScrollArea,
     QSizePolicy,
@@ -60,12 +62,21 @@ class Card(QFrame):
 
 
 class ElidedLabel(QLabel):
-    """A label that shortens its text to the room it has, with the whole text as tool tip."""
+    """A label that shortens its text to the room it has, with the whole text as tool tip then."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
-        self.setToolTip(text)
         self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+
+    def setText(self, text: str) -> None:  # noqa: N802
+        """Show another text."""
+        super().setText(text)
+        self._offer_whole()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+        """See whether the text fits now."""
+        super().resizeEvent(event)
+        self._offer_whole()
 
     def minimumSizeHint(self) -> QSize:  # noqa: N802
         """Allow any width."""
@@ -75,10 +86,24 @@ class ElidedLabel(QLabel):
         """Draw what fits."""
         painter = QPainter(self)
         painter.setPen(self.palette().color(self.foregroundRole()))
-        fitting = self.fontMetrics().elidedText(
-            self.text(), Qt.TextElideMode.ElideRight, self.width()
-        )
-        painter.drawText(self.rect(), int(self.alignment()), fitting)
+        painter.drawText(self.rect(), int(self.alignment()), self._fitting())
+
+    def _fitting(self) -> str:
+        return self.fontMetrics().elidedText(self.text(), Qt.TextElideMode.ElideRight, self.width())
+
+    def _offer_whole(self) -> None:
+        self.setToolTip("" if self._fitting() == self.text() else self.text())
+
+
+def title_row(title: str, source: ElidedLabel) -> QHBoxLayout:
+    """Return a card's title, with where its facts come from at the other end."""
+    source.setObjectName("caption")
+    source.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+    row = QHBoxLayout()
+    row.setSpacing(CLOSE)
+    row.addWidget(labelled(title, "title"))
+    row.addWidget(source, 1)
+    return row
 
 
 class HoverRow(QWidget):

@@ -10,7 +10,15 @@ from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPolygonF
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy, QToolButton, QVBoxLayout, QWidget
 
 from app.icons import icon
-from app.panels.parts import Card, ElidedLabel, HoverRow, labelled, show_verdict, silent
+from app.panels.parts import (
+    Card,
+    ElidedLabel,
+    HoverRow,
+    labelled,
+    show_verdict,
+    silent,
+    title_row,
+)
 from app.shading import FULL_PREDICTED
 from app.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme, visible_colour
 from app.wording import heading, overlap_text
@@ -224,11 +232,7 @@ class PredictionCard(Card):
         super().__init__()
         self._document = document
         self.rows: list[DomainRow] = []
-        title = QHBoxLayout()
-        title.addWidget(labelled("Prediction", "title"))
-        title.addStretch()
-        self._source = labelled(_SOURCE, "caption")
-        title.addWidget(self._source)
+        self._source = ElidedLabel(_SOURCE)
         self.verdict = labelled("", "verdict")
         self.percent = labelled("", "headline")
         self.meter = ProbabilityMeter()
@@ -239,12 +243,11 @@ class PredictionCard(Card):
         self._missing.setObjectName("caption")
         self._missing.setWordWrap(True)
         line = QHBoxLayout()
-        line.addWidget(self.verdict)
-        line.addStretch()
+        line.addWidget(self.verdict, 1)
         line.addWidget(self.percent)
         self._rows = QVBoxLayout()
         self._rows.setSpacing(0)
-        self.column.addLayout(title)
+        self.column.addLayout(title_row("Prediction", self._source))
         self.column.addLayout(line)
         self.column.addWidget(self.meter)
         self.column.addWidget(self._missing)

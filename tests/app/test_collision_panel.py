@@ -1,8 +1,9 @@
-"""The right panel: a result is seen whole, and prediction and truth are told apart."""
+"""The right panel: it has the room it needs, and tells prediction and truth apart."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -11,13 +12,13 @@ from PySide6.QtCore import QPoint, QRect
 from PySide6.QtWidgets import QLabel, QScrollArea, QWidget
 from pytestqt.qtbot import QtBot
 
-from app.document import PosePrediction
+from app.document import PoseDocument, PosePrediction
 from app.frames import PoseShower
 from app.main_window import MainWindow
 from app.theme import current_theme
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult
-from tests.app.windows import PATIENCE, rest
+from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -60,6 +61,43 @@ def test_the_result_of_resolve_scrolls_into_sight(
     resolve(qtbot, window)
     assert scrolled(window).verticalScrollBar().maximum() > 0
     qtbot.waitUntil(lambda: is_seen_whole(window, card.outcome), timeout=PATIENCE)
+
+
+def test_the_panel_keeps_the_width_that_its_cards_need_also_where_a_layout_says_less(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = PosePrediction(np.zeros(2), 0.0, 9.0, 1.0)
+    monkeypatch.setattr(PoseShower, "_predict", lambda *_: told)
+    settings = settings_in(tmp_path)
+    before = open_window(qtbot, document, settings)
+    shrink_and_grow(qtbot, before)
+    assert has_room(before)
+    # As it was remembered while the panel could be made as narrow as one liked.
+    before.collision.setMinimumWidth(0)
+    qtbot.wait(100)
+    shrink_and_grow(qtbot, before)
+    assert not has_room(before)
+    close_window(before)
+    after = open_window(qtbot, PoseDocument(document.model), settings)
+    qtbot.waitUntil(lambda: not after.document.busy, timeout=PATIENCE)
+    rest(qtbot, after)
+    assert after.collision.prediction.percent.text() == "100 %"
+    assert after.collision.prediction.verdict.text() == "Predicted colliding"
+    assert has_room(after)
+    close_window(after)
+
+
+def shrink_and_grow(qtbot: QtBot, window: MainWindow) -> None:
+    for size in ((300, 300), (1280, 720)):
+        window.resize(*size)
+        qtbot.wait(100)
+
+
+def has_room(window: MainWindow) -> bool:
+    """Whether nothing of the panel is cut off at its right, with a scroll bar beside it."""
+    area = scrolled(window)
+    bar = area.verticalScrollBar().sizeHint().width()
+    return area.width() >= area.widget().minimumSizeHint().width() + bar
 
 
 def texts(widget: QWidget) -> list[str]:
