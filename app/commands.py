@@ -32,7 +32,7 @@ class DocumentState:
     pose_name : under which Save stores the pose
     placement : where the decoded pose belongs, for one that came in as a mesh
     poses : the user's library
-    ghost : (V, 3) float32 array, read-only: the mesh before Resolve
+    ghost : (V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`
     outcome : of the Resolve that ended in this pose
     """
 

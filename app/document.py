@@ -441,7 +441,7 @@ class PoseDocument(PoseHistory):
         self.end_gesture()
         if np.array_equal(result.latent, self.latent):
             # Nothing to undo, but the reasons are worth seeing.
-            self._amend(replace(self._state, outcome=result))
+            self._amend(replace(self._state, ghost=None, outcome=result))
         else:
             latent = read_only(np.array(result.latent, dtype=np.float64))
             after = replace(self._state, latent=latent, ghost=resolved.ghost, outcome=result)

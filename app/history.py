@@ -87,7 +87,7 @@ class PoseHistory(QObject):
 
     @property
     def ghost(self) -> npt.NDArray[np.float32] | None:
-        """(V, 3) float32 array, read-only: the mesh before Resolve, while that is to be seen."""
+        """(V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`, if shown."""
         return self._state.ghost if self._ghost_shown else None
 
     @property
@@ -219,7 +219,8 @@ class PoseHistory(QObject):
         self.pose_loaded.emit()
 
     def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
-        self._push(label, replace(self._state, latent=read_only(latent), outcome=None), run)
+        state = replace(self._state, latent=read_only(latent), ghost=None, outcome=None)
+        self._push(label, state, run)
 
     def _push(self, label: str, state: DocumentState, run: int | None = None) -> None:
         """Go to another state, as a step of its own or as part of the gesture."""

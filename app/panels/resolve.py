@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Signal, Slot
+from PySide6.QtCore import Qt, Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import (
     QGridLayout,
@@ -187,7 +187,8 @@ class ResolveCard(Card):
                 ("Took", self._took),
             )
         ):
-            numbers.addWidget(labelled(name, "caption"), place, 0)
+            value.setWordWrap(True)
+            numbers.addWidget(labelled(name, "caption"), place, 0, Qt.AlignmentFlag.AlignTop)
             numbers.addWidget(value, place, 1)
         numbers.setColumnStretch(1, 1)
         column.addLayout(numbers)
@@ -250,9 +251,9 @@ class ResolveCard(Card):
                 f"{overlap_text(result.energy_before)} → {overlap_text(result.energy_after)}"
             )
         mean, largest = result.vertex_distance_mean, result.vertex_distance_max
-        moved = f"{height_text(mean)}, at most {height_text(largest)}"
+        moved = f"{height_text(mean)}, at most {height_text(largest)} of the height"
         self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
-        self._moved.setToolTip("Of the body's height: on average, and where it moved furthest")
+        self._moved.setToolTip("On average, and where it moved furthest")
         self._took.setText(seconds_text(result.seconds))
         self._note.setText(heading(result.note or ""))
         self._note.setVisible(bool(result.note))

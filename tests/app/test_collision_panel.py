@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from PySide6.QtCore import QPoint, QRect
+from PySide6.QtCore import QPoint, QRect, Qt
+from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QLabel, QScrollArea, QWidget
 from pytestqt.qtbot import QtBot
 
@@ -191,3 +193,43 @@ def test_a_free_pose_reads_as_success_whatever_was_predicted(
             outcome.predicted_free,
         ]
     assert len({fact.toolTip() for fact in facts} - {""}) == 3
+
+
+def test_the_ghost_goes_and_comes_back_with_the_result_it_belongs_to(
+    qtbot: QtBot, window: MainWindow, colliding: FloatArray
+) -> None:
+    document, card, scene = window.document, window.collision.resolve, window.viewport.scene
+    assert scene is not None
+
+    def seen() -> tuple[bool, bool]:
+        rest(qtbot, window)
+        return card.outcome.isVisible(), scene.ghost_shown
+
+    document.set_latent(colliding, "Test")
+    rest(qtbot, window)
+    resolve(qtbot, window)
+    assert seen() == (True, True)
+    window.actions_by_key["randomise"].trigger()
+    assert seen() == (False, False)
+    window.actions_by_key["undo"].trigger()
+    assert seen() == (True, True)
+    QTest.keyClick(window.sliders.row_of(0).slider, Qt.Key.Key_Right)
+    assert seen() == (False, False)
+    window.actions_by_key["undo"].trigger()
+    assert seen() == (True, True)
+    # Nothing to do: it has no ghost, and that of the Resolve before is not its.
+    assert resolve(qtbot, window).latent_distance == 0.0
+    assert seen() == (True, False)
+
+
+def test_a_result_says_of_what_the_body_has_moved_its_shares(
+    qtbot: QtBot, window: MainWindow, colliding: FloatArray
+) -> None:
+    window.document.set_latent(colliding, "Test")
+    rest(qtbot, window)
+    resolve(qtbot, window)
+    (moved,) = (text for text in texts(window.collision.resolve) if "at most" in text)
+    assert re.fullmatch(r"[\d.]+ %, at most [\d.]+ % of the height", moved)
+    window.resizeDocks([window.docks["collision"]], [1], Qt.Orientation.Horizontal)
+    qtbot.wait(100)
+    assert has_room(window)
