@@ -6,10 +6,13 @@ from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QKeyEvent, QMouseEvent
 from PySide6.QtWidgets import QHBoxLayout, QWidget
 
-from app.panels.parts import ElidedLabel, HoverRow, QuietSpinBox, Slider, silent
+from app.panels.parts import NAME_SHARE, ElidedLabel, HoverRow, QuietSpinBox, Slider, silent
 from app.theme import CLOSE, ROW_HEIGHT, TIGHT
 
 _STEPS = 1000
+
+_BEYOND = 1.5
+"""Widths of a slider's range that a number may be typed beyond either end of it."""
 
 
 class CodeSlider(Slider):
@@ -102,22 +105,33 @@ class CodeRow(HoverRow):
     domain : that it moves
     low, high : range of the slider
     colour : of the bar
+    name_width : room that the name takes before the slider gets any but the least
     """
 
     number_changed = Signal(int, float)
     reset_wanted = Signal(int)
 
     def __init__(
-        self, code: int, name: str, domain: int, low: float, high: float, colour: str | None
+        self,
+        code: int,
+        name: str,
+        domain: int,
+        low: float,
+        high: float,
+        colour: str | None,
+        name_width: int,
     ) -> None:
         super().__init__(domain)
         self.code = code
         label = ElidedLabel(name)
+        label.setMaximumWidth(name_width)
         self.slider = CodeSlider(low, high, colour)
         self.field = QuietSpinBox()
         self.field.setObjectName("code")
         self.field.setDecimals(3)
-        self.field.setRange(-1e4, 1e4)
+        beyond = _BEYOND * (high - low)
+        self._limits = low - beyond, high + beyond
+        self.field.setRange(*self._limits)
         self.field.setSingleStep((high - low) / 100)
         self.field.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.field.setFixedWidth(62)
@@ -126,12 +140,15 @@ class CodeRow(HoverRow):
         self.slider.setToolTip(
             f"{name}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
         )
-        self.field.setToolTip(f"{name}: type a number; the arrow keys change it in small steps")
+        least, most = (self.field.textFromValue(limit) for limit in self._limits)
+        self.field.setToolTip(
+            f"{name}: type a number from {least} to {most}; the arrow keys change it in small steps"
+        )
         row = QHBoxLayout(self)
         row.setContentsMargins(TIGHT, 0, TIGHT, 0)
         row.setSpacing(CLOSE)
-        row.addWidget(label, 7)
-        row.addWidget(self.slider, 5)
+        row.addWidget(label, NAME_SHARE)
+        row.addWidget(self.slider, 1)
         row.addWidget(self.field)
         self.setFixedHeight(ROW_HEIGHT)
         self.slider.valueChanged.connect(self._on_slider)
@@ -139,9 +156,11 @@ class CodeRow(HoverRow):
         self.field.valueChanged.connect(self._on_field)
 
     def show_number(self, number: float) -> None:
-        """Follow the document."""
+        """Follow the document, also beyond what can be typed."""
         self.slider.show_number(number)
+        low, high = self._limits
         with silent(self.field):
+            self.field.setRange(min(low, number), max(high, number))
             self.field.setValue(number)
 
     def _on_slider(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from PySide6.QtCore import QEvent, QObject, QPointF, QRectF, QSize, Qt, Signal
@@ -35,6 +35,9 @@ from app.theme import CLOSE, NORMAL, ROW_HEIGHT, current_theme, visible_colour
 
 HANDLE = 7.0
 """Radius of a slider's handle, in device-independent pixels."""
+
+NAME_SHARE = 9
+"""Parts of a row's room to one of its slider or bar, as long as the longest name needs them."""
 
 _FINE = 0.1
 """Of the pointer's way that a handle follows while Ctrl or Shift is held."""
@@ -93,6 +96,11 @@ class ElidedLabel(QLabel):
 
     def _offer_whole(self) -> None:
         self.setToolTip("" if self._fitting() == self.text() else self.text())
+
+
+def longest_name(widget: QWidget, names: Iterable[str]) -> int:
+    """Return the width that the longest of some names takes in a widget's font."""
+    return max(widget.fontMetrics().horizontalAdvance(name) for name in names) + 1
 
 
 def title_row(title: str, source: ElidedLabel) -> QHBoxLayout:

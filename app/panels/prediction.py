@@ -11,10 +11,12 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy, QToolButton, QVB
 
 from app.icons import icon
 from app.panels.parts import (
+    NAME_SHARE,
     Card,
     ElidedLabel,
     HoverRow,
     labelled,
+    longest_name,
     show_verdict,
     silent,
     title_row,
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 EVEN_ODDS = 0.5
 """Probability above which a pose counts as predicted to collide."""
 
-_BAR_WIDTH = 54
+_BAR_WIDTH = 40
 _SOURCE = "by the model, at once"
 
 
@@ -107,7 +109,11 @@ class EnergyBar(QWidget):
         super().__init__()
         self._colour = colour
         self._share = 0.0
-        self.setFixedWidth(_BAR_WIDTH)
+        self.setMinimumWidth(_BAR_WIDTH)
+        # Or else the locks of a model that does not predict would follow the names.
+        policy = self.sizePolicy()
+        policy.setRetainSizeWhenHidden(True)
+        self.setSizePolicy(policy)
 
     @property
     def share(self) -> float:
@@ -141,11 +147,18 @@ class DomainRow(HoverRow):
     Signals
     -------
     lock_toggled : int and bool, the domain and whether it is to be locked
+
+    Parameters
+    ----------
+    domain : index from 0
+    name : of the domain
+    colour : "#rrggbb"
+    name_width : room that the name takes before the bar gets any but the least
     """
 
     lock_toggled = Signal(int, bool)
 
-    def __init__(self, domain: int, name: str, colour: str) -> None:
+    def __init__(self, domain: int, name: str, colour: str, name_width: int) -> None:
         super().__init__(domain)
         self._index = domain
         self._name = heading(name)
@@ -160,8 +173,10 @@ class DomainRow(HoverRow):
         row = QHBoxLayout(self)
         row.setContentsMargins(TIGHT + 12 + CLOSE, 0, 0, 0)
         row.setSpacing(CLOSE)
-        row.addWidget(ElidedLabel(self._name), 1)
-        row.addWidget(self.bar)
+        label = ElidedLabel(self._name)
+        label.setMaximumWidth(name_width)
+        row.addWidget(label, NAME_SHARE)
+        row.addWidget(self.bar, 1)
         row.addWidget(self.lock)
         self.setFixedHeight(ROW_HEIGHT - 3)
         self.lock.toggled.connect(self._on_lock)
@@ -277,10 +292,11 @@ class PredictionCard(Card):
             row.deleteLater()
         model = self._document.model
         self.rows = []
+        name_width = longest_name(self, map(heading, model.domain_names))
         for domain, (name, colour) in enumerate(
             zip(model.domain_names, model.domain_colours, strict=True)
         ):
-            row = DomainRow(domain, name, colour)
+            row = DomainRow(domain, name, colour, name_width)
             row.hovered.connect(self.domain_hovered)
             row.lock_toggled.connect(self._document.set_locked)
             self._rows.addWidget(row)

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QAbstractButton, QLineEdit, QVBoxLayout, QWidget
 
 from app.icons import pixmap
 from app.panels.code_slider import CodeRow, tab_order
-from app.panels.parts import scrolling
+from app.panels.parts import longest_name, scrolling
 from app.theme import CLOSE, NORMAL, TIGHT, current_theme, visible_colour
 from app.wording import heading
 
@@ -181,6 +181,7 @@ class SliderGroup(QWidget):
                 low[code],
                 high[code],
                 colours[domain],
+                self._panel.name_width,
             )
             row.show_number(float(document.latent[code]))
             row.hovered.connect(self._panel.domain_hovered)
@@ -204,6 +205,11 @@ class SlidersPanel(QWidget):
     Parameters
     ----------
     document : followed, and changed by the sliders
+
+    Attributes
+    ----------
+    groups : one for the whole body, then one for each domain
+    name_width : of the longest name of a slider, in device-independent pixels
     """
 
     domain_hovered = Signal(object)
@@ -212,6 +218,7 @@ class SlidersPanel(QWidget):
         super().__init__()
         self.document = document
         self.groups: list[SliderGroup] = []
+        self.name_width = 0
         self._shown = np.zeros(0)
         self.filter = QLineEdit()
         self.filter.setPlaceholderText("Filter sliders, such as “thigh”")
@@ -270,6 +277,8 @@ class SlidersPanel(QWidget):
             self._column.removeWidget(group)
             group.deleteLater()
         space = self.document.model.latent_space
+        names = (heading(name) for group in space.groups for name in group.code_names)
+        self.name_width = longest_name(self, names)
         self.groups = [SliderGroup(self, place, group) for place, group in enumerate(space.groups)]
         for place, group in enumerate(self.groups):
             self._column.insertWidget(place, group)

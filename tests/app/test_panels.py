@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QIcon
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QInputDialog, QLabel
+from PySide6.QtWidgets import QInputDialog, QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
+from app.document import PoseDocument
 from app.main_window import MainWindow
+from app.panels.code_slider import CodeRow
 from app.panels.library import THUMBNAIL
+from app.panels.prediction import DomainRow
 from app.wording import heading
-from tests.app.windows import PATIENCE, answer
+from lcollision_core.model import PoseModel
+from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 
 CONTROL, LEFT = Qt.KeyboardModifier.ControlModifier, Qt.MouseButton.LeftButton
 
@@ -156,3 +161,64 @@ def test_a_slider_is_found_by_what_its_row_and_undo_call_it(window: MainWindow) 
         panel.filter.setText(words)
         assert shown_codes(window) == codes
     assert panel.row_of(0).slider.accessibleName() == heading(space.groups[0].code_names[0])
+
+
+def test_what_can_be_typed_is_near_the_sliders_range(qtbot: QtBot, window: MainWindow) -> None:
+    document, row = window.document, window.sliders.row_of(1)
+    space = document.model.latent_space
+    low, high = float(space.low[1]), float(space.high[1])
+    beyond = 1.5 * (high - low)
+
+    def type_in(text: str) -> float:
+        row.field.setFocus()
+        row.field.selectAll()
+        QTest.keyClicks(row.field, text)
+        QTest.keyClick(row.field, Qt.Key.Key_Return)
+        return float(document.latent[1])
+
+    for wanted in (high + 0.9 * beyond, low - 0.9 * beyond):
+        assert type_in(f"{wanted:.3f}") == pytest.approx(wanted, abs=1e-3)
+    for far in ("9999", "-9999", "1e9"):
+        assert low - beyond <= type_in(far) <= high + beyond
+    for limit in (low - beyond, high + beyond):
+        assert f"{limit:.3f}" in row.field.toolTip()
+    # What comes from a file may be further away: it is shown as it is, and stays so.
+    pose = document.latent.copy()
+    pose[1] = high + 10.0 * beyond + 1e-5
+    document.set_latent(pose, "Test")
+    rest(qtbot, window)
+    assert row.field.value() == pytest.approx(pose[1], abs=1e-3)
+    row.field.setFocus()
+    QTest.keyClick(row.field, Qt.Key.Key_Return)
+    window.viewport.setFocus()
+    assert document.latent.tobytes() == pose.tobytes()
+    assert low - beyond <= type_in("0.125") <= high + beyond
+    assert low - beyond <= type_in("9999") <= high + beyond
+
+
+def name_label(row: QWidget) -> QLabel:
+    return next(label for label in row.findChildren(QLabel) if label.text())
+
+
+def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
+    qtbot: QtBot, editor_model: PoseModel, tmp_path: Path
+) -> None:
+    long, endless = "right upper arm & chest", "arm and " * 7 + "arm"
+    document = PoseDocument(editor_model.rename_domains({1: long}))
+    window = open_window(qtbot, document, settings_in(tmp_path))
+
+    def labels() -> list[QLabel]:
+        window.sliders.row_of(0)
+        rows = [*window.sliders.findChildren(CodeRow), *window.collision.findChildren(DomainRow)]
+        return [name_label(row) for row in rows if row.isVisible()]
+
+    assert heading(long) in [label.text() for label in labels()]
+    for label in labels():
+        assert label.width() >= label.fontMetrics().horizontalAdvance(label.text())
+        assert label.toolTip() == ""
+    window.document.set_model(editor_model.rename_domains({0: long, 1: endless}))
+    rest(qtbot, window)
+    told = {label.text(): label.toolTip() for label in labels()}
+    assert told[heading(endless)] == heading(endless)
+    assert all(row.slider.width() >= 60 for row in window.sliders.groups[0].rows)
+    close_window(window)
