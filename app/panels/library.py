@@ -41,7 +41,12 @@ _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
 
 
 class PoseList(QListWidget):
-    """Pictures of poses with their names beneath; the wheel scrolls them sideways too."""
+    """Pictures of poses with their names beneath; the wheel scrolls them sideways too.
+
+    Attributes
+    ----------
+    hint : what would be there, to be shown in an empty list
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -55,6 +60,10 @@ class PoseList(QListWidget):
         self.setTextElideMode(Qt.TextElideMode.ElideRight)
         self.setVerticalScrollMode(QListWidget.ScrollMode.ScrollPerPixel)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.hint = labelled("The poses that you keep are shown here", "caption")
+        self.hint.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.hint.setWordWrap(True)
+        QVBoxLayout(self.viewport()).addWidget(self.hint)
 
     def sizeHint(self) -> QSize:  # noqa: N802
         """Ask for one row of pictures."""
@@ -218,6 +227,7 @@ class LibraryPanel(QWidget):
                 self.list.addItem(item)
             if before is not None and before.name in self._names():
                 self.list.setCurrentRow(self._names().index(before.name))
+        self.list.hint.setVisible(not self._poses)
         self.own.setText(f"Yours ({len(document.poses)})" if document.poses else "Yours")
         self._on_chosen(self.list.currentRow())
         self._draw_soon()

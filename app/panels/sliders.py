@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QAbstractButton, QLineEdit, QVBoxLayout, QWidget
 
 from app.icons import pixmap
 from app.panels.code_slider import CodeRow, tab_order
-from app.panels.parts import longest_name, scrolling
+from app.panels.parts import labelled, longest_name, scrolling
 from app.theme import CLOSE, NORMAL, TIGHT, current_theme, visible_colour
 from app.wording import heading
 
@@ -126,6 +126,7 @@ class SliderGroup(QWidget):
         self._panel = panel
         self._group = group
         self._domain = place - 1 if place else None
+        self._open_before: bool | None = None
         self.rows: list[CodeRow] = []
         self.header = GroupHeader(heading(group.name), group.colour, self._domain)
         self._body = QWidget()
@@ -148,13 +149,27 @@ class SliderGroup(QWidget):
         self._body.setVisible(is_open)
         self.header.setChecked(is_open)
 
-    def show_matching(self, words: str) -> None:
-        """Show only rows whose name, with that of their group, holds all of the words."""
+    def show_matching(self, words: str) -> bool:
+        """Show only rows whose name, with that of their group, holds all of the words.
+
+        Parameters
+        ----------
+        words : in lower case; "" shows all rows, and opens or closes the group as it was before
+
+        Returns
+        -------
+        found : whether a row is left
+        """
         if not words:
-            self.setVisible(True)
             for row in self.rows:
                 row.setVisible(True)
-            return
+            if self._open_before is not None:
+                self.set_open(self._open_before)
+            self._open_before = None
+            self.setVisible(True)
+            return True
+        if self._open_before is None:
+            self._open_before = self.header.isChecked()
         hits = []
         for place in range(len(self._group.code_names)):
             name = f"{self._group.name} {self._group.full_name(place)}".casefold()
@@ -164,6 +179,7 @@ class SliderGroup(QWidget):
             self.set_open(True)
             for row, hit in zip(self.rows, hits, strict=True):
                 row.setVisible(hit)
+        return any(hits)
 
     def _make_rows(self) -> None:
         document = self._panel.document
@@ -229,6 +245,10 @@ class SlidersPanel(QWidget):
         self._column = QVBoxLayout(self._page)
         self._column.setContentsMargins(CLOSE, 0, CLOSE, CLOSE)
         self._column.setSpacing(2)
+        self._nothing = labelled("No slider is called that", "caption")
+        self._nothing.setContentsMargins(TIGHT, TIGHT, TIGHT, TIGHT)
+        self._nothing.hide()
+        self._column.addWidget(self._nothing)
         self._column.addStretch()
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
@@ -303,5 +323,5 @@ class SlidersPanel(QWidget):
 
     def _on_filter(self, text: str) -> None:
         words = text.strip().casefold()
-        for group in self.groups:
-            group.show_matching(words)
+        found = [group.show_matching(words) for group in self.groups]
+        self._nothing.setVisible(not any(found))

@@ -222,3 +222,47 @@ def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
     assert told[heading(endless)] == heading(endless)
     assert all(row.slider.width() >= 60 for row in window.sliders.groups[0].rows)
     close_window(window)
+
+
+def folds(window: MainWindow) -> list[bool]:
+    return [group.header.isChecked() for group in window.sliders.groups]
+
+
+def says(widget: QWidget, text: str) -> bool:
+    return text in [label.text() for label in widget.findChildren(QLabel) if label.isVisible()]
+
+
+def test_a_cleared_filter_leaves_the_groups_folded_as_they_were(window: MainWindow) -> None:
+    panel, find = window.sliders, window.actions_by_key["filter"]
+    QTest.mouseClick(panel.groups[0].header, LEFT)
+    QTest.mouseClick(panel.groups[2].header, LEFT)
+    before = folds(window)
+    assert before == [False, False, True]
+    find.trigger()
+    for text in ("motion", "left thigh", "knuckle"):
+        panel.filter.selectAll()
+        QTest.keyClicks(panel.filter, text)
+        assert says(panel, "No slider is called that") == (text == "knuckle")
+    panel.filter.clear()
+    assert folds(window) == before
+    assert not says(panel, "No slider is called that")
+    assert shown_codes(window) == [row.code for row in panel.groups[2].rows]
+    # Another time, from other folds.
+    QTest.mouseClick(panel.groups[2].header, LEFT)
+    QTest.keyClicks(panel.filter, "motion")
+    assert any(folds(window))
+    panel.filter.clear()
+    assert not any(folds(window))
+
+
+def test_an_empty_library_says_what_would_be_there(window: MainWindow) -> None:
+    library, hint = window.library, "The poses that you keep are shown here"
+    assert not says(library, hint)
+    QTest.mouseClick(library.own, LEFT)
+    assert says(library, hint)
+    window.document.add_pose_to_library("mine")
+    assert not says(library, hint)
+    window.actions_by_key["undo"].trigger()
+    assert says(library, hint)
+    QTest.mouseClick(library.training, LEFT)
+    assert not says(library, hint)
