@@ -124,7 +124,7 @@ class PoseDocument(PoseHistory):
 
     @property
     def locked_domains(self) -> frozenset[int]:
-        """Domains that Resolve, Randomise and Reset all leave as they are."""
+        """Domains that Resolve, Randomise, Reset all and blending leave as they are."""
         return self._locked
 
     @property
@@ -212,7 +212,7 @@ class PoseDocument(PoseHistory):
         return group.full_name(index - group.codes.start)
 
     def set_locked(self, domain: int, locked: bool) -> None:
-        """Lock a domain against Resolve, Randomise and Reset all, or let it go."""
+        """Lock a domain against Resolve, Randomise, Reset all and blending, or let it go."""
         changed = self._locked | {domain} if locked else self._locked - {domain}
         if changed != self._locked:
             self._locked = changed

@@ -133,10 +133,14 @@ class PoseHistory(QObject):
         self._edit(label, np.array(latent, dtype=np.float64))
 
     def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
-        """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1."""
+        """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1.
+
+        Locked domains stay as they are.
+        """
         start = self._gesture[1].latent if self._gesture else self.latent
         target = np.asarray(latent, dtype=np.float64)
-        self._edit("Blend", target.copy() if share == 1.0 else start + share * (target - start))
+        blended = target.copy() if share == 1.0 else start + share * (target - start)
+        self._edit("Blend", self._with_locked(blended))
 
     def undo(self) -> None:
         """Take back the last step; a drag that has not ended is that step."""
@@ -281,6 +285,10 @@ class PoseHistory(QObject):
 
     def _follow_latent(self) -> None:
         """Tell the workers, before the widgets, that the pose is another."""
+
+    def _with_locked(self, latent: FloatArray) -> FloatArray:
+        """Return the latent with the present codes of locked domains."""
+        return latent
 
     def _tell_modified(self) -> None:
         if self.modified != self._told_modified:

@@ -124,7 +124,9 @@ class LibraryPanel(QWidget):
         self.blend.setRange(0, _BLEND_STEPS)
         self.blend.setEnabled(False)
         self.blend.setAccessibleName("Blend towards the chosen pose")
-        self.blend.setToolTip("Drag to blend the pose towards the chosen one")
+        self.blend.setToolTip(
+            "Drag to blend the pose towards the chosen one; the next begins where this one ends"
+        )
         side = QWidget()
         side.setFixedWidth(182)
         column = QVBoxLayout(side)
@@ -359,6 +361,9 @@ class LibraryPanel(QWidget):
 
     def _rest_blend(self) -> None:
         """Back to 0: the next blend begins at the pose that this one ended in."""
+        share = self.blend.value()
+        if share and self.chosen is not None:
+            self._document.message.emit(f"Blended {share} % of the way to {self.chosen.name}")
         with silent(self.blend):
             self.blend.setValue(0)
         self._share.setText("")

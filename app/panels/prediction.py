@@ -191,7 +191,8 @@ class DomainRow(HoverRow):
         self.lock.setToolTip(
             f"{self._name} keeps its numbers: click to let it move again"
             if locked
-            else f"Lock {self._name}: Resolve, Randomise and Reset all leave its numbers alone"
+            else f"Lock {self._name}: Resolve, Randomise, Reset all and blending leave its numbers "
+            "alone"
         )
 
     def show_energy(self, energy: float | None) -> None:

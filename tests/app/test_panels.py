@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QPoint, Qt
 from PySide6.QtGui import QIcon
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QInputDialog, QLabel, QWidget
@@ -266,3 +267,35 @@ def test_an_empty_library_says_what_would_be_there(window: MainWindow) -> None:
     assert says(library, hint)
     QTest.mouseClick(library.training, LEFT)
     assert not says(library, hint)
+
+
+def test_a_blend_tells_its_share_and_leaves_locked_parts_alone(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    document, library = window.document, window.library
+    choose(window, document.model.pose_names[4])
+    assert library.chosen is not None
+    name, target = library.chosen.name, library.chosen.latent
+    QTest.mouseClick(window.collision.prediction.rows[1].lock, LEFT)
+    assert document.locked_domains == {1}
+    start = document.latent
+    held = np.zeros(len(start), dtype=bool)
+    held[1] = held[document.model.latent_space.groups[2].codes] = True
+    assert (start != target)[held].any()
+    slider = library.blend
+    QTest.mousePress(slider, LEFT, pos=QPoint(8, slider.height() // 2))
+    QTest.mouseMove(slider, QPoint(slider.width() // 2, slider.height() // 2))
+    share = slider.value()
+    assert 40 < share < 60
+    assert says(library, f"{share} %")
+    blended = np.where(held, start, start + share / 100 * (target - start))
+    np.testing.assert_allclose(document.latent, blended, rtol=1e-12, atol=1e-12)
+    assert document.latent[held].tobytes() == start[held].tobytes()
+    QTest.mouseRelease(slider, LEFT, pos=QPoint(slider.width() // 2, slider.height() // 2))
+    rest(qtbot, window)
+    assert slider.value() == 0
+    assert not says(library, f"{share} %")
+    assert f"{share} % of the way to {name}" in window.statusBar().currentMessage()
+    np.testing.assert_allclose(document.latent, blended, rtol=1e-12, atol=1e-12)
+    QTest.keyClick(slider, Qt.Key.Key_End)
+    assert np.array_equal(document.latent, np.where(held, start, target))
