@@ -38,6 +38,11 @@ def _kinds(*wanted: str) -> str:
     return ";;".join(filters)
 
 
+def _plain(name: str) -> str:
+    """Return a name as a menu shows it to the letter."""
+    return name.replace("&", "&&")
+
+
 def _mesh_suffixes() -> tuple[str, ...]:
     # Loads SciPy: not before the window is on the screen.
     from lcollision_core.meshes import READABLE_SUFFIXES
@@ -56,6 +61,10 @@ class FileActions(QObject):
     document : opened into and saved from
     settings : remembers the last folder, the recent files and the model
     attempt : does something and shows what a user can mend of what goes wrong
+
+    Attributes
+    ----------
+    recent_menu, models_menu : list what can be opened by a click
     """
 
     def __init__(
@@ -70,7 +79,9 @@ class FileActions(QObject):
         self._window = window
         self._document = document
         self._settings = settings
-        self._recent: QMenu | None = None
+        self.recent_menu = self._listing("Open &recent", self._fill_recent)
+        self._fill_recent()
+        self.models_menu = self._listing("Mode&ls", self._fill_models)
         document.may_replace = lambda: bool(attempt(self.may_lose_changes))
         document.file_changed.connect(self._on_file)
         document.model_changed.connect(self._on_model)
@@ -194,27 +205,41 @@ class FileActions(QObject):
             return self.save()
         return answer is Answer.DISCARD
 
-    def fill_recent(self, menu: QMenu) -> None:
-        """Keep a menu filled with the recent files."""
-        self._recent = menu
-        menu.aboutToShow.connect(self._on_recent)
-        self._on_recent()
+    def _listing(self, title: str, fill: Callable[[], None]) -> QMenu:
+        """Make a menu that lists anew what there is whenever it is about to be shown."""
+        menu = QMenu(title, self._window)
+        menu.setToolTipsVisible(True)
+        menu.aboutToShow.connect(fill)
+        return menu
+
+    def _list(self, menu: QMenu, text: str, path: str) -> QAction:
+        """Add a file to a menu, to be opened by a click."""
+        action = menu.addAction(text)
+        action.setData(path)
+        action.setToolTip(path)
+        action.triggered.connect(self._on_listed)
+        return action
 
     @Slot()
-    def _on_recent(self) -> None:
-        if self._recent is None:
-            return
-        self._recent.clear()
+    def _fill_recent(self) -> None:
+        self.recent_menu.clear()
         for place, name in enumerate(self._settings["recent_files"], start=1):
-            action = self._recent.addAction(f"&{place}  {Path(name).name}")
-            action.setData(name)
-            action.setToolTip(name)
-            action.triggered.connect(self._on_recent_chosen)
-        if self._recent.isEmpty():
-            self._recent.addAction("No files yet").setEnabled(False)
+            self._list(self.recent_menu, f"&{place}  {_plain(Path(name).name)}", name)
+        if self.recent_menu.isEmpty():
+            self.recent_menu.addAction("No files yet").setEnabled(False)
 
     @Slot()
-    def _on_recent_chosen(self) -> None:
+    def _fill_models(self) -> None:
+        from lcollision_core.model import list_models
+
+        self.models_menu.clear()
+        for model in list_models():
+            action = self._list(self.models_menu, _plain(model.name), str(model.path))
+            action.setCheckable(True)
+            action.setChecked(model.path.absolute() == Path(self._document.model_file))
+
+    @Slot()
+    def _on_listed(self) -> None:
         action = self.sender()
         if isinstance(action, QAction):
             path = Path(action.data())

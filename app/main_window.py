@@ -133,7 +133,6 @@ class MainWindow(QMainWindow):
         }
         self._camera_menu = self._submenu("&Camera", self._cameras.values())
         self._theme_menu = self._submenu("&Theme", self._themes.values())
-        recent = self._submenu("Open &recent", ())
         self.menus = fill_menus(
             self,
             act,
@@ -141,9 +140,13 @@ class MainWindow(QMainWindow):
                 "shading": self._shadings.values(),
                 "docks": [dock.toggleViewAction() for dock in self.docks.values()],
             },
-            {"recent": recent, "cameras": self._camera_menu, "themes": self._theme_menu},
+            {
+                "recent": self.files.recent_menu,
+                "models": self.files.models_menu,
+                "cameras": self._camera_menu,
+                "themes": self._theme_menu,
+            },
         )
-        self.files.fill_recent(recent)
         self._bar = make_bar(act, self._shadings.values(), self._camera_menu)
         self.addToolBar(self._bar)
         self._handlers = ActionHandlers(self)

@@ -14,7 +14,7 @@ SEPARATOR = ""
 
 MENUS: dict[str, tuple[str, ...]] = {
     "&File": (
-        *("new", "open", "open_model", "recent", SEPARATOR),
+        *("new", "open", "open_model", "models", "recent", SEPARATOR),
         *("save", "save_as", SEPARATOR),
         *("import", "export", SEPARATOR),
         *("screenshot", "turntable", SEPARATOR, "quit"),

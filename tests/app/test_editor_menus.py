@@ -1,0 +1,58 @@
+"""What the menus list, and how they look."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QMenu
+from pytestqt.qtbot import QtBot
+
+from app.main_window import MainWindow
+from lcollision_core.model import PoseModel, user_models_folder
+from tests.app.windows import PATIENCE, answer, rest
+
+
+def listed(menu: QMenu) -> dict[str, QAction]:
+    """Return what a menu lists when it is opened, by text."""
+    menu.aboutToShow.emit()
+    return {action.text(): action for action in menu.actions()}
+
+
+def ticked(menu: QMenu) -> list[str]:
+    return [text for text, action in listed(menu).items() if action.isChecked()]
+
+
+@pytest.fixture
+def own_model(
+    editor_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> PoseModel:
+    """Return a model that lies in the user's folder as "dancer & co"."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    file = user_models_folder() / "dancer & co.safetensors"
+    file.parent.mkdir(parents=True)
+    editor_model.save(file)
+    return PoseModel.load(file)
+
+
+def test_the_models_that_there_are_open_from_a_menu(
+    qtbot: QtBot, window: MainWindow, own_model: PoseModel
+) -> None:
+    document, menu = window.document, window.files.models_menu
+    assert menu.menuAction() in window.menus["&File"].actions()
+    assert list(listed(menu)) == ["body", "body-jump", "body-swing", "dancer && co"]
+    assert ticked(menu) == []
+    before = document.model
+    document.set_code(0, 0.5)
+    asked = answer(lambda dialog: dialog.reject())
+    listed(menu)["dancer && co"].trigger()
+    assert not asked.isActive()
+    assert not document.busy
+    assert document.model is before
+    document.undo()
+    with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
+        listed(menu)["dancer && co"].trigger()
+    assert document.model.fingerprint == own_model.fingerprint
+    assert ticked(menu) == ["dancer && co"]
+    rest(qtbot, window)
