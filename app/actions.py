@@ -133,5 +133,7 @@ def equip_action(action: QAction, spec: ActionSpec) -> None:
     action.setToolTip(f"{spec.tip} ({shown})")
     action.setStatusTip(spec.tip)
     action.setCheckable(spec.checkable)
+    # In a menu an icon would stand where the tick is.
+    action.setIconVisibleInMenu(not spec.checkable)
     if spec.icon:
         action.setIcon(icon(spec.icon))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from PySide6.QtGui import QAction
+from PySide6.QtGui import QAction, QImage
 from PySide6.QtWidgets import QMenu
 from pytestqt.qtbot import QtBot
 
@@ -56,3 +56,19 @@ def test_the_models_that_there_are_open_from_a_menu(
     assert document.model.fingerprint == own_model.fingerprint
     assert ticked(menu) == ["dancer && co"]
     rest(qtbot, window)
+
+
+def test_a_tick_shows_what_is_on(window: MainWindow) -> None:
+    menu, ghost = window.menus["&View"], window.actions_by_key["ghost"]
+
+    def entry() -> QImage:
+        return menu.grab(menu.actionGeometry(ghost)).toImage()
+
+    menu.popup(window.pos())
+    assert ghost.isChecked()
+    on = entry()
+    ghost.trigger()
+    assert entry() != on
+    ghost.trigger()
+    assert entry() == on
+    menu.close()
