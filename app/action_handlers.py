@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, Qt, Slot
 from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QDialog, QInputDialog, QMenu
+from PySide6.QtWidgets import QDialog, QMenu
 
 from app.camera import CAMERAS
 from app.dialogs.failure import open_log_file
 from app.dialogs.forms import resolve_form
 from app.dialogs.help import AboutDialog, ShortcutsDialog
+from app.dialogs.questions import ask_for_name
 
 if TYPE_CHECKING:
     from app.main_window import MainWindow
@@ -80,11 +81,10 @@ class ActionHandlers(QObject):
     @Slot()
     def keep_pose(self) -> None:
         """Ask for a name, and put the pose into the library."""
-        name, accepted = QInputDialog.getText(
-            self._window, "Keep this pose", "Name in your library:", text=self._document.pose_name
-        )
-        if accepted:
-            self._document.add_pose_to_library(name.strip())
+        proposed = self._document.pose_name
+        name = ask_for_name(self._window, "Keep this pose", "Name in your library:", proposed)
+        if name is not None:
+            self._document.add_pose_to_library(name)
             self._window.library.choose_own(self._document.pose_name)
 
     def _find_slider(self) -> None:
@@ -120,12 +120,11 @@ class ActionHandlers(QObject):
         chosen = library.chosen_own
         if chosen is None:
             return
-        name, accepted = QInputDialog.getText(
-            self._window, "Rename a pose", f"New name of “{chosen.name}”:", text=chosen.name
-        )
-        if accepted:
-            self._document.rename_pose(chosen.name, name.strip())
-            library.choose_own(name.strip())
+        label = f"New name of “{chosen.name}”:"
+        name = ask_for_name(self._window, "Rename a pose", label, chosen.name)
+        if name is not None:
+            self._document.rename_pose(chosen.name, name)
+            library.choose_own(name)
 
     def _remove(self) -> None:
         chosen = self._window.library.chosen_own

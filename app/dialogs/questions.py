@@ -6,13 +6,24 @@ from datetime import datetime
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from PySide6.QtWidgets import QMessageBox, QPushButton, QWidget
+from PySide6.QtWidgets import (
+    QDialog,
+    QGridLayout,
+    QInputDialog,
+    QMessageBox,
+    QPushButton,
+    QSpacerItem,
+    QWidget,
+)
 
 from app.icons import pixmap
 from app.theme import WIDE, current_theme
 
 if TYPE_CHECKING:
     from app.recovery import LostPose
+
+_WIDTH = 400
+"""At least, so that no title is cut."""
 
 
 class Answer(Enum):
@@ -33,7 +44,6 @@ def ask_about_changes(parent: QWidget, pose_name: str) -> Answer:
     cancel = box.addButton("Cancel", QMessageBox.ButtonRole.RejectRole)
     box.setDefaultButton(save)
     box.setEscapeButton(cancel)
-    box.exec()
     return _answer(box, save, discard)
 
 
@@ -53,21 +63,35 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Answer:
     later = box.addButton("Ask later", QMessageBox.ButtonRole.RejectRole)
     box.setDefaultButton(recover)
     box.setEscapeButton(later)
-    box.exec()
     return _answer(box, recover, discard)
+
+
+def ask_for_name(parent: QWidget, title: str, label: str, proposed: str) -> str | None:
+    """Ask what something is to be called; None where the user gives up."""
+    dialog = QInputDialog(parent)
+    dialog.setWindowTitle(title)
+    dialog.setLabelText(label)
+    dialog.setTextValue(proposed)
+    dialog.resize(_WIDTH, dialog.sizeHint().height())
+    accepted = dialog.exec() == QDialog.DialogCode.Accepted
+    dialog.deleteLater()
+    return dialog.textValue().strip() if accepted else None
 
 
 def _box(parent: QWidget, title: str) -> QMessageBox:
     box = QMessageBox(parent)
     box.setWindowTitle(title)
     box.setIconPixmap(pixmap("question", current_theme().accent, 36, parent.devicePixelRatioF()))
-    layout = box.layout()
-    if layout is not None:
-        layout.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
     return box
 
 
 def _answer(box: QMessageBox, save: QPushButton, discard: QPushButton) -> Answer:
+    layout = box.layout()
+    if isinstance(layout, QGridLayout):
+        layout.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
+        # A message box takes no minimum width of its own.
+        layout.addItem(QSpacerItem(_WIDTH, 0), layout.rowCount(), 0, 1, layout.columnCount())
+    box.exec()
     clicked = box.clickedButton()
     box.deleteLater()
     if clicked is save:

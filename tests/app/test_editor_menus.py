@@ -1,17 +1,24 @@
-"""What the menus list, and how they look."""
+"""What the menus list and how they look, and the small dialogs that they open."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 from PySide6.QtGui import QAction, QImage
-from PySide6.QtWidgets import QMenu
+from PySide6.QtWidgets import QDialog, QMenu
 from pytestqt.qtbot import QtBot
 
+from app.dialogs.questions import ask_about_recovery
 from app.main_window import MainWindow
+from app.recovery import LostPose, Session
 from lcollision_core.model import PoseModel, user_models_folder
 from tests.app.windows import PATIENCE, answer, rest
+
+WIDEST_TITLE = "Recover a pose — LCollision"
+TITLE_BUTTONS = 160
+"""Pixels beside a title that a window manager takes for itself."""
 
 
 def listed(menu: QMenu) -> dict[str, QAction]:
@@ -72,3 +79,28 @@ def test_a_tick_shows_what_is_on(window: MainWindow) -> None:
     ghost.trigger()
     assert entry() == on
     menu.close()
+
+
+def test_no_title_is_cut(window: MainWindow, tmp_path: Path) -> None:
+    widths: list[int] = []
+
+    def look(dialog: QDialog) -> None:
+        widths.append(dialog.width())
+        dialog.reject()
+
+    lost = LostPose(Session.new(tmp_path), "tube", "kick", None, time.time())
+    window.document.set_code(0, 0.5)
+    window.document.add_pose_to_library("kick")
+    window.library.choose_own("kick")
+    for act in (
+        window.actions_by_key["keep"].trigger,
+        window.actions_by_key["rename"].trigger,
+        window.actions_by_key["new"].trigger,
+        lambda: ask_about_recovery(window, lost),
+    ):
+        asked = answer(look)
+        act()
+        assert not asked.isActive()
+    least = window.fontMetrics().horizontalAdvance(WIDEST_TITLE) + TITLE_BUTTONS
+    assert len(widths) == 4
+    assert min(widths) >= least
