@@ -53,6 +53,7 @@ from app.panels.randomise import RandomiseCard
 from app.panels.sliders import SlidersPanel
 from app.settings import Settings
 from app.shading import Shading
+from app.shortcuts import WindowShortcuts
 from app.theme import NORMAL, apply_theme, wanted_theme
 from app.viewport import Viewport
 from lcollision_core.errors import LCollisionError
@@ -150,6 +151,7 @@ class MainWindow(QMainWindow):
         self._bar = make_bar(act, self._shadings.values(), self._camera_menu)
         self.addToolBar(self._bar)
         self._handlers = ActionHandlers(self)
+        WindowShortcuts(self)
         self._make_status_bar()
         self._connect()
         self.viewport.set_shading(Shading[settings["shading"].upper()])

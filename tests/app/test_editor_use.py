@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PySide6.QtCore import QPoint, QPointF, Qt
-from PySide6.QtGui import QAction, QColor, QPalette, QWheelEvent
+from PySide6.QtGui import QAction, QColor, QKeySequence, QPalette, QWheelEvent
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialog, QMenu, QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
@@ -360,6 +360,34 @@ def test_keys_move_a_focused_slider(
     assert window.document.latent[1] - before == pytest.approx(share * width)
     rest(qtbot, window)
     assert np.array_equal(shown(window), decoded(window.document))
+
+
+@pytest.mark.parametrize("of_words", [False, True], ids=["number", "words"])
+def test_the_window_s_shortcuts_work_while_a_field_has_the_keyboard(
+    window: MainWindow, of_words: bool
+) -> None:
+    row = window.sliders.row_of(0)
+    field: QWidget = window.sliders.filter if of_words else row.field
+    fired: list[str] = []
+    window.document.set_code(1, 0.5)
+    for action in window.actions_by_key.values():
+        # Told by its key alone: most of what it would do opens a dialog.
+        action.triggered.disconnect()
+        action.triggered.connect(
+            lambda _, action=action: fired.append(action.shortcut().toString())
+        )
+    field.setFocus()
+    for keys in ("Ctrl+E", "Ctrl+Home", "Ctrl+Backspace", "Ctrl+R"):
+        pressed = QKeySequence(keys)[0]
+        QTest.keyClick(field, pressed.key(), pressed.keyboardModifiers())
+        assert fired.pop() == keys
+    for keys in ("Ctrl+A", "Ctrl+C", "Ctrl+V", "Ctrl+X", "Left", "Right", "Backspace", "Del"):
+        pressed = QKeySequence(keys)[0]
+        QTest.keyClick(field, pressed.key(), pressed.keyboardModifiers())
+    assert fired == []
+    QTest.keyClicks(field, "1")
+    QTest.keyClick(field, Qt.Key.Key_Z, Qt.KeyboardModifier.ControlModifier)
+    assert fired == ([] if of_words else ["Ctrl+Z"])
 
 
 def turn_wheel(widget: QWidget) -> None:

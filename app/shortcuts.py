@@ -1,0 +1,45 @@
+"""The window's shortcuts while a field has the keyboard."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import QEvent, QObject, Slot
+from PySide6.QtGui import QAction, QKeyEvent, QKeySequence
+from PySide6.QtWidgets import QAbstractSpinBox, QApplication, QDialog, QLineEdit, QWidget
+
+_Key = QKeySequence.StandardKey
+_EDITING = (_Key.Undo, _Key.Redo, _Key.Copy, _Key.Cut, _Key.Paste, _Key.SelectAll, _Key.Delete)
+
+
+class WindowShortcuts(QObject):
+    """Lets a window's shortcuts win over the rarer editing keys of its fields, as Ctrl+E is on X.
+
+    Copying, pasting and the like stay the field's.
+
+    Parameters
+    ----------
+    window : its actions have the shortcuts
+    """
+
+    def __init__(self, window: QWidget) -> None:
+        super().__init__(window)
+        self._window = window
+        application = QApplication.instance()
+        assert isinstance(application, QApplication)
+        application.focusChanged.connect(self._on_focus)
+
+    @Slot(QWidget, QWidget)
+    def _on_focus(self, _: QWidget | None, now: QWidget | None) -> None:
+        if isinstance(now, QLineEdit | QAbstractSpinBox) and not isinstance(now.window(), QDialog):
+            now.installEventFilter(self)
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: ARG002, N802 - Qt's names
+        """Keep from a field what is the window's; see Qt's ShortcutOverride."""
+        if event.type() is not QEvent.Type.ShortcutOverride or not isinstance(event, QKeyEvent):
+            return False
+        if any(event.matches(key) for key in _EDITING):
+            return False
+        keys = QKeySequence(event.keyCombination())
+        if any(keys in action.shortcuts() for action in self._window.findChildren(QAction)):
+            event.ignore()
+            return True
+        return False
