@@ -129,11 +129,16 @@ def equip_action(action: QAction, spec: ActionSpec) -> None:
     action.setText(spec.text)
     keys = QKeySequence.listFromString(spec.shortcut.replace(", ", "; "))
     action.setShortcuts(keys)
-    shown = keys[0].toString(QKeySequence.SequenceFormat.NativeText)
-    action.setToolTip(f"{spec.tip} ({shown})")
-    action.setStatusTip(spec.tip)
+    explain_action(action, spec.tip)
     action.setCheckable(spec.checkable)
     # In a menu an icon would stand where the tick is.
     action.setIconVisibleInMenu(not spec.checkable)
     if spec.icon:
         action.setIcon(icon(spec.icon))
+
+
+def explain_action(action: QAction, tip: str) -> None:
+    """Say in an action's tool tip what it does, or why it cannot now, and name its shortcut."""
+    shown = action.shortcut().toString(QKeySequence.SequenceFormat.NativeText)
+    action.setToolTip(f"{tip} ({shown})")
+    action.setStatusTip(tip)

@@ -62,6 +62,7 @@ class PoseDocument(PoseHistory):
     busy_changed : str, what the long work is, or "" where there is none
     message : str, one sentence for the status bar
     failed : Failure, one sentence and its details, for a dialog
+    imported : Path, the mesh that has become the pose
     recovered : Path, the poses file that `recover` has put in
     """
 
@@ -75,6 +76,7 @@ class PoseDocument(PoseHistory):
     busy_changed = Signal(str)
     message = Signal(str)
     failed = Signal(object)
+    imported = Signal(object)
     recovered = Signal(object)
 
     def __init__(self, model: PoseModel | None = None, parent: QObject | None = None) -> None:
@@ -148,6 +150,11 @@ class PoseDocument(PoseHistory):
         return self._long.busy
 
     @property
+    def incoming(self) -> str:
+        """What brings another pose or model, or "" where nothing does."""
+        return self._long.label_of(self._incoming)
+
+    @property
     def can_resolve(self) -> bool:
         """Whether Resolve can be asked for: the model has a predictor."""
         return self._model is not None and self._model.has_predictor
@@ -207,8 +214,7 @@ class PoseDocument(PoseHistory):
 
     def code_name(self, index: int) -> str:
         """Return what a person would call one number of the latent."""
-        groups = self.model.latent_space.groups
-        group = next(group for group in groups if index < group.codes.stop)
+        group = next(g for g in self.model.latent_space.groups if index < g.codes.stop)
         return group.full_name(index - group.codes.start)
 
     def set_locked(self, domain: int, locked: bool) -> None:
@@ -318,8 +324,7 @@ class PoseDocument(PoseHistory):
     def export_mesh(self, path: str | Path) -> None:
         """Write the mesh on the screen, back in its place, in the format that `path` says."""
         work = tasks.exported(self.model, self.latent, self.placement, Path(path))
-        number = self._long.start(f"Exporting {Path(path).name}", work, self._on_exported)
-        self._exports.append(number)
+        self._exports.append(self._long.start(f"Exporting {Path(path).name}", work, self._tell))
 
     def finish_exports(self) -> None:
         """Write here and now what still waits to be exported, as before the window closes.
@@ -355,7 +360,7 @@ class PoseDocument(PoseHistory):
         self.cancel_resolve()
         chosen = replace(options or ResolveOptions(), locked_domains=self._locked)
         work = tasks.resolved(self.model, self.latent, self.placement, chosen)
-        self._solve = self._long.start("Resolving", work, self._on_resolved, self._on_solve_failed)
+        self._solve = self._long.start("Resolving", work, self._on_resolved, self.cancel_resolve)
         self.solve_started.emit()
 
     def cancel_resolve(self) -> None:
@@ -422,19 +427,17 @@ class PoseDocument(PoseHistory):
         self.message.emit(f"Recovered {edited.name}")
         self.recovered.emit(found.poses_file)
 
-    def _on_encoded(self, pose: NamedPose) -> None:
-        self._load(f"Import {pose.name}", pose)
-        self.message.emit(
-            f"Imported {pose.name}: the pose lies {pose.fit_error_mean:.2%} of the height from "
-            f"the mesh on average, {pose.fit_error_max:.2%} at most"
-        )
+    def _on_encoded(self, imported: tasks.Imported) -> None:
+        self._load(f"Import {imported.pose.name}", imported.pose)
+        self._tell(imported)
+        self.imported.emit(imported.path)
+
+    def _tell(self, done: tasks.Imported | tasks.Exported) -> None:
+        self.message.emit(done.sentence)
 
     def _on_mirrored(self, latent: FloatArray) -> None:
         self.end_gesture()
         self._edit("Mirror", latent)
-
-    def _on_exported(self, exported: tasks.Exported) -> None:
-        self.message.emit(exported.sentence)
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
         result, self._solve = resolved.result, None
@@ -447,10 +450,6 @@ class PoseDocument(PoseHistory):
             after = replace(self._state, latent=latent, ghost=resolved.ghost, outcome=result)
             self._push("Resolve", after)
         self.solve_finished.emit(result)
-
-    def _on_solve_failed(self) -> None:
-        self._solve = None
-        self.solve_finished.emit(None)
 
     def _load_predictor(self) -> None:
         """Have predictions soon: the pose is shown, and can be edited, before."""
@@ -478,6 +477,7 @@ class PoseDocument(PoseHistory):
                 done(value)
 
         self._incoming = self._long.start(label, work, arrive)
+        self.busy_changed.emit(self.busy)
 
     def _blank(self) -> DocumentState:
         return DocumentState(read_only(self.model.training_latent[0]), UNNAMED)

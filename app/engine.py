@@ -321,6 +321,10 @@ class LongWork(QObject):
         """What is being done, or ""."""
         return next((job.label for job, _, _ in self._jobs.values()), "")
 
+    def label_of(self, number: int) -> str:
+        """Return what a job does, or "" where it is done."""
+        return self._jobs[number][0].label if number in self._jobs else ""
+
     def start(
         self,
         label: str,

@@ -39,6 +39,7 @@ from app.actions import (
     THEMES,
     ActionSpec,
     equip_action,
+    explain_action,
     make_action,
 )
 from app.dialogs.failure import FailureDialog
@@ -416,13 +417,16 @@ class MainWindow(QMainWindow):
             "redo": stack.canRedo(),
             "mirror": document.can_mirror,
             "unlock": bool(document.locked_domains),
-            "resolve": document.can_resolve and not document.solving,
+            "resolve": document.can_resolve and not (document.solving or document.incoming),
             "resolve_options": document.can_resolve,
             "cancel": bool(self._busy),
             "load": self.library.chosen is not None,
             "rename": own_chosen,
             "remove": own_chosen,
         }
+        waits = f"{document.incoming}: what comes replaces this pose"
+        tip = waits if document.incoming else ACTIONS["resolve"].tip
+        explain_action(self.actions_by_key["resolve"], tip)
         always = ("open_model", "quit", "reset_layout", "full_screen", "shortcuts", "log", "about")
         for key, action in self.actions_by_key.items():
             action.setEnabled(key in always or (has_model and allowed.get(key, True)))

@@ -68,6 +68,23 @@ class RecoveredPoses:
     file: Path | None
 
 
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """A mesh that was read as a pose."""
+
+    path: Path
+    pose: NamedPose
+
+    @property
+    def sentence(self) -> str:
+        """What the status bar says of it."""
+        pose = self.pose
+        return (
+            f"Imported {pose.name}: the pose lies {pose.fit_error_mean:.2%} of the height from "
+            f"the mesh on average, {pose.fit_error_max:.2%} at most"
+        )
+
+
 @dataclass(frozen=True)
 class Exported:
     """A mesh that was written, and how many pairs of its triangles collide."""
@@ -171,14 +188,15 @@ def recovered(
 def encoded(model: PoseModel, path: Path) -> Work:
     """Read a mesh of a model's topology as a latent pose, named after its file."""
 
-    def work(_: Progress, cancel: CancelToken) -> NamedPose:
+    def work(_: Progress, cancel: CancelToken) -> Imported:
         from lcollision_core.meshes import read_mesh
         from lcollision_core.model import NamedPose, name_of_file
 
         mesh = read_mesh(path, topology=model.topology)
         model.require_topology(mesh.topology, str(path))
         cancel.raise_if_cancelled()
-        return NamedPose.of_mesh(name_of_file(path), model.encode(mesh.vertices, cancel=cancel))
+        encoding = model.encode(mesh.vertices, cancel=cancel)
+        return Imported(path, NamedPose.of_mesh(name_of_file(path), encoding))
 
     return work
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +33,7 @@ from app.main_window import MainWindow
 from app.panels.parts import HANDLE
 from app.shading import Shading
 from lcollision_core.meshes import read_mesh, write_mesh
-from lcollision_core.model import PoseModel, read_poses, sample_poses
+from lcollision_core.model import EncodedPose, PoseModel, read_poses, sample_poses
 from tests.app.windows import (
     PATIENCE,
     answer,
@@ -423,6 +425,38 @@ def test_an_edit_while_a_file_is_read_is_asked_about(
     assert document.latent[0] == 0.5
     document.undo()
     assert document.latent.tobytes() == before.tobytes()
+
+
+def test_resolve_waits_for_a_mesh_that_is_read_and_undo_keeps_what_was_edited_meanwhile(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document, model = window.document, window.document.model
+    resolve, button = window.actions_by_key["resolve"], window.collision.resolve.button
+    mesh, tip = tmp_path / "bent.obj", resolve.toolTip()
+    write_mesh(mesh, model.decode(0.6 * model.latent_space.maximum), model.faces)
+    encode, go_on = PoseModel.encode, threading.Event()
+
+    def slow(*arguments: Any, **options: Any) -> EncodedPose:
+        go_on.wait(PATIENCE / 1000)
+        return encode(*arguments, **options)
+
+    monkeypatch.setattr(PoseModel, "encode", slow)
+    window.files.open_path(mesh)
+    assert not resolve.isEnabled()
+    assert not button.isEnabled()
+    assert "Importing bent.obj" in button.toolTip()
+    QTest.keyClick(window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
+    assert not document.solving
+    document.set_code(0, 0.5)
+    edited = document.latent
+    with qtbot.waitSignal(document.imported, timeout=PATIENCE):
+        go_on.set()
+    qtbot.waitUntil(button.isEnabled, timeout=PATIENCE)
+    assert button.toolTip() == tip
+    assert document.pose_name == "bent"
+    document.undo()
+    assert document.latent.tobytes() == edited.tobytes()
+    rest(qtbot, window)
 
 
 @pytest.mark.parametrize("typed", ["mine", "mine.v2"])
