@@ -85,6 +85,7 @@ class FileActions(QObject):
         document.may_replace = lambda: bool(attempt(self.may_lose_changes))
         document.file_changed.connect(self._on_file)
         document.model_changed.connect(self._on_model)
+        document.imported.connect(self._remember)
 
     def open(self) -> None:
         """Ask for any file that can be opened, and open it."""
@@ -113,7 +114,7 @@ class FileActions(QObject):
         """
         suffix = path.suffix.lower()
         if not path.is_file():
-            self._settings.forget_file(str(path))
+            self._settings.forget_file(str(path.resolve()))
             kind = "is a folder" if path.is_dir() else "is not there"
             raise LCollisionError(f"{path} {kind}; choose a file of poses, a mesh or a model")
         if suffix == POSES_SUFFIX:
@@ -131,7 +132,7 @@ class FileActions(QObject):
                 f"{path.name} is nothing that the editor knows; open poses ({POSES_SUFFIX}), a "
                 f"mesh ({', '.join(_mesh_suffixes())}) or a model ({MODEL_SUFFIX})"
             )
-        self._remember(path)
+        self._settings["last_folder"] = str(path.resolve().parent)
 
     def new_pose(self) -> None:
         """Start anew, once unsaved changes are settled."""
@@ -157,7 +158,6 @@ class FileActions(QObject):
         if path is None:
             return False
         self._document.save(path)
-        self._remember(path)
         return True
 
     def export(self) -> None:
@@ -256,10 +256,13 @@ class FileActions(QObject):
         # By its name a bundled one is found after the program has moved.
         is_bundled = file.parent == bundled_folder("models")
         self._settings["model"] = file.stem if is_bundled else str(file)
+        if file.is_file() and not is_bundled:
+            self._remember(file)
 
+    @Slot(object)
     def _remember(self, path: Path) -> None:
+        """Put a file that has opened first among the recent ones."""
         self._settings.remember_file(str(path.resolve()))
-        self._settings["last_folder"] = str(path.resolve().parent)
 
     def _folder(self) -> Path:
         folder = Path(self._settings["last_folder"] or Path.home())

@@ -13,6 +13,7 @@ from pytestqt.qtbot import QtBot
 from app.dialogs.questions import ask_about_recovery
 from app.main_window import MainWindow
 from app.recovery import LostPose, Session
+from lcollision_core.meshes import write_mesh
 from lcollision_core.model import PoseModel, user_models_folder
 from tests.app.windows import PATIENCE, answer, rest
 
@@ -62,6 +63,32 @@ def test_the_models_that_there_are_open_from_a_menu(
         listed(menu)["dancer && co"].trigger()
     assert document.model.fingerprint == own_model.fingerprint
     assert ticked(menu) == ["dancer && co"]
+    rest(qtbot, window)
+
+
+def test_only_files_that_opened_are_recent_and_one_that_is_gone_is_dropped(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document, model, menu = window.document, window.document.model, window.files.recent_menu
+    files = [tmp_path / name for name in ("poses.json", "mine.safetensors", "bent.obj")]
+    broken = [tmp_path / f"broken{file.suffix}" for file in files]
+    for file in broken:
+        file.write_text("garbage")
+        with qtbot.waitSignal(document.failed, timeout=PATIENCE):
+            window.files.open_path(file)
+    assert list(listed(menu)) == ["No files yet"]
+    document.save(files[0])
+    model.save(files[1])
+    write_mesh(files[2], model.decode(document.latent), model.faces)
+    signals = (document.pose_loaded, document.model_changed, document.imported)
+    for file, opened in zip(files, signals, strict=True):
+        with qtbot.waitSignal(opened, timeout=PATIENCE):
+            window.files.open_path(file)
+    newest_first = [f"&{place}  {file.name}" for place, file in enumerate(files[::-1], start=1)]
+    assert list(listed(menu)) == newest_first
+    files[0].unlink()
+    listed(menu)["&3  poses.json"].trigger()
+    assert list(listed(menu)) == ["&1  bent.obj", "&2  mine.safetensors"]
     rest(qtbot, window)
 
 
