@@ -273,7 +273,10 @@ class FileActions(QObject):
         return Path(name) if name else None
 
     def _ask_save(self, title: str, proposed: Path, kinds: dict[str, str]) -> Path | None:
-        """Ask for a name; the chosen kind's extension is added to a name without one."""
+        """Ask for a name; the chosen kind's extension is added to a name without one.
+
+        Where the extension chooses among kinds, another one is left for the writer to refuse.
+        """
         filters = {f"{kind} (*{suffix})": suffix for kind, suffix in kinds.items()}
         dialog = QFileDialog(self._window, title, str(proposed))
         dialog.setAcceptMode(QFileDialog.AcceptMode.AcceptSave)
@@ -283,7 +286,8 @@ class FileActions(QObject):
         path = None
         while path is None and dialog.exec() == QDialog.DialogCode.Accepted:
             path = Path(dialog.selectedFiles()[0])
-            if path.suffix.lower() not in kinds.values():
+            chooses = len(kinds) > 1 and path.suffix
+            if path.suffix.lower() not in kinds.values() and not chooses:
                 # Qt adds no extension behind a dot, so that it has asked about another file.
                 path = path.with_name(f"{path.name}.{dialog.defaultSuffix()}")
                 if path.exists():

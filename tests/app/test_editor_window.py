@@ -385,6 +385,36 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     assert np.abs(back - on_screen).max() < 2e-3 * model.height
 
 
+@pytest.mark.parametrize(
+    ("action", "name", "sentence"),
+    [
+        ("export", "b.fbx", ".fbx is no mesh format known here"),
+        ("turntable", "b.mp4", "b.mp4 is no film that can be written"),
+    ],
+)
+def test_no_file_is_written_in_another_format_than_was_asked_for(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, action: str, name: str, sentence: str
+) -> None:
+    def choose(dialog: QDialog) -> None:
+        assert isinstance(dialog, QFileDialog)
+        field = dialog.findChild(QLineEdit, "fileNameEdit")
+        assert isinstance(field, QLineEdit)
+        field.setText(str(tmp_path / name))
+        dialog.accept()
+
+    def accept(dialog: QDialog) -> None:
+        timers.append(answer(choose))
+        dialog.accept()
+
+    timers = [answer(accept if action == "turntable" else choose)]
+    window.actions_by_key[action].trigger()
+    qtbot.waitUntil(lambda: bool(failures(window)), timeout=PATIENCE)
+    (dialog,) = failures(window)
+    assert sentence in f"{dialog.what.text()} {dialog.advice.text()}"
+    dialog.reject()
+    assert list(tmp_path.glob("b.*")) == []
+
+
 def test_changes_are_saved_kept_or_given_up_as_the_user_says(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
