@@ -22,10 +22,8 @@ from PySide6.QtWidgets import (
     QApplication,
     QDialog,
     QDockWidget,
-    QLabel,
     QMainWindow,
     QMenu,
-    QProgressBar,
     QToolButton,
     QWidget,
 )
@@ -52,10 +50,12 @@ from app.panels.library import LibraryPanel
 from app.panels.parts import silent
 from app.panels.randomise import RandomiseCard
 from app.panels.sliders import SlidersPanel
+from app.preparing import Preparing
 from app.settings import Settings
 from app.shading import Shading
 from app.shortcuts import WindowShortcuts
-from app.theme import NORMAL, apply_theme, wanted_theme
+from app.status_bar import StatusBar
+from app.theme import apply_theme, wanted_theme
 from app.viewport import Viewport
 from lcollision_core.errors import LCollisionError
 
@@ -66,7 +66,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _LAYOUT_VERSION = 1
-_MESSAGE_MILLISECONDS = 8000
 _SIZE = QSize(1440, 900)
 _SIDE_WIDTHS = {"sliders": 330, "collision": 312}
 _AREAS = {
@@ -153,7 +152,9 @@ class MainWindow(QMainWindow):
         self.addToolBar(self._bar)
         self._handlers = ActionHandlers(self)
         WindowShortcuts(self)
-        self._make_status_bar()
+        self._status = StatusBar()
+        self.setStatusBar(self._status)
+        self._preparing = Preparing(self)
         self._connect()
         self.viewport.set_shading(Shading[settings["shading"].upper()])
         document.show_ghost(settings["show_ghost"])
@@ -257,11 +258,12 @@ class MainWindow(QMainWindow):
         self.settings["window_geometry"] = self.saveGeometry()
         self.settings["window_layout"] = self.saveState(_LAYOUT_VERSION)
         self.settings["randomise_amount"] = self.randomise.amount.value() / 100
+        self._preparing.close()
         if self._autosave is not None:
             self._autosave.close(keep=self._unasked)
         if not self.document.close():
             _log.warning("a thread was still busy when the window closed")
-        self.statusBar().clearMessage()
+        self._status.clearMessage()
         self.library.stop()
         self.viewport.shut_down()
         super().closeEvent(event)
@@ -278,7 +280,7 @@ class MainWindow(QMainWindow):
             return
         event.acceptProposedAction()
         if len(paths) > 1:
-            self._on_message(f"Of {len(paths)} files {paths[0].name} was opened")
+            self._status.tell(f"Of {len(paths)} files {paths[0].name} was opened")
         # The program that is dragged from waits until this returns.
         QTimer.singleShot(0, self, lambda: self.attempt(lambda: self.files.open_path(paths[0])))
 
@@ -318,19 +320,6 @@ class MainWindow(QMainWindow):
         self.addDockWidget(_AREAS[key], dock)
         return dock
 
-    def _make_status_bar(self) -> None:
-        self._busy_text = QLabel()
-        self._busy_bar = QProgressBar()
-        self._busy_bar.setFixedWidth(120)
-        self._busy_bar.setTextVisible(False)
-        self._facts = QLabel()
-        self._facts.setObjectName("caption")
-        for widget in (self._busy_text, self._busy_bar, self._facts):
-            self.statusBar().addPermanentWidget(widget)
-        self.statusBar().setSizeGripEnabled(False)
-        self.statusBar().setContentsMargins(NORMAL, 0, NORMAL, 0)
-        self._on_busy()
-
     def _connect(self) -> None:
         document = self.document
         for panel in (self.sliders, self.collision):
@@ -353,8 +342,10 @@ class MainWindow(QMainWindow):
         document.solve_finished.connect(self._update_actions)
         document.busy_changed.connect(self._on_busy)
         self.viewport.pictures.busy_changed.connect(self._on_busy)
-        document.message.connect(self._on_message)
+        document.message.connect(self._status.tell)
         document.failed.connect(self.show_failure)
+        self._preparing.begun.connect(self._status.explain)
+        self._preparing.begun.connect(self.viewport.waiting.explain)
         stack = document.undo_stack
         stack.indexChanged.connect(self._update_actions)
         QGuiApplication.styleHints().colorSchemeChanged.connect(self._on_system_theme)
@@ -384,7 +375,7 @@ class MainWindow(QMainWindow):
             dock.widget().setEnabled(has_model)
         if has_model:
             model = self.document.model
-            self._facts.setText(f"{model.name} · {model.n_vertices} vertices")
+            self._status.show_facts(f"{model.name} · {model.n_vertices} vertices")
         self._update_title()
         self._update_actions()
 
@@ -457,17 +448,8 @@ class MainWindow(QMainWindow):
 
     @Slot()
     def _on_busy(self) -> None:
-        work = self._busy
-        self._busy_text.setText(f"{work}…" if work else "")
-        for widget in (self._busy_text, self._busy_bar):
-            widget.setVisible(bool(work))
-        # An endless bar is animated even while nobody sees it.
-        self._busy_bar.setRange(0, 0 if work else 1)
+        self._status.show_busy(self._busy)
         self._update_actions()
-
-    @Slot(str)
-    def _on_message(self, sentence: str) -> None:
-        self.statusBar().showMessage(sentence, _MESSAGE_MILLISECONDS)
 
     @Slot()
     def _on_system_theme(self) -> None:

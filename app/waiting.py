@@ -55,7 +55,7 @@ class WaitingPage(QWidget):
     def __init__(self, document: PoseDocument, parent: QWidget) -> None:
         super().__init__(parent)
         self._document = document
-        self._text = "Starting"
+        self._text, self._reason = "Starting", ""
         self._angle = 0
         self._failed = self._stopped = False
         self.button = QPushButton("Open another model…", self)
@@ -70,8 +70,8 @@ class WaitingPage(QWidget):
 
     @property
     def text(self) -> str:
-        """What is waited for, or what went wrong."""
-        return self._text
+        """What is waited for and why it takes long, or what went wrong."""
+        return self._text if self._failed else f"{self._text} …\n{self._reason}".rstrip()
 
     @property
     def turns(self) -> bool:
@@ -86,6 +86,12 @@ class WaitingPage(QWidget):
             self.button.hide()
             self._timer.start()
             self.update()
+
+    @Slot(str)
+    def explain(self, reason: str) -> None:
+        """Say why what is waited for takes long."""
+        self._reason = reason
+        self.update()
 
     @Slot(object)
     def _on_failed(self, failure: Failure) -> None:
@@ -127,8 +133,7 @@ class WaitingPage(QWidget):
             self._draw_ring(painter)
         painter.setFont(self._font())
         painter.setPen(QColor(theme.text if self._failed else theme.muted))
-        words = self._text if self._failed else f"{self._text} …"
-        painter.drawText(self._words(), _WORDS, words)
+        painter.drawText(self._words(), _WORDS, self.text)
         painter.end()
 
     def _draw_ring(self, painter: QPainter) -> None:
@@ -154,7 +159,7 @@ class WaitingPage(QWidget):
         """Return where the words are, as high as they need."""
         width = min(_WIDEST_WORDS, 0.9 * self.width())
         room = QRectF(0.5 * (self.width() - width), self._middle() + 2 * _RADIUS, width, 1e4)
-        return QFontMetricsF(self._font()).boundingRect(room, _WORDS, f"{self._text} …")
+        return QFontMetricsF(self._font()).boundingRect(room, _WORDS, self.text)
 
     def _place_button(self) -> None:
         self.button.adjustSize()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import time
 from collections.abc import Callable
 from typing import TypeVar, cast
 
@@ -12,6 +14,9 @@ from numba.core import event
 Function = TypeVar("Function", bound=Callable[..., object])
 
 _log = logging.getLogger(__name__)
+
+_PAUSE_SECONDS = 1.0
+"""After which compiling is another wait, as that of Resolve after that of the first pose."""
 
 
 def compiled(function: Function) -> Function:
@@ -46,17 +51,17 @@ def _compiled(function: Function, fastmath: bool | set[str]) -> Function:
 
 
 class _Compilations(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Logs the first one of the process: what comes from the cache is none."""
+    """Logs that compiling begins, after a pause again: what comes from the cache is none."""
 
-    _logged = False
+    _last = -math.inf
 
     def on_start(self, _: object) -> None:
-        if not self._logged:
-            self._logged = True
+        if time.monotonic() - self._last > _PAUSE_SECONDS:
             _log.info("compiling for this processor, which takes some seconds once")
+        self._last = time.monotonic()
 
     def on_end(self, _: object) -> None:
-        pass
+        self._last = time.monotonic()
 
 
 event.register("numba:compile", _Compilations())

@@ -49,10 +49,17 @@ def note(sentence: str) -> None:
 
 
 class _Notes(logging.Handler):
-    """Tells what is logged as notes."""
+    """Tells what is logged as notes, each once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._told: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        note(record.getMessage())
+        sentence = record.getMessage()
+        if sentence not in self._told:
+            self._told.add(sentence)
+            note(sentence)
 
 
 def tell_what_takes_time() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
 from collections.abc import Iterator
@@ -27,11 +28,15 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
+from app import tasks
 from app.dialogs.failure import FailureDialog
+from app.document import PoseDocument
 from app.engine import Failure
 from app.main_window import MainWindow
 from app.panels.parts import HANDLE
+from app.preparing import REASON
 from app.shading import Shading
+from app.status_bar import StatusBar
 from lcollision_core.meshes import read_mesh, write_mesh
 from lcollision_core.model import EncodedPose, PoseModel, read_poses, sample_poses
 from tests.app.windows import (
@@ -46,6 +51,7 @@ from tests.app.windows import (
     is_open,
     move_held,
     rest,
+    settings_in,
     shown,
 )
 
@@ -534,6 +540,40 @@ def test_closing_writes_what_waits_to_be_exported(
     assert "no folder" in failures(window)[0].what.text()
     close_window(window)
     assert (tmp_path / "pose.obj").is_file()
+
+
+def test_a_wait_for_compiling_is_explained_while_it_lasts(
+    qtbot: QtBot,
+    editor_model: PoseModel,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    log, go_on = logging.getLogger("lcollision_core.compiled"), threading.Event()
+    caplog.set_level(logging.INFO, log.name)
+    warm_up = tasks.warm_up
+
+    def compiling(model: PoseModel) -> None:
+        log.info("compiling for this processor")
+        go_on.wait(PATIENCE / 1000)
+        warm_up(model)
+
+    monkeypatch.setattr(tasks, "warm_up", compiling)
+    editor_model.save(tmp_path / "tube.safetensors")
+    document = PoseDocument()
+    window = MainWindow(document, settings_in(tmp_path))
+    window.show()
+    busy = window.findChild(StatusBar).busy
+    document.open_model(tmp_path / "tube.safetensors")
+    qtbot.waitUntil(lambda: REASON in busy.text(), timeout=PATIENCE)
+    assert busy.isVisible()
+    assert window.viewport.waiting.text.endswith(REASON)
+    go_on.set()
+    qtbot.waitUntil(lambda: document.has_model and not document.busy, timeout=PATIENCE)
+    assert busy.text() == ""
+    rest(qtbot, window)
+    close_window(window)
+    assert log.handlers == []
 
 
 def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -> None:

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
+import time
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
+
+from lcollision_core import compiled
 
 SOURCE = """\
 from lcollision_core.compiled import compiled
@@ -34,6 +39,19 @@ def _module(folder: Path) -> ModuleType:
 def test_a_loop_is_cached_beside_its_file(tmp_path: Path) -> None:
     assert _module(tmp_path).triangular(4) == 10
     assert list(tmp_path.glob("__pycache__/loops.triangular-*.nbc"))
+
+
+def test_compiling_is_logged_once_until_it_pauses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(compiled, "_PAUSE_SECONDS", 0.5)
+    caplog.set_level(logging.INFO, compiled.__name__)
+    triangular = _module(tmp_path).triangular
+    for kinds, n_logged in (((np.int8, np.int16), 1), ((np.int16,), 1), ((np.int32, np.int64), 2)):
+        time.sleep(0.6)
+        for kind in kinds:
+            assert triangular(kind(4)) == 10
+        assert len(caplog.records) == n_logged
 
 
 def test_a_loop_runs_where_nothing_can_be_cached(
