@@ -259,6 +259,10 @@ class MainWindow(QMainWindow):
         self.settings["window_layout"] = self.saveState(_LAYOUT_VERSION)
         self.settings["randomise_amount"] = self.randomise.amount.value() / 100
         self._preparing.close()
+        # What takes long to end need not be looked at.
+        for held in (self, *self.findChildren(QWidget)):
+            if held.isWindow():
+                held.hide()
         if self._autosave is not None:
             self._autosave.close(keep=self._unasked)
         if not self.document.close():

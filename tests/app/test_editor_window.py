@@ -576,6 +576,22 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
     assert log.handlers == []
 
 
+def test_a_window_that_closes_is_gone_before_its_work_has_ended(
+    window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close, seen = window.document.close, []
+    window.docks["sliders"].setFloating(True)
+    window.show_failure(Failure("the disk is full; make room", "details"))
+
+    def look() -> bool:
+        seen.extend(w for w in QApplication.topLevelWidgets() if w.isVisible())
+        return close()
+
+    monkeypatch.setattr(window.document, "close", look)
+    close_window(window)
+    assert seen == []
+
+
 def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -> None:
     window.document.set_code(0, 0.5)
     asked = answer(lambda _: window.close_unasked())
