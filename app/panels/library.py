@@ -157,6 +157,7 @@ class LibraryPanel(QWidget):
         self.blend.sliderReleased.connect(self._on_blend_released)
         document.model_changed.connect(self._on_model)
         document.library_changed.connect(self.refresh)
+        document.pose_loaded.connect(self._on_pose_loaded)
         if document.has_model:
             self._on_model()
 
@@ -264,6 +265,12 @@ class LibraryPanel(QWidget):
     def _on_model(self) -> None:
         self._pictures.clear()
         self._on_source()
+
+    @Slot()
+    def _on_pose_loaded(self) -> None:
+        # Only a file's poses come in without a past.
+        if self._document.poses and not self._document.undo_stack.count():
+            self.own.setChecked(True)
 
     @Slot()
     def _on_source(self) -> None:

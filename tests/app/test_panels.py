@@ -100,6 +100,24 @@ def is_drawn(icon: QIcon) -> bool:
     return picture.pixelColor(picture.rect().center()).alpha() > 0
 
 
+def test_the_library_shows_the_poses_of_a_file_that_is_opened(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document, library = window.document, window.library
+    for name in ("kick", "jump"):
+        document.add_pose_to_library(name)
+    document.save(tmp_path / "poses.json")
+    document.load_pose(document.training_pose(0))
+    document.new_pose()
+    assert not library.shows_own
+    with qtbot.waitSignal(document.pose_loaded, timeout=PATIENCE):
+        window.files.open_path(tmp_path / "poses.json")
+    assert library.shows_own
+    assert [library.list.item(row).text() for row in range(library.list.count())] == own_names(
+        window
+    )
+
+
 def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_is_seen(
     qtbot: QtBot, window: MainWindow
 ) -> None:
