@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from pathlib import Path
 from typing import Annotated
 
@@ -31,6 +32,21 @@ def edit(
             f"{file} is not there; name a file of poses, a mesh or a model, or none to begin anew"
         )
     raise typer.Exit(open_editor(file, model_name))
+
+
+def with_command(words: list[str], commands: Container[str]) -> list[str]:
+    """Put "edit" before words that begin as those of the editor do: with a file, or its option.
+
+    Parameters
+    ----------
+    words : all that follow the program's name
+    commands : the names that are no file's
+    """
+    first = words[0] if words else ""
+    path = Path(first)
+    names_file = path.is_file() or bool(path.suffix) or len(path.parts) > 1
+    is_file = names_file and first not in commands and not first.startswith("-")
+    return ["edit", *words] if is_file or first.partition("=")[0] == "--model" else words
 
 
 def edit_without_command(context: typer.Context) -> None:

@@ -36,6 +36,10 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 class _Commands(TyperGroup):
     """Turns the errors that a user can mend into one sentence."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:
+        """Take what the editor alone can be meant by as its command's."""
+        return super().parse_args(ctx, edit.with_command(args, self.commands))
+
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         try:
             return super().make_context(*args, **kwargs)
@@ -87,7 +91,7 @@ def _refuse_usage(error: Any) -> NoReturn:
 app = typer.Typer(
     cls=_Commands,
     name="lcollision",
-    help="Find where a body runs into itself, and move it free. Without a command: the editor.",
+    help="Find where a body runs into itself, and move it free. Without a command: edit.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -61,6 +62,10 @@ def test_version_is_that_of_the_package() -> None:
     ("words", "sentence"),
     [
         (["nonsense"], "No such command 'nonsense'; see lcollision --help"),
+        (["chek"], "No such command 'chek'"),
+        (["missing.obj"], "missing.obj is not there; name a file of poses, a mesh or a model"),
+        (["edit", "missing.obj"], "missing.obj is not there; name a file of poses, a mesh or a"),
+        (["--model"], "Option '--model' requires an argument"),
         (["--bogus"], "No such option: --bogus; see lcollision --help"),
         (["check"], "Missing argument 'MESH...'; see lcollision check --help"),
         (["dataset", "check", "--bogus"], "--bogus; see lcollision dataset check --help"),
@@ -75,6 +80,40 @@ def test_wrong_words_get_one_sentence(
     assert len(result.stderr.splitlines()) == 1
     assert result.stderr.startswith("lcollision: ")
     assert sentence in result.stderr
+
+
+@pytest.mark.parametrize("command", [[], ["edit"]], ids=["alone", "edit"])
+def test_the_editor_opens_what_it_is_given_with_its_command_or_without(
+    lcollision: Lcollision, stabbed: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    opened: list[tuple[Path | None, str | None]] = []
+
+    def open_editor(path: Path | None, model_name: str | None) -> int:
+        opened.append((path, model_name))
+        return 0
+
+    monkeypatch.setattr("app.editor.open_editor", open_editor)
+    # A file may be called as no command is, even without an extension.
+    monkeypatch.chdir(stabbed.parent)
+    plain = Path(stabbed.stem)
+    plain.write_bytes(stabbed.read_bytes())
+    for words in (
+        [],
+        [stabbed],
+        [plain],
+        ["--model", "body"],
+        ["--model=body", stabbed],
+        [stabbed, "--model", "body"],
+    ):
+        assert lcollision(*command, *words).exit_code == 0
+    assert opened == [
+        (None, None),
+        (stabbed, None),
+        (plain, None),
+        (None, "body"),
+        (stabbed, "body"),
+        (stabbed, "body"),
+    ]
 
 
 def test_a_group_alone_shows_its_commands(lcollision: Lcollision) -> None:
