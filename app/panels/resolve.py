@@ -251,7 +251,7 @@ class ResolveCard(Card):
                 f"{overlap_text(result.energy_before)} → {overlap_text(result.energy_after)}"
             )
         mean, largest = result.vertex_distance_mean, result.vertex_distance_max
-        moved = f"{height_text(mean)}, at most {height_text(largest)} of the height"
+        moved = f"{height_text(mean)} of the height,\nat most {height_text(largest)}"
         self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
         self._moved.setToolTip("On average, and where it moved furthest")
         self._took.setText(seconds_text(result.seconds))
