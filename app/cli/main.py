@@ -91,7 +91,7 @@ def _refuse_usage(error: Any) -> NoReturn:
 app = typer.Typer(
     cls=_Commands,
     name="lcollision",
-    help="Find where a body runs into itself, and move it free. Without a command: edit.",
+    help="Find where a body runs into itself, and move it free. Without a command: the editor.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
