@@ -132,12 +132,14 @@ def make_application(settings: Settings) -> QApplication:
     from PySide6.QtGui import QSurfaceFormat
     from PySide6.QtWidgets import QApplication
 
+    from app.garbage import GarbageCollector
     from app.memory import keep_memory_small
     from app.theme import apply_theme, wanted_theme
 
     keep_memory_small()
     QSurfaceFormat.setDefaultFormat(_surface_format())
     application = QApplication(sys.argv[:1])
+    GarbageCollector(application)
     application.setApplicationName("lcollision")
     application.setApplicationDisplayName("LCollision")
     application.setDesktopFileName("lcollision")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,21 @@ from typer.testing import CliRunner, Result
 from app.cli.main import app
 from lcollision_core.meshes import PoseSet, read_pose_set
 from tests.app.support import Lcollision
+
+
+@pytest.fixture(autouse=True)
+def _garbage_waits(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Keep Python's collector, as the editor does, from running while Qt destroys something.
+
+    Nor does it run between two tests with windows: what they left is destroyed there.
+    """
+    if "qtbot" not in request.fixturenames:
+        gc.enable()
+        yield
+        return
+    gc.disable()
+    yield
+    gc.collect()
 
 
 def _published_set(name: str) -> PoseSet:

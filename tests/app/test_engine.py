@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from pathlib import Path
@@ -10,11 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from PySide6.QtCore import QTimer
+from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.document import PoseDocument
 from app.engine import Failure, LongWork
 from app.frames import LiveFrame, PoseShower
+from app.garbage import GarbageCollector
 from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.model import NamedPose, PoseModel, sample_poses, write_poses
 
@@ -394,3 +397,36 @@ def test_an_answer_that_comes_twice_is_not_taken_for_that_of_a_later_request(
         settle(qtbot, document)
     assert document.frame is not None
     assert document.frame.latent[0] == 0.2
+
+
+class Knot:
+    """Refers to itself, and remembers in which thread it went."""
+
+    def __init__(self, seen: list[threading.Thread]) -> None:
+        self.own, self.seen = self, seen
+
+    def __del__(self) -> None:
+        self.seen.append(threading.current_thread())
+
+
+def test_garbage_of_other_threads_goes_in_the_window_s_thread(
+    qtbot: QtBot, qapp: QApplication
+) -> None:
+    seen: list[threading.Thread] = []
+
+    def leave_knots() -> None:
+        for _ in range(5000):
+            Knot(seen)
+
+    gc.enable()
+    collector = GarbageCollector(qapp)
+    worker = threading.Thread(target=leave_knots)
+    worker.start()
+    worker.join()
+    assert seen == []
+    qtbot.waitUntil(lambda: len(seen) == 5000)
+    assert set(seen) == {threading.main_thread()}
+    collector.close()
+    assert gc.isenabled()
+    gc.disable()
+    collector.deleteLater()

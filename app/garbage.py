@@ -1,0 +1,45 @@
+"""When Python looks for cyclic garbage: between two events of the window's thread."""
+
+from __future__ import annotations
+
+import gc
+
+from PySide6.QtCore import QObject, Qt, QTimer, Slot
+from PySide6.QtGui import QGuiApplication
+
+_MILLISECONDS = 1000
+
+
+class GarbageCollector(QObject):
+    """Takes over from Python's own collector, until it is closed.
+
+    That looks for garbage wherever something is allocated: in a worker thread, where no widget may
+    be destroyed, or while Qt destroys another object, whose locks it then waits for without end.
+
+    Parameters
+    ----------
+    parent : the application
+    """
+
+    def __init__(self, parent: QObject) -> None:
+        super().__init__(parent)
+        gc.disable()
+        self._timer = QTimer(self)
+        self._timer.setInterval(_MILLISECONDS)
+        self._timer.timeout.connect(self.collect_some)
+        self._timer.start()
+
+    @Slot()
+    def collect_some(self) -> None:
+        """Collect what Python would have by now, unless a drag would stutter."""
+        if QGuiApplication.mouseButtons() != Qt.MouseButton.NoButton:
+            return
+        limits, counts = gc.get_threshold(), gc.get_count()
+        due = [generation for generation in range(3) if counts[generation] > limits[generation]]
+        if due:
+            gc.collect(due[-1])
+
+    def close(self) -> None:
+        """Let Python collect as it likes again."""
+        self._timer.stop()
+        gc.enable()
