@@ -27,7 +27,8 @@ def _garbage_waits(request: pytest.FixtureRequest) -> Iterator[None]:
         return
     gc.disable()
     yield
-    gc.collect()
+    # All of it would take as long as many a test.
+    gc.collect(1)
 
 
 def _published_set(name: str) -> PoseSet:

@@ -42,11 +42,6 @@ class RigidTransform:
         moved: FloatArray = np.asarray(vertices, np.float64) @ self.rotation.T + self.translation
         return moved
 
-    def turn(self, direction: npt.NDArray[Any]) -> FloatArray:
-        """Rotate (..., 3) directions."""
-        turned: FloatArray = np.asarray(direction, np.float64) @ self.rotation.T
-        return turned
-
     def inverse(self) -> RigidTransform:
         """Return the transform that leads back."""
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)

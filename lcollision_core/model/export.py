@@ -18,18 +18,18 @@ def export_mesh(
     vertices: npt.NDArray[Any],
     placement: RigidTransform | None = None,
 ) -> None:
-    """Write a pose's mesh, upright where the format says which way is up.
+    """Write a pose's mesh, upright where the format says which way is up, unless it has a place.
 
     Parameters
     ----------
     path : see `write_mesh`
     model : of the pose
     vertices : (V, 3) array, in the data's unit, in the place that they are exported to
-    placement : what brought them there, or None
+    placement : what brought them there, for a mesh that came in from somewhere; else None
 
     Raises
     ------
     MeshFileError, ShapeError : as for `write_mesh`.
     """
-    up = np.eye(3)[model.up_axis]
-    write_mesh(path, vertices, model.faces, up=up if placement is None else placement.turn(up))
+    up = np.eye(3)[model.up_axis] if placement is None else None
+    write_mesh(path, vertices, model.faces, up=up)
