@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 
+_FAR = 0.03
+"""Heights by which a mesh is hardly ever off the pose nearest to it, unless it is another body."""
+
 
 def overlap_text(energy: float) -> str:
     """Write an energy in squared heights as the depth that it stands for, as in "1.1 %"."""
@@ -31,10 +34,6 @@ def heading(name: str) -> str:
 def seconds_text(seconds: float) -> str:
     """Write a duration as in "90 ms" or "1.4 s"."""
     return f"{1000 * seconds:.0f} ms" if seconds < 0.95 else f"{seconds:.1f} s"
-
-
-_FAR = 0.03
-"""Heights by which a mesh is hardly ever off the pose nearest to it, unless it is another body."""
 
 
 def fit_error(mean: float, most: float) -> str:

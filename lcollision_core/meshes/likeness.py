@@ -39,7 +39,8 @@ def is_torn(lengths: FloatArray, known: FloatArray) -> bool:
     ----------
     lengths, known : (E,) lengths of the same edges, of meshes about as tall
     """
-    return scale_of(lengths, known) is None and _spread(lengths, known)[1] > _TORN
+    low, middle, high = _spread(lengths, known)
+    return high > _UNIFORM * low and middle > _TORN
 
 
 def unlike_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, str]:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,11 +16,20 @@ import pytest
 import torch
 from torch.nn.modules.module import register_module_forward_pre_hook
 
+from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.model import PoseModel
-from lcollision_core.predictor import LOSSES, PRESETS, Loss, PredictorStatus, loop, train_predictor
+from lcollision_core.predictor import (
+    LOSSES,
+    PRESETS,
+    Loss,
+    PredictorConfig,
+    PredictorStatus,
+    loop,
+    train_predictor,
+)
 from lcollision_core.predictor.loop import rate_at
 from lcollision_core.predictor.networks import PredictorNetwork
 from lcollision_core.predictor.predictor import BATCH_ROWS
@@ -152,26 +162,37 @@ def test_progress_ends_at_the_last_step(tube_model: PoseModel, rows: LabelRows) 
     assert seen[-1].held_out_accuracy > 0.5
 
 
-def test_a_cancelled_run_goes_on_to_the_same_bits(
-    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+def _stop_training(
+    rows: LabelRows,
+    embedding: Embedding,
+    chosen: PredictorConfig,
+    checkpoint: Path,
+    is_time: Callable[[PredictorStatus], bool],
 ) -> None:
-    embedding, checkpoint, cancel = tube_model.embedding, tmp_path / "checkpoint", CancelToken()
-    steps: list[int] = []
+    """Train with a checkpoint, and cancel at the first status that it is time at."""
+    cancel = CancelToken()
 
-    def stop_in_the_second_epoch(status: PredictorStatus) -> None:
-        steps.append(status.done)
-        if status.done >= 17:
+    def stop(status: PredictorStatus) -> None:
+        if is_time(status):
             cancel.cancel()
 
     with pytest.raises(CancelledError):
         train_predictor(
-            rows,
-            embedding,
-            config(),
-            checkpoint=checkpoint,
-            progress=stop_in_the_second_epoch,
-            cancel=cancel,
+            rows, embedding, chosen, checkpoint=checkpoint, progress=stop, cancel=cancel
         )
+
+
+def test_a_cancelled_run_goes_on_to_the_same_bits(
+    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+) -> None:
+    embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
+    steps: list[int] = []
+
+    def in_the_second_epoch(status: PredictorStatus) -> bool:
+        steps.append(status.done)
+        return status.done >= 17
+
+    _stop_training(rows, embedding, config(), checkpoint, in_the_second_epoch)
     later: list[PredictorStatus] = []
     resumed = train_predictor(
         rows, embedding, config(), checkpoint=checkpoint, progress=later.append
@@ -187,22 +208,9 @@ def test_a_cancelled_run_goes_on_to_the_same_bits(
 def test_patches_are_not_labelled_again(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path
 ) -> None:
-    embedding, checkpoint, cancel = tube_model.embedding, tmp_path / "checkpoint", CancelToken()
+    embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
     chosen = replace(PRESETS["default"], epochs=1, batch_rows=256)
-
-    def stop_at_the_first_step(status: PredictorStatus) -> None:
-        if status.preparing is None:
-            cancel.cancel()
-
-    with pytest.raises(CancelledError):
-        train_predictor(
-            rows,
-            embedding,
-            chosen,
-            checkpoint=checkpoint,
-            progress=stop_at_the_first_step,
-            cancel=cancel,
-        )
+    _stop_training(rows, embedding, chosen, checkpoint, lambda status: status.preparing is None)
     patches = tmp_path / "checkpoint.patches"
     assert patches.exists()
     seen: list[PredictorStatus] = []
@@ -305,25 +313,13 @@ def test_a_stopped_run_remembers_its_best_pass_and_its_mean_weights(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     embedding, chosen = tube_model.embedding, config(epochs=3, average_passes=1.0, kept="best")
-    checkpoint, cancel = tmp_path / "checkpoint", CancelToken()
+    checkpoint = tmp_path / "checkpoint"
     validation = rows.taken(split_rows(len(rows), chosen).validation)
-
-    def stop_in_the_third_pass(status: PredictorStatus) -> None:
-        if status.epoch == 2:
-            cancel.cancel()
 
     _scripted(monkeypatch, validation, [0.6, 0.9, 0.7])
     whole = train_predictor(rows, embedding, chosen)
     _scripted(monkeypatch, validation, [0.6, 0.9])
-    with pytest.raises(CancelledError):
-        train_predictor(
-            rows,
-            embedding,
-            chosen,
-            checkpoint=checkpoint,
-            progress=stop_in_the_third_pass,
-            cancel=cancel,
-        )
+    _stop_training(rows, embedding, chosen, checkpoint, lambda status: status.epoch == 2)
     _scripted(monkeypatch, validation, [0.7])
     resumed = train_predictor(rows, embedding, chosen, checkpoint=checkpoint)
     assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
