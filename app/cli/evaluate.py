@@ -42,7 +42,7 @@ def evaluate(
 ) -> None:
     """Score a model's predictor against exact labels.
 
-    On the store that it was trained upon only the rows that were held out count, on any other
+    On the store that it was trained upon only the rows that measured it count, on any other
     store of the model every row does. MSE and RANK are in energies divided by the mean of the
     colliding training samples.
     """
@@ -106,12 +106,12 @@ def scores_sentence(metrics: PredictorMetrics) -> str:
 
 
 def _unseen(store: LabelStore, rows: LabelRows, trained: CollisionPredictor) -> LabelRows:
-    """Return the rows that did not train the predictor."""
+    """Return the rows that neither trained the predictor nor chose anything for it."""
     from lcollision_core.predictor import held_out_rows
 
     if trained.facts.store != store.identity:
         return rows
-    held_out = held_out_rows(rows)
+    held_out = held_out_rows(rows, trained.config)
     if not len(held_out):
         raise LabelStoreError(
             f"{store.path} has {counted(len(rows), 'row')}, none of which is held out; label more"

@@ -8,8 +8,8 @@ from lcollision_core.predictor.predictor import (
     PredictorRecord,
     TrainingFacts,
     evaluate_predictor,
-    held_out_rows,
 )
+from lcollision_core.predictor.row_split import held_out_rows
 from lcollision_core.predictor.training import (
     PredictorStatus,
     StatusCallback,

@@ -18,9 +18,6 @@ LOSSES: tuple[Loss, ...] = ("full", "no-rank", "no-depth", "entropy")
 LEAST_PASSES = 6
 """Over any number of rows, where `shown_rows` shortens a training."""
 
-VALIDATION_SHARE = 0.1
-"""Of the rows that are not held out, where the best pass is looked for."""
-
 
 @dataclass(frozen=True)
 class PredictorConfig:
@@ -40,8 +37,10 @@ class PredictorConfig:
     shown_rows : where not None, passes over many rows end when so many have been shown
     average_passes : time constant, in passes, of the exponential mean of the weights that is
         watched and kept in their place; 0 takes them as they are
-    kept : the weights after the last pass, or after the one that is right about most of
-        `VALIDATION_SHARE` of the training rows, which are then not trained on
+    kept : the weights after the last pass, or after the one that is right about most of a tenth
+        of the training rows, which are then not trained on
+    balanced : whether the logit is shifted to where free and colliding poses are mistaken equally
+        often, see `balanced_logit`; of the rows of `split_rows`
 
     Raises
     ------
@@ -60,6 +59,7 @@ class PredictorConfig:
     shown_rows: int | None = None
     average_passes: float = 0.0
     kept: Kept = "last"
+    balanced: bool = False
 
     def __post_init__(self) -> None:
         for name, low in (("batch_rows", 2), ("epochs", 1)):
@@ -112,6 +112,7 @@ PRESETS = {
         batch_rows=128,
         epochs=10,
         shown_rows=2_800_000,
+        balanced=True,
     ),
     # Its constant rate never lets the weights settle, and it knows its rows by heart long before
     # the last pass; the paper does not say which weights it kept.

@@ -27,7 +27,8 @@ from lcollision_core.predictor.patch_labels import patch_roots
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
 from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.processes import Processes, joined_processes
-from lcollision_core.predictor.training import PredictorStatus, RowSplit, StatusCallback
+from lcollision_core.predictor.row_split import RowSplit
+from lcollision_core.predictor.training import PredictorStatus, StatusCallback
 
 _RUN_VERSION = 6
 """Goes up when training changes, so that no checkpoint is continued by other rules."""
@@ -255,7 +256,7 @@ class TrainingLoop:
         return network if self._average is None else cast(PredictorNetwork, self._average.module)
 
     def _keep_best(self, network: PredictorNetwork) -> None:
-        if not len(self._validation_index):
+        if self._config.kept != "best" or not len(self._validation_index):
             return
         accuracy = _accuracy(network, self._rows.taken(self._validation_index))
         if accuracy > self._best_accuracy:

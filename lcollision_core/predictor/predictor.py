@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy.typing as npt
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
-from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
+from lcollision_core.labels import LabelRows, StoreIdentity
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.compiled_network import CompiledNetwork
@@ -71,6 +72,7 @@ class TrainingFacts:
         divided by it
     margin : alpha of the ranking loss, scaled
     store : what the rows label, None if they came without a store
+    logit_shift : added to the network's logit, which makes 0 the place to call poses colliding
     """
 
     rows: int
@@ -80,6 +82,7 @@ class TrainingFacts:
     energy_scale: float
     margin: float
     store: StoreIdentity | None
+    logit_shift: float = 0.0
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> TrainingFacts:
@@ -90,6 +93,8 @@ class TrainingFacts:
         facts = cls(**values)
         if not facts.energy_scale > 0.0:
             raise ValueError("no energy scale")
+        if not math.isfinite(facts.logit_shift):
+            raise ValueError("the logit's shift is not finite")
         return facts
 
 
@@ -203,7 +208,7 @@ class CollisionPredictor:
         return Prediction(*results)
 
     def scaled_outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-        """Return what the network itself says: scaled energies, also below 0, and the logit.
+        """Return what the network says: scaled energies, also below 0, and the shifted logit.
 
         Parameters
         ----------
@@ -226,6 +231,7 @@ class CollisionPredictor:
             domain_energy[:], logit[:] = self._few.outputs(codes.astype(np.float64))
         else:
             self._predict_many(codes, domain_energy, logit)
+        logit += self.facts.logit_shift
         return domain_energy, logit
 
     def _predict_many(
@@ -286,15 +292,16 @@ class CollisionPredictor:
         # Never read-only: the loops would be compiled for that, too.
         poses = np.array(latent, dtype=np.float64)
         if self._few is not None:
-            return self._few.logit_and_gradient(poses)
+            logit, gradient = self._few.logit_and_gradient(poses)
+            return logit + self.facts.logit_shift, gradient
         import torch
 
         codes = torch.tensor(poses, device=self.device)
         with torch.enable_grad():
             codes.requires_grad_()
-            logit = self._exact_network(codes).logit
-            (gradient,) = torch.autograd.grad(logit.sum(), codes)
-        return logit.detach().cpu().numpy(), gradient.cpu().numpy()
+            found = self._exact_network(codes).logit
+            (slope,) = torch.autograd.grad(found.sum(), codes)
+        return found.detach().cpu().numpy() + self.facts.logit_shift, slope.cpu().numpy()
 
     def flops(self, n_rows: int) -> int:
         """Count the floating-point operations of the matrix products that predict `n_rows` poses.
@@ -318,6 +325,13 @@ class CollisionPredictor:
         """Return the same predictor with what was measured of it."""
         return CollisionPredictor(
             self._embedding, self._arrays, self.config, self.facts, metrics, self.device
+        )
+
+    def shifted(self, logit_shift: float) -> CollisionPredictor:
+        """Return a predictor that adds so much to the network's logit, without metrics."""
+        facts = replace(self.facts, logit_shift=logit_shift)
+        return CollisionPredictor(
+            self._embedding, self._arrays, self.config, facts, device=self.device
         )
 
     def to_section(self) -> Section:
@@ -475,8 +489,3 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
             raise ShapeError(
                 f"row {row} (from 0) has a number that is not finite; label the samples again"
             )
-
-
-def held_out_rows(rows: LabelRows) -> LabelRows:
-    """Return copies of the rows that never train, of rows 0, 1, 2, ... of a store."""
-    return rows.taken(is_held_out(np.arange(len(rows))))

@@ -6,21 +6,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError
 from lcollision_core.jobs import CancelToken
-from lcollision_core.labels import LabelRows, StoreIdentity, is_held_out
-from lcollision_core.predictor.config import PRESETS, VALIDATION_SHARE, PredictorConfig
+from lcollision_core.labels import LabelRows, StoreIdentity
+from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.metrics import mean_difference
+from lcollision_core.predictor.operating_point import balanced_logit
 from lcollision_core.predictor.predictor import (
     CollisionPredictor,
     TrainingFacts,
     evaluate_predictor,
     require_model,
 )
+from lcollision_core.predictor.row_split import split_rows
 
 
 @dataclass(frozen=True)
@@ -43,31 +42,6 @@ class PredictorStatus:
     loss: float | None
     held_out_accuracy: float | None
     preparing: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class RowSplit:
-    """Which rows do what: three int64 arrays of indices, ascending, no row in two of them.
-
-    Attributes
-    ----------
-    training : rows that are learnt from
-    validation : rows that choose among passes; none where the last is kept
-    held_out : rows that measure the result
-    """
-
-    training: npt.NDArray[np.int64]
-    validation: npt.NDArray[np.int64]
-    held_out: npt.NDArray[np.int64]
-
-
-def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
-    """Share out the samples 0, 1, ... of a store."""
-    is_out = is_held_out(np.arange(n_rows))
-    rest = np.flatnonzero(~is_out)
-    n_validation = int(VALIDATION_SHARE * len(rest)) if config.kept == "best" else 0
-    n_training = len(rest) - n_validation
-    return RowSplit(rest[:n_training], rest[n_training:], np.flatnonzero(is_out))
 
 
 StatusCallback = Callable[[PredictorStatus], None]
@@ -99,7 +73,7 @@ def train_predictor(
     Parameters
     ----------
     rows : samples 0, 1, 2, ... of a store; at least one free and one colliding one to train on.
-        Where the best pass is kept, a tenth of those not held out only chooses it.
+        Where something is chosen, some of them only do that, see `split_rows`.
     embedding : of the model that the rows label
     config : the choices, by default the preset "default"
     store : what the rows label, kept with the predictor
@@ -153,4 +127,10 @@ def train_predictor(
     state = loop.run().state_dict()
     arrays = {name: values.detach().cpu().numpy() for name, values in state.items()}
     predictor = CollisionPredictor(embedding, arrays, config, facts)
+    if config.balanced:
+        chosen_by = rows.taken(split.validation)
+        logit = predictor.scaled_outputs(chosen_by.latent)[1]
+        limit = balanced_logit(logit, chosen_by.colliding)
+        if limit != 0.0:
+            predictor = predictor.shifted(-limit)
     return predictor.with_metrics(evaluate_predictor(predictor, rows.taken(split.held_out)))

@@ -1,0 +1,53 @@
+"""Which labelled samples train, which choose, and which measure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.labels import LabelRows, is_held_out
+from lcollision_core.predictor.config import PredictorConfig
+
+_VALIDATION_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class RowSplit:
+    """Which rows do what: three int64 arrays of indices, ascending, no row in two of them.
+
+    Attributes
+    ----------
+    training : rows that are learnt from
+    validation : rows that choose among passes, or where to call a pose colliding; none where
+        neither is chosen
+    held_out : rows that measure the result
+    """
+
+    training: npt.NDArray[np.int64]
+    validation: npt.NDArray[np.int64]
+    held_out: npt.NDArray[np.int64]
+
+
+def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
+    """Share out the samples 0, 1, ... of a store.
+
+    What is chosen by rows in training's way is chosen by a tenth of those that would train; what
+    is chosen once by a tenth of those that would measure, which are more than enough.
+    """
+    is_out = is_held_out(np.arange(n_rows))
+    rest, held_out = np.flatnonzero(~is_out), np.flatnonzero(is_out)
+    if config.kept == "best":
+        n_training = len(rest) - int(_VALIDATION_SHARE * len(rest))
+        return RowSplit(rest[:n_training], rest[n_training:], held_out)
+    if config.balanced:
+        # Every tenth, so that a row keeps its side when its store grows.
+        every = slice(None, None, round(1.0 / _VALIDATION_SHARE))
+        return RowSplit(rest, held_out[every], np.delete(held_out, every))
+    return RowSplit(rest, rest[:0], held_out)
+
+
+def held_out_rows(rows: LabelRows, config: PredictorConfig) -> LabelRows:
+    """Return copies of the rows that measure a predictor, of rows 0, 1, 2, ... of its store."""
+    return rows.taken(split_rows(len(rows), config).held_out)
