@@ -23,12 +23,15 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor import field_kernels, network_kernels
 from lcollision_core.predictor.compiled_skin import SkinMap, SkinOfFew, SkinOfMany, SkinOfPoses
 from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
-from lcollision_core.predictor.network_kernels import ROWS_AT_ONCE, SQUASHED
+from lcollision_core.predictor.network_kernels import SQUASHED
 from lcollision_core.predictor.skin_geometry import SkinGeometry
 
 State = Mapping[str, npt.NDArray[Any]]
 Array = npt.NDArray[np.floating[Any]]
 Float32Array = npt.NDArray[np.float32]
+
+_ROWS_AT_ONCE = 256
+"""Poses that are taken together: each time, hundreds of small products cost like ten poses."""
 
 _SPARE_ROOMS = 2
 """Kept for later calls: of the editor's one pose and the solver's few, or of two threads."""
@@ -114,7 +117,7 @@ class CompiledNetwork:
         if not n_rows:
             return
         codes = latent.astype(self._kind)
-        n_parts = -(-n_rows // ROWS_AT_ONCE)
+        n_parts = -(-n_rows // _ROWS_AT_ONCE)
         size = -(-n_rows // n_parts)
         trace = self._take_room(size)
         for part in range(n_parts):
@@ -275,7 +278,8 @@ class _Activations:
     Attributes
     ----------
     inputs : (n, B, n_in) standardised; None of networks that take them as they come
-    before, after : (n, B, width) of each hidden layer, before and after the silu
+    before, after : (n, B, width) of each hidden layer, before and after the silu; in single
+        precision the last of several in the same room
     outputs : (n, B, n_out)
     """
 
@@ -323,9 +327,17 @@ class _Network:
         """Return room for what B poses need."""
         n, kind = len(self._layers[0].weight), self._layers[0].bias.dtype
         widths = [layer.weight.shape[2] for layer in self._layers[:-1]]
-        before, after = ([np.empty((n, n_rows, w), dtype=kind) for w in widths] for _ in range(2))
-        inputs, outputs = (np.empty((n, n_rows, w), dtype=kind) for w in (self.n_in, self.n_out))
-        return _Activations(None if self._mean is None else inputs, before, after, outputs)
+
+        def hidden() -> list[Array]:
+            if kind != np.float32:
+                return [np.empty((n, n_rows, width), dtype=kind) for width in widths]
+            # Without a way back, layers of one width share their room, which stays in the caches.
+            rooms = {width: np.empty((n, n_rows, width), dtype=kind) for width in widths}
+            return [rooms[width] for width in widths]
+
+        inputs = None if self._mean is None else np.empty((n, n_rows, self.n_in), dtype=kind)
+        outputs = np.empty((n, n_rows, self.n_out), dtype=kind)
+        return _Activations(inputs, hidden(), hidden(), outputs)
 
     def forward(self, inputs: Array, room: _Activations) -> Array:
         """Apply to (n, B, n_in) inputs, and return the (n, B, n_out) outputs."""

@@ -61,7 +61,7 @@ from lcollision_core.predictor.body_points import N_POINTS, skin_cells
 from lcollision_core.predictor.field import contact_field, fold_view, normalised
 from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
 from lcollision_core.predictor.folds import N_MEMBERS, find_fold_sites
-from lcollision_core.predictor.network_kernels import ROWS_AT_ONCE, SQUASHED
+from lcollision_core.predictor.network_kernels import SQUASHED
 from lcollision_core.predictor.networks import (
     NetworkOutput,
     PredictorNetwork,
@@ -80,6 +80,9 @@ if TYPE_CHECKING:
 
 PATCH_WIDTH = 32
 HEAD_SIZES = (256, 64)
+
+_ROWS_AT_ONCE = 64
+"""Poses whose intermediate arrays stay in the caches."""
 
 _PATCH_WEIGHT, _DEPTH_WEIGHT = 20.0, 5.0
 _FOLD_WEIGHT, _FOLD_DEPTH_WEIGHT = 5.0, 1.25
@@ -236,7 +239,7 @@ class GeometricNetwork(PredictorNetwork):
 
     def forward(self, latent: torch.Tensor) -> NetworkOutput:
         """Predict from (B, D) latent codes."""
-        if len(latent) <= ROWS_AT_ONCE or latent.device.type != "cpu":
+        if len(latent) <= _ROWS_AT_ONCE or latent.device.type != "cpu":
             return self._forward(latent)
         parts = [self._forward(part) for part in _parts(latent)]
         auxiliary = zip(*(part.auxiliary for part in parts), strict=True)
@@ -329,4 +332,4 @@ class _PatchNetworks(nn.Module):
 
 
 def _parts(rows: torch.Tensor) -> list[torch.Tensor]:
-    return [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]
+    return [rows[start : start + _ROWS_AT_ONCE] for start in range(0, len(rows), _ROWS_AT_ONCE)]

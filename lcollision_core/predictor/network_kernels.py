@@ -13,9 +13,6 @@ from lcollision_core.compiled import compiled, compiled_sums
 Array = npt.NDArray[np.floating[Any]]
 Number = np.floating[Any]
 
-ROWS_AT_ONCE = 64
-"""Poses whose intermediate arrays stay in the caches."""
-
 SQUASHED = 4.0
 """A patch's logit is divided by this and squashed before the head sees it."""
 
