@@ -93,6 +93,7 @@ class LostPose:
     model : the file of its model, or the name of one
     pose_name : of the edited pose
     file : the poses file that it came from or went to
+    locked : its domains that were to stay
     saved : when it was written last, in seconds since 1970
     """
 
@@ -100,6 +101,7 @@ class LostPose:
     model: str
     pose_name: str
     file: Path | None
+    locked: tuple[int, ...]
     saved: float
 
     @property
@@ -133,6 +135,7 @@ def _lost(parent: Path) -> Iterator[LostPose]:
                 model=str(held["model"]),
                 pose_name=str(held["pose_name"]),
                 file=Path(held["file"]) if held["file"] else None,
+                locked=tuple(map(int, held.get("locked", ()))),
                 saved=(folder / _POSES).stat().st_mtime,
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -149,6 +152,7 @@ class _Snapshot:
     model_file: str
     pose_name: str
     file: Path | None
+    locked: tuple[int, ...]
     poses: tuple[NamedPose, ...] | None
 
 
@@ -173,6 +177,7 @@ class _Writer(QObject):
                 "model": snapshot.model_file,
                 "pose_name": snapshot.pose_name,
                 "file": str(snapshot.file) if snapshot.file else None,
+                "locked": snapshot.locked,
             }
             with atomic_write(folder / _SESSION) as file:
                 file.write(json.dumps(held).encode())
@@ -223,7 +228,12 @@ class Autosave(QObject):
         self._writer.failed.connect(self._on_failed)
         self._writer.written.connect(self._on_written)
         self._due: QTimer = single_shot(self, int(1000 * seconds), self._write)
-        for changed in (document.latent_changed, document.library_changed, document.file_changed):
+        for changed in (
+            document.latent_changed,
+            document.locks_changed,
+            document.library_changed,
+            document.file_changed,
+        ):
             changed.connect(self._on_changed)
         document.modified_changed.connect(self._on_modified_changed)
         document.recovered.connect(self._on_recovered)
@@ -287,6 +297,7 @@ class Autosave(QObject):
             model_file=document.model_file,
             pose_name=document.pose_name,
             file=document.file,
+            locked=tuple(sorted(document.locked_domains)),
             poses=document.all_poses() if document.modified else None,
         )
 
@@ -298,6 +309,8 @@ class Autosave(QObject):
             if self._session is not None:
                 self._session.discard()
             self._session = lost.session
+            for domain in lost.locked:
+                self._document.set_locked(domain, True)
 
     @Slot()
     def _on_written(self) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from app.engine import Work
 from app.frames import PoseShower, keep_torch_to_one_thread
 from app.symmetry import mirror_vertices
-from app.wording import counted
+from app.wording import counted, fit_error
 from lcollision_core.errors import ModelFileError
 from lcollision_core.jobs import CancelToken, Progress
 
@@ -79,10 +79,8 @@ class Imported:
     def sentence(self) -> str:
         """What the status bar says of it."""
         pose = self.pose
-        return (
-            f"Imported {pose.name}: the pose lies {pose.fit_error_mean:.2%} of the height from "
-            f"the mesh on average, {pose.fit_error_max:.2%} at most"
-        )
+        fit = fit_error(pose.fit_error_mean or 0.0, pose.fit_error_max or 0.0)
+        return f"Imported {pose.name}: {fit}"
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,11 @@ def edit(
     from app.editor import open_editor
     from lcollision_core.errors import LCollisionError
 
+    if file is not None and file.is_dir():
+        raise LCollisionError(
+            f"{file} is a folder; name a file of poses, a mesh or a model, or fix all its meshes "
+            "with `lcollision resolve`"
+        )
     if file is not None and not file.is_file():
         raise LCollisionError(
             f"{file} is not there; name a file of poses, a mesh or a model, or none to begin anew"
@@ -35,7 +40,7 @@ def edit(
 
 
 def with_command(words: list[str], commands: Container[str]) -> list[str]:
-    """Put "edit" before words that begin as those of the editor do: with a file, or its option.
+    """Put "edit" before words that begin as those of the editor do: with a path, or its option.
 
     Parameters
     ----------
@@ -44,7 +49,7 @@ def with_command(words: list[str], commands: Container[str]) -> list[str]:
     """
     first = words[0] if words else ""
     path = Path(first)
-    names_file = path.is_file() or bool(path.suffix) or len(path.parts) > 1
+    names_file = path.exists() or bool(path.suffix) or len(path.parts) > 1
     is_file = names_file and first not in commands and not first.startswith("-")
     return ["edit", *words] if is_file or first.partition("=")[0] == "--model" else words
 

@@ -491,6 +491,22 @@ def test_a_mesh_at_rest_imports_in_its_own_place(
     assert np.abs(back - placed).max() / model.height < 0.05
 
 
+def test_an_import_says_how_far_off_it_is_and_doubts_another_body(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    model = document.model
+    for name, vertices in (
+        ("own", model.decode(model.training_latent[1])),
+        ("flat", model.reference * [1.0, 1.0, 0.02]),
+    ):
+        write_mesh(tmp_path / f"{name}.ply", vertices, model.faces)
+        with qtbot.waitSignal(document.message, timeout=20_000) as told:
+            document.import_mesh(tmp_path / f"{name}.ply")
+        (sentence,) = told.args
+        assert sentence.startswith(f"Imported {name}: fit error of ")
+        assert ("is it this body" in sentence) == (name == "flat")
+
+
 def test_a_model_without_predictor_shows_poses_but_does_not_resolve(
     qtbot: QtBot, document: PoseDocument
 ) -> None:

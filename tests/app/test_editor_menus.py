@@ -115,7 +115,7 @@ def test_no_title_is_cut(window: MainWindow, tmp_path: Path) -> None:
         widths.append(dialog.width())
         dialog.reject()
 
-    lost = LostPose(Session.new(tmp_path), "tube", "kick", None, time.time())
+    lost = LostPose(Session.new(tmp_path), "tube", "kick", None, (), time.time())
     window.document.set_code(0, 0.5)
     window.document.add_pose_to_library("kick")
     window.library.choose_own("kick")

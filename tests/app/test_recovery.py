@@ -32,6 +32,7 @@ autosave.failed.connect(lambda failure: print(failure.sentence, flush=True))
 def edit():
     document.add_pose_to_library("kick")
     document.set_code(2, 0.625)
+    document.set_locked(1, True)
 
 document.failed.connect(lambda failure: print(failure.sentence, flush=True))
 QTimer.singleShot(60_000, application.quit)
@@ -83,6 +84,7 @@ def test_a_killed_editor_loses_nothing_that_was_written(
     with qtbot.waitSignal(document.recovered, timeout=20_000):
         autosave.recover(lost)
     assert document.latent[2] == 0.625
+    assert document.locked_domains == {1}
     assert document.pose_name == "kick"
     assert [pose.name for pose in document.poses] == ["kick"]
     assert document.modified
@@ -130,6 +132,18 @@ def test_a_long_drag_is_kept_while_it_lasts(
     with qtbot.waitSignal(autosave.written):
         document.set_code(0, 0.6)
     document.end_gesture()
+
+
+def test_a_lock_that_changes_later_is_kept_too(
+    qtbot: QtBot, document: PoseDocument, autosave: Autosave, tmp_path: Path
+) -> None:
+    with qtbot.waitSignal(autosave.written):
+        document.set_code(0, 0.5)
+    with qtbot.waitSignal(autosave.written):
+        document.set_locked(0, True)
+    autosave.close(keep=True)
+    (lost,) = find_lost_poses(tmp_path / "sessions")
+    assert lost.locked == (0,)
 
 
 @pytest.mark.usefixtures("autosave")
