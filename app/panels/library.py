@@ -264,6 +264,8 @@ class LibraryPanel(QWidget):
     @Slot()
     def _on_model(self) -> None:
         self._pictures.clear()
+        if not self._document.poses:
+            self.training.setChecked(True)
         self._on_source()
 
     @Slot()

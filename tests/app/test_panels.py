@@ -116,6 +116,10 @@ def test_the_library_shows_the_poses_of_a_file_that_is_opened(
     assert [library.list.item(row).text() for row in range(library.list.count())] == own_names(
         window
     )
+    # Another model has nothing of one's own yet.
+    document.set_model(document.model)
+    assert own_names(window) == []
+    assert not library.shows_own
 
 
 def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_is_seen(
