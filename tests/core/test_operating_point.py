@@ -99,7 +99,7 @@ def test_a_trained_predictor_calls_from_there(
 ) -> None:
     embedding = tube_model.embedding
     rows = made_up_rows(embedding, 6000)
-    chosen = config(preset=preset, epochs=1, balanced=True)
+    chosen = config(preset=preset, epochs=1, batch_rows=600, balanced=True)
     trained = train_predictor(rows, embedding, chosen)
     plain = train_predictor(rows, embedding, replace(chosen, balanced=False))
     shift = trained.facts.logit_shift
