@@ -26,7 +26,7 @@ class PosePrediction:
     ----------
     domain_energy : (K,) float64 array, read-only, >= 0, in squared heights
     energy : their total, in squared heights
-    collision_logit, collision_probability : above 0, and above 0.5, where a collision is likelier
+    collision_logit, collision_probability : above 0, and above 0.5, where it is called colliding
     """
 
     domain_energy: FloatArray

@@ -309,8 +309,8 @@ class Autosave(QObject):
             if self._session is not None:
                 self._session.discard()
             self._session = lost.session
-            for domain in lost.locked:
-                self._document.set_locked(domain, True)
+            for domain in range(self._document.model.embedding.n_domains):
+                self._document.set_locked(domain, domain in lost.locked)
 
     @Slot()
     def _on_written(self) -> None:

@@ -49,7 +49,7 @@ def with_command(words: list[str], commands: Container[str]) -> list[str]:
     """
     first = words[0] if words else ""
     path = Path(first)
-    names_file = path.exists() or bool(path.suffix) or len(path.parts) > 1
+    names_file = bool(first) and (path.exists() or bool(path.suffix) or len(path.parts) > 1)
     is_file = names_file and first not in commands and not first.startswith("-")
     return ["edit", *words] if is_file or first.partition("=")[0] == "--model" else words
 

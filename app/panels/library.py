@@ -264,9 +264,11 @@ class LibraryPanel(QWidget):
     @Slot()
     def _on_model(self) -> None:
         self._pictures.clear()
-        if not self._document.poses:
+        if self.shows_own and not self._document.poses:
+            # Which shows them.
             self.training.setChecked(True)
-        self._on_source()
+        else:
+            self._on_source()
 
     @Slot()
     def _on_pose_loaded(self) -> None:

@@ -329,7 +329,9 @@ class PredictionCard(Card):
         self.meter.show_probability(probability, overruled)
         self.verdict.setText(f"{'Predicted' if overruled else 'Probably'} {word}")
         self.percent.setText(f"{100 * probability:.0f} %")
-        self.percent.setToolTip("How likely this pose collides with itself, as predicted")
+        self.percent.setToolTip(
+            "How likely this pose collides with itself, as predicted; over 50 % it is called so"
+        )
         self._source.setText("overruled by the exact check" if overruled else _SOURCE)
         for label in (self.verdict, self.percent):
             show_verdict(label, "overruled" if overruled else word)

@@ -30,8 +30,9 @@ State = Mapping[str, npt.NDArray[Any]]
 Array = npt.NDArray[np.floating[Any]]
 Float32Array = npt.NDArray[np.float32]
 
-_ROWS_AT_ONCE = 256
-"""Poses that are taken together: each time, hundreds of small products cost like ten poses."""
+_MANY_ROWS, _FEW_ROWS = 256, 64
+"""Poses that are taken together: each time, hundreds of small products cost like ten poses, but
+in double precision, and with a way back, a pose needs a megabyte of room."""
 
 _SPARE_ROOMS = 2
 """Kept for later calls: of the editor's one pose and the solver's few, or of two threads."""
@@ -117,7 +118,7 @@ class CompiledNetwork:
         if not n_rows:
             return
         codes = latent.astype(self._kind)
-        n_parts = -(-n_rows // _ROWS_AT_ONCE)
+        n_parts = -(-n_rows // (_MANY_ROWS if self._kind == np.float32 else _FEW_ROWS))
         size = -(-n_rows // n_parts)
         trace = self._take_room(size)
         for part in range(n_parts):

@@ -40,7 +40,7 @@ class PredictorConfig:
     kept : the weights after the last pass, or after the one that is right about most of a tenth
         of the training rows, which are then not trained on
     balanced : whether the logit is shifted to where free and colliding poses are mistaken equally
-        often, see `balanced_logit`; of the rows of `split_rows`
+        often, see `balanced_logit`; not with the best pass
 
     Raises
     ------
@@ -65,6 +65,8 @@ class PredictorConfig:
         for name, low in (("batch_rows", 2), ("epochs", 1)):
             if getattr(self, name) < low:
                 raise LCollisionError(f"{name} must be at least {low}, got {getattr(self, name)}")
+        if self.balanced and self.kept == "best":
+            raise LCollisionError("the same rows cannot choose the best pass and be balanced upon")
         if self.batch_rows % 2:
             raise LCollisionError(f"batch_rows must be even, got {self.batch_rows}")
         for name in ("depth_weight", "rank_weight", "average_passes"):

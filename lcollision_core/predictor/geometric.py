@@ -37,7 +37,7 @@ and half of the folds that those missed lay where no site was. Of the rows that 
 gets 96.8 there, and 97.5 at M = 50 000 (96.9 with the decay): rows limit it still. At a million,
 gone over six times, it gets 96.2, and 96.7 of those that it learnt from: now its size limits it as
 much. Of the free ones it takes 5.4 % for colliding and of the colliding 3.0 % for free; those come
-to 4.0 and 3.8, with 96.1 right, where `balanced_logit` calls them. A head of twice that width,
+to 3.9 each, with 96.1 right, where `balanced_logit` calls them. A head of twice that width,
 trained on those patches' outputs alone, is right about no more.
 
 A list of who may meet whom was the limit: a hand meets anything. Of the colliding samples that were

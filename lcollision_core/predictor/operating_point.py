@@ -17,10 +17,11 @@ _ERRORS_APART = 2.0
 def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float:
     """Return the logit above which to call poses colliding, such that both kinds fare alike.
 
-    A classifier that is right as often as it can be mistakes the rarer kind more often. This goes
-    from even odds, logit 0, as little as makes the false positive and the false negative rate
-    differ by no more than chance may, or else as far towards that as costs no more than a
-    thousandth of all calls.
+    A classifier that is right as often as it can be mistakes the rarer kind more often. Where the
+    false positive and the false negative rate at even odds, logit 0, differ by more than chance,
+    this goes as far towards equal ones as is expected to cost no more than a thousandth of all
+    calls. What is expected is a logistic curve's through all rows (Platt 1999): counting the few
+    rows near a limit would go where these happen to be favourable.
 
     Parameters
     ----------
@@ -31,26 +32,56 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
     -------
     limit : 0 where poses of one kind are missing
     """
-    n_colliding = int(colliding.sum())
-    n_free = len(colliding) - n_colliding
+    n_rows, n_colliding = len(logit), int(colliding.sum())
+    n_free = n_rows - n_colliding
     if not n_colliding or not n_free:
         return 0.0
-    # Between two neighbours, or at 0: how many lie below says all.
-    order = np.argsort(logit)
-    ordered = logit[order]
-    limits = np.append(0.5 * (ordered[1:] + ordered[:-1]), 0.0)
-    n_below = np.append(np.arange(1, len(logit)), np.searchsorted(ordered, 0.0, side="right"))
-    missed = np.append(0, np.cumsum(colliding[order]))[n_below]
-    alarms = n_free - (n_below - missed)
+    false_positive, its_variance = _rate(int((logit[~colliding] > 0.0).sum()), n_free)
+    false_negative, other_variance = _rate(int((logit[colliding] <= 0.0).sum()), n_colliding)
+    error = np.sqrt(its_variance + other_variance)
+    if abs(false_positive - false_negative) <= _ERRORS_APART * error:
+        return 0.0
+    ordered = np.sort(logit)
+    probability = _calibrated(logit, colliding, ordered)
+    # Between two different neighbours, or at 0: how many lie below says all.
+    cuts = 1 + np.flatnonzero(ordered[1:] > ordered[:-1])
+    limits = np.append(0.5 * (ordered[cuts] + ordered[cuts - 1]), 0.0)
+    n_below = np.append(cuts, np.searchsorted(ordered, 0.0, side="right"))
+    missed = np.append(0.0, probability.cumsum())[n_below]
+    alarms = np.append(0.0, (1.0 - probability)[::-1].cumsum())[n_rows - n_below]
+    gap = np.abs(alarms / (1.0 - probability).sum() - missed / probability.sum())
     wrong = missed + alarms
-    false_positive, false_negative = alarms / n_free, missed / n_colliding
-    variance = (
-        false_positive * (1.0 - false_positive) / n_free
-        + false_negative * (1.0 - false_negative) / n_colliding
-    )
-    gap = np.abs(false_positive - false_negative)
-    # What cannot be told from nothing is nothing.
-    gap[gap <= _ERRORS_APART * np.sqrt(variance)] = 0.0
-    gap[wrong > wrong[-1] + _ACCURACY_GIVEN_UP * len(logit)] = np.inf
+    gap[wrong > wrong[-1] + _ACCURACY_GIVEN_UP * n_rows] = np.inf
     best = limits[gap == gap.min()]
     return float(best[np.abs(best).argmin()])
+
+
+def _rate(count: int, total: int) -> tuple[float, float]:
+    """Return a rate and its variance, of none and of all too (Agresti and Coull 1998)."""
+    rate = (count + 2.0) / (total + 4.0)
+    return rate, rate * (1.0 - rate) / (total + 4.0)
+
+
+def _calibrated(
+    logit: FloatArray, colliding: npt.NDArray[np.bool_], wanted: FloatArray
+) -> FloatArray:
+    """Return how likely poses of the wanted logits collide, by a logistic curve through the rows.
+
+    Platt's targets stay off 0 and 1, so that the curve is one even where a limit divides the rows.
+    """
+    from scipy.optimize import minimize
+    from scipy.special import expit
+
+    n_colliding = int(colliding.sum())
+    n_free = len(logit) - n_colliding
+    target = np.where(colliding, (n_colliding + 1.0) / (n_colliding + 2.0), 1.0 / (n_free + 2.0))
+
+    def loss(curve: FloatArray) -> tuple[float, FloatArray]:
+        score = curve[0] * logit + curve[1]
+        slope = expit(score) - target
+        value = np.logaddexp(0.0, score) - target * score
+        return float(value.mean()), np.array([(slope * logit).mean(), slope.mean()])
+
+    scale, offset = minimize(loss, [1.0, 0.0], jac=True, method="BFGS").x
+    probability: FloatArray = expit(scale * wanted + offset)
+    return probability

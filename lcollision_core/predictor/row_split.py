@@ -12,6 +12,9 @@ from lcollision_core.predictor.config import PredictorConfig
 
 _VALIDATION_SHARE = 0.1
 
+LEAST_BALANCING = 5000
+"""Fewer rows do not say where to call poses colliding: their chance costs more than is gained."""
+
 
 @dataclass(frozen=True, eq=False)
 class RowSplit:
@@ -20,8 +23,7 @@ class RowSplit:
     Attributes
     ----------
     training : rows that are learnt from
-    validation : rows that choose among passes, or where to call a pose colliding; none where
-        neither is chosen
+    validation : rows that choose among passes, or where to call a pose colliding, or none
     held_out : rows that measure the result
     """
 
@@ -33,18 +35,17 @@ class RowSplit:
 def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
     """Share out the samples 0, 1, ... of a store.
 
-    What is chosen by rows in training's way is chosen by a tenth of those that would train; what
-    is chosen once by a tenth of those that would measure, which are more than enough.
+    A tenth of the rows that would train choose among passes; where to call a pose colliding is
+    chosen by a tenth of those that would measure, if these are many.
     """
     is_out = is_held_out(np.arange(n_rows))
     rest, held_out = np.flatnonzero(~is_out), np.flatnonzero(is_out)
     if config.kept == "best":
         n_training = len(rest) - int(_VALIDATION_SHARE * len(rest))
         return RowSplit(rest[:n_training], rest[n_training:], held_out)
-    if config.balanced:
-        # Every tenth, so that a row keeps its side when its store grows.
-        every = slice(None, None, round(1.0 / _VALIDATION_SHARE))
-        return RowSplit(rest, held_out[every], np.delete(held_out, every))
+    every_tenth = slice(None, None, round(1.0 / _VALIDATION_SHARE))
+    if config.balanced and len(held_out[every_tenth]) >= LEAST_BALANCING:
+        return RowSplit(rest, held_out[every_tenth], np.delete(held_out, every_tenth))
     return RowSplit(rest, rest[:0], held_out)
 
 

@@ -127,7 +127,7 @@ def train_predictor(
     state = loop.run().state_dict()
     arrays = {name: values.detach().cpu().numpy() for name, values in state.items()}
     predictor = CollisionPredictor(embedding, arrays, config, facts)
-    if config.balanced:
+    if config.balanced and len(split.validation):
         chosen_by = rows.taken(split.validation)
         logit = predictor.scaled_outputs(chosen_by.latent)[1]
         limit = balanced_logit(logit, chosen_by.colliding)

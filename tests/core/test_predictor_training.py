@@ -33,7 +33,7 @@ from lcollision_core.predictor import (
 from lcollision_core.predictor.loop import rate_at
 from lcollision_core.predictor.networks import PredictorNetwork
 from lcollision_core.predictor.predictor import BATCH_ROWS
-from lcollision_core.predictor.row_split import held_out_rows, split_rows
+from lcollision_core.predictor.row_split import split_rows
 from lcollision_core.predictor.training import no_status
 from tests.core.predictor_rows import PAPER, config, made_up_rows, weights_of
 
@@ -68,8 +68,8 @@ def test_both_presets_learn_what_collides_and_how_deep(
         chosen = replace(preset, batch_rows=32, epochs=12)
         metrics = train_predictor(rows, tube_model.embedding, chosen).metrics
         assert metrics is not None
-        assert metrics.samples == len(held_out_rows(rows, chosen))
-        assert 0.6 < metrics.majority_rate < 0.75
+        assert metrics.samples == 450
+        assert 0.6 < metrics.majority_rate < 0.72
         assert metrics.accuracy > metrics.majority_rate + 0.15
         assert metrics.spearman is not None
         assert metrics.spearman > 0.8
