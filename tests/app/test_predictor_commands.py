@@ -21,7 +21,8 @@ from app.benchmarks import predictor as timing
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.labels import LabelStore
 from lcollision_core.model import PoseModel
-from lcollision_core.predictor import PRESETS
+from lcollision_core.model_file import Section
+from lcollision_core.predictor import PRESETS, CollisionPredictor, row_split
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 
@@ -118,6 +119,27 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     assert predictor.config == PRESETS["paper"]
     assert predictor.facts.rows == N_ROWS
     assert predictor.facts.seed == 3
+
+
+def test_rows_that_set_where_to_call_do_not_count(
+    lcollision: Lcollision,
+    trained: Path,
+    store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(row_split, "LEAST_BALANCING", 10)
+    model = PoseModel.load(trained)
+    section = model.require_predictor().to_section()
+    config = {**section.metadata["config"], "kept": "last", "balanced": True}
+    balanced = CollisionPredictor.from_section(
+        Section(section.arrays, {**section.metadata, "config": config}), model.embedding
+    )
+    path = tmp_path / "balanced.safetensors"
+    model.with_predictor(balanced).save(path)
+    report = json.loads(lcollision("evaluate", path, store, "--json").stdout)
+    held_out = 3 * N_ROWS // 10
+    assert report["samples"] == held_out - held_out // 10
 
 
 def test_all_rows_of_another_store_count(
