@@ -123,7 +123,7 @@ class LabelStore:
         LabelStoreError : naming the first difference.
         """
         for name, what in (
-            ("model", "the model {}"),
+            ("model", "the model of fingerprint {}"),
             ("seed", "samples of seed {}"),
             ("near_exclusion", "with a near exclusion of {}"),
             ("height", "with a height of {}"),
@@ -132,7 +132,8 @@ class LabelStore:
             if ours != theirs:
                 raise LabelStoreError(
                     f"{self.path} labels {what.format(ours)}, not {what.format(theirs)}; name "
-                    f"another store, or the model and seed that this one was made with"
+                    "another store, or the model and seed that this one was made with (a model "
+                    "whose embedding is trained anew is another)"
                 )
         if self.identity != identity:
             raise LabelStoreError(

@@ -169,7 +169,7 @@ def test_what_cannot_be_labelled_is_refused(
         n_domains=2, n_domain_codes=2, level1_epochs=1, level2_epochs=1, held_out_stride=0
     )
     PoseModel.from_training("other", train_embedding(few, config), few).save(other)
-    assert f"labels the model {trained.fingerprint}, not the model" in _refusal(
+    assert f"labels the model of fingerprint {trained.fingerprint}, not the model of" in _refusal(
         lcollision, "label", other, "-n", 40, "-o", store
     )
     both = ("--workers", 2, "--scheduler", "tcp://127.0.0.1:9")

@@ -177,7 +177,7 @@ def test_a_store_of_something_else_is_refused_and_left_alone(
 ) -> None:
     before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
     for other, seed, difference in (
-        (replace(labeller, fingerprint="0123"), 0, "not the model 0123"),
+        (replace(labeller, fingerprint="0123"), 0, "not the model of fingerprint 0123"),
         (labeller, 1, "labels samples of seed 0, not samples of seed 1"),
         (replace(labeller, near_exclusion=0.02), 0, "a near exclusion of 0.0, not .* of 0.02"),
         (replace(labeller, height=2.0), 0, "with a height of 170"),
