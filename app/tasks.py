@@ -79,8 +79,7 @@ class Imported:
     def sentence(self) -> str:
         """What the status bar says of it."""
         pose = self.pose
-        fit = fit_error(pose.fit_error_mean or 0.0, pose.fit_error_max or 0.0)
-        return f"Imported {pose.name}: {fit}"
+        return f"Imported {pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}"
 
 
 @dataclass(frozen=True)

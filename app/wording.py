@@ -36,7 +36,8 @@ def seconds_text(seconds: float) -> str:
     return f"{1000 * seconds:.0f} ms" if seconds < 0.95 else f"{seconds:.1f} s"
 
 
-def fit_error(mean: float, most: float) -> str:
-    """Say how far off the nearest pose of a mesh is, in heights."""
+def fit_error(mean: float | None, most: float | None) -> str:
+    """Say how far off the nearest pose of a mesh is, in heights; None is not off at all."""
+    mean, most = mean or 0.0, most or 0.0
     far = ", which is far: is it this body, in the model's vertex order?" if mean > _FAR else ""
     return f"fit error of {100.0 * mean:.3f} % of the height, at most {100.0 * most:.2f} %{far}"

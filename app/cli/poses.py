@@ -52,8 +52,7 @@ def encode(
             progress(len(poses), len(files))
     written = write_result(output, OutputForm.POSES, model, poses)
     for pose in poses:
-        fit = fit_error(pose.fit_error_mean or 0.0, pose.fit_error_max or 0.0)
-        typer.echo(f"{pose.name}: {fit}")
+        typer.echo(f"{pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}")
     written.note()
 
 

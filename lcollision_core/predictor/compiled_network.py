@@ -30,7 +30,7 @@ State = Mapping[str, npt.NDArray[Any]]
 Array = npt.NDArray[np.floating[Any]]
 Float32Array = npt.NDArray[np.float32]
 
-_MANY_ROWS, _FEW_ROWS = 256, 64
+_ROWS_IN_SINGLE, _ROWS_IN_DOUBLE = 256, 64
 """Poses that are taken together: each time, hundreds of small products cost like ten poses, but
 in double precision, and with a way back, a pose needs a megabyte of room."""
 
@@ -118,7 +118,7 @@ class CompiledNetwork:
         if not n_rows:
             return
         codes = latent.astype(self._kind)
-        n_parts = -(-n_rows // (_MANY_ROWS if self._kind == np.float32 else _FEW_ROWS))
+        n_parts = -(-n_rows // (_ROWS_IN_SINGLE if self._kind == np.float32 else _ROWS_IN_DOUBLE))
         size = -(-n_rows // n_parts)
         trace = self._take_room(size)
         for part in range(n_parts):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -293,15 +293,20 @@ class CollisionPredictor:
         poses = np.array(latent, dtype=np.float64)
         if self._few is not None:
             logit, gradient = self._few.logit_and_gradient(poses)
-            return logit + self.facts.logit_shift, gradient
+        else:
+            logit, gradient = self._differentiated(poses)
+        return logit + self.facts.logit_shift, gradient
+
+    def _differentiated(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the network's own logits and their gradients, by torch."""
         import torch
 
         codes = torch.tensor(poses, device=self.device)
         with torch.enable_grad():
             codes.requires_grad_()
-            found = self._exact_network(codes).logit
-            (slope,) = torch.autograd.grad(found.sum(), codes)
-        return found.detach().cpu().numpy() + self.facts.logit_shift, slope.cpu().numpy()
+            logit = self._exact_network(codes).logit
+            (gradient,) = torch.autograd.grad(logit.sum(), codes)
+        return logit.detach().cpu().numpy(), gradient.cpu().numpy()
 
     def flops(self, n_rows: int) -> int:
         """Count the floating-point operations of the matrix products that predict `n_rows` poses.
@@ -325,13 +330,6 @@ class CollisionPredictor:
         """Return the same predictor with what was measured of it."""
         return CollisionPredictor(
             self._embedding, self._arrays, self.config, self.facts, metrics, self.device
-        )
-
-    def shifted(self, logit_shift: float) -> CollisionPredictor:
-        """Return a predictor that adds so much to the network's logit, without metrics."""
-        facts = replace(self.facts, logit_shift=logit_shift)
-        return CollisionPredictor(
-            self._embedding, self._arrays, self.config, facts, device=self.device
         )
 
     def to_section(self) -> Section:

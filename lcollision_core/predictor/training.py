@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lcollision_core.embedding import Embedding
@@ -132,5 +132,6 @@ def train_predictor(
         logit = predictor.scaled_outputs(chosen_by.latent)[1]
         limit = balanced_logit(logit, chosen_by.colliding)
         if limit != 0.0:
-            predictor = predictor.shifted(-limit)
+            facts = replace(facts, logit_shift=-limit)
+            predictor = CollisionPredictor(embedding, arrays, config, facts)
     return predictor.with_metrics(evaluate_predictor(predictor, rows.taken(split.held_out)))
