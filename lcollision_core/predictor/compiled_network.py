@@ -77,8 +77,9 @@ class CompiledNetwork:
         self._skin_of: type[SkinOfFew | SkinOfMany]
         self._skin_of = SkinOfMany if kind == np.float32 else SkinOfFew
         self._reach = np.array(REACHES, dtype=kind)
+        self._steepness = (1.0 / np.square(REACHES)).astype(kind)
         # Loops over numbers of two sizes are slow.
-        self._apart = skin.apart.astype(kind)
+        self._apart = field_kernels.by_blocks(skin.apart.astype(kind), skin.order)
         n_members = sites.shape[1]
         n_sums = SUMS_A_REACH * len(REACHES)
         self._patch = _Network.read(state, "patch", n_points, n_sums, 2, kind)
@@ -160,7 +161,7 @@ class CompiledNetwork:
         """Fill in all of the trace, and return (B,) logits of (B, D) codes."""
         skin, n_rows, posed = self.skin, len(latent), trace.skin
         posed.set_codes(latent)
-        given = posed.frame, posed.places, skin.order, self._apart, self._reach
+        given = posed.frame, posed.places, skin.order, self._apart, self._steepness
         field_kernels.contact_field(*given, trace.sums)
         field_kernels.normalised(trace.sums, self._reach, FULL, SOME, trace.field)
         n_points = skin.n_points
@@ -202,7 +203,7 @@ class CompiledNetwork:
         by_sums = np.empty_like(trace.sums)
         by_frame, by_places = np.zeros_like(posed.frame), np.zeros_like(posed.places)
         field_kernels.normalised_backward(trace.sums, self._reach, by_field, FULL, SOME, by_sums)
-        given = posed.frame, posed.places, skin.order, self._apart, self._reach, by_sums
+        given = posed.frame, posed.places, skin.order, self._apart, self._steepness, by_sums
         field_kernels.contact_field_backward(*given, by_frame, by_places)
         return posed.by_codes(by_frame, by_places, by_view)
 

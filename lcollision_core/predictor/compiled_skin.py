@@ -21,6 +21,9 @@ from lcollision_core.predictor.skin_geometry import SkinGeometry
 Array = npt.NDArray[np.floating[Any]]
 Float32Array = npt.NDArray[np.float32]
 
+_POINTS_AT_ONCE = 64
+"""Of many poses: what moves them is made and added up while it is in the caches."""
+
 
 @dataclass(frozen=True, eq=False)
 class SkinMap:
@@ -41,6 +44,20 @@ class SkinMap:
     def weight_back(self) -> Float32Array:
         """Transposed, of which the way back reads rows, too."""
         return np.ascontiguousarray(self.weight.T)
+
+    @cached_property
+    def tables(self) -> list[tuple[slice, npt.NDArray[np.int32], Float32Array]]:
+        """For some points at a time the codes that move them, they, and the (9 n, codes) table."""
+        rows = N_FEATURES * _POINTS_AT_ONCE
+        return [
+            (
+                group,
+                target[start : start + _POINTS_AT_ONCE],
+                np.ascontiguousarray(table.T[N_FEATURES * start :][:rows]),
+            )
+            for group, target, table in self.geometry.groups()
+            for start in range(0, len(target), _POINTS_AT_ONCE)
+        ]
 
 
 class SkinOfPoses(ABC):
@@ -136,7 +153,7 @@ class SkinOfMany(SkinOfPoses):
 
     def __init__(self, skin: SkinMap, n_rows: int) -> None:
         geometry = self._geometry = skin.geometry
-        self._weight = skin.weight
+        self._weight, self._tables = skin.weight, skin.tables
         self._origin = skin.origin.astype(np.float32)[..., None]
         self._rest_frame = geometry.rest_frame.astype(np.float32)
         n_points, n_frames, n_skin = geometry.n_points, len(self._rest_frame), len(geometry.offset)
@@ -145,7 +162,7 @@ class SkinOfMany(SkinOfPoses):
         def empty(*shape: int) -> Float32Array:
             return np.empty(shape, dtype=np.float32)
 
-        self._outputs = empty(n_skin, N_FEATURES, n_rows)
+        self._outputs = empty(_POINTS_AT_ONCE, N_FEATURES, n_rows)
         self._features = empty(n_skin, N_FEATURES, n_rows)
         self._rows = empty(3, n_skin, 3, n_rows)
         self._turned = empty(n_frames, 3, 3, n_rows)
@@ -162,10 +179,10 @@ class SkinOfMany(SkinOfPoses):
         geometry, n_rows = self._geometry, len(latent)
         codes = torch.from_numpy(np.ascontiguousarray(latent.T))
         self._features[:] = geometry.offset[..., None]
-        for group, target, table in geometry.groups():
+        for group, target, table in self._tables:
             outputs = self._outputs[: len(target)]
             products = torch.from_numpy(outputs).view(-1, n_rows)
-            torch.mm(torch.from_numpy(table).T, codes[group], out=products).tanh_()
+            torch.mm(torch.from_numpy(table), codes[group], out=products).tanh_()
             batch_kernels.add_features(outputs, target, geometry.scale, self._features)
         batch_kernels.deform(self._features, self._rest_frame, self._rows, self._turned, self.frame)
         gradients = torch.from_numpy(self._rows).view(3, -1, n_rows)[:, : len(self._weight)]

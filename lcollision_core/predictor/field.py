@@ -109,7 +109,7 @@ def contact_field(
     order : (O,) int32, all P points, neighbours next to each other, and some again until O is a
         multiple of `BLOCK`
     apart : (P, O) added to squared distances to the points in that order: 0 for pairs that see
-        each other, else 1, as for all that are there again
+        each other, which they do both ways, else 1, as for all that are there again
     reach : (2,) ascending, below 1
 
     Returns
@@ -276,7 +276,9 @@ class _ContactField(torch.autograd.Function):
     ) -> torch.Tensor:
         ctx.save_for_backward(frame, places, order, apart, reach)
         sums = frame.new_empty((places.shape[2], len(frame), len(reach), 8))
-        field_kernels.contact_field(*_arrays(frame, places, order, apart, reach, sums))
+        field_kernels.contact_field(
+            *_arrays(frame, places), *_fixed(order, apart, reach), *_arrays(sums)
+        )
         return sums
 
     @staticmethod
@@ -287,7 +289,9 @@ class _ContactField(torch.autograd.Function):
         frame, places, order, apart, reach = ctx.saved_tensors
         by_frame, by_places = _zeros_like(frame), _zeros_like(places)
         field_kernels.contact_field_backward(
-            *_arrays(frame, places, order, apart, reach, by_sums, by_frame, by_places)
+            *_arrays(frame, places),
+            *_fixed(order, apart, reach),
+            *_arrays(by_sums, by_frame, by_places),
         )
         return by_frame, by_places, None, None, None
 
@@ -343,6 +347,12 @@ class _FoldView(torch.autograd.Function):
             )
         )
         return by_frame, by_rows, None
+
+
+def _fixed(order: torch.Tensor, apart: torch.Tensor, reach: torch.Tensor) -> list[Any]:
+    """Return what the loops of the contact field take of what is the same for all poses."""
+    turns, pairs, steepness = _arrays(order, apart, reach.square().reciprocal())
+    return [turns, field_kernels.by_blocks(pairs, turns), steepness]
 
 
 def _gradients(rows: torch.Tensor) -> torch.Tensor:

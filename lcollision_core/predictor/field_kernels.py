@@ -1,7 +1,9 @@
 """The compiled loops of `field`: what points feel of each other, forward and backward.
 
 Several points are taken at a time, without branches: far ones weigh 0. Those are mostly left out
-all the same, `BLOCK` neighbours at a time. Sums over points run in a fixed order.
+all the same: forward, a block of neighbours goes through the points near its box, side by side;
+backward, where the others are added to as well, each point goes through the blocks that are near
+its own. Sums over points run in a fixed order.
 """
 
 from __future__ import annotations
@@ -28,7 +30,23 @@ FULL, SOME = 0.3, 0.05
 """Sums of weights: one that fills half of the scale, and one that keeps means of nothing at 0."""
 
 BLOCK = 8
-"""Points that are left out together."""
+"""Neighbours that are taken, or left out, together."""
+
+
+def by_blocks(apart: Array, order: npt.NDArray[np.int32]) -> Array:
+    """Lay out which pairs are apart as the loops read it.
+
+    Parameters
+    ----------
+    apart, order : (P, O) and (O,), as of `field.contact_field`; the same both ways
+
+    Returns
+    -------
+    apart : (O / BLOCK, O, BLOCK) of each block, all points in order, and the block's
+    """
+    rows = apart[order]
+    rows[len(apart) :] = 1.0
+    return np.ascontiguousarray(rows.reshape(-1, BLOCK, len(order)).transpose(0, 2, 1))
 
 
 @compiled_sums
@@ -37,72 +55,149 @@ def contact_field(
     places: Array,
     order: npt.NDArray[np.int32],
     apart: Array,
-    reach: Array,
+    steepness: Array,
     sums: Array,
 ) -> None:
-    """Fill in the sums (P, B, 2, 8) of `field.contact_field`, for two reaches."""
+    """Fill in the sums (P, B, 2, 8) of `field.contact_field`: a block's points side by side.
+
+    Parameters
+    ----------
+    frame, places, order : as there
+    apart : as `by_blocks` returns it
+    steepness : (2,) one over the squared reaches; passed on, as loops that reorder sums would
+        divide by what is inverted in them
+    """
     n_points, n_ordered = places.shape[2], len(order)
-    kind = frame.dtype.type
-    zero, one, two, three = kind(0.0), kind(1.0), kind(2.0), kind(3.0)
-    behind, sharpness = kind(BEHIND), kind(1.0 / FADE)
-    inner, outer = one / (reach[0] * reach[0]), one / (reach[1] * reach[1])
+    n_blocks = n_ordered // BLOCK
+    # What compilers know to be `BLOCK` they write out, point by point.
+    width = n_ordered // n_blocks
     ordered = np.empty((6, n_ordered), dtype=frame.dtype)
-    boxes = np.empty((6, n_ordered // BLOCK), dtype=frame.dtype)
-    near = np.empty(n_ordered // BLOCK, dtype=np.uintp)
-    seen = np.empty((7, n_ordered), dtype=frame.dtype)
-    x, y, z, nx, ny, nz, away = seen[0], seen[1], seen[2], seen[3], seen[4], seen[5], seen[6]
+    boxes = np.empty((6, n_blocks), dtype=frame.dtype)
+    gap = np.empty(n_points, dtype=frame.dtype)
+    near = np.empty(n_points, dtype=np.uintp)
+    lanes = np.empty(22 * BLOCK, dtype=frame.dtype)
     for b in range(frame.shape[0]):
         _order(frame[b], places[b], order, ordered, boxes)
-        for place in range(n_points):
-            if place % BLOCK == 0:
-                n_seen = _see(place // BLOCK, ordered, boxes, reach[1], near, seen)
-            p = order[place]
-            _copy_blocks(apart[p], near, n_seen, away)
-            px, py, pz = ordered[0, place], ordered[1, place], ordered[2, place]
-            own_x, own_y, own_z = ordered[3, place], ordered[4, place], ordered[5, place]
-            # Sums with the inner reach, then with the outer one: of weights, heights, offsets and
-            # normals. Local numbers, as only those stay in registers.
-            w0, h0, x0, y0, z0, a0, b0, c0 = zero, zero, zero, zero, zero, zero, zero, zero
-            w1, h1, x1, y1, z1, a1, b1, c1 = zero, zero, zero, zero, zero, zero, zero, zero
-            for q in range(n_seen):
-                dx, dy, dz = x[q] - px, y[q] - py, z[q] - pz
-                squared = dx * dx + dy * dy + dz * dz + away[q]
-                s = (dx * own_x + dy * own_y + dz * own_z + behind) * sharpness
-                s = s if s > zero else zero
-                s = s if s < one else one
-                facing = s * s * (three - two * s)
-                above = dx * nx[q] + dy * ny[q] + dz * nz[q]
-                t = one - squared * inner
-                t = t if t > zero else zero
-                weight = facing * t * t * t
-                w0 += weight
-                h0 -= weight * above
-                x0 += weight * dx
-                y0 += weight * dy
-                z0 += weight * dz
-                a0 += weight * nx[q]
-                b0 += weight * ny[q]
-                c0 += weight * nz[q]
-                t = one - squared * outer
-                t = t if t > zero else zero
-                weight = facing * t * t * t
-                w1 += weight
-                h1 -= weight * above
-                x1 += weight * dx
-                y1 += weight * dy
-                z1 += weight * dz
-                a1 += weight * nx[q]
-                b1 += weight * ny[q]
-                c1 += weight * nz[q]
-            # Offsets and normals turned into the point's frame.
-            sums[p, b, 0, 0], sums[p, b, 0, 1] = w0, h0
-            sums[p, b, 1, 0], sums[p, b, 1, 1] = w1, h1
-            for c in range(3):
-                f0, f1, f2 = frame[b, p, 0, c], frame[b, p, 1, c], frame[b, p, 2, c]
-                sums[p, b, 0, 2 + c] = f0 * x0 + f1 * y0 + f2 * z0
-                sums[p, b, 0, 5 + c] = f0 * a0 + f1 * b0 + f2 * c0
-                sums[p, b, 1, 2 + c] = f0 * x1 + f1 * y1 + f2 * z1
-                sums[p, b, 1, 5 + c] = f0 * a1 + f1 * b1 + f2 * c1
+        for own in range(n_blocks):
+            first = BLOCK * own
+            n_near = _find_near(own, ordered, boxes, steepness[1], gap, near)
+            for i in range(BLOCK):
+                for c in range(6):
+                    lanes[BLOCK * c + i] = ordered[c, first + i]
+            lanes[6 * BLOCK :] = frame.dtype.type(0.0)
+            _feel(near[:n_near], ordered, apart[own], width, steepness, lanes)
+            for i in range(min(BLOCK, n_points - first)):
+                p = order[first + i]
+                for k in range(2):
+                    start = (6 + 8 * k) * BLOCK + i
+                    sums[p, b, k, 0], sums[p, b, k, 1] = lanes[start], lanes[start + BLOCK]
+                    # Offsets and normals turned into the point's frame.
+                    for c in range(3):
+                        f0, f1, f2 = frame[b, p, 0, c], frame[b, p, 1, c], frame[b, p, 2, c]
+                        sums[p, b, k, 2 + c] = (
+                            f0 * lanes[start + 2 * BLOCK]
+                            + f1 * lanes[start + 3 * BLOCK]
+                            + f2 * lanes[start + 4 * BLOCK]
+                        )
+                        sums[p, b, k, 5 + c] = (
+                            f0 * lanes[start + 5 * BLOCK]
+                            + f1 * lanes[start + 6 * BLOCK]
+                            + f2 * lanes[start + 7 * BLOCK]
+                        )
+
+
+@compiled
+def _find_near(
+    own: int,
+    ordered: Array,
+    boxes: Array,
+    steepness: Number,
+    gap: Array,
+    near: npt.NDArray[np.uintp],
+) -> int:
+    """List the points within reach of a block's box; returns how many there are."""
+    zero, one = ordered.dtype.type(0.0), ordered.dtype.type(1.0)
+    low_x, low_y, low_z = boxes[0, own], boxes[1, own], boxes[2, own]
+    high_x, high_y, high_z = boxes[3, own], boxes[4, own], boxes[5, own]
+    for q in range(len(gap)):
+        x, y, z = ordered[0, q], ordered[1, q], ordered[2, q]
+        dx = low_x - x if low_x - x > x - high_x else x - high_x
+        dy = low_y - y if low_y - y > y - high_y else y - high_y
+        dz = low_z - z if low_z - z > z - high_z else z - high_z
+        dx = dx if dx > zero else zero
+        dy = dy if dy > zero else zero
+        dz = dz if dz > zero else zero
+        gap[q] = (dx * dx + dy * dy + dz * dz) * steepness
+    n_near = 0
+    for q in range(len(gap)):
+        # Without a branch, which would be mispredicted.
+        near[n_near] = q
+        n_near += gap[q] < one
+    return n_near
+
+
+@compiled_sums
+def _feel(
+    near: npt.NDArray[np.uintp],
+    ordered: Array,
+    apart: Array,
+    width: int,
+    steepness: Array,
+    lanes: Array,
+) -> None:
+    """Add what a block's points feel of some others.
+
+    Parameters
+    ----------
+    near : the others, of those in order
+    apart : (O, BLOCK) of the block
+    width : `BLOCK`
+    lanes : (22 BLOCK,) of each of its points place and normal, then its sums with the inner reach,
+        then with the outer one: of weights, heights, offsets and normals; in one array, or else
+        compilers would not see that nothing overlaps
+    """
+    kind = ordered.dtype.type
+    zero, one, two = kind(0.0), kind(1.0), kind(2.0)
+    behind, sharpness = kind(BEHIND), kind(1.0 / FADE)
+    inner, outer = steepness[0], steepness[1]
+    for n in range(len(near)):
+        q = near[n]
+        x, y, z = ordered[0, q], ordered[1, q], ordered[2, q]
+        nx, ny, nz = ordered[3, q], ordered[4, q], ordered[5, q]
+        for i in range(width):
+            dx, dy, dz = x - lanes[i], y - lanes[BLOCK + i], z - lanes[2 * BLOCK + i]
+            squared = dx * dx + dy * dy + dz * dz + apart[q, i]
+            ahead = (
+                dx * lanes[3 * BLOCK + i] + dy * lanes[4 * BLOCK + i] + dz * lanes[5 * BLOCK + i]
+            )
+            s = (ahead + behind) * sharpness
+            s = s if s > zero else zero
+            rest = one - s
+            rest = rest if rest > zero else zero
+            facing = (one - rest) * (one - rest) * (one + two * rest)
+            above = dx * nx + dy * ny + dz * nz
+            t = one - squared * inner
+            t = t if t > zero else zero
+            weight = facing * t * t * t
+            lanes[6 * BLOCK + i] += weight
+            lanes[7 * BLOCK + i] -= weight * above
+            lanes[8 * BLOCK + i] += weight * dx
+            lanes[9 * BLOCK + i] += weight * dy
+            lanes[10 * BLOCK + i] += weight * dz
+            lanes[11 * BLOCK + i] += weight * nx
+            lanes[12 * BLOCK + i] += weight * ny
+            lanes[13 * BLOCK + i] += weight * nz
+            t = one - squared * outer
+            t = t if t > zero else zero
+            weight = facing * t * t * t
+            lanes[14 * BLOCK + i] += weight
+            lanes[15 * BLOCK + i] -= weight * above
+            lanes[16 * BLOCK + i] += weight * dx
+            lanes[17 * BLOCK + i] += weight * dy
+            lanes[18 * BLOCK + i] += weight * dz
+            lanes[19 * BLOCK + i] += weight * nx
+            lanes[20 * BLOCK + i] += weight * ny
+            lanes[21 * BLOCK + i] += weight * nz
 
 
 @compiled_sums
@@ -111,7 +206,7 @@ def contact_field_backward(
     places: Array,
     order: npt.NDArray[np.int32],
     apart: Array,
-    reach: Array,
+    steepness: Array,
     by_sums: Array,
     by_frame: Array,
     by_places: Array,
@@ -121,7 +216,7 @@ def contact_field_backward(
     kind = frame.dtype.type
     zero, one, two, three, six = kind(0.0), kind(1.0), kind(2.0), kind(3.0), kind(6.0)
     behind, sharpness = kind(BEHIND), kind(1.0 / FADE)
-    inner, outer = one / (reach[0] * reach[0]), one / (reach[1] * reach[1])
+    inner, outer = steepness[0], steepness[1]
     ordered = np.empty((6, n_ordered), dtype=frame.dtype)
     by_ordered = np.empty((6, n_ordered), dtype=frame.dtype)
     boxes = np.empty((6, n_ordered // BLOCK), dtype=frame.dtype)
@@ -132,15 +227,16 @@ def contact_field_backward(
     by_x, by_y, by_z = by_seen[0], by_seen[1], by_seen[2]
     by_nx, by_ny, by_nz = by_seen[3], by_seen[4], by_seen[5]
     given = np.empty((2, 8), dtype=frame.dtype)
+    pairs = apart.reshape(-1)
     for b in range(frame.shape[0]):
         _order(frame[b], places[b], order, ordered, boxes)
         by_ordered[:] = zero
         for place in range(n_points):
             if place % BLOCK == 0:
-                n_seen = _see(place // BLOCK, ordered, boxes, reach[1], near, seen)
+                n_seen = _see(place // BLOCK, ordered, boxes, outer, near, seen)
                 by_seen[:, :n_seen] = zero
             p = order[place]
-            _copy_blocks(apart[p], near, n_seen, away)
+            _copy_blocks(pairs, BLOCK * place, n_ordered, near, n_seen, away)
             px, py, pz = ordered[0, place], ordered[1, place], ordered[2, place]
             own_x, own_y, own_z = ordered[3, place], ordered[4, place], ordered[5, place]
             _turn_back(frame[b, p], by_sums[p, b], given)
@@ -262,7 +358,7 @@ def _see(
     own: int,
     ordered: Array,
     boxes: Array,
-    reach: Number,
+    outer: Number,
     near: npt.NDArray[np.uintp],
     seen: Array,
 ) -> int:
@@ -270,7 +366,7 @@ def _see(
 
     Returns how many points they have.
     """
-    zero = ordered.dtype.type(0.0)
+    zero, one = ordered.dtype.type(0.0), ordered.dtype.type(1.0)
     n_near = 0
     for k in range(boxes.shape[1]):
         x = max(boxes[0, own] - boxes[3, k], boxes[0, k] - boxes[3, own], zero)
@@ -278,19 +374,24 @@ def _see(
         z = max(boxes[2, own] - boxes[5, k], boxes[2, k] - boxes[5, own], zero)
         # Without a branch, which would be mispredicted.
         near[n_near] = BLOCK * k
-        n_near += x * x + y * y + z * z < reach * reach
+        n_near += (x * x + y * y + z * z) * outer < one
     for c in range(6):
-        _copy_blocks(ordered[c], near, BLOCK * n_near, seen[c])
+        _copy_blocks(ordered[c], 0, 1, near, BLOCK * n_near, seen[c])
     return BLOCK * n_near
 
 
 @compiled
-def _copy_blocks(given: Array, near: npt.NDArray[np.uintp], n_seen: int, copy: Array) -> None:
-    """Copy blocks side by side, each in one piece, as a loop over its points would not."""
+def _copy_blocks(
+    given: Array, start: int, times: int, near: npt.NDArray[np.uintp], n_seen: int, copy: Array
+) -> None:
+    """Copy blocks side by side, each in one piece, as a loop over its points would not.
+
+    They begin at so many times their numbers after a start.
+    """
     i1, i2, i3, i4 = np.uintp(1), np.uintp(2), np.uintp(3), np.uintp(4)
     i5, i6, i7 = np.uintp(5), np.uintp(6), np.uintp(7)
     for n in range(n_seen // BLOCK):
-        i, j = near[n], np.uintp(BLOCK * n)
+        i, j = np.uintp(start) + np.uintp(times) * near[n], np.uintp(BLOCK * n)
         # All are read before any is written.
         v0, v1, v2, v3 = given[i], given[i + i1], given[i + i2], given[i + i3]
         v4, v5, v6, v7 = given[i + i4], given[i + i5], given[i + i6], given[i + i7]
