@@ -261,18 +261,44 @@ def _is_near(corners, slot_a, slot_b, near):
     for i in range(3):
         v = corners[base_a + i * LEAF_SIZE]
         for j in range(3):
-            w = corners[base_b + j * LEAF_SIZE]
-            low = near.start[v]
-            high = near.start[v + 1]
-            while low < high:
-                probe = (low + high) // 2
-                if near.vertex[probe] < w:
-                    low = probe + 1
-                else:
-                    high = probe
-            if low < near.start[v + 1] and near.vertex[low] == w:
+            if _are_vertices_near(v, corners[base_b + j * LEAF_SIZE], near):
                 return True
     return False
+
+
+@compiled
+def _are_vertices_near(v, w, near):
+    low = near.start[v]
+    high = near.start[v + 1]
+    while low < high:
+        probe = (low + high) // 2
+        if near.vertex[probe] < w:
+            low = probe + 1
+        else:
+            high = probe
+    return low < near.start[v + 1] and near.vertex[low] == w
+
+
+@compiled
+def find_near(
+    faces: npt.NDArray[np.integer],
+    pairs: npt.NDArray[np.integer],
+    near: NearVertices,
+    is_near: npt.NDArray[np.bool_],
+) -> None:
+    """Fill in (n,) whether some corner of one face is near some corner of the other.
+
+    Parameters
+    ----------
+    faces : (F, 3)
+    pairs : (n, 2) of them
+    """
+    for n in range(len(pairs)):
+        is_near[n] = False
+        for i in range(3):
+            for j in range(3):
+                v, w = faces[pairs[n, 0], i], faces[pairs[n, 1], j]
+                is_near[n] |= len(near.vertex) > 0 and _are_vertices_near(v, w, near)
 
 
 @compiled

@@ -8,6 +8,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from lcollision_core.contact.arrays import NearVertices
+from lcollision_core.contact.kernels import find_near
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import Topology
 
@@ -56,3 +57,12 @@ def near_vertices(
                 f"{topology.n_vertices} vertices; make it smaller"
             )
     return NearVertices(start=np.cumsum(counts), vertex=np.concatenate(reached))
+
+
+def are_pairs_near(
+    topology: Topology, pairs: npt.NDArray[np.integer], near: NearVertices
+) -> npt.NDArray[np.bool_]:
+    """Return (n,) whether some corners of the faces of (n, 2) pairs are near each other."""
+    is_near = np.empty(len(pairs), dtype=np.bool_)
+    find_near(topology.faces, pairs, near, is_near)
+    return is_near

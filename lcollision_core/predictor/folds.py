@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector, SelfCollisions
+from lcollision_core.contact.near import are_pairs_near, near_vertices
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.body_points import (
@@ -48,24 +49,17 @@ class FoldDetector:
     def __init__(self, embedding: Embedding, near_exclusion: float) -> None:
         topology, rest = embedding.topology, embedding.rest_vertices
         reach = near_exclusion + FOLD_REACH
-        self._contacts = CollisionDetector(topology, rest, near_exclusion=reach)
-        self._all = None
-        if near_exclusion > 0.0:
-            self._all = CollisionDetector(topology, rest, near_exclusion=near_exclusion)
+        self._detector = CollisionDetector(topology, rest, near_exclusion=reach)
+        self._excluded = near_vertices(topology, rest, near_exclusion * self._detector.height)
 
     def detect(
         self, vertices: npt.NDArray[np.floating]
     ) -> tuple[SelfCollisions, npt.NDArray[np.int32], FloatArray]:
         """Find the contacts, and the folds' pairs of faces (n, 2) with their depths (n,)."""
-        contacts = self._contacts.detect(vertices)
-        if self._all is None:
-            return contacts, contacts.near_pairs, contacts.near_penetration_depth
-        found = self._all.detect(vertices)
-        # Both are in ascending order, so a pair is one number.
-        unit = np.int64(len(self._all.topology.faces))
-        number, known = (one.pairs[:, 0] * unit + one.pairs[:, 1] for one in (found, contacts))
-        folds = ~np.isin(number, known, assume_unique=True)
-        return contacts, found.pairs[folds], found.penetration_depth[folds]
+        found = self._detector.detect(vertices)
+        pairs = found.near_pairs
+        folds = ~are_pairs_near(self._detector.topology, pairs, self._excluded)
+        return found, pairs[folds], found.near_penetration_depth[folds]
 
 
 def find_fold_sites(

@@ -86,7 +86,7 @@ class TrainingLoop:
         self._rows, self._embedding = rows, embedding
         self._config, self._facts = config, facts
         self._device_name, self._path = device, checkpoint
-        # A file of its own, for it is large, and written once.
+        # A file of its own, for it is large, and written before the first step.
         self._patches_path = checkpoint and checkpoint.with_name(f"{checkpoint.name}.patches")
         self._progress, self._cancel = progress, cancel
         self._near_exclusion = 0.0 if facts.store is None else facts.store.near_exclusion
@@ -188,8 +188,13 @@ class TrainingLoop:
             return np.empty((len(self._training_index), 0), dtype=np.float16)
         kept = Checkpoint(self._patches_path, key)
         stored = kept.get(_PATCHES)
-        if stored is not None:
-            return stored.arrays["root"]
+        known = None if stored is None else stored.arrays["root"]
+        if known is not None and len(known) == len(self._training_index):
+            return known
+
+        def keep(roots: npt.NDArray[np.float16]) -> None:
+            if processes.rank == 0:
+                kept.put(_PATCHES, {"root": roots}, {}, now=True)
 
         def report(done: int, total: int) -> None:
             self._preparing = done / total
@@ -202,11 +207,12 @@ class TrainingLoop:
             cells,
             self._near_exclusion,
             self._facts.energy_scale,
+            known=known,
+            keep=keep,
             progress=report,
             cancel=self._cancel,
         )
-        if processes.rank == 0:
-            kept.put(_PATCHES, {"root": roots}, {}, now=True)
+        keep(roots)
         return roots
 
     def _after_step(

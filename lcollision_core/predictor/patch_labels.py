@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
+from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.labels import LabelRows
 from lcollision_core.predictor.folds import FoldDetector
@@ -16,6 +18,8 @@ from lcollision_core.predictor.folds import FoldDetector
 _ROWS_A_BLOCK = 256
 _PATCH_SHARE, _FOLD_SHARE = 0.05, 0.005
 """A patch that is hit has about this share of its pose's energy; so has a fold."""
+
+_TIMES_KEPT = 20
 
 _LEAST_ROOT = 1e-3
 """So that the shallowest touch is still told from none in half precision."""
@@ -52,6 +56,8 @@ def patch_roots(
     cells: SkinCells,
     near_exclusion: float,
     energy_scale: float,
+    known: npt.NDArray[np.float16] | None = None,
+    keep: Callable[[npt.NDArray[np.float16]], None] | None = None,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> npt.NDArray[np.float16]:
@@ -67,6 +73,8 @@ def patch_roots(
     cells : pairs within `FOLD_REACH` of each other along the surface go to the folds, if any
     near_exclusion : in heights
     energy_scale : the mean energy of a colliding pose, in squared heights
+    known : (m, P + S) what an earlier call found in the first m of the rows
+    keep : is given what is known so far, after each twentieth of the work and when it is cancelled
     progress : in rows that collide
     cancel : polled for every block of rows
 
@@ -86,6 +94,10 @@ def patch_roots(
     unit = np.repeat([_PATCH_SHARE, _FOLD_SHARE], [n_patches, n_folds]) * energy_scale
 
     places = np.flatnonzero(rows.colliding[index])
+    n_known = 0
+    if known is not None:
+        roots[: len(known)] = known
+        n_known = int(np.searchsorted(places, len(known)))
 
     def label(start: int) -> None:
         if cancel is not None:
@@ -102,9 +114,18 @@ def patch_roots(
             hit = energy > 0.0
             roots[row, hit] = np.maximum(np.sqrt(energy[hit] / unit[hit]), _LEAST_ROOT)
 
-    starts = range(0, len(places), _ROWS_A_BLOCK)
+    starts = range(n_known, len(places), _ROWS_A_BLOCK)
+    kept_every = -(-len(starts) // _TIMES_KEPT)
     _ = embedding.codec, embedding.decoder
     with ThreadPoolExecutor(available_cores()) as pool:
-        for done, _ in enumerate(pool.map(label, starts), start=1):
-            progress(min(done * _ROWS_A_BLOCK, len(places)), len(places))
+        try:
+            for done, _ in enumerate(pool.map(label, starts), start=1):
+                n_known = min(starts[done - 1] + _ROWS_A_BLOCK, len(places))
+                progress(n_known, len(places))
+                if keep is not None and done % kept_every == 0:
+                    keep(roots[: places[n_known - 1] + 1])
+        except CancelledError:
+            if keep is not None and n_known:
+                keep(roots[: places[n_known - 1] + 1])
+            raise
     return roots

@@ -12,7 +12,7 @@ from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.model import PoseModel
-from lcollision_core.predictor import PRESETS
+from lcollision_core.predictor import PRESETS, patch_labels
 from lcollision_core.predictor.body_points import (
     body_points,
     neighbour_order,
@@ -422,6 +422,46 @@ def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
             1.0,
             cancel=cancel,
         )
+
+
+class _ThirdTime(CancelToken):
+    """Cancelled when it is asked for the third time."""
+
+    _asked = 0
+
+    def raise_if_cancelled(self) -> None:
+        self._asked += 1
+        if self._asked == 3:
+            self.cancel()
+        super().raise_if_cancelled()
+
+
+def test_labelling_patches_goes_on_where_it_was_stopped(
+    tube_model: PoseModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patch_labels, "_ROWS_A_BLOCK", 4)
+    monkeypatch.setattr(patch_labels, "available_cores", lambda: 1)
+    embedding, latent = tube_model.embedding, colliding_latent(tube_model)
+    rows = labeller_of(tube_model).label(latent)
+    cells = SkinCells(
+        skin_cells(embedding, body_points(embedding, 25)), np.full(tube_model.n_vertices, -1)
+    )
+    given = embedding, rows, np.arange(len(latent)), cells, 0.0, 1e-4
+    whole = patch_roots(*given)
+    kept = list[np.ndarray]()
+    with pytest.raises(CancelledError):
+        patch_roots(*given, keep=lambda roots: kept.append(roots.copy()), cancel=_ThirdTime())
+    # Once for each block, as there are fewer than twenty, and for being stopped.
+    n_kept = len(kept[-1])
+    assert len(kept) == 3
+    assert 0 < n_kept < len(whole)
+    assert all(np.array_equal(roots, whole[: len(roots)]) for roots in kept)
+    told = list[int]()
+    rest = patch_roots(*given, known=kept[-1], progress=lambda done, _: told.append(done))
+    assert np.array_equal(rest, whole)
+    assert told[0] > np.count_nonzero(rows.colliding[:n_kept])
+    # What is known is believed.
+    assert np.array_equal(patch_roots(*given, known=0.5 * whole), 0.5 * whole)
 
 
 def test_a_stored_network_predicts_the_same(
