@@ -91,7 +91,7 @@ def predictor(
     from lcollision_core.labels import LabelStore
     from lcollision_core.meshes import require_writable
     from lcollision_core.model import PoseModel, checkpoint_path, model_destination
-    from lcollision_core.predictor import PRESETS, train_predictor
+    from lcollision_core.predictor import PRESETS, has_begun, train_predictor
     from lcollision_core.resolve import find_free_poses
 
     destination = model_destination(output)
@@ -103,7 +103,7 @@ def predictor(
     # torchrun starts this command many times; the first process writes for all.
     leads = os.environ.get("RANK", "0") == "0"
     checkpoint = checkpoint_path(destination)
-    if leads and checkpoint.exists():
+    if leads and has_begun(checkpoint):
         note(f"going on from {checkpoint}")
     try:
         with cancel_on_interrupt() as cancel, _training_bar(leads) as progress:
@@ -119,7 +119,7 @@ def predictor(
                 seed=seed,
             )
     except CancelledError:
-        if leads and checkpoint.exists():
+        if leads and has_begun(checkpoint):
             note(f"stopped; run the same command again to go on from {checkpoint}")
         raise
     if leads:

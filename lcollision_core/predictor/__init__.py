@@ -13,6 +13,7 @@ from lcollision_core.predictor.row_split import held_out_rows
 from lcollision_core.predictor.training import (
     PredictorStatus,
     StatusCallback,
+    has_begun,
     no_status,
     train_predictor,
 )
@@ -31,6 +32,7 @@ __all__ = [
     "StatusCallback",
     "TrainingFacts",
     "evaluate_predictor",
+    "has_begun",
     "held_out_rows",
     "no_status",
     "train_predictor",

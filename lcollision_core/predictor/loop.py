@@ -28,7 +28,7 @@ from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
 from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.processes import Processes, joined_processes
 from lcollision_core.predictor.row_split import RowSplit
-from lcollision_core.predictor.training import PredictorStatus, StatusCallback
+from lcollision_core.predictor.training import PredictorStatus, StatusCallback, patches_path
 
 _RUN_VERSION = 6
 """Goes up when training changes, so that no checkpoint is continued by other rules."""
@@ -87,7 +87,7 @@ class TrainingLoop:
         self._config, self._facts = config, facts
         self._device_name, self._path = device, checkpoint
         # A file of its own, for it is large, and written before the first step.
-        self._patches_path = checkpoint and checkpoint.with_name(f"{checkpoint.name}.patches")
+        self._patches_path = checkpoint and patches_path(checkpoint)
         self._progress, self._cancel = progress, cancel
         self._near_exclusion = 0.0 if facts.store is None else facts.store.near_exclusion
         self._training_index, self._validation_index = split.training, split.validation

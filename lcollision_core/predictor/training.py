@@ -51,6 +51,16 @@ def no_status(status: PredictorStatus) -> None:
     """Report to nobody."""
 
 
+def patches_path(checkpoint: Path) -> Path:
+    """Return the file beside a checkpoint that keeps the labelled patches."""
+    return checkpoint.with_name(f"{checkpoint.name}.patches")
+
+
+def has_begun(checkpoint: Path) -> bool:
+    """Whether a stopped run goes on from a checkpoint, or at least from its patches."""
+    return checkpoint.exists() or patches_path(checkpoint).exists()
+
+
 def train_predictor(
     rows: LabelRows,
     embedding: Embedding,
@@ -93,7 +103,8 @@ def train_predictor(
     LabelStoreError : all rows collide, or none does, or none is held out.
     LCollisionError : the checkpoint belongs to another run or is damaged, the training diverges,
         or there is no such device.
-    CancelledError : `cancel` was set; the checkpoint holds the last step.
+    CancelledError : `cancel` was set; the checkpoint holds the last step, or the patches that
+        were labelled by then, see `patches_path`.
     """
     # Here, so that reading a predictor's types loads no torch.
     from lcollision_core.predictor.loop import TrainingLoop

@@ -197,14 +197,21 @@ def test_a_killed_training_goes_on_to_the_same_model(
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
-def test_ctrl_c_keeps_a_checkpoint_and_says_so(model: Path, store: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("preset", "kept"), [("paper", ""), ("default", ".patches")])
+def test_ctrl_c_keeps_a_checkpoint_and_says_so(
+    model: Path, store: Path, tmp_path: Path, preset: str, kept: str
+) -> None:
+    """The preset default begins with labelling patches."""
     output = tmp_path / "stopped.safetensors"
     code = (
         "import os, signal\n"
-        "from lcollision_core.predictor import loop\n"
+        "from lcollision_core.predictor import loop, patch_labels\n"
+        "patch_labels._ROWS_A_BLOCK = 4\n"
+        "patch_labels.available_cores = lambda: 1\n"
         "report = loop.TrainingLoop._report\n"
         "def interrupted(self, step):\n"
         "    report(self, step)\n"
+        "    loop.TrainingLoop._report = report\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
         "loop.TrainingLoop._report = interrupted\n"
         "from app.cli.main import main\n"
@@ -212,7 +219,7 @@ def test_ctrl_c_keeps_a_checkpoint_and_says_so(model: Path, store: Path, tmp_pat
     )
     command = [sys.executable, "-c", code, "train", "predictor", model, store, "-o", output]
     result = subprocess.run(
-        [*command, "--preset", "paper"],
+        [*command, "--preset", preset],
         capture_output=True,
         text=True,
         timeout=SECONDS_TO_WAIT,
@@ -223,8 +230,7 @@ def test_ctrl_c_keeps_a_checkpoint_and_says_so(model: Path, store: Path, tmp_pat
     assert _without_progress(result.stderr) == (
         f"lcollision: stopped; run the same command again to go on from {checkpoint}\n"
     )
-    assert checkpoint.exists()
-    assert not output.exists()
+    assert [path.name for path in tmp_path.iterdir()] == [f"{checkpoint.name}{kept}"]
 
 
 def test_what_cannot_be_trained_or_evaluated_is_refused(
