@@ -274,11 +274,10 @@ class _ContactField(torch.autograd.Function):
         apart: torch.Tensor,
         reach: torch.Tensor,
     ) -> torch.Tensor:
-        ctx.save_for_backward(frame, places, order, apart, reach)
+        ctx.save_for_backward(frame, places)
+        ctx.fixed = _fixed(order, apart, reach)
         sums = frame.new_empty((places.shape[2], len(frame), len(reach), 8))
-        field_kernels.contact_field(
-            *_arrays(frame, places), *_fixed(order, apart, reach), *_arrays(sums)
-        )
+        field_kernels.contact_field(*_arrays(frame, places), *ctx.fixed, *_arrays(sums))
         return sums
 
     @staticmethod
@@ -286,12 +285,10 @@ class _ContactField(torch.autograd.Function):
     def backward(
         ctx: Any, by_sums: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, None, None, None]:
-        frame, places, order, apart, reach = ctx.saved_tensors
+        frame, places = ctx.saved_tensors
         by_frame, by_places = _zeros_like(frame), _zeros_like(places)
         field_kernels.contact_field_backward(
-            *_arrays(frame, places),
-            *_fixed(order, apart, reach),
-            *_arrays(by_sums, by_frame, by_places),
+            *_arrays(frame, places), *ctx.fixed, *_arrays(by_sums, by_frame, by_places)
         )
         return by_frame, by_places, None, None, None
 
