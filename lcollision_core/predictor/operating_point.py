@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from lcollision_core.meshes.topology import FloatArray
 
-_ACCURACY_GIVEN_UP = 1e-3
+_ACCURACY_GIVEN_UP = 1e-2
 """So much of what is right at even odds may be lost."""
 
 _ERRORS_APART = 2.0
@@ -19,7 +19,7 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
 
     A classifier that is right as often as it can be mistakes the rarer kind more often. Where the
     false positive and the false negative rate at even odds, logit 0, differ by more than chance,
-    this goes as far towards equal ones as is expected to cost no more than a thousandth of all
+    this goes as far towards equal ones as is expected to cost no more than a hundredth of all
     calls. What is expected is a logistic curve's through all rows (Platt 1999): counting the few
     rows near a limit would go where these happen to be favourable.
 
