@@ -18,12 +18,12 @@ from torch.optim.swa_utils import AveragedModel
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.embedding.checkpoint import Checkpoint, run_key
-from lcollision_core.errors import LCollisionError
+from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows
 from lcollision_core.predictor.config import PredictorConfig
 from lcollision_core.predictor.networks import PredictorNetwork, Targets
-from lcollision_core.predictor.patch_labels import patch_roots
+from lcollision_core.predictor.patch_labels import PatchLabeller
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
 from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.processes import Processes, joined_processes
@@ -42,6 +42,9 @@ _BUILDING_ROWS = 65_536
 _SECONDS_BETWEEN_REPORTS = 0.25
 _STEPS_BETWEEN_TALKS = 20
 """Processes agree this often on whether to stop or to save: each time costs a round trip."""
+
+_TIMES_PATCHES_KEPT, _LEAST_PATCHES_KEPT = 20, 4096
+"""Patches are written after each twentieth of the training rows, or after so many rows."""
 
 _STEPS_BETWEEN_CLEARINGS = 100
 _TINY_MOMENT = 1e-30
@@ -182,38 +185,56 @@ class TrainingLoop:
     def _patch_roots(
         self, network: PredictorNetwork, key: str, processes: Processes
     ) -> npt.NDArray[np.float16]:
-        """Label the patches, or read what an earlier run kept beside the checkpoint."""
+        """Label the patches, or go on from what an earlier run kept beside the checkpoint."""
+        n_rows = len(self._training_index)
         cells = network.skin_cells(self._embedding)
         if cells is None:
-            return np.empty((len(self._training_index), 0), dtype=np.float16)
+            return np.empty((n_rows, 0), dtype=np.float16)
         kept = Checkpoint(self._patches_path, key)
-        stored = kept.get(_PATCHES)
-        known = None if stored is None else stored.arrays["root"]
-        if known is not None and len(known) == len(self._training_index):
-            return known
-
-        def keep(roots: npt.NDArray[np.float16]) -> None:
+        roots = np.zeros((n_rows, cells.n_patches + cells.n_folds), dtype=np.float16)
+        stored, n_known = kept.get(_PATCHES), 0
+        if stored is not None:
+            known = stored.arrays["root"]
+            n_known = len(known)
+            roots[:n_known] = known
+        processes.require_same(n_known)
+        if n_known == n_rows:
+            return roots
+        labeller = PatchLabeller(
+            self._embedding, self._rows, cells, self._near_exclusion, self._facts.energy_scale
+        )
+        step = max(-(-n_rows // _TIMES_PATCHES_KEPT), _LEAST_PATCHES_KEPT)
+        for start in range(n_known, n_rows, step):
+            part = roots[start : start + step]
+            self._label_patches(labeller, start, part, processes)
             if processes.rank == 0:
-                kept.put(_PATCHES, {"root": roots}, {}, now=True)
+                kept.put(_PATCHES, {"root": roots[: start + len(part)]}, {}, now=True)
+        return roots
+
+    def _label_patches(
+        self,
+        labeller: PatchLabeller,
+        start: int,
+        part: npt.NDArray[np.float16],
+        processes: Processes,
+    ) -> None:
+        """Fill in the zeros of a part of the training rows, each process its share."""
 
         def report(done: int, total: int) -> None:
-            self._preparing = done / total
+            self._preparing = (start + len(part) * done / total) / len(self._training_index)
             self._report(0)
 
-        roots = patch_roots(
-            self._embedding,
-            self._rows,
-            self._training_index,
-            cells,
-            self._near_exclusion,
-            self._facts.energy_scale,
-            known=known,
-            keep=keep,
-            progress=report,
-            cancel=self._cancel,
-        )
-        keep(roots)
-        return roots
+        first, end = processes.share(len(part))
+        mine = self._training_index[start + first : start + end]
+        stopped = False
+        try:
+            part[first:end] = labeller.roots(mine, report, self._cancel)
+        except CancelledError:
+            stopped = True
+        if processes.any_of(stopped):
+            self._cancel.cancel()
+            self._cancel.raise_if_cancelled()
+        processes.add_up(part)
 
     def _after_step(
         self,

@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from lcollision_core.meshes.topology import FloatArray
 
-_ACCURACY_GIVEN_UP = 1e-2
-"""So much of what is right at even odds may be lost."""
+_MISTAKES_ADDED = 0.5
+"""This share of the mistakes at even odds may be made beside them."""
 
 _ERRORS_APART = 2.0
 """Rates that differ by fewer standard errors may be the same."""
@@ -19,9 +19,10 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
 
     A classifier that is right as often as it can be mistakes the rarer kind more often. Where the
     false positive and the false negative rate at even odds, logit 0, differ by more than chance,
-    this goes as far towards equal ones as is expected to cost no more than a hundredth of all
-    calls. What is expected is a logistic curve's through all rows (Platt 1999): counting the few
-    rows near a limit would go where these happen to be favourable.
+    this goes as far towards equal ones as is expected to make half as many mistakes again at most.
+    What is expected is a logistic curve's through all rows (Platt 1999): counting the few rows near
+    a limit would go where these happen to be favourable. The bound counts mistakes and not calls,
+    for a predictor that errs once in a thousand calls is not to err ten times.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
     alarms = np.append(0.0, (1.0 - probability)[::-1].cumsum())[n_rows - n_below]
     gap = np.abs(alarms / (1.0 - probability).sum() - missed / probability.sum())
     wrong = missed + alarms
-    gap[wrong > wrong[-1] + _ACCURACY_GIVEN_UP * n_rows] = np.inf
+    gap[wrong > wrong[-1] * (1.0 + _MISTAKES_ADDED)] = np.inf
     best = limits[gap == gap.min()]
     return float(best[np.abs(best).argmin()])
 

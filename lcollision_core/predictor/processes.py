@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
 import torch
 import torch.distributed as dist
 
@@ -48,6 +50,14 @@ class Processes:
         if self.count > 1:
             dist.all_reduce(total)
         return float(total)
+
+    def add_up(self, values: npt.NDArray[np.float16]) -> None:
+        """Put the sum over all processes into the place of an array's values."""
+        if self.count == 1:
+            return
+        total = torch.from_numpy(values.astype(np.float32)).to(self.device)
+        dist.all_reduce(total)
+        values[...] = total.cpu().numpy()
 
     def require_same(self, number: int) -> None:
         """Refuse to go on where the processes begin at different steps.

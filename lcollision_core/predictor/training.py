@@ -77,8 +77,8 @@ def train_predictor(
 
     Rows whose index `is_held_out` never train. A killed run that is started again with the same
     checkpoint goes on where it was and ends with the same bits, on one machine with one number of
-    threads. Under torchrun every process calls this with the same arguments: they share each
-    batch, and all return the same predictor.
+    threads. Under torchrun every process calls this with the same arguments: they share the
+    labelling of patches and each batch, and all return the same predictor.
 
     Parameters
     ----------
@@ -103,8 +103,8 @@ def train_predictor(
     LabelStoreError : all rows collide, or none does, or none is held out.
     LCollisionError : the checkpoint belongs to another run or is damaged, the training diverges,
         or there is no such device.
-    CancelledError : `cancel` was set; the checkpoint holds the last step, or the patches that
-        were labelled by then, see `patches_path`.
+    CancelledError : `cancel` was set; the checkpoint holds the last step, or the file beside it,
+        see `patches_path`, what was labelled up to the last twentieth.
     """
     # Here, so that reading a predictor's types loads no torch.
     from lcollision_core.predictor.loop import TrainingLoop

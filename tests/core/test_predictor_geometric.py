@@ -40,7 +40,7 @@ from lcollision_core.predictor.folds import (
 )
 from lcollision_core.predictor.geometric import GeometricNetwork
 from lcollision_core.predictor.networks import Targets
-from lcollision_core.predictor.patch_labels import SkinCells, patch_roots
+from lcollision_core.predictor.patch_labels import PatchLabeller, SkinCells
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import colliding_latent, made_up_rows
 
@@ -368,7 +368,7 @@ def test_patches_and_folds_share_out_the_exact_energy(
     )
     index = np.arange(0, 60, 2)
     rows = labeller_of(tube_model).label(latent)
-    roots = patch_roots(embedding, rows, index, cells, 0.0, energy_scale=1e-4)
+    roots = PatchLabeller(embedding, rows, cells, 0.0, energy_scale=1e-4).roots(index)
     assert roots.shape == (30, cells.n_patches + cells.n_folds)
     detector = CollisionDetector(embedding.topology, embedding.rest_vertices)
     vertices = embedding.decode(latent[index]).astype(np.float32)
@@ -398,9 +398,8 @@ def test_every_collision_that_counts_is_taught(
     assert len(sites)
     for fold in (skin_cells(embedding, centres) for centres in (sites[:, 0], sites[:0, 0])):
         cells = SkinCells(patch, fold)
-        roots = patch_roots(
-            embedding, rows, np.arange(60), cells, near_exclusion, energy_scale=1e-4
-        )
+        labeller = PatchLabeller(embedding, rows, cells, near_exclusion, energy_scale=1e-4)
+        roots = labeller.roots(np.arange(60))
         assert ((roots > 0.0).any(axis=1) == found.colliding).all()
         shares = np.repeat([0.05, 0.005], [cells.n_patches, cells.n_folds])
         taught = (roots.astype(np.float64) ** 2 * shares).sum(axis=1) * 1e-4
@@ -412,56 +411,27 @@ def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
     cancel = CancelToken()
     cancel.cancel()
     zeros = np.zeros(tube_model.n_vertices, dtype=np.int64)
+    rows = labeller_of(tube_model).label(colliding_latent(tube_model))
+    labeller = PatchLabeller(tube_model.embedding, rows, SkinCells(zeros, zeros - 1), 0.0, 1.0)
     with pytest.raises(CancelledError):
-        patch_roots(
-            tube_model.embedding,
-            labeller_of(tube_model).label(colliding_latent(tube_model)),
-            np.arange(4),
-            SkinCells(zeros, zeros - 1),
-            0.0,
-            1.0,
-            cancel=cancel,
-        )
+        labeller.roots(np.arange(4), cancel=cancel)
 
 
-class _ThirdTime(CancelToken):
-    """Cancelled when it is asked for the third time."""
-
-    _asked = 0
-
-    def raise_if_cancelled(self) -> None:
-        self._asked += 1
-        if self._asked == 3:
-            self.cancel()
-        super().raise_if_cancelled()
-
-
-def test_labelling_patches_goes_on_where_it_was_stopped(
-    tube_model: PoseModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(patch_labels, "_ROWS_A_BLOCK", 4)
-    monkeypatch.setattr(patch_labels, "available_cores", lambda: 1)
-    embedding, latent = tube_model.embedding, colliding_latent(tube_model)
-    rows = labeller_of(tube_model).label(latent)
+def test_patches_do_not_depend_on_what_is_labelled_beside_them(tube_model: PoseModel) -> None:
+    embedding = tube_model.embedding
+    rows = labeller_of(tube_model).label(colliding_latent(tube_model))
     cells = SkinCells(
         skin_cells(embedding, body_points(embedding, 25)), np.full(tube_model.n_vertices, -1)
     )
-    given = embedding, rows, np.arange(len(latent)), cells, 0.0, 1e-4
-    whole = patch_roots(*given)
-    kept = list[np.ndarray]()
-    with pytest.raises(CancelledError):
-        patch_roots(*given, keep=lambda roots: kept.append(roots.copy()), cancel=_ThirdTime())
-    # Once for each block, as there are fewer than twenty, and for being stopped.
-    n_kept = len(kept[-1])
-    assert len(kept) == 3
-    assert 0 < n_kept < len(whole)
-    assert all(np.array_equal(roots, whole[: len(roots)]) for roots in kept)
-    told = list[int]()
-    rest = patch_roots(*given, known=kept[-1], progress=lambda done, _: told.append(done))
-    assert np.array_equal(rest, whole)
-    assert told[0] > np.count_nonzero(rows.colliding[:n_kept])
-    # What is known is believed.
-    assert np.array_equal(patch_roots(*given, known=0.5 * whole), 0.5 * whole)
+    labeller = PatchLabeller(embedding, rows, cells, 0.0, 1e-4)
+    told = list[tuple[int, int]]()
+    whole = labeller.roots(np.arange(60), progress=lambda *step: told.append(step))
+    n_colliding = np.count_nonzero(rows.colliding)
+    assert n_colliding > patch_labels._ROWS_A_BLOCK
+    assert told == [(patch_labels._ROWS_A_BLOCK, n_colliding), (n_colliding, n_colliding)]
+    assert whole.any()
+    for part in (np.arange(7), np.arange(7, 60), np.array([50, 3])):
+        assert np.array_equal(labeller.roots(part), whole[part])
 
 
 def test_a_stored_network_predicts_the_same(

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionEr
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.model import PoseModel
+from lcollision_core.model_file import read_model_file
 from lcollision_core.predictor import (
     LOSSES,
     PRESETS,
@@ -32,9 +34,11 @@ from lcollision_core.predictor import (
 )
 from lcollision_core.predictor.loop import rate_at
 from lcollision_core.predictor.networks import PredictorNetwork
+from lcollision_core.predictor.patch_labels import PatchLabeller
 from lcollision_core.predictor.predictor import BATCH_ROWS
 from lcollision_core.predictor.row_split import split_rows
-from lcollision_core.predictor.training import no_status
+from lcollision_core.predictor.training import has_begun, no_status, patches_path
+from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import PAPER, config, made_up_rows, weights_of
 
 SECONDS_TO_WAIT = 120.0
@@ -224,6 +228,89 @@ def test_patches_are_not_labelled_again(
     assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
 
 
+def _folded(model: PoseModel, n_rows: int) -> LabelRows:
+    """Label poses far outside the latent box exactly, where a tube folds onto itself."""
+    latent = 2.5 * model.latent_space.sample(n_rows, np.random.default_rng(3))
+    return labeller_of(model).label(latent)
+
+
+def test_labelling_patches_goes_on_where_it_was_stopped(
+    tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "_LEAST_PATCHES_KEPT", 100)
+    embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
+    rows, chosen = _folded(tube_model, 600), replace(PRESETS["default"], epochs=1, batch_rows=64)
+    _stop_training(
+        rows, embedding, chosen, checkpoint, lambda status: (status.preparing or 0.0) > 0.5
+    )
+    assert has_begun(checkpoint)
+    assert not checkpoint.exists()
+    n_known = len(read_model_file(patches_path(checkpoint))["patches"].arrays["root"])
+    assert n_known in (200, 300)
+
+    labelled: list[int] = []
+    roots = PatchLabeller.roots
+
+    def noted(labeller: PatchLabeller, index: np.ndarray, *others: Any) -> np.ndarray:
+        labelled.extend(index)
+        return roots(labeller, index, *others)
+
+    monkeypatch.setattr(PatchLabeller, "roots", noted)
+    resumed = train_predictor(rows, embedding, chosen, checkpoint=checkpoint)
+    training = split_rows(len(rows), chosen).training
+    np.testing.assert_array_equal(labelled, training[n_known:])
+    whole = train_predictor(rows, embedding, chosen)
+    assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
+
+
+PATCHES = """
+from lcollision_core.predictor import loop
+loop._LEAST_PATCHES_KEPT = 100
+labelled, roots = [], loop.PatchLabeller.roots
+def noted(labeller, index, *others):
+    labelled.append(index)
+    return roots(labeller, index, *others)
+loop.PatchLabeller.roots = noted
+class Batches(loop._Batches):
+    def __init__(self, *given):
+        import os, pickle, sys
+        from pathlib import Path
+        rank = os.environ["RANK"]
+        Path(sys.argv[2] + "patches" + rank).write_bytes(pickle.dumps((labelled, given[-1])))
+        super().__init__(*given)
+loop._Batches = Batches
+"""
+
+
+def test_two_processes_share_the_labelling_of_patches(
+    tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    embedding, rows = tube_model.embedding, _folded(tube_model, 600)
+    chosen = replace(PRESETS["default"], epochs=1, batch_rows=64)
+    _train_in_two(tmp_path, PATCHES, rows, embedding, chosen, tmp_path / "checkpoint")
+    labelled, roots = zip(
+        *(pickle.loads((tmp_path / f"sharedpatches{rank}").read_bytes()) for rank in (0, 1)),
+        strict=True,
+    )
+    training = split_rows(len(rows), chosen).training
+    each = [np.concatenate(parts) for parts in labelled]
+    np.testing.assert_array_equal(np.sort(np.concatenate(each)), training)
+    assert abs(len(each[0]) - len(each[1])) <= 10
+
+    alone: list[np.ndarray] = []
+
+    class Batches(loop._Batches):
+        def __init__(self, *given: Any) -> None:
+            alone.append(given[-1])
+            super().__init__(*given)
+
+    monkeypatch.setattr(loop, "_Batches", Batches)
+    train_predictor(rows, embedding, chosen)
+    assert alone[0].any()
+    for shared in roots:
+        np.testing.assert_array_equal(shared, alone[0])
+
+
 def _written(path: Path, *parts: object) -> Path:
     path.write_bytes(pickle.dumps(parts))
     return path
@@ -372,24 +459,29 @@ def test_a_killed_run_goes_on_to_the_same_bits(
     assert resumed.metrics == whole.metrics
 
 
+def _train_in_two(folder: Path, before: str, *job: object) -> None:
+    """Train in two processes; each leaves its result in the file "shared" and its number."""
+    script = folder / "train.py"
+    script.write_text(before + TRAIN)
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "torch.distributed.run", "--standalone"),
+            *("--nproc-per-node", "2", script, _written(folder / "job", *job)),
+            *(folder / "shared", "rank"),
+        ],
+        check=True,
+        timeout=SECONDS_TO_WAIT,
+        capture_output=True,
+    )
+
+
 def test_two_processes_learn_what_one_does(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path
 ) -> None:
     # One pass, for sums in another order grow apart with every step. Of the 1026 rows to train on,
     # the last batch has 2: the second process gets none of them.
     embedding, chosen, some = tube_model.embedding, config(epochs=1), rows.head(1464)
-    job = _written(tmp_path / "job", some, embedding, chosen, tmp_path / "checkpoint")
-    script = tmp_path / "train.py"
-    script.write_text(TRAIN)
-    subprocess.run(
-        [
-            *(sys.executable, "-m", "torch.distributed.run", "--standalone"),
-            *("--nproc-per-node", "2", script, job, tmp_path / "shared", "rank"),
-        ],
-        check=True,
-        timeout=SECONDS_TO_WAIT,
-        capture_output=True,
-    )
+    _train_in_two(tmp_path, "", some, embedding, chosen, tmp_path / "checkpoint")
     first, second = (pickle.loads((tmp_path / f"shared{rank}").read_bytes()) for rank in (0, 1))
     assert weights_of(first[0]) == weights_of(second[0])
     alone = train_predictor(some, embedding, chosen)
