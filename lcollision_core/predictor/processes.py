@@ -60,7 +60,7 @@ class Processes:
         values[...] = total.cpu().numpy()
 
     def require_same(self, number: int) -> None:
-        """Refuse to go on where the processes begin at different steps.
+        """Refuse to go on where the processes begin at different places.
 
         Raises
         ------
