@@ -182,7 +182,9 @@ class SkinOfMany(SkinOfPoses):
         for group, target, table in self._tables:
             outputs = self._outputs[: len(target)]
             products = torch.from_numpy(outputs).view(-1, n_rows)
-            torch.mm(torch.from_numpy(table), codes[group], out=products).tanh_()
+            torch.mm(torch.from_numpy(table), codes[group], out=products)
+            # Not torch's, which takes 13 times as long on an AMD processor.
+            np.tanh(outputs, out=outputs)
             batch_kernels.add_features(outputs, target, geometry.scale, self._features)
         batch_kernels.deform(self._features, self._rest_frame, self._rows, self._turned, self.frame)
         gradients = torch.from_numpy(self._rows).view(3, -1, n_rows)[:, : len(self._weight)]
