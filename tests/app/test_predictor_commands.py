@@ -201,18 +201,18 @@ def test_a_killed_training_goes_on_to_the_same_model(
 def test_ctrl_c_keeps_a_checkpoint_and_says_so(
     model: Path, store: Path, tmp_path: Path, preset: str, kept: str
 ) -> None:
-    """The preset default begins with labelling patches."""
+    """The preset default begins with labelling patches, which are kept some rows at a time."""
     output = tmp_path / "stopped.safetensors"
     code = (
         "import os, signal\n"
-        "from lcollision_core.predictor import loop, patch_labels\n"
-        "patch_labels._ROWS_A_BLOCK = 4\n"
-        "patch_labels.available_cores = lambda: 1\n"
+        "from lcollision_core.predictor import loop\n"
+        "loop._LEAST_PATCHES_KEPT = 16\n"
         "report = loop.TrainingLoop._report\n"
         "def interrupted(self, step):\n"
         "    report(self, step)\n"
-        "    loop.TrainingLoop._report = report\n"
-        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    if self._config.preset == 'paper' or self._patches_path.exists():\n"
+        "        loop.TrainingLoop._report = report\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
         "loop.TrainingLoop._report = interrupted\n"
         "from app.cli.main import main\n"
         "main()\n"
