@@ -438,6 +438,29 @@ def test_importing_the_body_loads_nothing_heavy() -> None:
     assert result.stdout.strip() == "[]"
 
 
+def test_reading_the_source_shapes_leaves_standard_output_in_its_place() -> None:
+    """As of a notebook, or of a program that has redirected it."""
+    # anny imports that module only where its own cache is empty.
+    code = (
+        "import io, sys\n"
+        "import anny\n"
+        "from lcollision_core.meshes.body.template import _read_anny\n"
+        "read = anny.Anny\n"
+        "def read_as_the_first_time(**options):\n"
+        "    import anny.utils.warp_mesh_utils\n"
+        "    return read(**options)\n"
+        "anny.Anny = read_as_the_first_time\n"
+        "mine = sys.stdout = io.StringIO()\n"
+        "_read_anny()\n"
+        "assert sys.stdout is mine\n"
+    )
+    subprocess.run(
+        [sys.executable, "-c", code],
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+
+
 # Edge collapse
 
 

