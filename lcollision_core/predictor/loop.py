@@ -192,19 +192,17 @@ class TrainingLoop:
             return np.empty((n_rows, 0), dtype=np.float16)
         kept = Checkpoint(self._patches_path, key)
         roots = np.zeros((n_rows, cells.n_patches + cells.n_folds), dtype=np.float16)
-        stored, n_known = kept.get(_PATCHES), 0
-        if stored is not None:
-            known = stored.arrays["root"]
-            n_known = len(known)
-            roots[:n_known] = known
-        processes.require_same(n_known)
-        if n_known == n_rows:
-            return roots
+        stored = kept.get(_PATCHES)
+        known = roots[:0] if stored is None else stored.arrays["root"]
+        processes.require_same(len(known))
+        if len(known) == n_rows:
+            return known
+        roots[: len(known)] = known
         labeller = PatchLabeller(
             self._embedding, self._rows, cells, self._near_exclusion, self._facts.energy_scale
         )
         step = max(-(-n_rows // _TIMES_PATCHES_KEPT), _LEAST_PATCHES_KEPT)
-        for start in range(n_known, n_rows, step):
+        for start in range(len(known), n_rows, step):
             part = roots[start : start + step]
             self._label_patches(labeller, start, part, processes)
             if processes.rank == 0:

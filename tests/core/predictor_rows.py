@@ -34,9 +34,9 @@ def made_up_rows(embedding: Embedding, n_rows: int = N_ROWS, seed: int = 1) -> L
     )
 
 
-def colliding_latent(model: PoseModel) -> np.ndarray:
-    """Draw 60 poses far outside the latent box, where a tube folds onto itself."""
-    latent = model.latent_space.sample(60, np.random.default_rng(3))
+def colliding_latent(model: PoseModel, n_poses: int = 60) -> np.ndarray:
+    """Draw poses far outside the latent box, where a tube folds onto itself."""
+    latent = model.latent_space.sample(n_poses, np.random.default_rng(3))
     return (2.5 * latent).astype(np.float32)
 
 

@@ -39,7 +39,7 @@ from lcollision_core.predictor.predictor import BATCH_ROWS
 from lcollision_core.predictor.row_split import split_rows
 from lcollision_core.predictor.training import has_begun, no_status, patches_path
 from tests.core.labelled import labeller_of
-from tests.core.predictor_rows import PAPER, config, made_up_rows, weights_of
+from tests.core.predictor_rows import PAPER, colliding_latent, config, made_up_rows, weights_of
 
 SECONDS_TO_WAIT = 120.0
 
@@ -228,18 +228,13 @@ def test_patches_are_not_labelled_again(
     assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
 
 
-def _folded(model: PoseModel, n_rows: int) -> LabelRows:
-    """Label poses far outside the latent box exactly, where a tube folds onto itself."""
-    latent = 2.5 * model.latent_space.sample(n_rows, np.random.default_rng(3))
-    return labeller_of(model).label(latent)
-
-
 def test_labelling_patches_goes_on_where_it_was_stopped(
     tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop, "_LEAST_PATCHES_KEPT", 100)
     embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
-    rows, chosen = _folded(tube_model, 600), replace(PRESETS["default"], epochs=1, batch_rows=64)
+    rows = labeller_of(tube_model).label(colliding_latent(tube_model, 600))
+    chosen = replace(PRESETS["default"], epochs=1, batch_rows=64)
     _stop_training(
         rows, embedding, chosen, checkpoint, lambda status: (status.preparing or 0.0) > 0.5
     )
@@ -256,9 +251,12 @@ def test_labelling_patches_goes_on_where_it_was_stopped(
         return roots(labeller, index, *others)
 
     monkeypatch.setattr(PatchLabeller, "roots", noted)
-    resumed = train_predictor(rows, embedding, chosen, checkpoint=checkpoint)
+    seen: list[PredictorStatus] = []
+    resumed = train_predictor(rows, embedding, chosen, checkpoint=checkpoint, progress=seen.append)
     training = split_rows(len(rows), chosen).training
     np.testing.assert_array_equal(labelled, training[n_known:])
+    assert seen[0].preparing is not None
+    assert seen[0].preparing > n_known / len(training)
     whole = train_predictor(rows, embedding, chosen)
     assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
 
@@ -285,7 +283,8 @@ loop._Batches = Batches
 def test_two_processes_share_the_labelling_of_patches(
     tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    embedding, rows = tube_model.embedding, _folded(tube_model, 600)
+    embedding = tube_model.embedding
+    rows = labeller_of(tube_model).label(colliding_latent(tube_model, 600))
     chosen = replace(PRESETS["default"], epochs=1, batch_rows=64)
     _train_in_two(tmp_path, PATCHES, rows, embedding, chosen, tmp_path / "checkpoint")
     labelled, roots = zip(
