@@ -83,10 +83,10 @@ def predictor(
     """Learn to predict collisions from labelled samples.
 
     Three tenths of the rows are held out to measure the predictor; from 170 000 rows on, a tenth of
-    these sets the place from which the preset default calls a pose colliding; of the preset paper,
-    a tenth of the rest chooses which pass is kept. A checkpoint beside the output lets a run that
-    was stopped or killed go on when it is started again; it is removed at the end. To use several
-    devices or machines, start it with `torchrun -m app train predictor ...`.
+    these sets the place from which the preset default calls a pose colliding. A checkpoint beside
+    the output lets a run that was stopped or killed go on when it is started again; it is removed
+    at the end. To use several devices or machines, start it with `torchrun -m app train predictor
+    ...`.
     """
     from lcollision_core.labels import LabelStore
     from lcollision_core.meshes import require_writable

@@ -30,7 +30,7 @@ from lcollision_core.predictor.processes import Processes, joined_processes
 from lcollision_core.predictor.row_split import RowSplit
 from lcollision_core.predictor.training import PredictorStatus, StatusCallback, patches_path
 
-_RUN_VERSION = 6
+_RUN_VERSION = 7
 """Goes up when training changes, so that no checkpoint is continued by other rules."""
 
 _WATCHED_ROWS = 4000
@@ -58,7 +58,7 @@ _LEAST_RATE = 1e-2
 """Where the one-cycle schedule begins, in its largest rate."""
 
 _PART, _PATCHES = "training", "patches"
-_NETWORK, _AVERAGE, _BEST, _OPTIMISER = "network:", "average:", "best:", "optimiser:"
+_NETWORK, _AVERAGE, _OPTIMISER = "network:", "average:", "optimiser:"
 
 
 class TrainingLoop:
@@ -93,7 +93,7 @@ class TrainingLoop:
         self._patches_path = checkpoint and patches_path(checkpoint)
         self._progress, self._cancel = progress, cancel
         self._near_exclusion = 0.0 if facts.store is None else facts.store.near_exclusion
-        self._training_index, self._validation_index = split.training, split.validation
+        self._training_index = split.training
         self._watched = rows.taken(split.held_out[:_WATCHED_ROWS])
         self._steps_an_epoch = -(-len(self._training_index) // config.batch_rows)
         self._epochs = config.passes(len(self._training_index))
@@ -102,8 +102,6 @@ class TrainingLoop:
         self._accuracy: float | None = None
         self._average: AveragedModel | None = None
         self._averaged_every = min(_STEPS_BETWEEN_AVERAGES, self._steps_an_epoch)
-        self._best: dict[str, torch.Tensor] = {}
-        self._best_accuracy = -1.0
         self._reported = -math.inf
         self._preparing: float | None = None
 
@@ -120,10 +118,7 @@ class TrainingLoop:
             network = self._run(processes)
         if self._patches_path is not None:
             self._patches_path.unlink(missing_ok=True)
-        judged = self._judged(network)
-        if self._best:
-            judged.load_state_dict(self._best)
-        return judged
+        return self._judged(network)
 
     def _run(self, processes: Processes) -> PredictorNetwork:
         config = self._config
@@ -247,9 +242,7 @@ class TrainingLoop:
             talk = step % _STEPS_BETWEEN_TALKS == 0
             stop = talk and processes.any_of(stop)
         if step % self._steps_an_epoch == 0:
-            judged = self._judged(network)
-            self._accuracy = _accuracy(judged, self._watched)
-            self._keep_best(judged)
+            self._accuracy = _accuracy(self._judged(network), self._watched)
         if processes.rank == 0 and (stop or due):
             self._save(step, network, optimiser, checkpoint)
         if stop:
@@ -280,14 +273,6 @@ class TrainingLoop:
         """Return the network that is watched and kept: itself, or with the mean of its weights."""
         return network if self._average is None else cast(PredictorNetwork, self._average.module)
 
-    def _keep_best(self, network: PredictorNetwork) -> None:
-        if self._config.kept != "best" or not len(self._validation_index):
-            return
-        accuracy = _accuracy(network, self._rows.taken(self._validation_index))
-        if accuracy > self._best_accuracy:
-            self._best_accuracy = accuracy
-            self._best = {name: values.clone() for name, values in network.state_dict().items()}
-
     def _key(self) -> str:
         """Return a digest of all that decides how this run ends."""
         rows = self._rows
@@ -310,7 +295,7 @@ class TrainingLoop:
         checkpoint: Checkpoint,
     ) -> None:
         average = {} if self._average is None else self._average.state_dict()
-        held = ((_NETWORK, network.state_dict()), (_AVERAGE, average), (_BEST, self._best))
+        held = ((_NETWORK, network.state_dict()), (_AVERAGE, average))
         state = {
             prefix + name: values.cpu().numpy()
             for prefix, weights in held
@@ -319,12 +304,7 @@ class TrainingLoop:
         for number, moments in optimiser.state_dict()["state"].items():
             for name, values in moments.items():
                 state[f"{_OPTIMISER}{number}:{name}"] = values.cpu().numpy()
-        facts = {
-            "step": step,
-            "losses": self._losses,
-            "accuracy": self._accuracy,
-            "best_accuracy": self._best_accuracy,
-        }
+        facts = {"step": step, "losses": self._losses, "accuracy": self._accuracy}
         checkpoint.put(_PART, state, facts, now=True)
 
     def _restore(
@@ -341,8 +321,6 @@ class TrainingLoop:
                 weights[name.removeprefix(_NETWORK)] = values
             elif name.startswith(_AVERAGE):
                 average[name.removeprefix(_AVERAGE)] = values
-            elif name.startswith(_BEST):
-                self._best[name.removeprefix(_BEST)] = values
             else:
                 _, number, what = name.split(":")
                 state["state"].setdefault(int(number), {})[what] = values
@@ -352,7 +330,6 @@ class TrainingLoop:
         optimiser.load_state_dict(state)
         self._losses = list(stored.metadata["losses"])
         self._accuracy = stored.metadata["accuracy"]
-        self._best_accuracy = stored.metadata["best_accuracy"]
         return int(stored.metadata["step"])
 
 

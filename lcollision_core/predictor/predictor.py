@@ -129,12 +129,14 @@ class PredictorRecord:
             )
         try:
             measured = metadata["metrics"]
+            # Earlier versions wrote which pass was kept.
+            config = {name: value for name, value in metadata["config"].items() if name != "kept"}
             return cls(
-                PredictorConfig(**metadata["config"]),
+                PredictorConfig(**config),
                 TrainingFacts.from_metadata(metadata["facts"]),
                 None if measured is None else PredictorMetrics.from_metadata(measured),
             )
-        except (KeyError, TypeError, ValueError, LCollisionError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, LCollisionError) as error:
             raise ModelFileError(_MISFIT) from error
 
 

@@ -1,4 +1,4 @@
-"""Which labelled samples train, which choose, and which measure."""
+"""Which labelled samples train, which choose where to call poses colliding, which measure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy.typing as npt
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.predictor.config import PredictorConfig
 
-_VALIDATION_SHARE = 0.1
+_EVERY = 10
+"""So manieth of the held-out rows chooses."""
 
 LEAST_BALANCING = 5000
 """Fewer rows do not say where to call poses colliding: their chance costs more than is gained."""
@@ -23,7 +24,7 @@ class RowSplit:
     Attributes
     ----------
     training : rows that are learnt from
-    validation : rows that choose among passes, or where to call a pose colliding, or none
+    validation : rows that choose where to call a pose colliding, or none
     held_out : rows that measure the result
     """
 
@@ -35,17 +36,14 @@ class RowSplit:
 def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
     """Share out the samples 0, 1, ... of a store.
 
-    A tenth of the rows that would train choose among passes; where to call a pose colliding is
-    chosen by a tenth of those that would measure, if these are many.
+    Where to call a pose colliding is chosen by a tenth of the rows that would measure, if these
+    are many.
     """
     is_out = is_held_out(np.arange(n_rows))
     rest, held_out = np.flatnonzero(~is_out), np.flatnonzero(is_out)
-    if config.kept == "best":
-        n_training = len(rest) - int(_VALIDATION_SHARE * len(rest))
-        return RowSplit(rest[:n_training], rest[n_training:], held_out)
-    every_tenth = slice(None, None, round(1.0 / _VALIDATION_SHARE))
-    if config.balanced and len(held_out[every_tenth]) >= LEAST_BALANCING:
-        return RowSplit(rest, held_out[every_tenth], np.delete(held_out, every_tenth))
+    choosing = slice(None, None, _EVERY)
+    if config.balanced and len(held_out[choosing]) >= LEAST_BALANCING:
+        return RowSplit(rest, held_out[choosing], np.delete(held_out, choosing))
     return RowSplit(rest, rest[:0], held_out)
 
 

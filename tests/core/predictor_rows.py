@@ -14,7 +14,7 @@ from lcollision_core.predictor import PRESETS, PredictorConfig
 N_ROWS = 1500
 
 PAPER = PRESETS["paper"]
-QUICK = replace(PAPER, batch_rows=64, epochs=4, average_passes=0.0, kept="last")
+QUICK = replace(PAPER, batch_rows=64, epochs=4, average_passes=0.0)
 
 
 def made_up_rows(embedding: Embedding, n_rows: int = N_ROWS, seed: int = 1) -> LabelRows:

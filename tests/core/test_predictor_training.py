@@ -43,8 +43,6 @@ from tests.core.predictor_rows import PAPER, colliding_latent, config, made_up_r
 
 SECONDS_TO_WAIT = 120.0
 
-_MEASURED = loop._accuracy
-
 TRAIN = """
 import pickle, sys
 from pathlib import Path
@@ -315,50 +313,6 @@ def _written(path: Path, *parts: object) -> Path:
     return path
 
 
-def _scripted(monkeypatch: pytest.MonkeyPatch, validation: LabelRows, passes: list[float]) -> None:
-    """Let the passes be right about so many of the validation rows, whatever they are."""
-    left = iter(passes)
-
-    def accuracy(network: PredictorNetwork, rows: LabelRows) -> float:
-        is_validation = np.array_equal(rows.latent, validation.latent)
-        return next(left) if is_validation else _MEASURED(network, rows)
-
-    monkeypatch.setattr(loop, "_accuracy", accuracy)
-
-
-def test_the_best_pass_is_kept_by_rows_that_do_not_train(
-    tube_model: PoseModel, rows: LabelRows, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    embedding, chosen = tube_model.embedding, config(epochs=3, kept="best")
-    split = split_rows(len(rows), chosen)
-    validation = rows.taken(split.validation)
-    assert len(validation) == int(0.1 * len(np.union1d(split.training, split.validation))) > 50
-    seen: list[np.ndarray] = []
-    hook = register_module_forward_pre_hook(
-        lambda module, given: (
-            seen.append(given[0].numpy())
-            if module.training and isinstance(module, PredictorNetwork)
-            else None
-        )
-    )
-    try:
-        _scripted(monkeypatch, validation, [0.6, 0.9, 0.7])
-        best = train_predictor(rows, embedding, chosen)
-    finally:
-        hook.remove()
-    trained_on = {row.tobytes() for part in seen for row in part}
-    assert trained_on == {row.tobytes() for row in rows.latent[split.training]}
-    assert not trained_on & {row.tobytes() for row in validation.latent}
-    assert best.facts.training_rows == len(split.training)
-    # The second of three passes is the last of two.
-    _scripted(monkeypatch, validation, [0.6, 0.9])
-    second = train_predictor(rows, embedding, replace(chosen, epochs=2))
-    assert weights_of(best.to_section().arrays) == weights_of(second.to_section().arrays)
-    _scripted(monkeypatch, validation, [0.6, 0.9, 0.95])
-    third = train_predictor(rows, embedding, chosen)
-    assert weights_of(best.to_section().arrays) != weights_of(third.to_section().arrays)
-
-
 def test_the_mean_of_the_weights_is_kept(tube_model: PoseModel, rows: LabelRows) -> None:
     """That of every tenth step: the newest count alike at first, then exponentially."""
     chosen = config(epochs=1, batch_rows=16, average_passes=0.5)
@@ -396,19 +350,15 @@ def test_a_few_steps_are_in_the_mean_of_the_weights(tube_model: PoseModel, rows:
     assert weights_of(averaged.to_section().arrays) == weights_of(last.to_section().arrays)
 
 
-def test_a_stopped_run_remembers_its_best_pass_and_its_mean_weights(
-    tube_model: PoseModel, rows: LabelRows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_stopped_run_remembers_its_mean_weights(
+    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
 ) -> None:
-    embedding, chosen = tube_model.embedding, config(epochs=3, average_passes=1.0, kept="best")
+    embedding, chosen = tube_model.embedding, config(epochs=3, average_passes=1.0)
     checkpoint = tmp_path / "checkpoint"
-    validation = rows.taken(split_rows(len(rows), chosen).validation)
-
-    _scripted(monkeypatch, validation, [0.6, 0.9, 0.7])
-    whole = train_predictor(rows, embedding, chosen)
-    _scripted(monkeypatch, validation, [0.6, 0.9])
     _stop_training(rows, embedding, chosen, checkpoint, lambda status: status.epoch == 2)
-    _scripted(monkeypatch, validation, [0.7])
-    resumed = train_predictor(rows, embedding, chosen, checkpoint=checkpoint)
+    resumed, whole = (
+        train_predictor(rows, embedding, chosen, checkpoint=path) for path in (checkpoint, None)
+    )
     assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
 
 
