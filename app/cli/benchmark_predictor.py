@@ -9,6 +9,7 @@ import typer
 
 from app.cli.console import note, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
+from app.cli.models import measured_model, measured_model_sentence
 
 if TYPE_CHECKING:
     from app.benchmarks.predictor import PredictorTiming
@@ -40,8 +41,9 @@ def predictor(
     with cancel_on_interrupt() as cancel, progress_bar("Timing exact verdicts") as progress:
         rows = time_predictor(model, trained, n_poses, progress, cancel)
     if as_json:
-        print_json([asdict(row) for row in rows])
+        print_json([measured_model(model) | asdict(row) for row in rows])
         return
+    typer.echo(f"{model.name}: {measured_model_sentence(model)}")
     _print_exact(rows[0])
     for row in rows:
         typer.echo(

@@ -9,7 +9,7 @@ import typer
 
 from app.cli.console import print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import ModelArgument
+from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from app.wording import counted
 from lcollision_core.errors import LabelStoreError
 
@@ -60,14 +60,14 @@ def evaluate(
             trained, rows, threshold=threshold, progress=progress, cancel=cancel
         )
     if as_json:
-        print_json({"threshold": threshold} | metrics.to_metadata())
+        share = {"colliding_share": float(rows.colliding.mean())}
+        print_json(measured_model(model) | share | {"threshold": threshold} | metrics.to_metadata())
         return
-    near = store.identity.near_exclusion
     called = "" if threshold == 0.5 else f", called from a probability of {threshold:g} on"
     typer.echo(f"{model.name}, preset {trained.preset}{called}: {scores_sentence(metrics)}")
     typer.echo(
-        f"  {100.0 * rows.colliding.mean():.1f} % of these {counted(len(rows), 'sample')} collide"
-        + (f", pairs within {near:g} heights along the surface left out" if near else "")
+        f"  {measured_model_sentence(model)}; {_percent(rows.colliding.mean())} of these "
+        f"{counted(len(rows), 'sample')} collide"
     )
     typer.echo(
         f"  MSE {_number(metrics.energy_mse)}, RANK {_number(metrics.ranking_margin)}, "

@@ -9,6 +9,7 @@ import typer
 
 from app.cli.console import ExitStatus, note, print_json
 from app.cli.results import require_output
+from app.wording import counted
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
@@ -165,6 +166,27 @@ def describe(model: PoseModel) -> dict[str, Any]:
         "source": model.card.source,
         "provenance": dict(model.card.provenance),
     }
+
+
+def measured_model(model: PoseModel) -> dict[str, Any]:
+    """Return the JSON fields that tell which model a predictor's figures are of."""
+    first, *others = model.embedding.group_sizes
+    return {
+        "model": model.name,
+        "level1_codes": first,
+        "domain_codes": others,
+        "near_exclusion": model.near_exclusion,
+    }
+
+
+def measured_model_sentence(model: PoseModel) -> str:
+    """Put the sizes and the pair rule of `measured_model` into words."""
+    first, *others = model.embedding.group_sizes
+    least, most = min(others), max(others)
+    each = f"{least}" if least == most else f"{least} to {most}"
+    near = model.near_exclusion
+    rule = f"near exclusion {near:g} heights" if near else "no near exclusion"
+    return f"|Z_0| = {first}, |Z_k| = {each} for {counted(len(others), 'part')}, {rule}"
 
 
 def _describe_predictor(model: PoseModel) -> dict[str, Any] | None:

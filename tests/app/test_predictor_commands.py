@@ -18,8 +18,9 @@ import pytest
 import torch
 
 from app.benchmarks import predictor as timing
+from app.cli.models import measured_model_sentence
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.labels import LabelStore
+from lcollision_core.labels import LabelStore, is_held_out
 from lcollision_core.model import PoseModel
 from lcollision_core.model_file import Section
 from lcollision_core.predictor import PRESETS, CollisionPredictor, row_split
@@ -95,6 +96,15 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     curve = report.pop("calibration")
+    assert [report.pop(name) for name in ("model", "level1_codes", "domain_codes")] == [
+        "trained",
+        2,
+        [3, 3],
+    ]
+    assert report.pop("near_exclusion") == 0.0
+    rows = LabelStore.open(store).load()
+    held_out = rows.colliding[is_held_out(np.arange(N_ROWS))]
+    assert report.pop("colliding_share") == held_out.mean()
     assert set(report) == {
         "threshold",
         "samples",
@@ -131,7 +141,7 @@ def test_rows_that_set_where_to_call_do_not_count(
     monkeypatch.setattr(row_split, "LEAST_BALANCING", 10)
     model = PoseModel.load(trained)
     section = model.require_predictor().to_section()
-    config = {**section.metadata["config"], "kept": "last", "balanced": True}
+    config = {**section.metadata["config"], "balanced": True}
     balanced = CollisionPredictor.from_section(
         Section(section.arrays, {**section.metadata, "config": config}), model.embedding
     )
@@ -160,6 +170,9 @@ def test_all_rows_of_another_store_count(
     text = lcollision("evaluate", trained, other, "--rows", 200).stdout
     assert text.startswith("trained, preset paper: ")
     assert " of 200 unseen samples right" in text
+    share = 100.0 * rows.colliding[:200].mean()
+    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion"
+    assert f"\n  {sizes}; {share:.1f} % of these 200 samples collide\n" in text
 
 
 def test_a_killed_training_goes_on_to_the_same_model(
@@ -269,6 +282,7 @@ def test_what_cannot_be_trained_or_evaluated_is_refused(
     assert loaded.predictor is not None
     changed.with_predictor(loaded.predictor).save(nearer)
     assert "near exclusion of 0.0, not" in _refusal(lcollision, "evaluate", nearer, store)
+    assert measured_model_sentence(changed).endswith("for 2 parts, near exclusion 0.2 heights")
     assert not output.exists()
 
 
@@ -280,6 +294,8 @@ def test_the_benchmark_times_the_predictor_beside_the_exact_check(
     assert result.exit_code == 0, result.output
     row = json.loads(result.stdout)[0]
     assert (row["device"], row["preset"], row["batch"]) == ("cpu", "paper", 500)
+    assert (row["model"], row["level1_codes"], row["domain_codes"]) == ("trained", 2, [3, 3])
+    assert row["near_exclusion"] == 0.0
     assert (row["table_poses"], row["exact_poses"], row["fcl_poses"]) == (900, 300, 8)
     truth = row["exact_ms_per_pose"] + row["decode_ms_per_pose"]
     assert row["speedup"] == pytest.approx(1e3 * truth / row["us_per_pose"])
@@ -292,6 +308,7 @@ def test_the_benchmark_times_the_predictor_beside_the_exact_check(
     detector = CollisionDetector(loaded.topology, loaded.reference)
     assert row["colliding_share"] == detector.are_colliding(vertices).mean()
     text = lcollision("benchmark", "predictor", "--model", trained, "-n", 20).stdout
+    assert text.startswith("trained: |Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion\n")
     assert "s for 900 (scaled up from 20, " in text
     assert "has no predictor" in _refusal(lcollision, "benchmark", "predictor", "--model", model)
 
