@@ -111,7 +111,7 @@ def _unseen(store: LabelStore, rows: LabelRows, trained: CollisionPredictor) -> 
 
     if trained.facts.store != store.identity:
         return rows
-    held_out = held_out_rows(rows, trained.config)
+    held_out = held_out_rows(rows, trained.config, trained.facts.rows)
     if not len(held_out):
         raise LabelStoreError(
             f"{store.path} has {counted(len(rows), 'row')}, none of which is held out; label more"

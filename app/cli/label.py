@@ -12,7 +12,7 @@ import typer
 
 from app.cli.console import note, print_json, status_bar
 from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import ModelArgument
+from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from app.wording import counted
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
 
@@ -78,12 +78,11 @@ def label(
     seconds = time.monotonic() - started
     report: dict[str, Any] = {
         "store": str(output),
-        "model": model.name,
+        **measured_model(model),
         "seed": seed,
         "rows": store.n_rows,
         "labelled": watched.labelled,
         "colliding_share": store.n_colliding / store.n_rows,
-        "near_exclusion": model.near_exclusion,
         "seconds": seconds,
     }
     if store.n_rows > count:
@@ -91,16 +90,12 @@ def label(
     if as_json:
         print_json(report)
         return
-    near = (
-        f", pairs within {model.near_exclusion:g} heights along the surface left out"
-        if model.near_exclusion
-        else ""
-    )
     typer.echo(
         f"{output}: {counted(store.n_rows, 'row')} of {model.name}, "
-        f"{100.0 * report['colliding_share']:.1f} % collide{near} "
+        f"{100.0 * report['colliding_share']:.1f} % collide "
         f"({watched.labelled} labelled now, {watched.labelled / seconds:.0f}/s)"
     )
+    typer.echo(f"  {measured_model_sentence(model)}")
 
 
 class _Watched:

@@ -15,7 +15,7 @@ import typer
 from app.cli.console import note, status_bar
 from app.cli.evaluate import require_store_of, scores_sentence
 from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import ModelArgument
+from app.cli.models import ModelArgument, measured_model_sentence
 from lcollision_core.errors import CancelledError
 
 if TYPE_CHECKING:
@@ -133,6 +133,8 @@ def predictor(
         checkpoint.unlink(missing_ok=True)
         if trained.metrics is not None:
             note(f"wrote {destination}: {scores_sentence(trained.metrics)}")
+            share = 100.0 * trained.facts.colliding_share
+            note(f"{measured_model_sentence(model)}; {share:.1f} % of its box collide")
 
 
 @contextmanager

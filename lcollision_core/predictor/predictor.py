@@ -65,7 +65,7 @@ class TrainingFacts:
     Attributes
     ----------
     rows : M, labelled rows given, those held out among them
-    training_rows : of them, that trained, without those that only chose among passes
+    training_rows : of them, that trained
     colliding_share : of all rows
     seed : of the initial weights and the order
     energy_scale : mean PDe-sum of the colliding training rows, in squared heights; energies are

@@ -47,6 +47,14 @@ def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
     return RowSplit(rest, rest[:0], held_out)
 
 
-def held_out_rows(rows: LabelRows, config: PredictorConfig) -> LabelRows:
-    """Return copies of the rows that measure a predictor, of rows 0, 1, 2, ... of its store."""
-    return rows.taken(split_rows(len(rows), config).held_out)
+def held_out_rows(rows: LabelRows, config: PredictorConfig, n_given: int) -> LabelRows:
+    """Return copies of the rows that neither trained a predictor nor chose anything for it.
+
+    Parameters
+    ----------
+    rows : samples 0, 1, 2, ... of its store; fewer or more than it was given
+    config : how it was trained
+    n_given : how many rows of the store it was given, those held out among them
+    """
+    held_out = np.flatnonzero(is_held_out(np.arange(len(rows))))
+    return rows.taken(np.setdiff1d(held_out, split_rows(n_given, config).validation))

@@ -81,6 +81,8 @@ def test_label_says_how_many_and_what_share_collides(
     assert share > 0.5
     expected = f"{store}: 600 rows of tube, {share:.1f} % collide (600 labelled now, "
     assert result.stdout.startswith(expected)
+    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion"
+    assert result.stdout.endswith(f"/s)\n  {sizes}\n")
 
 
 def test_json_is_one_document_and_a_second_run_has_nothing_to_do(
@@ -99,6 +101,8 @@ def test_json_is_one_document_and_a_second_run_has_nothing_to_do(
             "rows": 300,
             "labelled": labelled,
             "colliding_share": LabelStore.open(store).load().colliding.mean(),
+            "level1_codes": 2,
+            "domain_codes": [3, 3],
             "near_exclusion": 0.0,
         }
         assert result.stderr == ""

@@ -204,7 +204,11 @@ def test_a_killed_training_goes_on_to_the_same_model(
         for path in (killed, whole)
     ]
     assert results[0].stderr.startswith(f"lcollision: going on from {checkpoint}\n")
-    assert _without_progress(results[1].stderr).startswith(f"lcollision: wrote {whole}: ")
+    wrote, measured = _without_progress(results[1].stderr).splitlines()[:2]
+    assert wrote.startswith(f"lcollision: wrote {whole}: ")
+    share = 100.0 * LabelStore.open(store).load(600).colliding.mean()
+    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion"
+    assert measured == f"lcollision: {sizes}; {share:.1f} % of its box collide"
     assert not checkpoint.exists()
     assert killed.read_bytes() == whole.read_bytes()
 

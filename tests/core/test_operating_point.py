@@ -119,10 +119,17 @@ def test_a_trained_predictor_calls_from_there(
     assert shift == -expected
     assert plain.facts.logit_shift == 0.0
 
-    measured = held_out_rows(rows, chosen)
+    measured = held_out_rows(rows, chosen, len(rows))
     assert trained.metrics == evaluate_predictor(trained, measured)
     assert trained.metrics is not None
     assert trained.metrics.samples == len(measured) == 1620
+    # What chose stays apart where fewer rows are read, and where the store has grown.
+    choosing = {row.tobytes() for row in chosen_by.latent}
+    for n_read, n_measured in ((1000, 270), (6000, 1620)):
+        read = held_out_rows(rows.head(n_read), chosen, len(rows))
+        assert len(read) == n_measured
+        assert not choosing & {row.tobytes() for row in read.latent}
+    assert len(held_out_rows(rows, chosen, 4000)) == 1800 - 120
     for latent in (measured.latent[:3], measured.latent[:200]):
         logit, gradient = trained.logit_and_gradient(latent)
         plain_logit, plain_gradient = plain.logit_and_gradient(latent)

@@ -248,7 +248,7 @@ def test_wrong_latents_are_refused(predictor: CollisionPredictor) -> None:
 def test_evaluation_counts_what_it_is_given(
     predictor: CollisionPredictor, rows: LabelRows, tube_model: PoseModel
 ) -> None:
-    kept = held_out_rows(rows, predictor.config)
+    kept = held_out_rows(rows, predictor.config, len(rows))
     assert len(kept) == 450
     np.testing.assert_array_equal(kept.latent[:4], rows.latent[[7, 8, 9, 17]])
     assert evaluate_predictor(predictor, kept) == predictor.metrics

@@ -38,8 +38,8 @@ from lcollision_core.predictor.folds import (
     N_SITES,
     find_fold_sites,
 )
-from lcollision_core.predictor.geometric import GeometricNetwork
-from lcollision_core.predictor.networks import Targets
+from lcollision_core.predictor.geometric import GeometricNetwork, _Auxiliary
+from lcollision_core.predictor.networks import NetworkOutput, Targets
 from lcollision_core.predictor.patch_labels import PatchLabeller, SkinCells
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import colliding_latent, made_up_rows
@@ -447,6 +447,48 @@ def test_a_stored_network_predicts_the_same(
     state = folding.state_dict() | {"site_vertices": torch.tensor([[10**6] * N_MEMBERS])}
     with pytest.raises(ValueError, match="fold sites"):
         GeometricNetwork.restore(embedding, config, state)
+
+
+def test_the_loss_teaches_patches_folds_energies_and_the_verdict(
+    tube_model: PoseModel, tube_folds: np.ndarray
+) -> None:
+    network = GeometricNetwork(tube_model.embedding, 0, tube_folds)
+    n_points, n_folds, n_domains = len(network.skin.point_vertices), len(tube_folds), 2
+    assert n_folds > 0
+    # Two rows. The first one's patches and folds are hit, with roots of 0.4 and 3.
+    taught = torch.zeros((2, n_points + n_folds), dtype=torch.float64)
+    taught[0, :n_points], taught[0, n_points:] = 0.4, 3.0
+    energy = torch.tensor([[0.25, 0.0], [0.0, 0.0]], dtype=torch.float64)
+    colliding = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    targets = Targets(energy, energy.sum(dim=1), colliding, taught)
+
+    def loss(values: torch.Tensor) -> torch.Tensor:
+        logit, patch_logit, patch_root, root = values.split(
+            [1, n_points + n_folds, n_points + n_folds, n_domains + 1], dim=1
+        )
+        output = NetworkOutput(energy, logit[:, 0], _Auxiliary(patch_logit, patch_root, root))
+        return network.loss(output, targets, (0, 2), PRESETS["default"], 0.0)
+
+    n_values = 1 + 2 * (n_points + n_folds) + n_domains + 1
+    values = torch.zeros((2, n_values), dtype=torch.float64)
+    values[:, 0] = np.log(3.0)
+    patches = 20.0 * np.log(2.0) + 5.0 * 0.5 * 0.4**2 / 2
+    folds = 5.0 * np.log(2.0) + 1.25 * (3.0 - 0.5) / 2
+    verdict = -(np.log(0.75) + np.log(0.25)) / 2
+    # Of six roots two are 0.5.
+    energies = 2 * 0.5 * 0.5**2 / 6
+    expected = patches + folds + verdict + energies
+    assert float(loss(values)) == pytest.approx(expected)
+
+    values = values + torch.linspace(-0.7, 0.7, 2 * n_values, dtype=torch.float64).view(2, -1)
+    (gradient,) = torch.autograd.grad(loss(values.requires_grad_()), values)
+    assert (gradient != 0.0).all()
+    values, step = values.detach(), 1e-6
+    for place in np.ndindex(*values.shape):
+        moved = torch.zeros_like(values)
+        moved[place] = step
+        slope = float(loss(values + moved) - loss(values - moved)) / (2 * step)
+        assert float(gradient[place]) == pytest.approx(slope, abs=1e-7)
 
 
 def test_a_process_without_rows_adds_nothing(tube_model: PoseModel, tube_folds: np.ndarray) -> None:

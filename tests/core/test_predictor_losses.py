@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from lcollision_core.predictor import PRESETS
 from lcollision_core.predictor.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
 from lcollision_core.predictor.metrics import EnergyScores, mean_difference, measure
+from lcollision_core.predictor.networks import NetworkOutput, PaperNetwork, Targets
 
 BOTH = EnergyScores(depth=True, rank=True)
 
@@ -68,6 +71,34 @@ def test_entropy_loss_is_minus_the_log_of_the_right_answer_s_probability() -> No
     expected = [-math.log(0.75), -math.log(0.25), 800.0]
     assert entropy_loss(logit, colliding).tolist() == pytest.approx(expected)
     _require_gradient(lambda values: entropy_loss(values, colliding[:2]), logit[:2])
+
+
+def test_the_paper_s_hybrid_loss_weighs_the_means_of_all_three() -> None:
+    paper = PRESETS["paper"]
+    predicted = _double([1.0, 3.0], [0.5, 0.0], [0.0, 2.0], [1.0, 1.0], [0.0, 0.0])
+    truth = _double([2.0, 1.0], [0.0, 0.0], [1.0, 1.0], [0.0, 0.0], [0.0, 0.0])
+    logit, colliding = _double(*[math.log(3.0)] * 5), _double(1.0, 0.0, 1.0, 0.0, 1.0)
+    no_patches = torch.zeros((5, 0))
+    targets = Targets(truth, truth.sum(dim=1), colliding, no_patches)
+    network = PaperNetwork((2, 1, 1), True, 0)
+
+    def loss(start: int, stop: int, **changes: object) -> float:
+        output = NetworkOutput(predicted[start:stop], logit[start:stop])
+        config = replace(paper, **changes)  # type: ignore[arg-type]
+        return float(network.loss(output, targets, (start, stop), config, 4.0))
+
+    # L_PD: 6, 0.75, 2, 4 and 0 of five rows. L_rank: leads of 3.5 and 0 where 4 is wanted, of two
+    # pairs; the fifth row has no partner. L_entropy: right three times, wrong twice.
+    depth, rank = 12.75 / 5, (0.5 + 4.0) / 2
+    entropy = -(3 * math.log(0.75) + 2 * math.log(0.25)) / 5
+    assert loss(0, 5) == pytest.approx(5.0 * depth + 2.0 * rank + 2.0 * entropy)
+    # Processes that share a batch add up to the same.
+    assert loss(0, 2) + loss(2, 5) == pytest.approx(loss(0, 5))
+    assert loss(0, 5, rank_weight=0.0) == pytest.approx(5.0 * depth + 2.0 * entropy)
+    assert loss(0, 5, depth_weight=0.0) == pytest.approx(2.0 * rank + 2.0 * entropy)
+    # Without domains there is the sum's error alone: 1, 0.5, 0, 2 and 0.
+    undivided = 5.0 * 3.5 / 5 + 2.0 * rank + 2.0 * entropy
+    assert loss(0, 5, by_domain=False) == pytest.approx(undivided)
 
 
 def test_scores_of_eight_poses_worked_by_hand() -> None:

@@ -79,6 +79,16 @@ def test_both_presets_learn_what_collides_and_how_deep(
         assert metrics.energy_mse < 0.1
 
 
+def test_the_default_preset_learns_real_collisions(tube_model: PoseModel) -> None:
+    """Patches, folds and labels are all of the same mesh, as they are for who uses it."""
+    latent = colliding_latent(tube_model, 2000)
+    rows = labeller_of(tube_model).label(latent)
+    chosen = replace(PRESETS["default"], batch_rows=64)
+    metrics = train_predictor(rows, tube_model.embedding, chosen).metrics
+    assert metrics is not None
+    assert metrics.accuracy > metrics.majority_rate + 0.1
+
+
 def test_domains_get_their_own_energy(tube_model: PoseModel, rows: LabelRows) -> None:
     trained = train_predictor(rows, tube_model.embedding, config(epochs=6))
     deep = is_held_out(np.arange(len(rows))) & (rows.latent[:, 0] > 0.6)
