@@ -42,9 +42,9 @@ def evaluate(
 ) -> None:
     """Score a model's predictor against exact labels.
 
-    On the store that it was trained upon only the rows that measured it count, on any other
-    store of the model every row does. MSE and RANK are in energies divided by the mean of the
-    colliding training samples.
+    On the store that it was trained upon only rows that neither trained it nor chose anything for
+    it count, on any other store of the model every row does. MSE and RANK are in energies divided
+    by the mean of the colliding training samples.
     """
     from lcollision_core.labels import LabelStore
     from lcollision_core.model import PoseModel
