@@ -23,9 +23,6 @@ from lcollision_core.labels.layout import ROWS_A_CHUNK
 CountRows = Callable[[int, int], None]
 """Called with (rows labelled, of these colliding) since the last call."""
 
-_BLOCKS_AHEAD = 4
-"""Blocks that wait for a free thread, for each thread: none idles while a chunk is written."""
-
 
 @dataclass(frozen=True)
 class ChunkTask:
@@ -56,6 +53,9 @@ def label_locally(
 ) -> Generator[tuple[ChunkTask, LabelRows], None, None]:
     """Label chunks one after the other, their blocks spread over threads.
 
+    One block a thread is begun beyond the chunk in work: so no thread idles while a chunk is
+    written, and a kill costs little more than that chunk.
+
     Parameters
     ----------
     labeller : of the model
@@ -81,7 +81,7 @@ def label_locally(
         for task in tasks:
             parts: list[LabelRows] = []
             for _ in task.blocks:
-                while len(waiting) <= _BLOCKS_AHEAD * n_threads:
+                while len(parts) + len(waiting) < len(task.blocks) + n_threads:
                     block = next(blocks, None)
                     if block is None:
                         break

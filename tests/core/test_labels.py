@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from lcollision_core.labels import (
     is_held_out,
     label_poses,
 )
+from lcollision_core.labels.local import ChunkTask, label_locally
 from lcollision_core.model import PoseModel
 from tests.core.labelled import as_bytes, labeller_of
 
@@ -142,6 +144,29 @@ def test_any_number_of_workers_gives_the_same_store(
     assert store.n_rows == len(store) == N_ROWS
     assert store.n_colliding == truth.colliding.sum()
     assert as_bytes(store.load()) == as_bytes(truth)
+
+
+def test_no_more_than_a_block_a_thread_is_begun_beyond_the_chunk_in_work(
+    labeller: Labeller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a kill may cost: the rows of finished blocks whose chunk is not written."""
+    begun: list[int] = []
+    label_block = Labeller.label_block
+
+    def count_and_label(self: Labeller, seed: int, block: int) -> LabelRows:
+        begun.append(block)
+        return label_block(self, seed, block)
+
+    monkeypatch.setattr(Labeller, "label_block", count_and_label)
+    tasks = [ChunkTask(chunk, ROWS_A_CHUNK) for chunk in range(4)]
+    labelled = label_locally(labeller, 3, tasks, 20, lambda *_: None, CancelToken())
+    next(labelled)
+    expected = ROWS_A_CHUNK // ROWS_A_BLOCK + 20
+    deadline = time.monotonic() + 60
+    while len(begun) < expected and time.monotonic() < deadline:
+        time.sleep(0.01)
+    labelled.close()
+    assert sorted(begun) == list(range(expected))
 
 
 def test_a_cancelled_run_keeps_its_chunks_and_goes_on(
