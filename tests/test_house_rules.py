@@ -29,11 +29,11 @@ def test_tool_has_no_complaint(command: tuple[str, ...]) -> None:
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_no_source_file_is_over_500_lines() -> None:
+def test_no_source_file_is_over_700_lines() -> None:
     lengths = {
         str(path.relative_to(ROOT)): len(path.read_text().splitlines())
         for folder in ("app", "lcollision_core")
         for path in (ROOT / folder).rglob("*.py")
     }
     assert len(lengths) > 10
-    assert {name: length for name, length in lengths.items() if length > 500} == {}
+    assert {name: length for name, length in lengths.items() if length > 700} == {}
