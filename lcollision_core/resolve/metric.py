@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
@@ -64,14 +62,3 @@ class LatentMetric:
         """Measure (..., D) differences of poses: (...) squared distances."""
         distance: FloatArray = np.einsum("...i,ij,...j->...", moved, self.gram, moved)
         return distance
-
-    @cached_property
-    def whitening(self) -> FloatArray:
-        """(D, D) array R with ||y||^2 = d for a move of R y."""
-        return self.whitening_of(np.arange(len(self.gram)))
-
-    def whitening_of(self, codes: npt.NDArray[np.int64]) -> FloatArray:
-        """Return the (M, M) array R of moves of some codes alone, given by their indices."""
-        lower = np.linalg.cholesky(self.gram[np.ix_(codes, codes)])
-        root: FloatArray = np.linalg.inv(lower).T
-        return root

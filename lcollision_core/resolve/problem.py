@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -93,13 +92,6 @@ class ResolveProblem:
         """(D,) which codes are not locked."""
         free: npt.NDArray[np.bool_] = self.high > self.low
         return free
-
-    @cached_property
-    def whitening(self) -> FloatArray:
-        """(M, M) array R of the M movable codes, with ||y||^2 = d for a move of R y."""
-        if self.movable.all():
-            return self.metric.whitening  # the same for all poses of a model
-        return self.metric.whitening_of(np.flatnonzero(self.movable))
 
     def distance(self, latent: FloatArray) -> FloatArray:
         """Measure d of (..., D) poses from Z*: (...)."""
