@@ -288,41 +288,6 @@ class AcapCodec:
         _spread(pull_block, len(at), BLOCK_POSES, n_threads)
         return by_features
 
-    def encode_vjp(
-        self, vertices: FloatArray, features: FloatArray, by_features: FloatArray
-    ) -> FloatArray:
-        """Turn a loss's derivative by the features of one pose into the one by its vertices.
-
-        Parameters
-        ----------
-        vertices : (V, 3) float64 array, the pose
-        features : (V, 9) float64 array, what `encode` makes of it
-        by_features : (V, 9) float64 array
-
-        Returns
-        -------
-        by_vertices : (V, 3) float64 array
-        """
-        from lcollision_core.acap import torch_encode
-
-        def pull(at: FloatArray, by_gradients: FloatArray) -> FloatArray:
-            faces = self.topology.faces
-            return torch_encode.pull_ring_gradients(at, faces, self._fit, by_gradients)
-
-        by_gradients = torch_encode.pull_features(features, by_features)
-        by_sharpened = pull(self._sharpened(vertices[None])[0], by_gradients)
-        # The sharpened pose is 2 p' minus its round trip.
-        by_round_trip = np.empty((self.topology.n_vertices, 3, 3))
-        solution = self._poisson.solve_transposed(by_sharpened[None])
-        self._poisson.load_transposed(solution, 0, by_round_trip)
-        return 2.0 * by_sharpened - pull(vertices, by_round_trip)
-
-    def encode_torch(self, vertices: torch.Tensor) -> torch.Tensor:
-        """Encode a (..., V, 3) tensor differentiably: see `torch_encode.encode_torch`."""
-        from lcollision_core.acap.torch_encode import encode_torch
-
-        return encode_torch(self, vertices)
-
     def decode_torch(self, features: torch.Tensor) -> torch.Tensor:
         """Decode a (..., V, 9) tensor differentiably: see `torch_decode.decode_torch`."""
         from lcollision_core.acap.torch_decode import decode_torch

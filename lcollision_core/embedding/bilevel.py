@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numba
 import numpy as np
@@ -30,9 +30,6 @@ from lcollision_core.errors import ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray, Topology
-
-if TYPE_CHECKING:
-    import torch
 
 _LEAST_RANGE = 1e-6
 """So that the range of a code that no training pose uses still straddles 0."""
@@ -155,10 +152,6 @@ class Embedding:
             with ThreadPoolExecutor(min(wanted, len(starts))) as pool:
                 list(pool.map(decode_block, starts))
         return vertices
-
-    def decode_torch(self, latent: torch.Tensor) -> torch.Tensor:
-        """Decode (B, D) latent codes differentiably to (B, V, 3) vertices in heights."""
-        return self.codec.decode_torch(self.decoder.features_torch(latent))
 
     def guess(self, features: npt.NDArray[Any]) -> Float32Array:
         """Run the encoders: (B, V, 9) unscaled features to a (B, D) float32 latent."""

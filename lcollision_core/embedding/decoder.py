@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +17,6 @@ from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.compiled import compiled
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, IntArray
-
-if TYPE_CHECKING:
-    import torch
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -108,22 +105,6 @@ class FeatureDecoder:
             tangents[start:stop, group.support] = by_code * self.scale
             start = stop
         return tangents
-
-    def features_torch(self, latent: torch.Tensor) -> torch.Tensor:
-        """Decode (B, D) latent codes differentiably to (B, V, 9), in their dtype and device."""
-        import torch
-
-        result = latent.new_tensor(self.offset).expand(len(latent), *self.offset.shape)
-        scale = latent.new_tensor(self.scale)
-        start = 0
-        for group in self.groups:
-            stop = start + len(group.weights)
-            output = torch.tanh(latent[:, start:stop] @ latent.new_tensor(group.weights))
-            part = output.reshape(len(latent), -1, N_FEATURES) * scale
-            support = torch.as_tensor(group.support, dtype=torch.int64, device=latent.device)
-            result = result.index_add(1, support, part)
-            start = stop
-        return result
 
     def _checked(self, latent: npt.NDArray[Any]) -> Float32Array:
         if np.ndim(latent) != 2 or np.shape(latent)[1] != self.latent_size:

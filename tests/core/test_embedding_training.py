@@ -263,40 +263,15 @@ def test_encode_improves_on_the_guess() -> None:
     assert (fit.mean_error < guess.mean_error).all()
 
 
-def test_decode_serial_batch_and_torch_agree() -> None:
+def test_decode_serial_and_batch_agree() -> None:
     embedding = trained_tube()
     rng = np.random.default_rng(0)
     latent = rng.uniform(embedding.latent_min, embedding.latent_max, (19, 15))
     batch = embedding.decode(latent, n_threads=2)
     for row, vertices in zip(latent, batch, strict=True):
         assert np.array_equal(embedding.decode(row[None])[0], vertices)
-    by_torch = embedding.decode_torch(torch.tensor(latent)).numpy()
-    assert np.abs(by_torch - batch).max() < 1e-6
     with pytest.raises(ShapeError, match="latent"):
         embedding.decode(latent[:, :-1])
-
-
-def test_gradient_of_decoding_matches_finite_differences() -> None:
-    embedding = trained_tube()
-    rng = np.random.default_rng(2)
-    at = rng.uniform(embedding.latent_min, embedding.latent_max).astype(np.float64)
-    weights = rng.standard_normal((embedding.topology.n_vertices, 3))
-
-    def loss(latent: torch.Tensor) -> torch.Tensor:
-        return (embedding.decode_torch(latent[None])[0] * torch.tensor(weights)).sum()
-
-    variable = torch.tensor(at, requires_grad=True)
-    loss(variable).backward()
-    gradient = variable.grad
-    assert gradient is not None
-    step = 1e-5
-    for code in range(len(at)):
-        offset = torch.zeros(len(at), dtype=torch.float64)
-        offset[code] = step
-        with torch.no_grad():
-            slope = (loss(torch.tensor(at) + offset) - loss(torch.tensor(at) - offset)) / (2 * step)
-        assert float(gradient[code]) == pytest.approx(float(slope), rel=1e-5, abs=1e-6)
-    assert float(gradient.abs().min()) > 1e-4
 
 
 def test_arrays_bring_the_same_embedding_back() -> None:
