@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
 
 from lcollision_core.errors import LabelStoreError
-
-_LOCKED_BYTE = 1 << 30
-"""Far beyond the file's end: Windows keeps others from reading what is locked."""
+from lcollision_core.meshes.locks import lock_open_file
 
 
 @contextmanager
@@ -28,21 +24,9 @@ def only_writer(store: Path) -> Iterator[None]:
     """
     with (store / "zarr.json").open("r+b", buffering=0) as file:
         try:
-            _lock(file)
+            lock_open_file(file)
         except (BlockingIOError, PermissionError) as error:
             raise LabelStoreError(
                 f"another run is labelling into {store}; wait for it to end, or name another store"
             ) from error
         yield
-
-
-def _lock(file: BinaryIO) -> None:
-    if sys.platform == "win32":
-        import msvcrt
-
-        file.seek(_LOCKED_BYTE)
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

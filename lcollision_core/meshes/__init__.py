@@ -1,7 +1,13 @@
 """What a pose is: topology, files, pose sets, alignment and the built-in body."""
 
 from lcollision_core.meshes.alignment import Alignment, RigidTransform, align_rigid, fit_rigid
-from lcollision_core.meshes.atomic import atomic_write, require_writable
+from lcollision_core.meshes.atomic import (
+    FileStamp,
+    atomic_write,
+    file_stamp,
+    require_writable,
+    spare_name,
+)
 from lcollision_core.meshes.audit import (
     MeshAudit,
     PoseSetInspection,
@@ -16,6 +22,7 @@ from lcollision_core.meshes.files import (
     read_mesh,
     write_mesh,
 )
+from lcollision_core.meshes.locks import locked
 from lcollision_core.meshes.pose_set import (
     PoseSet,
     mesh_files,
@@ -30,6 +37,7 @@ __all__ = [
     "READABLE_SUFFIXES",
     "WRITABLE_SUFFIXES",
     "Alignment",
+    "FileStamp",
     "Mesh",
     "MeshAudit",
     "PoseSet",
@@ -39,13 +47,16 @@ __all__ = [
     "align_rigid",
     "atomic_write",
     "audit_mesh",
+    "file_stamp",
     "fit_rigid",
     "height",
     "inspect_pose_set",
+    "locked",
     "mesh_files",
     "read_mesh",
     "read_pose_set",
     "require_writable",
+    "spare_name",
     "up_axis",
     "write_mesh",
     "write_pose_set",

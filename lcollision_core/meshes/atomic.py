@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
+import stat
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.locks import is_named, lock_open_file, shortened
+
+_MAX_NAME_BYTES = 100
+"""Of the name that a file has while it is written, but for what marks it so."""
+_MAX_STEM_BYTES = 200
+"""Of a spare name, so that the number fits."""
+_SECONDS_TO_RENAME = 60.0
+"""On Windows, where a file is closed, and so no longer locked, before it is renamed."""
+
+FileStamp = tuple[int, int, int, int]
+"""What changes whenever a file is replaced or written to."""
 
 
 @contextmanager
@@ -18,7 +33,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     The bytes go to a hidden file beside `path`, which is flushed, fsynced and renamed when the
     block ends. When the block raises, the hidden file is removed and an older `path` stays as it
-    was. A symbolic link keeps pointing where it did; the file that it names is replaced.
+    was; what a killed process left is removed by the next one to write this name. A symbolic link
+    keeps pointing where it did; the file that it names is replaced.
 
     Parameters
     ----------
@@ -34,20 +50,46 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         or a device.
     """
     target = _plain_file_in_a_folder(path)
-    unfinished = target.with_name(f".{target.name[:100]}.{secrets.token_hex(6)}.part")
+    unfinished = None
     try:
-        with unfinished.open("xb") as file:
+        _remove_dead_parts(target)
+        unfinished, file = _new_part(target)
+        with file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        unfinished.replace(target)
+            if sys.platform != "win32":  # while it is locked: nobody takes it for a dead one
+                unfinished.replace(target)
+        if sys.platform == "win32":
+            unfinished.replace(target)
     except OSError as error:
         raise MeshFileError(
             f"{path} cannot be written: {error.strerror or error}; choose another place"
         ) from error
     finally:
-        with suppress(OSError):
-            unfinished.unlink(missing_ok=True)
+        if unfinished is not None:
+            with suppress(OSError):
+                unfinished.unlink(missing_ok=True)
+
+
+def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
+    """Return what tells a file from any that is later in its place; None where there is none.
+
+    Compared inside `locked`, it says whether the file is still the one that was read.
+    """
+    try:
+        found = Path(path).stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def spare_name(path: Path) -> Path:
+    """Return a name beside `path` that no file has: "m 2.obj"."""
+    stem, number = shortened(path.stem, _MAX_STEM_BYTES), 2
+    while (spare := path.with_name(f"{stem} {number}{path.suffix}")).exists():
+        number += 1
+    return spare
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
@@ -67,18 +109,59 @@ def require_writable(path: str | os.PathLike[str]) -> None:
 def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
     target = Path(os.path.realpath(path))
     try:
-        is_folder, is_device = target.is_dir(), target.exists() and not target.is_file()
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        mode = None
     except OSError as error:
         raise MeshFileError(
             f"{path} cannot be written: {error.strerror or error}; choose another name"
         ) from error
-    if is_folder:
+    if mode is not None and stat.S_ISDIR(mode):
         raise MeshFileError(f"{path} cannot be written: it is a folder; add a file name")
     # Renaming over a device such as /dev/null would replace it by a plain file.
-    if is_device:
+    if mode is not None and not stat.S_ISREG(mode):
         raise MeshFileError(f"{path} cannot be written: it is not a plain file; choose another")
     if not target.parent.is_dir():
         raise MeshFileError(
             f"{path} cannot be written: there is no folder {target.parent}; create it first"
         )
     return target
+
+
+def _part_name(target: Path, token: str) -> str:
+    return f".{shortened(target.name, _MAX_NAME_BYTES)}.{token}.part"
+
+
+def _new_part(target: Path) -> tuple[Path, BinaryIO]:
+    """Make the hidden file that becomes `target`, locked for as long as it is open."""
+    while True:
+        part = target.with_name(_part_name(target, secrets.token_hex(6)))
+        file = part.open("xb")
+        with suppress(OSError):  # a disk without locks, where nobody removes it either
+            lock_open_file(file)
+        if is_named(file, part):
+            return part, file
+        # Another writer removed it before it was locked.
+        file.close()
+
+
+def _remove_dead_parts(target: Path) -> None:
+    """Remove the hidden files of writers of `target` that are no more."""
+    head, tail = map(re.escape, _part_name(target, "/").split("/"))
+    is_part = re.compile(rf"{head}[0-9a-f]{{12}}{tail}")
+    with suppress(OSError):  # a folder that may be written to, but not listed
+        for part in target.parent.iterdir():
+            if is_part.fullmatch(part.name):
+                _remove_if_dead(part)
+
+
+def _remove_if_dead(part: Path) -> None:
+    with suppress(OSError):
+        if sys.platform == "win32":
+            # What is open there cannot be removed.
+            if time.time() - part.stat().st_mtime > _SECONDS_TO_RENAME:
+                part.unlink()
+            return
+        with part.open("rb+") as file:
+            lock_open_file(file)
+            part.unlink()
