@@ -1,4 +1,4 @@
-"""``lcollision benchmark``: the measurements that the README quotes."""
+"""``lcollision benchmark``: the measurements of docs/results.md."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.cli.benchmark_predictor import predictor
 from app.cli.benchmark_resolve import resolve
 from app.cli.console import note, print_json, progress_bar
 
-app = typer.Typer(help="Measure what the README quotes.", no_args_is_help=True)
+app = typer.Typer(help="Measure what docs/results.md quotes.", no_args_is_help=True)
 app.command("predictor")(predictor)
 app.command("resolve")(resolve)
 app.command("editor")(editor)

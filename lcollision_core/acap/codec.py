@@ -1,36 +1,9 @@
 """Poses of one reference mesh to deformation features and back.
 
-What was tried, each row one change from what is in use. Errors are mean / maximum over the
-vertices of all aligned poses in per cent of the height; "held out" is the mean error of every
-10th pose after 20 principal components of the others; jumps are edges over the whole set.
-
-=====================================  ========================  ========================
-variant                                SCAPE, 71 poses           jumping, every 2nd frame
-                                       error, held out, jumps    error, held out, jumps
-=====================================  ========================  ========================
-**in use**                             .0163 / .167  1.903  17   .0062 / .269  1.065  20
-no sharpening                          .0646 / .423  1.902  12   .0250 / .556  1.054  15
-sharpening twice                       .0092 / .089  1.902  18   .0039 / .190  1.066  15
-sharpening four times                  .0044 / .068  1.902  19   .0023 / .120  1.068  14
-cotangents clamped at 0.001            .0155 / .158  1.903  17   .0060 / .258  1.065  20
-cotangents clamped at 0.5              .0208 / .278  1.905  17   .0078 / .313  1.064  19
-all weights 1                          .0205 / .372  1.909  14   .0106 / .308  1.066  18
-weights 1 in the reconstruction only   .0228 / .283  1.915  18   .0086 / .379  1.066  19
-weights 1 / squared length             .0127 / .259  1.909  16   .0068 / .316  1.065  21
-normal's row at weight 0.1             .0122 / .163  1.907  49   .0046 / .255  1.142  41
-normal's row at weight 10              .0210 / .179  1.898  19   .0092 / .272  1.060  75
-=====================================  ========================  ========================
-
-*Sharpening*: T_i averages over a one-ring, so a round trip blurs. Features are therefore taken
-from the pose plus the difference that its round trip would leave, which costs one substitution
-and leaves what exact poses (rigid, evenly scaled, flat) get unchanged. Further passes go on
-inverting folded one-rings for less and less gain. A lighter normal's row round-trips better but
-leaves flat one-rings ill-determined: more jumps, worse components.
-
-*Jumps*: those left sit in folded skin, 15 of SCAPE's 17 in the two meshes that intersect
-themselves, between neighbours that are turned against each other, half of them by more than 140
-degrees. Giving single vertices other turns afterwards mended none of them, and 8 of jumping's 53;
-so the integer refinement of Gao et al. 2019 is left out.
+A vertex's deformation gradient averages over its one-ring, so a round trip blurs. Features are
+therefore computed from the pose plus the difference that its round trip would leave; poses that are
+exact already (rigid, uniformly scaled, flat) are not changed. What else was tried, with its
+figures, is in docs/experiments.md.
 """
 
 from __future__ import annotations

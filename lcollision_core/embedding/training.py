@@ -1,67 +1,6 @@
 """Stage 1: learn the latent space of a pose set, and measure it.
 
-What was tried, so that nobody need try it again. Errors are mean / largest vertex distances in
-percent of the height; *encoded* codes come straight from the encoders, *fitted* ones from
-`fitting`; *held out* poses are every 10th, unseen. *Connected* is the least share of a domain's
-vertices in one patch, *overlap* the effective domains per vertex, *box* the share of uniform
-samples of the 1.2-fold latent box that collide (120 to 300 samples, so within 0.05).
-
-SCAPE, 10 domains of 10 codes. How level 1 starts and where its locality loss acts (trial code,
-features alone, level 2 not trained):
-
-================================================================ =========== ========= =======
-start; distances of the locality loss; epochs                    level 1     connected overlap
-================================================================ =========== ========= =======
-farthest points; from the strongest vertex 0.2 to 0.4; 900       4.49 / 25.9 0.35      1.63
-the same, locality weighed four times as much                    4.65 / 32.4 0.40      1.47
-motion parts; from the strongest vertex 0.2 to 0.4; 400          4.55 / 25.2 0.65      1.57
-the same and a penalty on the product of overlapping weights     4.81 / 31.7 0.83      1.03
-the same with the vertex error in the loss                       2.65 / 18.4 0.47      1.44
-motion parts; from the part 0 to 0.1; 300                        4.70 / 32.3 0.99      1.01
-================================================================ =========== ========= =======
-
-With domains that hardly overlap all goes well but the latent box: parts that turn on their own
-break at the joints, and nearly every sample collides. Overlap lets a part take its neighbours
-along; it fades as level 1 trains on, so level 1 stops early (whole runs; the last two rows with 20
-epochs of level 2 and encoded codes):
-
-========================== ======= =========== =========== =========== ========= ======= ====
-locality reach; epochs     level 1 encoded     fitted      held out    connected overlap box
-========================== ======= =========== =========== =========== ========= ======= ====
-0 to 0.1; 300              4.91    0.30 / 1.30 0.14 / 1.30 0.18 / 0.93 1.000     1.00    0.98
-0.1 to 0.4; 100            4.55    0.25 / 1.42 0.11 / 0.87 0.16 / 0.99 0.997     1.52    0.71
-**0.1 to 0.4; 60**         4.78    0.27 / 1.59 0.11 / 0.88 0.17 / 0.91 0.998     1.59    0.65
-0.1 to 0.5, weight 0.1; 60 5.37    0.39 / 2.09                         0.932     1.78    0.46
-0.2 to 0.5; 100            4.48    0.43 / 2.54                         0.608     2.19    0.50
-========================== ======= =========== =========== =========== ========= ======= ====
-
-On the jumping sequence with its 12 smaller parts the same reach overlaps too much: connected 0.79,
-overlap 2.26; 100 epochs 0.92 and 2.23. So the reach follows from how much the windows overlap:
-3.7 effective domains make it 0.1 to 0.4 on SCAPE and 0.07 to 0.27 on jumping, there connected 0.99,
-overlap 1.83. What is not connected after that is given to the neighbours (`keep_one_patch`): 1.00
-on both.
-
-Jumping, 12 domains of 10 codes, with the defaults: level 1 4.19; encoded 0.37 / 3.06; fitted 0.25 /
-2.40; held out 0.28 / 3.13, where 132 plain components fitted alike have 0.16: each held-out frame
-lies between two frames of the same jump, which is what global components do best. Box 0.94 (36 %
-of the decoded training frames collide, 79 % of the box with pairs nearer than 0.05 left out).
-
-Plain principal components of the features, fitted in the same way, have 0.30 held out with all the
-63 numbers that 64 poses span; their box collides at 0.38, 0.65 and 0.69 with 10, 20 and 60 numbers.
-
-Level 2, on domains without overlap. Principal components of the masked residual alone: encoded
-0.51 / 7.36, held out 0.63, because tanh bends large residuals; with the features halved, which
-keeps them where tanh is straight, 0.47 / 2.75 and 0.59; trained on the vertex error too, 0.31 /
-1.80 and 0.46, and with nine times its weight 0.25 / 1.57 and 0.42. Fitted codes hardly notice:
-held out 0.16 in each case. Training level 2 on the features alone is no better than the principal
-components.
-
-Codes per domain, fitted, trained and held out: 5 give 0.31 and 0.32, 10 give 0.17 and 0.20, 14
-give 0.16 and 0.18 (trial code, no overlap). The box collides alike with 5, 7 and 10: its extent is
-in the leading codes. A weaker or stronger pull of fitted codes to 0 hardly changes it either.
-
-No penalty on the codes' magnitude is needed: C has unit norm and the features are bounded, so the
-codes are. Latent 0 is the mean of the features, hence all ranges straddle 0.
+What was tried, with its figures, is in docs/experiments.md.
 """
 
 from __future__ import annotations

@@ -9,51 +9,7 @@ each point and each site, say whether the patch of skin round it is hit, and how
 taught that by its exact energy, which is worth hundreds of labels a pose. What follows joins them
 to the domains' energies and the logit.
 
-What was tried, on SCAPE (110 codes, 66.2 % of the box collides) at M = 50 000, CLASSIFY in per cent
-of the 15 000 samples held out, one seed each:
-
-===============================================================  ========
-the paper's preset                                               81.2
-200 points, each shown where 16 far and 8 near others lie        90.2
-the same with 300 points, 24 far and 10 near                     91.3
-the same with the exact places of the points, not the reduced    91.0
-200 points, one hidden layer more                                90.9
-and taught its distance to other parts, not only energies        90.9
-and 56 more points where skin folds                              91.4
-200 points and 48 fold sites of 12 vertices                      91.7
-the logits of four of these networks averaged                    92.1
-200 points with the contact field, and the fold sites            94.0
-the same from 0.06 along the surface on, with three reaches      93.7
-the same and shown the 16 far and 3 near others too              94.4
-200 points with the field and 48 fold sites, in half the time    93.7
-240 points with the field and 96 fold sites                      94.4
-as it stands: 240 points, 128 fold sites                         94.3
-and weights decaying by 0.1 of the rate a step                   94.3
-and a constant rate of 0.001 instead of the one-cycle schedule   93.9
-and the running mean of the weights over a pass                  94.4
-and ReLU, without curvature for a solver, instead of SiLU        94.4
-and energies taught as they are, not their square roots          94.4
-and each domain's energy read off its own patches alone          94.4
-and no patch's energy taught, only the domains' and the label    92.6
-the logits of three as it stands, with other seeds, averaged     94.4
-one taught half by those three's mean, half by the labels        94.3
-===============================================================  ========
-
-At M = 500 000, gone over eight times, it gets 96.0; 288 points, 96 sites and patches of width 48
-get 96.2 in one and a half times the time; 200 points and 48 sites, gone over five times, got 95.1,
-and half of the folds that those missed lay where no site was. Of the rows that it learnt from it
-gets 96.8 there, and 97.5 at M = 50 000 (96.9 with the decay): rows limit it still. At a million,
-gone over six times, it gets 96.2, and 96.7 of those that it learnt from: now its size limits it as
-much. Of the free ones it takes 5.4 % for colliding and of the colliding 3.0 % for free; those come
-to 3.9 each, with 96.1 right, where `balanced_logit` calls them. A head of twice that width,
-trained on those patches' outputs alone, is right about no more. At 2 500 000, gone over six times,
-it gets 96.6 (4.9 and 2.6), and 96.5 where `balanced_logit` calls them (3.6 and 3.4); of those that
-it learnt from 97.0, so that more rows would help little. Half of the colliding that it misses have
-less energy than 95 % of all colliding samples.
-
-A list of who may meet whom was the limit: a hand meets anything. Of the colliding samples that were
-missed before, two fifths had nothing but a fold of less than 0.03 heights, which points 0.04 apart
-cannot show.
+What was tried, with its figures, is in docs/experiments.md.
 """
 
 from __future__ import annotations
