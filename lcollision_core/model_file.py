@@ -138,6 +138,41 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
         raise ModelFileError(f"{path} cannot be read: {reason}; check the file") from error
 
 
+def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
+    """Read one section of a model file and nothing else, without the check of the whole file.
+
+    Returns
+    -------
+    section : None where the file has none of this name
+
+    Raises
+    ------
+    ModelFileError : the file cannot be read, or is no model of this program and version.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    source = Path(path)
+    try:
+        if not stat.S_ISREG(source.stat().st_mode):
+            raise ModelFileError(f"{path} is no model: it is not a plain file; name a model file")
+        with source.open("rb") as file:
+            header = _read_header(file, os.fstat(file.fileno()).st_size, path)
+        metadata = header.document["sections"].get(name)
+        if metadata is None:
+            return None
+        with safe_open(source, "numpy") as tensors:
+            arrays = {
+                full_name.removeprefix(f"{name}/"): tensors.get_tensor(full_name)
+                for full_name in tensors.keys()  # noqa: SIM118 - no mapping
+                if full_name.startswith(f"{name}/")
+            }
+    except SafetensorError as error:
+        _refuse_damaged(path, error)
+    except OSError as error:
+        raise ModelFileError(f"{path} cannot be read: {error.strerror or error}") from error
+    return Section(arrays, metadata)
+
+
 def _read_open_file(file: BinaryIO, path: str | os.PathLike[str]) -> dict[str, Section]:
     from safetensors import SafetensorError
     from safetensors.numpy import load

@@ -3,6 +3,7 @@
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.export import export_mesh
+from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace
 from lcollision_core.model.library import (
     MODEL_SUFFIX,
@@ -15,9 +16,13 @@ from lcollision_core.model.library import (
 )
 from lcollision_core.model.pose_file import (
     NamedPose,
+    OtherModelError,
+    PoseFile,
     name_of_file,
+    read_pose_file,
     read_poses,
     unique_names,
+    why_no_name,
     write_poses,
 )
 from lcollision_core.model.pose_model import PoseModel
@@ -31,16 +36,21 @@ __all__ = [
     "ListedModel",
     "ModelCard",
     "NamedPose",
+    "OtherModelError",
+    "PoseFile",
     "PoseModel",
     "checkpoint_path",
     "export_mesh",
+    "find_latent_space",
     "find_model",
     "list_models",
     "model_destination",
     "name_of_file",
+    "read_pose_file",
     "read_poses",
     "sample_poses",
     "unique_names",
     "user_models_folder",
+    "why_no_name",
     "write_poses",
 ]

@@ -6,7 +6,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,14 +16,17 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.meshes import RigidTransform, atomic_write
 from lcollision_core.model.encoded_pose import EncodedPose
+from lcollision_core.model.latent_identity import find_latent_space
+from lcollision_core.model.library import ListedModel, user_models_folder
 from lcollision_core.model.pose_model import PoseModel
 
 POSES_FORMAT = "lcollision-poses"
-POSES_VERSION = 1
-"""The version that `write_poses` stores; later ones are refused."""
+POSES_VERSION = 2
+"""The latest version that is read; version 1 has neither a working pose nor tags."""
 
 MAX_FILE_BYTES = 2**30
 MAX_NAME_LENGTH = 200
+MAX_TAGS = 50
 
 _NOT_ROTATED = 1e-6
 
@@ -39,6 +42,7 @@ class NamedPose:
     placement : where the decoded pose belongs, for one that came in as a mesh; None leaves it in
         the reference's frame
     fit_error_mean, fit_error_max : of one that came in as a mesh, in heights
+    tags : under which it is found in a library
     """
 
     name: str
@@ -46,6 +50,13 @@ class NamedPose:
     placement: RigidTransform | None = None
     fit_error_mean: float | None = None
     fit_error_max: float | None = None
+    tags: tuple[str, ...] = ()
+
+    def same_as(self, other: NamedPose) -> bool:
+        """Whether both have the same latent and placement, to the bit, whatever their names."""
+        return self.latent.tobytes() == other.latent.tobytes() and _placed_alike(
+            self.placement, other.placement
+        )
 
     @classmethod
     def of_mesh(cls, name: str, encoded: EncodedPose) -> NamedPose:
@@ -55,14 +66,65 @@ class NamedPose:
         )
 
 
-def write_poses(path: str | os.PathLike[str], model: PoseModel, poses: Sequence[NamedPose]) -> None:
+@dataclass(frozen=True, eq=False)
+class PoseFile:
+    """What a file of poses holds.
+
+    Attributes
+    ----------
+    poses : in the file's order, names all different
+    working : the pose that was being edited, which may be called as one of `poses`
+    """
+
+    poses: tuple[NamedPose, ...]
+    working: NamedPose | None = None
+
+    @property
+    def all_poses(self) -> tuple[NamedPose, ...]:
+        """The poses, and last the working one, numbered where its name is taken.
+
+        A working pose that is one of `poses` to the bit is not listed twice.
+        """
+        working = self.working
+        if working is None or any(pose.same_as(working) for pose in self.poses):
+            return self.poses
+        *_, name = unique_names([*(pose.name for pose in self.poses), working.name])
+        return (*self.poses, replace(working, name=name))
+
+
+class DamagedPosesError(ModelFileError):
+    """A file is no file of poses that this program, of whatever version, wrote for a model."""
+
+
+class OtherModelError(ModelFileError):
+    """A file holds the poses of another model.
+
+    Attributes
+    ----------
+    model : the model that the poses belong to, None where it is not among the listed ones
+    """
+
+    def __init__(self, sentence: str, model: ListedModel | None) -> None:
+        super().__init__(sentence)
+        self.model = model
+
+
+def write_poses(
+    path: str | os.PathLike[str],
+    model: PoseModel,
+    poses: Sequence[NamedPose],
+    working: NamedPose | None = None,
+) -> None:
     """Write latent poses, whole or not at all.
+
+    Without a working pose and tags the file is of version 1, which older programs read.
 
     Parameters
     ----------
     path : a .json file in an existing folder
     model : whose latent space they are in
     poses : names all different
+    working : the pose that is being edited, kept apart from `poses`
 
     Raises
     ------
@@ -74,19 +136,23 @@ def write_poses(path: str | os.PathLike[str], model: PoseModel, poses: Sequence[
     name, times = Counter(pose.name for pose in poses).most_common(1)[0] if poses else ("", 0)
     if times > 1:
         raise ModelFileError(f"{path} cannot be written: {times} poses are called {name!r}")
-    entries = [_to_json(pose) for pose in poses]
-    for pose, entry in zip(poses, entries, strict=True):
+    held = [*poses, *([] if working is None else [working])]
+    entries = [to_json(pose) for pose in held]
+    for pose, entry in zip(held, entries, strict=True):
         try:
             _from_json(entry, model.latent_size)
         except ValueError as error:
             raise ModelFileError(
-                f"{path} cannot be written: of the pose {pose.name[:80]!r}, {error}; mend that pose"
+                f"{path} cannot be written: of the pose {pose.name[:80]!r}, {error}; repair that "
+                f"pose"
             ) from error
+    needs_latest = working is not None or any(pose.tags for pose in poses)
     document = {
         "format": POSES_FORMAT,
-        "format_version": POSES_VERSION,
+        "format_version": POSES_VERSION if needs_latest else 1,
         "model": {"name": model.name, "fingerprint": model.fingerprint},
-        "poses": entries,
+        **({} if working is None else {"working": entries[-1]}),
+        "poses": entries[: len(poses)],
     }
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
     try:
@@ -98,12 +164,23 @@ def write_poses(path: str | os.PathLike[str], model: PoseModel, poses: Sequence[
 
 
 def read_poses(path: str | os.PathLike[str], model: PoseModel) -> tuple[NamedPose, ...]:
+    """Read all latent poses of a file, the working pose among them: `PoseFile.all_poses`.
+
+    Raises
+    ------
+    ModelFileError : as for `read_pose_file`.
+    """
+    return read_pose_file(path, model).all_poses
+
+
+def read_pose_file(path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
     """Read latent poses of a model.
 
     Raises
     ------
-    ModelFileError : the file is missing, empty, damaged, no file of poses, of a later version, or
-        of another model's poses.
+    DamagedPosesError : the file is empty, damaged, or no file of poses.
+    OtherModelError : the poses are another model's.
+    ModelFileError : the file is missing, cannot be read, or is of a later version.
     """
     source = Path(path)
     try:
@@ -119,10 +196,19 @@ def read_poses(path: str | os.PathLike[str], model: PoseModel) -> tuple[NamedPos
     try:
         document = json.loads(content.decode("utf-8-sig"), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise ModelFileError(
+        raise DamagedPosesError(
             f"{path} is no JSON ({error}); name a file of poses that lcollision wrote"
         ) from error
     return _parse(document, path, model)
+
+
+def why_no_name(name: str) -> str:
+    """Say why a pose cannot be called so, or return "" where it can."""
+    if not 0 < len(name) <= MAX_NAME_LENGTH:
+        return f"its name must be a text of 1 to {MAX_NAME_LENGTH} characters"
+    if any("\ud800" <= character <= "\udfff" for character in name):
+        return "its name has half a character, which no text file holds"
+    return ""
 
 
 def name_of_file(path: Path) -> str:
@@ -149,9 +235,9 @@ def unique_names(names: Iterable[str]) -> list[str]:
     return result
 
 
-def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> tuple[NamedPose, ...]:
+def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
     if not isinstance(document, dict) or document.get("format") != POSES_FORMAT:
-        raise ModelFileError(
+        raise DamagedPosesError(
             f"{path} holds no poses of this program; name a file that lcollision wrote"
         )
     version = document.get("format_version")
@@ -161,28 +247,54 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> tup
             f"update the program"
         )
     owner, entries = document.get("model"), document.get("poses")
-    if version != POSES_VERSION or not isinstance(owner, dict) or not isinstance(entries, list):
-        raise ModelFileError(f"{path} is damaged: it lacks its version, model or poses")
+    if version not in range(1, POSES_VERSION + 1) or isinstance(version, bool | float):
+        version = None
+    if version is None or not isinstance(owner, dict) or not isinstance(entries, list):
+        raise DamagedPosesError(f"{path} is damaged: it lacks its version, model or poses")
     if owner.get("fingerprint") != model.fingerprint:
-        raise ModelFileError(
-            f"{path} holds poses of the model {owner.get('name')!r} ({owner.get('fingerprint')}), "
-            f"which is not {model.name!r} ({model.fingerprint}); name their own model, or decode "
-            f"them with it and encode the meshes with this one"
-        )
-    poses = []
-    for place, entry in enumerate(entries):
+        raise _other_model(path, owner, model)
+
+    def pose(entry: Any, place: str) -> NamedPose:
         try:
-            poses.append(_from_json(entry, model.latent_size))
+            return _from_json(entry, model.latent_size)
         except ValueError as error:
-            raise ModelFileError(
-                f"{path} is damaged at pose {place} (from 0): {error}; mend or remove that pose"
+            raise DamagedPosesError(
+                f"{path} is damaged at {place}: {error}; repair or remove that pose"
             ) from error
+
+    poses = tuple(pose(entry, f"pose {place} (from 0)") for place, entry in enumerate(entries))
     if len({pose.name for pose in poses}) < len(poses):
-        raise ModelFileError(f"{path} is damaged: two of its poses share a name; rename one")
-    return tuple(poses)
+        raise DamagedPosesError(f"{path} is damaged: two of its poses share a name; rename one")
+    working = document.get("working") if version > 1 else None
+    return PoseFile(poses, None if working is None else pose(working, "its working pose"))
 
 
-def _to_json(pose: NamedPose) -> dict[str, Any]:
+def _other_model(
+    path: str | os.PathLike[str], owner: dict[str, Any], model: PoseModel
+) -> OtherModelError:
+    """Say whose poses a file holds, by the names of models alone."""
+    fingerprint, name = (str(owner.get(key))[:MAX_NAME_LENGTH] for key in ("fingerprint", "name"))
+    listed = find_latent_space(fingerprint, name)
+    if listed is not None:
+        sentence = (
+            f"{path} holds poses of the model {listed.name!r}, not of {model.name!r}; use them "
+            f"with {listed.name!r}"
+        )
+    elif name == model.name:
+        sentence = (
+            f"{path} holds poses of another model that is called {name!r} too, which is not among "
+            f"the models here; use them with the model that they were made with"
+        )
+    else:
+        sentence = (
+            f"{path} holds poses of the model {name!r}, not of {model.name!r}, and {name!r} is "
+            f"not among the models here; copy its file to {user_models_folder()}, or name it"
+        )
+    return OtherModelError(sentence, listed)
+
+
+def to_json(pose: NamedPose) -> dict[str, Any]:
+    """Return what a file holds of a pose; equal for equal poses, to the bit."""
     entry: dict[str, Any] = {"name": pose.name, "latent": pose.latent.tolist()}
     if pose.placement is not None:
         entry["placement"] = {
@@ -191,16 +303,17 @@ def _to_json(pose: NamedPose) -> dict[str, Any]:
         }
     if pose.fit_error_mean is not None and pose.fit_error_max is not None:
         entry["fit_error"] = {"mean": pose.fit_error_mean, "max": pose.fit_error_max}
+    if pose.tags:
+        entry["tags"] = list(pose.tags)
     return entry
 
 
 def _from_json(entry: Any, latent_size: int) -> NamedPose:
     pose = _object(entry, "entry")
     name = pose.get("name")
-    if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH:
-        raise ValueError(f"its name must be a text of 1 to {MAX_NAME_LENGTH} characters")
-    if any("\ud800" <= character <= "\udfff" for character in name):
-        raise ValueError("its name has half a character, which no text file holds")
+    reason = why_no_name(name if isinstance(name, str) else "")
+    if reason or not isinstance(name, str):
+        raise ValueError(reason)
     latent = _numbers(pose.get("latent"), (latent_size,), "latent")
     placement = None
     if "placement" in pose:
@@ -211,11 +324,32 @@ def _from_json(entry: Any, latent_size: int) -> NamedPose:
         if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
             raise ValueError("its rotation is no rotation matrix")
         placement = RigidTransform(rotation, translation)
-    if "fit_error" not in pose:
-        return NamedPose(name, latent, placement)
-    errors = _object(pose["fit_error"], "fit error")
-    mean, largest = _numbers([errors.get("mean"), errors.get("max")], (2,), "fit error")
-    return NamedPose(name, latent, placement, float(mean), float(largest))
+    mean = largest = None
+    if "fit_error" in pose:
+        errors = _object(pose["fit_error"], "fit error")
+        mean, largest = map(
+            float, _numbers([errors.get("mean"), errors.get("max")], (2,), "fit error")
+        )
+    return NamedPose(name, latent, placement, mean, largest, _tags(pose.get("tags", [])))
+
+
+def _tags(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or len(value) > MAX_TAGS:
+        raise ValueError(f"its tags must be a list of at most {MAX_TAGS} texts")
+    for tag in value:
+        if not isinstance(tag, str) or why_no_name(tag):
+            raise ValueError(
+                f"each of its tags must be a text of 1 to {MAX_NAME_LENGTH} characters"
+            )
+    return tuple(dict.fromkeys(value))
+
+
+def _placed_alike(one: RigidTransform | None, other: RigidTransform | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return np.array_equal(one.rotation, other.rotation) and np.array_equal(
+        one.translation, other.translation
+    )
 
 
 def _object(value: Any, name: str) -> dict[str, Any]:

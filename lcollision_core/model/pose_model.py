@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,6 +20,7 @@ from lcollision_core.meshes import PoseSet, RigidTransform, Topology, height, up
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.colours import domain_colours
 from lcollision_core.model.encoded_pose import EncodedPose
+from lcollision_core.model.latent_identity import EMBEDDING, fingerprint_of
 from lcollision_core.model.latent_space import WHOLE_BODY, LatentGroup, LatentSpace
 from lcollision_core.model.library import find_model
 from lcollision_core.model.matching import checked_mesh, require_same_faces
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
-_EMBEDDING = "embedding"
 _CARD = "model"
 _PREDICTOR = "predictor"
 _FREE_POSES = "free_poses"
@@ -103,14 +101,14 @@ class PoseModel:
         """
         path = find_model(name_or_path)
         sections = read_model_file(path)
-        missing = [name for name in (_EMBEDDING, _CARD) if name not in sections]
+        missing = [name for name in (EMBEDDING, _CARD) if name not in sections]
         if missing:
             raise ModelFileError(
                 f"{path} is unusable: it lacks its section {missing[0]!r}; train or copy the "
                 f"model again"
             )
         try:
-            embedding_section, card_section = sections.pop(_EMBEDDING), sections.pop(_CARD)
+            embedding_section, card_section = sections.pop(EMBEDDING), sections.pop(_CARD)
             embedding = Embedding.from_arrays(embedding_section.arrays, embedding_section.metadata)
             card = ModelCard.from_metadata(card_section.metadata)
             return cls(path.stem, embedding, card, sections)
@@ -170,7 +168,7 @@ class PoseModel:
         arrays, metadata = self.embedding.to_arrays()
         sections = {
             **self._other_sections,
-            _EMBEDDING: Section(arrays, metadata),
+            EMBEDDING: Section(arrays, metadata),
             _CARD: Section({}, self.card.to_metadata()),
         }
         write_model_file(path, sections)
@@ -405,13 +403,7 @@ class PoseModel:
         Models with one fingerprint understand each other's latent poses: it depends on neither
         names nor anything that is trained upon the latent space.
         """
-        arrays, metadata = self.embedding.to_arrays()
-        digest = hashlib.sha256(json.dumps(metadata["scaling"], sort_keys=True).encode())
-        for name in sorted(arrays):
-            array = np.ascontiguousarray(arrays[name])
-            digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-            digest.update(array.tobytes())
-        return digest.hexdigest()[:16]
+        return fingerprint_of(*self.embedding.to_arrays())
 
     @cached_property
     def latent_space(self) -> LatentSpace:

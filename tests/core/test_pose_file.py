@@ -16,11 +16,16 @@ from hypothesis import strategies as st
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.model import (
+    ListedModel,
     NamedPose,
+    OtherModelError,
     PoseModel,
+    find_latent_space,
     name_of_file,
+    read_pose_file,
     read_poses,
     unique_names,
+    user_models_folder,
     write_poses,
 )
 from lcollision_core.model.pose_file import POSES_VERSION
@@ -82,8 +87,68 @@ def test_poses_of_another_model_are_refused(model: PoseModel, path: Path) -> Non
     assert document["model"] == {"name": "tube", "fingerprint": model.fingerprint}
     document["model"] = {"name": "dancer", "fingerprint": "0123456789abcdef"}
     path.write_text(json.dumps(document))
-    with pytest.raises(ModelFileError, match=rf"{path} holds poses of the model 'dancer'.*'tube'"):
+    with pytest.raises(OtherModelError, match=rf"{path} holds poses of the model 'dancer'.*'tube'"):
         read_poses(path, model)
+
+
+def test_poses_of_another_model_name_it_and_never_its_fingerprint(
+    model: PoseModel, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the latent space, whatever it is called now; damaged models nearby do not matter."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    folder = user_models_folder()
+    folder.mkdir(parents=True)
+    (folder / "aaa.safetensors").write_bytes(b"garbage")
+    model.save(folder / "snake.safetensors")
+    assert find_latent_space(model.fingerprint) == ListedModel(
+        "snake", folder / "snake.safetensors", False
+    )
+    body = PoseModel.load("body")
+    assert find_latent_space(body.fingerprint, "body").bundled
+    assert find_latent_space("0123456789abcdef") is None
+    with pytest.raises(OtherModelError) as caught:
+        read_poses(path, body)
+    assert str(caught.value) == (
+        f"{path} holds poses of the model 'snake', not of 'body'; use them with 'snake'"
+    )
+    assert caught.value.model == ListedModel("snake", folder / "snake.safetensors", False)
+    (folder / "snake.safetensors").unlink()
+    for name in ("tube", "body"):
+        document = json.loads(path.read_text())
+        document["model"]["name"] = name
+        path.write_text(json.dumps(document))
+        with pytest.raises(OtherModelError, match="not among the models here") as caught:
+            read_poses(path, body)
+        assert caught.value.model is None
+        assert f"{name!r}" in str(caught.value)
+        assert model.fingerprint not in str(caught.value)
+
+
+def test_the_working_pose_is_apart_from_the_poses_and_lost_to_no_command(
+    model: PoseModel, tmp_path: Path
+) -> None:
+    path, (first, *others) = tmp_path / "poses.json", _poses(model)
+    tagged = replace(others[0], tags=("kick", "left leg"))
+    changed = replace(first, latent=2.0 * first.latent)
+    write_poses(path, model, [first, tagged], changed)
+    assert json.loads(path.read_text())["format_version"] == POSES_VERSION
+    held = read_pose_file(path, model)
+    assert held.working is not None
+    assert _same(held.working, changed)
+    assert all(map(_same, held.poses, [first, tagged]))
+    assert held.poses[1].tags == ("kick", "left leg")
+    names = [first.name, tagged.name, f"{first.name} 2"]
+    assert [pose.name for pose in read_poses(path, model)] == names
+    assert _same(replace(read_poses(path, model)[2], name=first.name), changed)
+    # One that is among the poses to the bit is no further pose.
+    write_poses(path, model, [first], replace(first, name="other"))
+    assert [pose.name for pose in read_poses(path, model)] == [first.name]
+
+
+def test_what_commands_write_stays_of_the_first_version(path: Path) -> None:
+    document = json.loads(path.read_text())
+    assert document["format_version"] == 1
+    assert document.keys() == {"format", "format_version", "model", "poses"}
 
 
 def _broken(document: Any) -> list[tuple[str, Any]]:
@@ -125,6 +190,14 @@ def _broken(document: Any) -> list[tuple[str, Any]]:
         ("pose 0", with_first(fit_error={"mean": 0.1})),
         ("pose 0", with_first(fit_error={"mean": "small", "max": 0.1})),
         ("share a name", with_first(name=second["name"])),
+        ("pose 0.*tags", with_first(tags="kick")),
+        ("pose 0.*tag", with_first(tags=["kick", ""])),
+        ("pose 0.*tag", with_first(tags=[1])),
+        ("pose 0.*tags", with_first(tags=["x"] * 51)),
+        ("working pose.*name", {**document, "format_version": 2, "working": {"name": ""}}),
+        ("working pose", {**document, "format_version": 2, "working": 3}),
+        ("damaged", {**document, "format_version": True}),
+        ("damaged", {**document, "format_version": 1.0}),
     ]
 
 

@@ -1,0 +1,58 @@
+"""Which latent space a model has, and which of the listed models has a given one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import ModelFileError
+from lcollision_core.model.library import ListedModel, list_models
+from lcollision_core.model_file import read_section
+
+EMBEDDING = "embedding"
+"""The section of a model file with its latent space."""
+
+
+def fingerprint_of(arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]) -> str:
+    """Return 16 hexadecimal digits that tell a latent space from others.
+
+    Parameters
+    ----------
+    arrays, metadata : of `Embedding.to_arrays`, or of a model file's section
+    """
+    digest = hashlib.sha256(json.dumps(metadata["scaling"], sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def find_latent_space(fingerprint: str, name: str = "") -> ListedModel | None:
+    """Find a bundled or user model by its latent space, without loading whole models.
+
+    Parameters
+    ----------
+    fingerprint : of the latent space
+    name : of the model that it probably is, which is looked at first
+
+    Returns
+    -------
+    model : None where no listed model has that latent space; files that cannot be read are passed
+        over
+    """
+    for model in sorted(list_models(), key=lambda listed: listed.name != name):
+        try:
+            section = read_section(model.path, EMBEDDING)
+        except ModelFileError:
+            continue
+        if section is None or "scaling" not in section.metadata:
+            continue
+        if fingerprint_of(section.arrays, section.metadata) == fingerprint:
+            return model
+    return None
