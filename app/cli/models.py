@@ -92,10 +92,9 @@ def domains(
     ] = None,
 ) -> None:
     """List the domains of a model, or rename them."""
-    from lcollision_core.model import PoseModel, find_model, list_models
+    from lcollision_core.model import PoseModel, change_model, find_model, list_models
 
     path = find_model(model_name)
-    model = PoseModel.load(path)
     renamings: dict[int, str] = {}
     for request in names or []:
         number, _, name = request.partition("=")
@@ -105,12 +104,13 @@ def domains(
             )
         renamings[int(number) - 1] = name
     if renamings:
-        model = model.rename_domains(renamings)
         if any(listed.bundled and listed.path == path for listed in list_models()):
             raise LCollisionError(
-                f"{model.name} is a bundled model and stays as it is; copy {path} and name the copy"
+                f"{path.stem} is a bundled model and stays as it is; copy {path} and name the copy"
             )
-        model.save(path)
+        model = change_model(path, lambda model: model.rename_domains(renamings))
+    else:
+        model = PoseModel.load(path)
     _print_domains(describe(model))
 
 
@@ -187,6 +187,15 @@ def measured_model_sentence(model: PoseModel) -> str:
     near = model.near_exclusion
     rule = f"near exclusion {near:g} heights" if near else "no near exclusion"
     return f"|Z_0| = {first}, |Z_k| = {each} for {counted(len(others), 'part')}, {rule}"
+
+
+def note_if_beside(written: Path, destination: Path) -> None:
+    """Say why a trained model is not where it was to go."""
+    if written != destination:
+        note(
+            f"{destination} was replaced by another model during the training and stays as it "
+            f"is; the trained one is {written}"
+        )
 
 
 def _describe_predictor(model: PoseModel) -> dict[str, Any] | None:

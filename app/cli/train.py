@@ -11,7 +11,7 @@ import typer
 
 from app.cli.console import note, status_bar
 from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import describe, error_sentence
+from app.cli.models import describe, error_sentence, note_if_beside
 from app.cli.train_predictor import predictor
 from lcollision_core.errors import CancelledError
 
@@ -71,11 +71,12 @@ def embedding(
 
     from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
-    from lcollision_core.meshes import read_pose_set, require_writable
-    from lcollision_core.model import PoseModel, checkpoint_path, model_destination
+    from lcollision_core.meshes import file_stamp, locked, read_pose_set, require_writable
+    from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
 
     destination = model_destination(output)
     require_writable(destination)
+    before = file_stamp(destination)
     poses = read_pose_set(dataset)
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
@@ -86,7 +87,11 @@ def embedding(
     if checkpoint.exists():
         note(f"going on from {checkpoint}")
     try:
-        with cancel_on_interrupt() as cancel, _training_bar() as progress:
+        with (
+            locked(checkpoint, wait=0.0),
+            cancel_on_interrupt() as cancel,
+            _training_bar() as progress,
+        ):
             trained = train_embedding(
                 poses, config, checkpoint=checkpoint, progress=progress, cancel=cancel, seed=seed
             )
@@ -97,9 +102,10 @@ def embedding(
     model = PoseModel.from_training(
         destination.stem, trained, poses, source, licence, _provenance(poses.vertices, seed)
     )
-    model.save(destination)
+    written = save_trained(destination, before, model)
+    note_if_beside(written, destination)
     checkpoint.unlink(missing_ok=True)
-    note(f"wrote {destination}: {error_sentence(describe(model))}")
+    note(f"wrote {written}: {error_sentence(describe(model))}")
 
 
 def _provenance(vertices: Any, seed: int) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -15,7 +15,7 @@ import typer
 from app.cli.console import note, status_bar
 from app.cli.evaluate import require_store_of, scores_sentence
 from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import ModelArgument, measured_model_sentence
+from app.cli.models import ModelArgument, measured_model_sentence, note_if_beside
 from lcollision_core.errors import CancelledError
 
 if TYPE_CHECKING:
@@ -89,13 +89,14 @@ def predictor(
     ...`.
     """
     from lcollision_core.labels import LabelStore
-    from lcollision_core.meshes import require_writable
-    from lcollision_core.model import PoseModel, checkpoint_path, model_destination
+    from lcollision_core.meshes import file_stamp, locked, require_writable
+    from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
     from lcollision_core.predictor import PRESETS, has_begun, train_predictor
     from lcollision_core.resolve import find_free_poses
 
     destination = model_destination(output)
     require_writable(destination)
+    before = file_stamp(destination)
     model = PoseModel.load(model_name)
     store = LabelStore.open(store_path)
     require_store_of(store, model)
@@ -106,7 +107,11 @@ def predictor(
     if leads and has_begun(checkpoint):
         note(f"going on from {checkpoint}")
     try:
-        with cancel_on_interrupt() as cancel, _training_bar(leads) as progress:
+        with (
+            locked(checkpoint, wait=0.0) if leads else nullcontext(),
+            cancel_on_interrupt() as cancel,
+            _training_bar(leads) as progress,
+        ):
             trained = train_predictor(
                 store.load(n_rows),
                 model.embedding,
@@ -129,10 +134,16 @@ def predictor(
                 "no pose of this body that was tried is free of collision; Resolve has nowhere "
                 "to walk back to and may leave poses colliding"
             )
-        model.with_predictor(trained).with_free_poses(free_latent).save(destination)
+        written = save_trained(
+            destination,
+            before,
+            model,
+            lambda base: base.with_predictor(trained).with_free_poses(free_latent),
+        )
+        note_if_beside(written, destination)
         checkpoint.unlink(missing_ok=True)
         if trained.metrics is not None:
-            note(f"wrote {destination}: {scores_sentence(trained.metrics)}")
+            note(f"wrote {written}: {scores_sentence(trained.metrics)}")
             share = 100.0 * trained.facts.colliding_share
             note(f"{measured_model_sentence(model)}; {share:.1f} % of its box collides")
 

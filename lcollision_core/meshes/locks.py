@@ -43,7 +43,7 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
     while (file := _taken(lock, path)) is None:
         if time.monotonic() >= give_up:
             raise MeshFileError(
-                f"{path} is being changed by another command; wait for that to end, then try again"
+                f"{path} is being written by another command; wait for that to end, then try again"
             )
         time.sleep(_SECONDS_BETWEEN_TRIES)
     try:

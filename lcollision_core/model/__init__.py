@@ -3,6 +3,7 @@
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.export import export_mesh
+from lcollision_core.model.keeping import change_model, save_trained
 from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace
 from lcollision_core.model.library import (
@@ -39,6 +40,7 @@ __all__ = [
     "OtherModelError",
     "PoseFile",
     "PoseModel",
+    "change_model",
     "checkpoint_path",
     "export_mesh",
     "find_latent_space",
@@ -49,6 +51,7 @@ __all__ = [
     "read_pose_file",
     "read_poses",
     "sample_poses",
+    "save_trained",
     "unique_names",
     "user_models_folder",
     "why_no_name",

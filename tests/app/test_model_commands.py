@@ -11,6 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +19,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from app.cli.main import app
-from lcollision_core.meshes import read_mesh, write_mesh, write_pose_set
-from lcollision_core.model import PoseModel, read_poses
+from lcollision_core.meshes import locked, read_mesh, write_mesh, write_pose_set
+from lcollision_core.model import PoseModel, change_model, checkpoint_path, read_poses
 from lcollision_core.model_file import Section
 from tests.app.support import Lcollision
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube
@@ -151,6 +152,48 @@ def test_domains_are_listed_and_renamed_for_good(lcollision: Lcollision, tube: P
     assert "foot = end" in lcollision("domains", tube).stdout
     lcollision("domains", tube, "--name", "1=foot = end", "--name", "2=neck")
     assert PoseModel.load(tube).domain_names == ("foot = end", "neck")
+
+
+def test_two_renamings_at_once_lose_no_name(tube: Path) -> None:
+    command = [sys.executable, "-m", "app", "domains", tube, "--name"]
+    renamings = [
+        subprocess.Popen([*command, request], stdout=subprocess.DEVNULL)
+        for request in ("1=neck", "2=foot")
+    ]
+    assert [renaming.wait(timeout=120) for renaming in renamings] == [0, 0]
+    assert PoseModel.load(tube).domain_names == ("neck", "foot")
+    assert list(tube.parent.iterdir()) == [tube]
+
+
+def test_a_model_renamed_while_another_is_trained_to_its_file_stays(
+    lcollision: Lcollision,
+    dataset: Path,
+    tube: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from lcollision_core.embedding import training
+
+    train = training.train_embedding
+
+    def rename_then_train(*arguments: Any, **options: Any) -> Any:
+        change_model(tube, lambda model: model.rename_domains({0: "neck"}))
+        return train(*arguments, **options)
+
+    monkeypatch.setattr(training, "train_embedding", rename_then_train)
+    result = lcollision("train", "embedding", dataset, "-o", tube, "--domains", 1, "--seed", 2)
+    assert result.exit_code == 0, result.output
+    beside = tube.with_name("tube 2.safetensors")
+    assert f"stays as it is; the trained one is {beside}" in result.stderr
+    assert PoseModel.load(tube).domain_names == ("neck", "part 2")
+    assert PoseModel.load(beside).domain_names == ("part 1",)
+
+
+def test_two_trainings_to_one_file_are_refused(
+    lcollision: Lcollision, dataset: Path, tube: Path
+) -> None:
+    with locked(checkpoint_path(tube)):
+        sentence = _refusal(lcollision, "train", "embedding", dataset, "-o", tube, *TRAINING)
+    assert f"{checkpoint_path(tube)} is being written by another command" in sentence
 
 
 @pytest.mark.parametrize("request_", ["3=tail", "0=tail", "x=tail", "tail", "1=", "1=fine", "=a"])

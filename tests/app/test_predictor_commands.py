@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.labels import LabelStore, is_held_out
-from lcollision_core.model import PoseModel
+from lcollision_core.model import PoseModel, find_model
 from lcollision_core.model_file import Section
 from lcollision_core.predictor import PRESETS, CollisionPredictor, row_split
 from tests.app.support import Lcollision
@@ -248,6 +249,69 @@ def test_ctrl_c_keeps_a_checkpoint_and_says_so(
         f"lcollision: stopped; run the same command again to go on from {checkpoint}\n"
     )
     assert [path.name for path in tmp_path.iterdir()] == [f"{checkpoint.name}{kept}"]
+
+
+def _finish_with(
+    monkeypatch: pytest.MonkeyPatch, trained: Path, meanwhile: Callable[[], object]
+) -> None:
+    """Let training do something else to the files, and come out with what is trained already."""
+    finished = PoseModel.load(trained).predictor
+
+    def train(*_: object, **__: object) -> CollisionPredictor | None:
+        meanwhile()
+        return finished
+
+    monkeypatch.setattr("lcollision_core.predictor.train_predictor", train)
+
+
+def test_a_renaming_during_the_training_stays(
+    lcollision: Lcollision,
+    model: Path,
+    store: Path,
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = Path(shutil.copy(model, tmp_path / "tube.safetensors"))
+    _finish_with(monkeypatch, trained, lambda: lcollision("domains", path, "--name", "2=left foot"))
+    result = lcollision("train", "predictor", path, store, "-o", path)
+    assert result.exit_code == 0, result.output
+    kept = PoseModel.load(path)
+    assert kept.domain_names == ("part 1", "left foot")
+    assert kept.has_predictor
+    assert len(kept.free_latent) > 0
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("change", ["another body", "no model", "gone"])
+def test_what_replaced_the_model_during_the_training_stays(
+    lcollision: Lcollision,
+    model: Path,
+    store: Path,
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    change: str,
+) -> None:
+    path = Path(shutil.copy(model, tmp_path / "tube.safetensors"))
+    changes: dict[str, Callable[[], object]] = {
+        "another body": lambda: shutil.copy(find_model("body"), path),
+        "no model": lambda: path.write_bytes(b"another program's"),
+        "gone": path.unlink,
+    }
+    _finish_with(monkeypatch, trained, changes[change])
+    result = lcollision("train", "predictor", path, store, "-o", path)
+    assert result.exit_code == 0, result.output
+    if change == "gone":
+        assert PoseModel.load(path).has_predictor
+        assert list(tmp_path.iterdir()) == [path]
+        return
+    beside = tmp_path / "tube 2.safetensors"
+    assert f"{path} was replaced" in result.stderr
+    assert f"the trained one is {beside}" in result.stderr
+    assert PoseModel.load(beside).has_predictor
+    stays = find_model("body").read_bytes() if change == "another body" else b"another program's"
+    assert path.read_bytes() == stays
 
 
 def test_what_cannot_be_trained_or_evaluated_is_refused(

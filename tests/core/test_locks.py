@@ -86,7 +86,7 @@ def test_lock_of_a_living_process_is_respected_and_that_of_a_killed_one_is_not(
     holder = _held_by_another(path)
     try:
         with (
-            pytest.raises(MeshFileError, match="being changed by another command"),
+            pytest.raises(MeshFileError, match="being written by another command"),
             locked(path, wait=0.2),
         ):
             pass
