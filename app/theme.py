@@ -266,11 +266,12 @@ QLabel#title {{ font-weight: 600; }}
 QLabel#caption {{ color: {theme.muted}; }}
 QLabel#caption:disabled {{ color: {faded}; }}
 QLabel#verdict {{ font-weight: 600; font-size: 14px; }}
-QLabel#headline {{ font-weight: 600; font-size: 20px; }}
+QLabel#headline {{ font-weight: 600; font-size: 15px; }}
+QLabel#aside {{ font-size: 11px; }}
 QLabel[verdict="free"] {{ color: {theme.free}; }}
 QLabel[verdict="colliding"] {{ color: {theme.colliding}; }}
 QLabel[verdict="waiting"] {{ color: {theme.waiting}; }}
-QLabel[verdict="overruled"] {{ color: {theme.muted}; }}
+QLabel[verdict="aside"] {{ color: {theme.muted}; }}
 QPushButton {{
     background: {theme.card}; border: 1px solid {theme.border}; border-radius: {RADIUS}px;
     padding: 5px {NORMAL}px; min-height: 18px;

@@ -1,4 +1,4 @@
-"""The right panel: what is predicted, what is true, and Resolve."""
+"""The right panel: the exact check, beneath it the estimate, and Resolve."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MIN_WIDTH = 288
 
 
 class CollisionPanel(QWidget):
-    """Three cards, one below the other.
+    """Three cards, one below the other; the first, the headline, is always in sight.
 
     Signals
     -------
@@ -40,28 +40,31 @@ class CollisionPanel(QWidget):
         super().__init__()
         self._document = document
         self.setMinimumWidth(_MIN_WIDTH)
-        self.prediction = PredictionCard(document)
         self.exact = ExactCard(document)
+        self.prediction = PredictionCard(document)
         self.resolve = ResolveCard(document, resolve_action)
         page = QWidget()
         cards = QVBoxLayout(page)
-        cards.setContentsMargins(NORMAL, TIGHT, NORMAL, CLOSE)
+        cards.setContentsMargins(NORMAL, 0, NORMAL, CLOSE)
         cards.setSpacing(CLOSE)
-        for card in (self.prediction, self.exact, self.resolve):
+        for card in (self.prediction, self.resolve):
             cards.addWidget(card)
         cards.addStretch()
+        headline = QVBoxLayout()
+        headline.setContentsMargins(NORMAL, TIGHT, NORMAL, 0)
+        headline.addWidget(self.exact)
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(CLOSE)
+        column.addLayout(headline)
         self._area = scrolling(page)
         column.addWidget(self._area)
         self.prediction.domain_hovered.connect(self.domain_hovered)
-        # The exact check follows a moment after the result, and may make its card higher.
-        for changed in (document.outcome_changed, document.exact_changed):
-            changed.connect(self._on_outcome)
+        document.outcome_changed.connect(self._on_outcome)
 
     def refresh_icons(self) -> None:
         """Draw all signs in the theme that has come."""
-        for card in (self.prediction, self.exact, self.resolve):
+        for card in (self.exact, self.prediction, self.resolve):
             card.refresh_icons()
 
     @Slot()

@@ -295,14 +295,14 @@ def silent(*widgets: QObject) -> Iterator[None]:
 
 
 def labelled(text: str, kind: str = "") -> QLabel:
-    """Return a label of a kind that the style knows: title, caption, verdict, headline."""
+    """Return a label of a kind that the style knows: title, caption, verdict, headline, aside."""
     label = QLabel(text)
     label.setObjectName(kind)
     return label
 
 
 def show_verdict(widget: QWidget, verdict: str) -> None:
-    """Colour a widget as "free", "colliding", "waiting" or "overruled"."""
+    """Colour a widget as "free", "colliding", "waiting" or, beside what is known, "aside"."""
     if widget.property("verdict") != verdict:
         widget.setProperty("verdict", verdict)
         widget.style().unpolish(widget)

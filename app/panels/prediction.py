@@ -1,4 +1,4 @@
-"""What the model believes of the pose: probability, verdict, and one row for each domain."""
+"""The estimate: what the model believes of the pose at once, and one row for each domain."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EVEN_ODDS = 0.5
 """Probability above which a pose counts as predicted to collide."""
 
 _BAR_WIDTH = 40
-_SOURCE = "by the model, at once"
+_TIP = "The model's instant estimate of how likely this pose collides with itself"
 
 
 class ProbabilityMeter(QWidget):
@@ -41,7 +41,7 @@ class ProbabilityMeter(QWidget):
     def __init__(self) -> None:
         super().__init__()
         self._probability: float | None = None
-        self._overruled = False
+        self._is_aside = False
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
         self.setAccessibleName("Probability of a collision")
 
@@ -50,10 +50,10 @@ class ProbabilityMeter(QWidget):
         """What is shown; None for nothing."""
         return self._probability
 
-    def show_probability(self, probability: float | None, overruled: bool = False) -> None:
-        """Move the mark; one that the exact check has overruled is no alarm."""
-        if (probability, overruled) != (self._probability, self._overruled):
-            self._probability, self._overruled = probability, overruled
+    def show_probability(self, probability: float | None, is_aside: bool = False) -> None:
+        """Move the mark; once the exact check has spoken it is grey, as it is no alarm."""
+        if (probability, is_aside) != (self._probability, self._is_aside):
+            self._probability, self._is_aside = probability, is_aside
             self.update()
 
     def sizeHint(self) -> QSize:  # noqa: N802
@@ -72,7 +72,7 @@ class ProbabilityMeter(QWidget):
         middle = bar.left() + EVEN_ODDS * bar.width()
         if self._probability is not None:
             verdict = theme.colliding if self._probability > EVEN_ODDS else theme.free
-            ink = QColor(theme.muted if self._overruled else verdict)
+            ink = QColor(theme.muted if self._is_aside else verdict)
             place = bar.left() + self._probability * bar.width()
             filled = QColor(ink)
             filled.setAlpha(130)
@@ -90,7 +90,7 @@ class ProbabilityMeter(QWidget):
         painter.setPen(QColor(theme.muted))
         scale = QRectF(0, 20, self.width(), self.fontMetrics().height() + 2)
         for text, side in (
-            ("free", Qt.AlignmentFlag.AlignLeft),
+            ("clear", Qt.AlignmentFlag.AlignLeft),
             (f"{EVEN_ODDS:g}", Qt.AlignmentFlag.AlignHCenter),
             ("colliding", Qt.AlignmentFlag.AlignRight),
         ):
@@ -231,7 +231,7 @@ class DomainRow(HoverRow):
 
 
 class PredictionCard(Card):
-    """The upper half of the right panel; nothing in it is the truth.
+    """The estimate, beneath the exact check: small, and grey once that has spoken.
 
     Signals
     -------
@@ -248,23 +248,23 @@ class PredictionCard(Card):
         super().__init__()
         self._document = document
         self.rows: list[DomainRow] = []
-        self._source = ElidedLabel(_SOURCE)
-        self.verdict = labelled("", "verdict")
-        self.percent = labelled("", "headline")
+        self.verdict = ElidedLabel("")
+        self.percent = labelled("", "aside")
         self.meter = ProbabilityMeter()
+        for widget in (self.percent, self.meter):
+            widget.setToolTip(_TIP)
         self._missing = QLabel(
             "This model has not learnt to predict collisions, so Resolve is off. Open another "
             "model, or teach this one with “lcollision train predictor” in a terminal."
         )
         self._missing.setObjectName("caption")
         self._missing.setWordWrap(True)
-        line = QHBoxLayout()
-        line.addWidget(self.verdict, 1)
-        line.addWidget(self.percent)
+        head = title_row("Estimate", self.verdict)
+        self.verdict.setObjectName("aside")
+        head.addWidget(self.percent)
         self._rows = QVBoxLayout()
         self._rows.setSpacing(0)
-        self.column.addLayout(title_row("Prediction", self._source))
-        self.column.addLayout(line)
+        self.column.addLayout(head)
         self.column.addWidget(self.meter)
         self.column.addWidget(self._missing)
         self.column.addSpacing(TIGHT)
@@ -303,7 +303,7 @@ class PredictionCard(Card):
             self._rows.addWidget(row)
             self.rows.append(row)
         predicts = self._document.can_resolve
-        for widget in (self.meter, self.verdict, self.percent, self._source):
+        for widget in (self.meter, self.verdict, self.percent):
             widget.setVisible(predicts)
         self._missing.setVisible(not predicts)
         self._on_frame()
@@ -316,7 +316,6 @@ class PredictionCard(Card):
             self.meter.show_probability(None)
             self.verdict.setText("…")
             self.percent.setText("")
-            self._source.setText(_SOURCE)
             show_verdict(self.verdict, "waiting")
             for row in self.rows:
                 row.show_energy(0.0 if self._document.can_resolve else None)
@@ -325,16 +324,13 @@ class PredictionCard(Card):
         collides = probability > EVEN_ODDS
         word = "colliding" if collides else "free"
         exact = self._document.exact
+        self.meter.show_probability(probability, is_aside=exact is not None)
         overruled = exact is not None and exact.colliding != collides
-        self.meter.show_probability(probability, overruled)
-        self.verdict.setText(f"{'Predicted' if overruled else 'Probably'} {word}")
+        said = "Probably colliding" if collides else "Probably clear"
+        self.verdict.setText("Overruled by the check" if overruled else said)
         self.percent.setText(f"{100 * probability:.0f} %")
-        self.percent.setToolTip(
-            "How likely this pose collides with itself, as predicted; over 50 % it is called so"
-        )
-        self._source.setText("overruled by the exact check" if overruled else _SOURCE)
         for label in (self.verdict, self.percent):
-            show_verdict(label, "overruled" if overruled else word)
+            show_verdict(label, word if exact is None else "aside")
         for row, energy in zip(self.rows, prediction.domain_energy, strict=True):
             row.show_energy(float(energy))
 

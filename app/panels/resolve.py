@@ -19,7 +19,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.icons import icon, pixmap
-from app.panels.parts import Card, ElidedLabel, labelled
+from app.panels.parts import Card, ElidedLabel, labelled, show_verdict
 from app.theme import CLOSE, NORMAL, TIGHT, current_theme
 from app.wording import heading, height_text, overlap_text, seconds_text
 
@@ -38,17 +38,21 @@ class Fact(QWidget):
     ----------
     sentences : for each of the three
     tip : what the fact means
+    is_aside : small and grey, whatever it says
     """
 
-    def __init__(self, sentences: dict[bool | None, str], tip: str) -> None:
+    def __init__(self, sentences: dict[bool | None, str], tip: str, is_aside: bool = False) -> None:
         super().__init__()
+        self._is_aside = is_aside
         self._sentences = sentences
         self._truth: bool | None = None
         self._sign = "info"
         self._picture = QLabel()
         self._picture.setFixedSize(18, 18)
-        self._text = QLabel()
+        self._text = labelled("", "aside" if is_aside else "")
         self._text.setWordWrap(True)
+        if is_aside:
+            show_verdict(self._text, "aside")
         self.setToolTip(tip)
         row = QHBoxLayout(self)
         row.setContentsMargins(0, 0, 0, 0)
@@ -76,7 +80,7 @@ class Fact(QWidget):
         sign : beside `instead`
         """
         self._truth = truth
-        self._sign = sign if instead else _SIGNS[truth]
+        self._sign = "info" if self._is_aside else sign if instead else _SIGNS[truth]
         ink = getattr(current_theme(), _INKS[self._sign])
         self._picture.setPixmap(pixmap(self._sign, ink, 18, self.devicePixelRatioF()))
         self._text.setText(instead or self._sentences[truth])
@@ -160,13 +164,18 @@ class ResolveCard(Card):
             "the pose is free",
         )
         self.predicted_free = Fact(
-            {True: "Predicted free", False: "Predicted colliding", None: "Not predicted"},
-            "What the model believes of the pose: where the exact check finds otherwise, the check "
-            "is right",
+            {
+                True: "Estimate: probably clear",
+                False: "Estimate: probably colliding",
+                None: "No estimate",
+            },
+            "The model's instant estimate of the pose: where the exact check finds otherwise, the "
+            "check is right",
+            is_aside=True,
         )
         self.exactly_free = Fact(
-            {True: "Exactly free", False: "Not exactly free", None: "Not checked exactly"},
-            "The exact check of the mesh: this alone tells whether the pose is free",
+            {True: "No collisions (checked)", False: "Still colliding", None: "Not checked"},
+            "The exact check of the mesh: this alone tells whether the pose collides",
         )
         self._energy, self._moved, self._took = (QLabel() for _ in range(3))
         self._note = labelled("", "caption")
@@ -240,9 +249,9 @@ class ResolveCard(Card):
             sign="check",
         )
         overruled = exactly_free is not None and exactly_free != predicted_free
-        word = "free" if predicted_free else "colliding"
+        word = "clear" if predicted_free else "colliding"
         self.predicted_free.show_truth(
-            predicted_free, f"Predicted {word}, overruled" if overruled else ""
+            predicted_free, f"Estimate: probably {word}, overruled" if overruled else ""
         )
         if result.energy_before is None or result.energy_after is None:
             self._energy.setText("not measured")

@@ -84,7 +84,7 @@ def test_the_panel_keeps_the_width_that_its_cards_need_also_where_a_layout_says_
     qtbot.waitUntil(lambda: not after.document.busy, timeout=PATIENCE)
     rest(qtbot, after)
     assert after.collision.prediction.percent.text() == "100 %"
-    assert after.collision.prediction.verdict.text() == "Predicted colliding"
+    assert after.collision.prediction.verdict.text() == "Overruled by the check"
     assert has_room(after)
     close_window(after)
 
@@ -111,44 +111,88 @@ def ink(label: QLabel) -> str:
 
 
 @pytest.mark.parametrize("collides", [False, True], ids=["free", "colliding"])
-def test_a_prediction_steps_back_where_the_exact_check_finds_otherwise(
+@pytest.mark.parametrize("right", [False, True], ids=["wrong", "right"])
+def test_the_estimate_steps_back_once_the_check_has_spoken(
     qtbot: QtBot,
     window: MainWindow,
     colliding: FloatArray,
     monkeypatch: pytest.MonkeyPatch,
     collides: bool,
+    right: bool,
 ) -> None:
-    document, card = window.document, window.collision.prediction
-
-    def predict(right: bool) -> None:
-        probability = 0.99 if collides == right else 0.01
-        told = PosePrediction(np.zeros(2), 0.0, 0.0, probability)
-        monkeypatch.setattr(PoseShower, "_predict", lambda *_: told)
-
-    pose = colliding if collides else np.zeros_like(colliding)
-    word, wrong = ("colliding", "free") if collides else ("free", "colliding")
-    predict(right=False)
-    document.set_latent(0.9 * pose + 0.01, "Elsewhere")
+    document, card, headline = window.document, window.collision.prediction, window.collision.exact
+    told = PosePrediction(np.zeros(2), 0.0, 0.0, 0.99 if collides == right else 0.01)
+    monkeypatch.setattr(PoseShower, "_predict", lambda *_: told)
+    said = "Probably colliding" if collides == right else "Probably clear"
+    alarm = getattr(current_theme(), "colliding" if collides == right else "free")
+    document.set_latent(colliding if collides else np.zeros_like(colliding) + 1e-3, "Test")
+    qtbot.waitUntil(
+        lambda: card.verdict.text() == said and ink(card.verdict) == alarm, timeout=PATIENCE
+    )
+    assert alarm in colours_of(card.meter)
     rest(qtbot, window)
-    document.set_latent(pose, "Test")
-    qtbot.waitUntil(lambda: card.verdict.text() == f"Probably {wrong}", timeout=PATIENCE)
-    alarm = getattr(current_theme(), wrong)
-    assert ink(card.verdict) == ink(card.percent) == alarm
-    rest(qtbot, window)
-    assert document.exact is not None
-    assert document.exact.colliding == collides
-    assert card.verdict.text() == f"Predicted {wrong}"
+    truth = "Colliding (checked)" if collides else "No collisions (checked)"
+    assert headline.verdict.text() == truth
+    assert ink(headline.verdict) == getattr(current_theme(), "colliding" if collides else "free")
+    assert card.verdict.text() == (said if right else "Overruled by the check")
     assert ink(card.verdict) == ink(card.percent) == current_theme().muted
-    assert "overruled by the exact check" in texts(card)
     assert alarm not in colours_of(card.meter)
-    assert ink(window.collision.exact.verdict) == getattr(current_theme(), word)
-    # It does not outlive the pose, nor a prediction that is right.
-    predict(right=True)
-    document.set_latent(pose + 1e-6, "Test")
+    for label in (card.verdict, card.percent):
+        assert label.fontInfo().pixelSize() < headline.details.fontInfo().pixelSize()
+        assert label.fontInfo().pixelSize() < 0.8 * headline.verdict.fontInfo().pixelSize()
+    assert headline.mapTo(window, QPoint(0, 0)).y() < card.mapTo(window, QPoint(0, 0)).y()
+
+
+def test_the_headline_stays_in_sight_below_which_the_panel_scrolls(
+    qtbot: QtBot, window: MainWindow, colliding: FloatArray
+) -> None:
+    headline = window.collision.exact
+    window.resize(1280, 560)
+    window.document.set_latent(colliding, "Test")
     rest(qtbot, window)
-    assert card.verdict.text() == f"Probably {word}"
-    assert ink(card.verdict) == getattr(current_theme(), word)
-    assert "overruled by the exact check" not in texts(card)
+    resolve(qtbot, window)
+    qtbot.waitUntil(lambda: scrolled(window).verticalScrollBar().value() > 0, timeout=PATIENCE)
+    seen = QRect(headline.mapTo(window.collision, QPoint(0, 0)), headline.size())
+    assert window.collision.rect().contains(seen)
+    assert not headline.visibleRegion().isEmpty()
+    assert headline.visibleRegion().boundingRect() == headline.rect()
+
+
+def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
+    qtbot: QtBot, window: MainWindow, colliding: FloatArray
+) -> None:
+    document, card = window.document, window.collision.exact
+    document.set_latent(colliding, "Test")
+    rest(qtbot, window)
+    told, height = texts(card), card.height()
+    places = [child.geometry() for child in card.findChildren(QLabel)]
+    assert "computed on the mesh" in told
+    document.begin_gesture("Move a slider")
+    for value in np.linspace(0.0, 1e-3, 20):
+        document.set_code(0, float(colliding[0] + value))
+        qtbot.wait(5)
+        if document.exact is None:
+            before = [text.replace("computed on the mesh", "of the pose before") for text in told]
+            assert texts(card) == before != told
+            assert card.is_of_the_pose_before
+            assert ink(card.verdict) == current_theme().waiting
+        assert card.height() == height
+        assert [child.geometry() for child in card.findChildren(QLabel)] == places
+    document.end_gesture()
+    rest(qtbot, window)
+    assert not card.is_of_the_pose_before
+    assert "of the pose before" not in texts(card)
+    # From one verdict to the other nothing moves either.
+    document.set_latent(np.zeros_like(colliding), "Test")
+    rest(qtbot, window)
+    assert card.verdict.text() == "No collisions (checked)"
+    assert card.height() == height
+    assert [child.geometry() for child in card.findChildren(QLabel)] == places
+    # What another model's pose was found to be says nothing about this one.
+    document.set_model(document.model)
+    assert card.verdict.text() == "Checking…"
+    assert not card.is_of_the_pose_before
+    rest(qtbot, window)
 
 
 def colours_of(widget: QWidget) -> set[str]:
@@ -169,17 +213,25 @@ def test_a_free_pose_reads_as_success_whatever_was_predicted(
         (
             {"converged": False, "predicted_free": False},
             ["check", "check", "info"],
-            ["Exactly free", "The search ended at a free pose", "Predicted colliding, overruled"],
+            [
+                "No collisions (checked)",
+                "The search ended at a free pose",
+                "Estimate: probably colliding, overruled",
+            ],
         ),
         (
             {"exactly_free": False, "converged": False},
             ["error", "error", "info"],
-            ["Not exactly free", "The search stopped early", "Predicted free, overruled"],
+            [
+                "Still colliding",
+                "The search stopped early",
+                "Estimate: probably clear, overruled",
+            ],
         ),
         (
             {"exactly_free": False, "predicted_free": False},
-            ["error", "check", "error"],
-            ["Not exactly free", "The search finished", "Predicted colliding"],
+            ["error", "check", "info"],
+            ["Still colliding", "The search finished", "Estimate: probably colliding"],
         ),
     ):
         known = {"solver_status": "known", "exactly_free": True, "converged": True}
