@@ -8,10 +8,13 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json
+from app.cli.console import ExitStatus, note, print_json, progress_bar
 from app.cli.inputs import expanded
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
+
+_DEEPEST = 100
+"""The most pairs of faces that are reported one by one."""
 
 
 def check(
@@ -72,16 +75,27 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
         note(f"{path}: {remark}")
     try:
         detector = CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=near_exclusion)
-        found = detector.detect(mesh.vertices)
+        with progress_bar("Finding self-collisions") as progress:
+            found = detector.summarise(mesh.vertices, n_deepest=_DEEPEST, progress=progress)
     except ShapeError as error:
         raise MeshFileError(f"{path} cannot be checked: {error}") from error
+    if found.n_coincident_pairs:
+        pairs = counted(found.n_coincident_pairs, "pair of faces lies", "pairs of faces lie")
+        note(f"{path}: {pairs} exactly on each other: such touch, which counts as no collision")
     return {
         "file": str(path),
         "vertices": mesh.topology.n_vertices,
         "faces": mesh.topology.n_faces,
         "watertight": audit.watertight,
-        "pairs": len(found.pairs),
-        "near_pairs": len(found.near_pairs),
+        "pairs": found.n_pairs,
+        "near_pairs": found.n_near_pairs,
+        "coincident_pairs": found.n_coincident_pairs,
+        "deepest": [
+            {"faces": faces, "depth": depth}
+            for faces, depth in zip(
+                found.deepest_pairs.tolist(), found.deepest_depth.tolist(), strict=True
+            )
+        ],
         "energy": found.energy,
         "colliding": found.colliding,
         "seconds": time.perf_counter() - start,

@@ -61,7 +61,8 @@ class AcapCodec:
     Parameters
     ----------
     topology : the connectivity of all poses
-    rest_vertices : (V, 3) array, the reference, in heights
+    rest_vertices : (V, 3) array, the reference, in heights; vertices that no face uses are put
+        amid the others
     anchor_weights : (V,) array >= 0 or None for equal weights; a decoded pose is put where its
         weighted mean vertex is the reference's. With the weights of the poses' rigid alignment
         a decoded pose lies where the aligned one lay.
@@ -86,6 +87,7 @@ class AcapCodec:
         rest = np.array(rest_vertices, dtype=np.float64)
         if not np.isfinite(rest).all():
             raise ShapeError("the reference has a vertex that is not finite")
+        rest = topology.gathered(rest)
         rest.flags.writeable = False
         given = np.ones(n_vertices) if anchor_weights is None else anchor_weights
         anchor = np.asarray(given, dtype=np.float64)

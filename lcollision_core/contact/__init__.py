@@ -1,10 +1,16 @@
-"""Exact self-collision: candidates, penetration depths, penetration energy."""
+"""Exact self-collision: candidates, penetration depths, penetration energy.
+
+Two triangles collide when they share no vertex and their penetration depth, the shortest
+translation that separates them, exceeds `DEPTH_TOLERANCE` heights. Surfaces that coincide exactly
+have depth 0: they touch, and do not collide. `CollisionDetector.summarise` counts them.
+"""
 
 from lcollision_core.contact.depth import penetration_depth
 from lcollision_core.contact.detector import (
     DEPTH_TOLERANCE,
     BatchCollisions,
     CollisionDetector,
+    CollisionSummary,
     SelfCollisions,
 )
 from lcollision_core.contact.energy import domain_energy
@@ -13,6 +19,7 @@ __all__ = [
     "DEPTH_TOLERANCE",
     "BatchCollisions",
     "CollisionDetector",
+    "CollisionSummary",
     "SelfCollisions",
     "domain_energy",
     "penetration_depth",

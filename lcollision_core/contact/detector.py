@@ -24,6 +24,7 @@ from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.meshes.topology import Topology
+from lcollision_core.meshes.units import height
 
 IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
@@ -35,8 +36,11 @@ MAX_HEIGHT = 1e150
 """The reference's height in its unit is at most this and at least its inverse: squared lengths
 then neither overflow nor vanish, either of which would call a colliding pose free."""
 
-_FIRST_ROOM = 256
-"""Pairs that a thread has room for at first; it grows to what a pose needs and stays there."""
+_PAIRS_AT_ONCE = 1 << 14
+"""Pairs that a thread's buffer holds; they are passed on whenever it is full."""
+
+_SHARES = 1000
+"""Of a search, in which `CollisionDetector.summarise` tells its progress."""
 
 _POSES_A_TASK = 8
 """The most poses that a thread takes at a time: a prompt cancel, and little waiting at the end."""
@@ -96,11 +100,45 @@ class BatchCollisions:
         return self.n_pairs > 0
 
 
+@dataclass(frozen=True, slots=True)
+class CollisionSummary:
+    """What `CollisionDetector.summarise` finds in one pose. Lengths are in heights.
+
+    Attributes
+    ----------
+    n_pairs, n_near_pairs : colliding pairs, and those within the near exclusion
+    deepest_pairs : (P, 2) int32, face indices of the deepest colliding pairs, the deepest first,
+        the smaller index first
+    deepest_depth : (P,) float64, their penetration depths
+    n_coincident_pairs : pairs of faces that share no vertex, lie in one plane and overlap there:
+        their depth is 0, so they do not collide
+    vertex_energy : (V,) float64, PDe of Algorithm 1 in squared heights
+    """
+
+    n_pairs: int
+    n_near_pairs: int
+    deepest_pairs: IntArray
+    deepest_depth: FloatArray
+    n_coincident_pairs: int
+    vertex_energy: FloatArray
+
+    @property
+    def colliding(self) -> bool:
+        """Whether the pose intersects itself."""
+        return self.n_pairs > 0
+
+    @property
+    def energy(self) -> float:
+        """PDe-sum, the penetration energy of the pose, in squared heights."""
+        return float(self.vertex_energy.sum())
+
+
 class CollisionDetector:
     """Finds where poses of one topology intersect themselves, exactly.
 
     Two faces collide when they share no vertex and their penetration depth exceeds
-    `DEPTH_TOLERANCE`. A detector may be used by several threads at once.
+    `DEPTH_TOLERANCE`. Surfaces that coincide have depth 0: they touch, which is no collision. A
+    detector may be used by several threads at once. Vertices that no face uses count for nothing.
 
     Parameters
     ----------
@@ -131,8 +169,7 @@ class CollisionDetector:
             raise ShapeError(f"the near exclusion must be 0 or more heights, got {near_exclusion}")
         self.topology = topology
         self.near_exclusion = float(near_exclusion)
-        # Halves, as the whole may be beyond the largest number.
-        self.height = 2.0 * float(np.ptp(0.5 * vertices, axis=0).max())
+        self.height = height(vertices, topology)
         if self.height == 0.0:
             raise ShapeError("all vertices are in one point; give it a mesh with an extent")
         if not 1.0 / MAX_HEIGHT <= self.height <= MAX_HEIGHT:
@@ -146,26 +183,29 @@ class CollisionDetector:
         )
         self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()
 
-    def detect(self, vertices: npt.ArrayLike) -> SelfCollisions:
+    def detect(self, vertices: npt.ArrayLike, *, unit: float = 1.0) -> SelfCollisions:
         """Find all colliding pairs of one pose.
 
         Parameters
         ----------
-        vertices : (V, 3) array in the unit of the reference
+        vertices : (V, 3) array
+        unit : of `vertices`, in units of the reference: 0.001 for millimetres where that has metres
 
         Raises
         ------
         ShapeError : another shape, or a vertex that is not finite or absurdly far away.
         """
         pose = self._checked(vertices, (self.topology.n_vertices, 3))
+        vertex_energy = np.zeros(self.topology.n_vertices)
+        parts: list[tuple[IntArray, FloatArray, npt.NDArray[np.bool_]]] = []
         with self._searcher() as searcher:
-            n_found = searcher.search(pose, first_only=False)
-            found = searcher.found
-            vertex_energy = np.zeros(self.topology.n_vertices)
-            add_vertex_energy(self._tree, found, n_found, vertex_energy)
-            pairs = np.sort(self._tree.slot_face[found.slots[:n_found]], axis=1)
-            depth = np.sqrt(found.squared_depth[:n_found])
-            is_near = found.is_near[:n_found].copy()
+            for n_found in searcher.search(pose, unit=unit):
+                found = searcher.found
+                add_vertex_energy(self._tree, found, n_found, vertex_energy)
+                pairs = np.sort(self._tree.slot_face[found.slots[:n_found]], axis=1)
+                depth = np.sqrt(found.squared_depth[:n_found])
+                parts.append((pairs, depth, found.is_near[:n_found].copy()))
+        pairs, depth, is_near = (np.concatenate(part) for part in zip(*parts, strict=True))
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         pairs, depth, is_near = pairs[order], depth[order], is_near[order]
         return SelfCollisions(
@@ -174,6 +214,55 @@ class CollisionDetector:
             near_pairs=pairs[is_near],
             near_penetration_depth=depth[is_near],
             vertex_energy=vertex_energy,
+        )
+
+    def summarise(
+        self,
+        vertices: npt.ArrayLike,
+        *,
+        n_deepest: int = 100,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> CollisionSummary:
+        """Count the colliding pairs of one pose and keep the deepest, however many there are.
+
+        Parameters
+        ----------
+        vertices : (V, 3) array in the unit of the reference
+        n_deepest : at most so many pairs are kept; of equally deep ones the first
+        progress : called with an estimate of (shares of the search done, all shares)
+        cancel : polled every few thousand pairs
+
+        Raises
+        ------
+        ShapeError : another shape, or a vertex that is not finite or absurdly far away.
+        CancelledError : `cancel` was set.
+        """
+        pose = self._checked(vertices, (self.topology.n_vertices, 3))
+        vertex_energy = np.zeros(self.topology.n_vertices)
+        n_coincident = np.zeros(1, dtype=np.int64)
+        n_pairs = n_near_pairs = 0
+        pairs, depth = np.empty((0, 2), dtype=np.int32), np.empty(0)
+        with self._searcher() as searcher:
+            for n_found in searcher.search(pose, n_coincident=n_coincident):
+                if cancel is not None:
+                    cancel.raise_if_cancelled()
+                found = searcher.found
+                add_vertex_energy(self._tree, found, n_found, vertex_energy)
+                counts = ~found.is_near[:n_found]
+                n_pairs += int(np.count_nonzero(counts))
+                n_near_pairs += n_found - int(np.count_nonzero(counts))
+                if len(depth) == n_deepest > 0:
+                    counts &= np.sqrt(found.squared_depth[:n_found]) >= depth[-1]
+                deep = np.flatnonzero(counts)
+                sides = np.sort(self._tree.slot_face[found.slots[deep]], axis=1)
+                pairs = np.concatenate([pairs, sides])
+                depth = np.concatenate([depth, np.sqrt(found.squared_depth[deep])])
+                order = np.lexsort((pairs[:, 1], pairs[:, 0], -depth))[:n_deepest]
+                pairs, depth = pairs[order], depth[order]
+                progress(int(_SHARES * searcher.share_done), _SHARES)
+        return CollisionSummary(
+            n_pairs, n_near_pairs, pairs, depth, int(n_coincident[0]), vertex_energy
         )
 
     def detect_batch(
@@ -203,10 +292,11 @@ class CollisionDetector:
         vertex_energy = np.zeros(poses.shape[:2])
 
         def search(searcher: _Searcher, pose: int) -> None:
-            n_found = searcher.search(poses[pose], first_only=False, number=pose)
-            add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
-            n_near_pairs[pose] = np.count_nonzero(searcher.found.is_near[:n_found])
-            n_pairs[pose] = n_found - n_near_pairs[pose]
+            for n_found in searcher.search(poses[pose], number=pose):
+                add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
+                n_near = int(np.count_nonzero(searcher.found.is_near[:n_found]))
+                n_near_pairs[pose] += n_near
+                n_pairs[pose] += n_found - n_near
 
         self._for_each(len(poses), search, workers, progress, cancel)
         return BatchCollisions(n_pairs, n_near_pairs, vertex_energy)
@@ -218,18 +308,20 @@ class CollisionDetector:
         workers: int | None = None,
         progress: Progress = no_progress,
         cancel: CancelToken | None = None,
+        unit: float = 1.0,
     ) -> npt.NDArray[np.bool_]:
         """Tell which poses intersect themselves, stopping at the first pair of each.
 
-        Parameters and errors are those of `detect_batch`; returns a (B,) bool array.
+        Parameters and errors are those of `detect_batch` and, for `unit`, of `detect`; returns a
+        (B,) bool array.
         """
         poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
         colliding = np.zeros(len(poses), dtype=np.bool_)
 
         def search(searcher: _Searcher, pose: int) -> None:
-            n_found = searcher.search(poses[pose], first_only=True, number=pose)
-            # The search ends at a pair that counts, so the last one found tells.
-            colliding[pose] = n_found > 0 and not searcher.found.is_near[n_found - 1]
+            for n_found in searcher.search(poses[pose], first_only=True, number=pose, unit=unit):
+                # The search ends at a pair that counts, so the last one found tells.
+                colliding[pose] = n_found > 0 and not searcher.found.is_near[n_found - 1]
 
         self._for_each(len(poses), search, workers, progress, cancel)
         return colliding
@@ -288,6 +380,9 @@ class CollisionDetector:
             self._idle.put(searcher)
 
 
+_NOT_COUNTED = np.empty(0, dtype=np.int64)
+
+
 class _Searcher:
     """One thread's work arrays and the search with them."""
 
@@ -296,21 +391,35 @@ class _Searcher:
     ) -> None:
         self._tree = tree
         self._near = near
+        self._height = height
         self._inverse_height = 1.0 / height
         self._work: PoseWork = allocate_work(tree)
         self._pose = np.empty((topology.n_vertices, 3))
-        self.found = _room_for(_FIRST_ROOM)
+        self._unused = topology.unused_vertices
+        self._used = topology.faces[0, 0]
+        self._waiting = 0
+        self.found = _buffer(_PAIRS_AT_ONCE)
 
     def search(
-        self, pose: npt.NDArray[np.floating], *, first_only: bool, number: int | None = None
-    ) -> int:
-        """Fill `found` with the pairs of one pose (V, 3) and return how many there are.
+        self,
+        pose: npt.NDArray[np.floating],
+        *,
+        first_only: bool = False,
+        number: int | None = None,
+        unit: float = 1.0,
+        n_coincident: npt.NDArray[np.int64] = _NOT_COUNTED,
+    ) -> Iterator[int]:
+        """Yield at least once how many pairs of a pose (V, 3) `found` holds, until all were there.
 
-        `number` is the pose's place in its batch, for the error message.
+        `number` is the pose's place in its batch, for the error message; `unit` is as of
+        `CollisionDetector.detect`; `n_coincident` is as of `search_pose`.
         """
         np.copyto(self._pose, pose)
+        self._pose[self._unused] = self._pose[self._used]
+        self._inverse_height = unit / self._height
+        self._waiting = 0
         while True:
-            n_found: int = search_pose(
+            n_found, self._waiting = search_pose(
                 self._pose,
                 self._inverse_height,
                 DEPTH_TOLERANCE,
@@ -319,13 +428,20 @@ class _Searcher:
                 self._work,
                 first_only,
                 self.found,
+                n_coincident,
+                self._waiting,
                 LEAF_SIZE,
             )
             if n_found < 0:
                 self._refuse(number)
-            if n_found <= len(self.found.slots):
-                return n_found
-            self.found = _room_for(2 * n_found)
+            yield n_found
+            if self._waiting == 0:
+                return
+
+    @property
+    def share_done(self) -> float:
+        """The share of the search that is guessed to be done."""
+        return 1.0 - float(self._work.share[: self._waiting].sum())
 
     def _refuse(self, number: int | None) -> NoReturn:
         within = np.abs(self._pose) * self._inverse_height <= MAX_REACH  # False for NaN
@@ -340,7 +456,7 @@ class _Searcher:
         raise ShapeError(f"vertex {vertex}{where} {what}, at {position}; move or mend the mesh")
 
 
-def _room_for(n_pairs: int) -> Found:
+def _buffer(n_pairs: int) -> Found:
     return Found(
         slots=np.empty((n_pairs, 2), dtype=np.int32),
         squared_depth=np.empty(n_pairs),

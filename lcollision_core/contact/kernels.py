@@ -302,8 +302,62 @@ def find_near(
 
 
 @compiled
+def _coincide(triangles, a, b, tolerance):
+    """Whether two triangles lie in one plane and overlap there in more than a line.
+
+    Parameters
+    ----------
+    triangles : (T, 3, 3) float64 array of corners
+    a, b : indices into `triangles`
+    tolerance : distance up to which points count as in the plane, or as touching, same unit
+    """
+    ox, oy, oz = triangles[a, 0, 0], triangles[a, 0, 1], triangles[a, 0, 2]
+    ux, uy, uz = triangles[a, 1, 0] - ox, triangles[a, 1, 1] - oy, triangles[a, 1, 2] - oz
+    vx, vy, vz = triangles[a, 2, 0] - ox, triangles[a, 2, 1] - oy, triangles[a, 2, 2] - oz
+    nx, ny, nz, length_squared = _across(ux, uy, uz, vx, vy, vz)
+    limit = tolerance * np.sqrt(length_squared)
+    if length_squared == 0.0:
+        return False
+    for k in range(3):
+        if abs(_along(triangles, b, k, ox, oy, oz, nx, ny, nz)) > limit:
+            return False
+    # Directions in the plane, across each edge: one of them parts convex shapes that are apart.
+    for side in range(2):
+        p = a if side == 0 else b
+        for i in range(3):
+            j = i + 1 if i < 2 else 0
+            ex = triangles[p, j, 0] - triangles[p, i, 0]
+            ey = triangles[p, j, 1] - triangles[p, i, 1]
+            ez = triangles[p, j, 2] - triangles[p, i, 2]
+            dx, dy, dz = ey * nz - ez * ny, ez * nx - ex * nz, ex * ny - ey * nx
+            limit = tolerance * np.sqrt(dx * dx + dy * dy + dz * dz)
+            a0 = _along(triangles, a, 0, ox, oy, oz, dx, dy, dz)
+            a1 = _along(triangles, a, 1, ox, oy, oz, dx, dy, dz)
+            a2 = _along(triangles, a, 2, ox, oy, oz, dx, dy, dz)
+            b0 = _along(triangles, b, 0, ox, oy, oz, dx, dy, dz)
+            b1 = _along(triangles, b, 1, ox, oy, oz, dx, dy, dz)
+            b2 = _along(triangles, b, 2, ox, oy, oz, dx, dy, dz)
+            above = max(a0, max(a1, a2)) - min(b0, min(b1, b2))
+            below = max(b0, max(b1, b2)) - min(a0, min(a1, a2))
+            if min(above, below) <= limit:
+                return False
+    return True
+
+
+@compiled
 def _search_leaves(
-    tree, work, near, leaf_a, leaf_b, box_b, tolerance, first_only, found, n_found, leaf_size
+    tree,
+    work,
+    near,
+    leaf_a,
+    leaf_b,
+    box_b,
+    tolerance,
+    first_only,
+    found,
+    n_found,
+    n_coincident,
+    leaf_size,
 ):
     """Append the pairs that penetrate between two leaves, or within one.
 
@@ -352,13 +406,14 @@ def _search_leaves(
             slot_b = leaf_b * LEAF_SIZE + j
             squared_depth = _pair_depth_squared(work.triangles, slot_a, slot_b, tolerance)
             if squared_depth == 0.0:
+                if len(n_coincident) > 0 and _coincide(work.triangles, slot_a, slot_b, tolerance):
+                    n_coincident[0] += 1
                 continue
             is_near = _is_near(corners, slot_a, slot_b, near)
-            if n_found < len(found.slots):
-                found.slots[n_found, 0] = slot_a
-                found.slots[n_found, 1] = slot_b
-                found.squared_depth[n_found] = squared_depth
-                found.is_near[n_found] = is_near
+            found.slots[n_found, 0] = slot_a
+            found.slots[n_found, 1] = slot_b
+            found.squared_depth[n_found] = squared_depth
+            found.is_near[n_found] = is_near
             n_found += 1
             if first_only and not is_near:
                 return n_found, True
@@ -375,9 +430,13 @@ def search_pose(
     work: PoseWork,
     first_only: bool,
     found: Found,
+    n_coincident: npt.NDArray[np.int64],
+    waiting: int,
     leaf_size: int,
-) -> int:
+) -> tuple[int, int]:
     """Find the pairs of faces that share no vertex and penetrate each other in one pose.
+
+    Ends when `found` is full; called again with what it returned, it goes on from there.
 
     Parameters
     ----------
@@ -386,28 +445,39 @@ def search_pose(
     tolerance : depth in heights up to which two faces touch rather than penetrate
     tree, near, work : of one topology; `work` is overwritten
     first_only : end the search at the first pair that is not near
-    found : `Found`, overwritten
+    found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
+    n_coincident : (1,) array that the pairs that touch face to face are added to, or (0,) where
+        nobody asks for them
+    waiting : 0 to begin, else what the call before returned
     leaf_size : `LEAF_SIZE`
 
     Returns
     -------
-    n_found : how many pairs there are. Those beyond the room in `found` were counted and not
-        stored: call again with more room. -1 where a vertex is not finite or beyond `MAX_REACH`.
+    n_found : how many pairs this call has put into `found`; -1 where a vertex is not finite or
+        beyond `MAX_REACH`
+    waiting : how many pairs of nodes are still to be visited, 0 at the end; `work.share` says what
+        share of the search each of them is guessed to be
     """
-    if not _refit(pose, inverse_height, tree, work):
-        return -1
     boxes = work.node_boxes
     stack = work.stack
+    share = work.share
     # Not a plain 0, for which the search of leaves would be compiled apart.
     n_found: int = int(np.int64(0))
-    stack[0, 0] = 0
-    stack[0, 1] = 0
-    height = 1
+    height = waiting
+    if waiting == 0:
+        if not _refit(pose, inverse_height, tree, work):
+            return -1, 0
+        stack[0, 0] = 0
+        stack[0, 1] = 0
+        share[0] = 1.0
+        height = 1
     while height > 0:
         height -= 1
         a = stack[height, 0]
         b = stack[height, 1]
         if tree.leaf[a] >= 0 and tree.leaf[b] >= 0:
+            if n_found + LEAF_SIZE * LEAF_SIZE > len(found.slots):
+                return n_found, height + 1
             n_found, stop = _search_leaves(
                 tree,
                 work,
@@ -419,11 +489,14 @@ def search_pose(
                 first_only,
                 found,
                 n_found,
+                n_coincident,
                 leaf_size,
             )
             if stop:
-                return n_found
+                return n_found, 0
             continue
+        first = height
+        part = share[first]
         if a == b:
             one = tree.left[a]
             two = tree.right[a]
@@ -436,25 +509,27 @@ def search_pose(
                 stack[height, 0] = one
                 stack[height, 1] = two
                 height += 1
-            continue
-        # Open the larger node of the two.
-        if tree.leaf[b] >= 0 or (tree.leaf[a] < 0 and tree.size[a] >= tree.size[b]):
-            one = tree.left[a]
-            two = tree.right[a]
-            other = b
         else:
-            one = tree.left[b]
-            two = tree.right[b]
-            other = a
-        if _overlap(boxes, one, other):
-            stack[height, 0] = one
-            stack[height, 1] = other
-            height += 1
-        if _overlap(boxes, two, other):
-            stack[height, 0] = two
-            stack[height, 1] = other
-            height += 1
-    return n_found
+            # Open the larger node of the two.
+            if tree.leaf[b] >= 0 or (tree.leaf[a] < 0 and tree.size[a] >= tree.size[b]):
+                one = tree.left[a]
+                two = tree.right[a]
+                other = b
+            else:
+                one = tree.left[b]
+                two = tree.right[b]
+                other = a
+            if _overlap(boxes, one, other):
+                stack[height, 0] = one
+                stack[height, 1] = other
+                height += 1
+            if _overlap(boxes, two, other):
+                stack[height, 0] = two
+                stack[height, 1] = other
+                height += 1
+        for k in range(first, height):
+            share[k] = part / (height - first)
+    return n_found, 0
 
 
 @compiled

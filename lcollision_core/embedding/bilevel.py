@@ -186,7 +186,10 @@ class Embedding:
         ShapeError : another shape.
         CancelledError : `cancel` was set.
         """
-        rotations, translations = fit_rigid(vertices, self.rest_vertices, self.alignment_weights)
+        vertices = self.topology.gathered(np.asarray(vertices, np.float64))
+        weights = np.zeros(self.topology.n_vertices)
+        weights[self.topology.picked] = self.alignment_weights[self.topology.picked]
+        rotations, translations = fit_rigid(vertices, self.rest_vertices, weights)
         moved = np.asarray(vertices, np.float64) @ np.swapaxes(rotations, 1, 2)
         guess = self.guess(self.codec.encode(moved + translations[:, None]).features)
         return fit_latent(

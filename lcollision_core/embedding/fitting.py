@@ -88,7 +88,8 @@ def fit_latent(
     ----------
     decoder : latent codes to features
     codec : features to vertices
-    vertices : (B, V, 3) array, in heights, in any rigid position
+    vertices : (B, V, 3) array, in heights, in any rigid position; only vertices that a face uses
+        count
     guess : (B, D) array, where to start
     deviation : (D,) array > 0, of the training codes
     max_steps : at most so many steps a mesh; it stops earlier when a step gains under 2 %
@@ -129,11 +130,13 @@ def _fit_one(
     max_steps: int,
 ) -> _Candidate:
     inverse_variance = deviation.astype(np.float64) ** -2.0
+    picked = codec.topology.picked
+    target = target[picked]
     n_vertices = len(target)
 
     def at(latent: npt.NDArray[Any]) -> _Candidate:
         code = latent.astype(np.float32)
-        decoded = codec.decode(decoder.features(code[None]), n_threads=1)[0]
+        decoded = codec.decode(decoder.features(code[None]), n_threads=1)[0, picked]
         rotation, translation = fit_rigid(target, decoded)
         aligned = target @ rotation.T + translation
         misfit = float(((decoded - aligned) ** 2).sum() / n_vertices)
@@ -148,7 +151,7 @@ def _fit_one(
         stiffness = PRIOR_SHARE * best.misfit * inverse_variance
         start_cost = cost(best, stiffness)
         features = decoder.features(best.latent[None])[0]
-        moved = codec.decode_jvp(features, decoder.tangents(best.latent))
+        moved = codec.decode_jvp(features, decoder.tangents(best.latent))[:, picked]
         # The mesh is free to turn and shift after the pose, so only what no small rigid motion
         # could undo counts.
         rigid = np.empty((n_vertices, 3, 6))

@@ -129,17 +129,20 @@ class _Run:
         seed: int,
     ) -> None:
         vertices = np.asarray(pose_set.vertices, dtype=np.float64)
-        vertices = vertices / height(vertices[0])
+        vertices = vertices / height(vertices[0], pose_set.topology)
         key = run_key(
             {"vertices": pose_set.vertices, "faces": pose_set.faces},
             {**asdict(config), "seed": seed, "version": _RUN_VERSION},
         )
         self._checkpoint = Checkpoint(checkpoint, key)
-        alignment = align_rigid(vertices, vertices[0], cancel)
-        self._alignment_weights = alignment.weights
-        self._vertices = alignment.vertices
-        self._codec = AcapCodec(pose_set.topology, vertices[0], alignment.weights)
-        self._features = self._codec.encode(alignment.vertices).features
+        self._picked = pose_set.topology.picked
+        alignment = align_rigid(vertices[:, self._picked], vertices[0, self._picked], cancel)
+        self._alignment_weights = np.zeros(pose_set.topology.n_vertices)
+        self._alignment_weights[self._picked] = alignment.weights
+        self._codec = AcapCodec(pose_set.topology, vertices[0], self._alignment_weights)
+        self._vertices = np.repeat(self._codec.rest_vertices[None], len(vertices), axis=0)
+        self._vertices[:, self._picked] = alignment.vertices
+        self._features = self._codec.encode(self._vertices).features
         self._config, self._cancel, self._seed = config, cancel, seed
         self._progress = progress
         poses = np.arange(len(vertices))
@@ -167,9 +170,9 @@ class _Run:
             (embedding.level1,), embedding.scaling, embedding.mean_features, embedding.topology
         )
         level1_features = level1.features(guess[:, : embedding.n_domains])
-        level1_distances = vertex_distances(self._codec.decode(level1_features), self._vertices)
-        guessed = vertex_distances(embedding.decode(guess), self._vertices)
-        acap = vertex_distances(self._codec.decode(self._features), self._vertices)
+        level1_distances = self._distances(self._codec.decode(level1_features))
+        guessed = self._distances(embedding.decode(guess))
+        acap = self._distances(self._codec.decode(self._features))
         masks = judge_masks(embedding.attention_mask, embedding.topology, embedding.rest_vertices)
         held_out = self._measure_held_out()
         metrics = EmbeddingMetrics(
@@ -188,6 +191,10 @@ class _Run:
             domains_per_vertex=masks.domains_per_vertex,
         )
         return replace(embedding, metrics=metrics)
+
+    def _distances(self, decoded: FloatArray) -> FloatArray:
+        """Return how far the decoded poses' used vertices lie from the poses', (N, U)."""
+        return vertex_distances(decoded[:, self._picked], self._vertices[:, self._picked])
 
     def _learn(self, model: str, poses: npt.NDArray[np.intp]) -> Embedding:
         """Train on some poses; the embedding's codes are still the encoders' own."""

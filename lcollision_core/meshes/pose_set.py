@@ -236,9 +236,12 @@ def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDAr
     float64's rounding, in any unit
     """
     points = np.asarray(vertices, dtype=np.float64)
-    # At one, squares neither overflow nor vanish, whatever the unit.
-    points = points / max(float(np.abs(points).max()), np.finfo(np.float64).tiny)
+    # About the origin, so that a mesh far from it keeps its digits; the first corner, as unused
+    # vertices may lie anywhere. At one, squares neither overflow nor vanish, whatever the unit.
+    points = 0.5 * points - 0.5 * points[topology.faces[0, 0]]
     a, b, c = (points[corner] for corner in topology.faces.T)
+    largest = max(float(np.abs(corners).max()) for corners in (a, b, c))
+    a, b, c = (corners / max(largest, np.finfo(np.float64).tiny) for corners in (a, b, c))
     longest_squared = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], 0)
     twice_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.flatnonzero(twice_area <= 1e-12 * longest_squared).astype(np.int32)

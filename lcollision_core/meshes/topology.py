@@ -149,12 +149,44 @@ class Topology:
         count, labels = csgraph.connected_components(self.adjacency, directed=False)
         return int(count), np.asarray(labels, dtype=np.int32)
 
-    @property
+    @cached_property
+    def _is_used(self) -> npt.NDArray[np.bool_]:
+        used = np.zeros(self.n_vertices, dtype=np.bool_)
+        used[self.faces] = True
+        return used
+
+    @cached_property
     def unused_vertices(self) -> IntArray:
         """Indices of the vertices that no face names."""
-        used = np.zeros(self.n_vertices, dtype=bool)
-        used[self.faces] = True
-        return np.flatnonzero(~used).astype(np.int32)
+        return np.flatnonzero(~self._is_used).astype(np.int32)
+
+    @cached_property
+    def used_vertices(self) -> IntArray:
+        """Indices of the vertices that some face names."""
+        return np.flatnonzero(self._is_used).astype(np.int32)
+
+    @cached_property
+    def picked(self) -> slice | IntArray:
+        """What picks the used vertices out of an array of all: a slice where all are used."""
+        return self.used_vertices if len(self.unused_vertices) else slice(None)
+
+    def gathered(self, vertices: FloatArray) -> FloatArray:
+        """Put the vertices that no face names, which may lie anywhere, amid the others.
+
+        Parameters
+        ----------
+        vertices : (..., V, 3) float64 array
+
+        Returns
+        -------
+        gathered : the same array where all vertices are used, else a copy
+        """
+        if not len(self.unused_vertices):
+            return vertices
+        gathered = vertices.copy()
+        middle = vertices[..., self.used_vertices, :].mean(axis=-2, keepdims=True)
+        gathered[..., self.unused_vertices, :] = middle
+        return gathered
 
     @property
     def euler_characteristic(self) -> int:

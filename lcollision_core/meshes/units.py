@@ -8,22 +8,27 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.topology import Topology
 
 
-def _box(vertices: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+def _sides(vertices: npt.NDArray[Any], topology: Topology | None) -> npt.NDArray[np.float64]:
+    """Return half of each side of the bounding box: the whole may be beyond the largest number."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) == 0:
         raise ShapeError(f"vertices must be a (V, 3) array with V > 0, got {vertices.shape}")
-    points = np.asarray(vertices, dtype=np.float64)
+    points = 0.5 * np.asarray(vertices, dtype=np.float64)
+    if topology is not None and len(topology.unused_vertices):
+        points = points[topology.used_vertices]
     sides: npt.NDArray[np.float64] = points.max(axis=0) - points.min(axis=0)
     return sides
 
 
-def height(vertices: npt.NDArray[Any]) -> float:
+def height(vertices: npt.NDArray[Any], topology: Topology | None = None) -> float:
     """Return the height of a mesh: the longest side of its bounding box.
 
     Parameters
     ----------
     vertices : (V, 3) array, the reference mesh, in the file's unit
+    topology : of the mesh: vertices that no face uses, which may lie anywhere, then do not count
 
     Returns
     -------
@@ -33,18 +38,19 @@ def height(vertices: npt.NDArray[Any]) -> float:
     ------
     ShapeError : `vertices` is not (V, 3), or empty.
     """
-    return float(_box(vertices).max())
+    return 2.0 * float(_sides(vertices, topology).max())
 
 
-def up_axis(vertices: npt.NDArray[Any]) -> int:
+def up_axis(vertices: npt.NDArray[Any], topology: Topology | None = None) -> int:
     """Return the axis along which a mesh is longest: 0, 1 or 2 for x, y or z.
 
     Parameters
     ----------
     vertices : (V, 3) array, the reference mesh
+    topology : as of `height`
 
     Raises
     ------
     ShapeError : `vertices` is not (V, 3), or empty.
     """
-    return int(_box(vertices).argmax())
+    return int(_sides(vertices, topology).argmax())

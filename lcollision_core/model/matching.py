@@ -80,12 +80,12 @@ def checked_mesh(
     scale, limit = scale_of(lengths, known), LARGEST_SIZE
     if scale is None:
         # Not scaled as a whole: not a pose perhaps, but no other unit unless it is far off.
-        scale, limit = height(mesh) / height(reference), _MOST_SIZE
+        scale, limit = height(mesh, topology) / height(reference, topology), _MOST_SIZE
     if not 1.0 / limit < scale < limit:
         advice = f"scale it by {1.0 / scale:.3g}" if 0.0 < scale < np.inf else "export it again"
         raise PoseSetError(
             f"the mesh is {scale:.3g} times as large as the body of {model!r}, which is "
-            f"{height(reference):.3g} tall in its own unit; {advice}"
+            f"{height(reference, topology):.3g} tall in its own unit; {advice}"
         )
     if is_torn(lengths, scale * known):
         raise PoseSetError(

@@ -82,7 +82,9 @@ class PoseModel:
         self.card = card
         self.embedding = embedding
         self._other_sections = dict(other_sections or {})
-        self.reference: FloatArray = _read_only(embedding.rest_vertices * card.height)
+        self.reference: FloatArray = _read_only(
+            embedding.topology.gathered(embedding.rest_vertices) * card.height
+        )
         self.attention_mask = _read_only(embedding.attention_mask)
         self.training_latent: FloatArray = _read_only(embedding.training_latent.astype(np.float64))
 
@@ -138,7 +140,7 @@ class PoseModel:
         provenance : how it was made, JSON values by name
         """
         reference = pose_set.vertices[0]
-        up = up_axis(reference) if pose_set.up_axis is None else pose_set.up_axis
+        up = up_axis(reference, pose_set.topology) if pose_set.up_axis is None else pose_set.up_axis
         if pose_set.vertex_labels is None:
             names = numbered_names(embedding.n_domains)
         else:
@@ -146,7 +148,7 @@ class PoseModel:
                 embedding.attention_mask, pose_set.vertex_labels, reference[:, up]
             )
         card = ModelCard(
-            height=height(reference),
+            height=height(reference, pose_set.topology),
             up_axis=up,
             near_exclusion=pose_set.near_exclusion,
             domain_names=names,

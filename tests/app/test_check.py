@@ -8,8 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from lcollision_core.meshes import write_mesh
 from tests.app.support import STABBED, Lcollision
 
 
@@ -19,6 +21,7 @@ def test_collision_is_reported_with_its_energy(lcollision: Lcollision, stabbed: 
     (report,) = json.loads(result.stdout)
     assert report.pop("seconds") > 0
     assert report.pop("energy") == pytest.approx(0.1**2)
+    assert report.pop("deepest") == [{"faces": [0, 1], "depth": pytest.approx(0.1)}]
     assert report == {
         "file": str(stabbed),
         "vertices": 6,
@@ -26,6 +29,7 @@ def test_collision_is_reported_with_its_energy(lcollision: Lcollision, stabbed: 
         "watertight": False,
         "pairs": 1,
         "near_pairs": 0,
+        "coincident_pairs": 0,
         "colliding": True,
     }
 
@@ -100,6 +104,29 @@ def test_near_pairs_are_counted_apart(lcollision: Lcollision, tmp_path: Path) ->
     excluded = json.loads(apart.stdout)[0]
     assert (excluded["pairs"], excluded["near_pairs"]) == (0, counted["pairs"])
     assert apart.exit_code == 0
+
+
+def test_surfaces_that_coincide_are_free_with_a_warning(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    twice = tmp_path / "twice.off"
+    twice.write_text("OFF\n6 2 0\n" + "0 0 0\n1 0 0\n0 1 0\n" * 2 + "3 0 1 2\n3 3 4 5\n")
+    result = lcollision("check", "--json", twice)
+    assert result.exit_code == 0
+    assert f"{twice}: 1 pair of faces lies exactly on each other" in result.stderr
+    (report,) = json.loads(result.stdout)
+    assert (report["coincident_pairs"], report["pairs"], report["deepest"]) == (1, 0, [])
+
+
+def test_the_deepest_of_many_pairs_are_listed(lcollision: Lcollision, tmp_path: Path) -> None:
+    path = tmp_path / "many.ply"
+    corners = np.random.default_rng(1).random((360, 3))
+    write_mesh(path, corners, np.arange(360).reshape(-1, 3))
+    (report,) = json.loads(lcollision("check", "--json", path).stdout)
+    depths = [pair["depth"] for pair in report["deepest"]]
+    assert report["pairs"] > len(depths) == 100
+    assert depths == sorted(depths, reverse=True)
+    assert sum(depth**2 for depth in depths) < report["energy"]
 
 
 BAD_FILES = {
