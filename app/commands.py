@@ -13,7 +13,7 @@ from PySide6.QtGui import QUndoCommand
 
 if TYPE_CHECKING:
     from lcollision_core.meshes import RigidTransform
-    from lcollision_core.model import NamedPose
+    from lcollision_core.model import MirrorSource, NamedPose
     from lcollision_core.resolve import ResolveResult
 
 MERGE_SECONDS = 1.0
@@ -34,6 +34,7 @@ class DocumentState:
     poses : the user's library
     ghost : (V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`
     outcome : of the Resolve that ended in this pose
+    mirror_of : what the pose was mirrored from; once it is changed, of no meaning
     """
 
     latent: npt.NDArray[np.float64]
@@ -42,6 +43,7 @@ class DocumentState:
     poses: tuple[NamedPose, ...] = ()
     ghost: npt.NDArray[np.float32] | None = None
     outcome: ResolveResult | None = None
+    mirror_of: MirrorSource | None = None
 
     def same_as(self, other: DocumentState) -> bool:
         """Whether there is nothing to undo between two states: equal poses, to the bit."""

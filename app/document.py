@@ -17,11 +17,11 @@ from app.commands import DocumentState
 from app.engine import Failure, LivePose, LongWork, Work
 from app.frames import ExactVerdict, LiveFrame, PosePrediction
 from app.history import UNNAMED, PoseHistory, read_only
-from app.wording import counted
+from app.wording import counted, heading, mirrored_text
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
-    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.model import MirroredPose, NamedPose, PoseModel
     from lcollision_core.resolve import ResolveOptions
 
 __all__ = ["ExactVerdict", "Failure", "LiveFrame", "PoseDocument", "PosePrediction"]
@@ -84,7 +84,6 @@ class PoseDocument(PoseHistory):
         self._model: PoseModel | None = None
         self._model_file = ""
         self._predicts = False
-        self._mirror: npt.NDArray[np.int32] | None = None
         self._locked: frozenset[int] = frozenset()
         self._frame: LiveFrame | None = None
         self._exact: ExactVerdict | None = None
@@ -162,7 +161,7 @@ class PoseDocument(PoseHistory):
     @property
     def can_mirror(self) -> bool:
         """Whether the model's mesh has a left and a right that mirror each other."""
-        return self._mirror is not None
+        return self._model is not None and self._model.symmetry is not None
 
     # Editing.
 
@@ -204,12 +203,20 @@ class PoseDocument(PoseHistory):
         self._edit("Randomise", self._with_locked(latent))
 
     def mirror(self) -> None:
-        """Exchange left and right, in the long worker, as the mirrored mesh is encoded."""
-        if self._mirror is None:
-            raise LCollisionError(f"{self.model.name} has no left and right to exchange")
+        """Exchange left and right of the whole pose, in the long worker.
+
+        Locked domains are mirrored too, as their other side is; where a free pose collides in the
+        mirror, it is resolved, and that leaves them as mirrored. A mirror image that was not
+        changed goes back to the pose that it was made from, to the bit.
+
+        Raises
+        ------
+        LCollisionError : the model has no two sides.
+        """
+        _ = self.model.pose_mirror
         self.end_gesture()
         self._long.cancel(self._mirroring)
-        work = tasks.mirrored(self.model, self.latent, self._mirror)
+        work = tasks.mirrored(self.model, self._state, self._locked)
         self._mirroring = self._long.start("Mirroring", work, self._on_mirrored)
 
     def code_name(self, index: int) -> str:
@@ -241,11 +248,11 @@ class PoseDocument(PoseHistory):
         model : may lack a predictor; `open_model` is kinder to the window, as it compiles and
             loads in the long worker what a first drag needs
         """
-        self._put_in(tasks.OpenedModel(model, model.name, tasks.mirror_of(model)))
+        self._put_in(tasks.OpenedModel(model, model.name))
 
     def _put_in(self, opened: tasks.OpenedModel) -> None:
         self._model = opened.model
-        self._model_file, self._mirror = opened.file, opened.mirror
+        self._model_file = opened.file
         self._locked = frozenset()
         self.cancel_resolve()
         # What is being exported is a snapshot, and goes on.
@@ -290,7 +297,7 @@ class PoseDocument(PoseHistory):
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
         """Read what a crash left, as `LostPose` tells of it, and make it the pose, unsaved."""
         is_open = model_file == self._model_file
-        opened = tasks.OpenedModel(self.model, model_file, self._mirror) if is_open else None
+        opened = tasks.OpenedModel(self.model, model_file) if is_open else None
         work = tasks.recovered(opened, model_file, poses_file, name, file)
         self._bring(f"Recovering {name}", work, self._on_recovered)
 
@@ -435,9 +442,19 @@ class PoseDocument(PoseHistory):
     def _tell(self, done: tasks.Imported | tasks.Exported) -> None:
         self.message.emit(done.sentence)
 
-    def _on_mirrored(self, latent: FloatArray) -> None:
+    def _on_mirrored(self, image: MirroredPose) -> None:
         self.end_gesture()
-        self._edit("Mirror", latent)
+        resolution = image.resolution if image.pairs_after == 0 else None
+        after = replace(
+            self._state,
+            latent=read_only(image.latent.copy()),
+            placement=image.placement,
+            ghost=None,
+            outcome=resolution,
+            mirror_of=image.source,
+        )
+        self._push("Mirror", after)
+        self.message.emit(heading(mirrored_text(image)))
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
         result, self._solve = resolved.result, None

@@ -11,14 +11,14 @@ import numpy.typing as npt
 
 from app.engine import Work
 from app.frames import PoseShower, keep_torch_to_one_thread
-from app.symmetry import mirror_vertices
 from app.wording import counted, fit_error
 from lcollision_core.errors import ModelFileError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
+    from app.commands import DocumentState
     from lcollision_core.meshes import RigidTransform
-    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.model import MirroredPose, NamedPose, PoseModel
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
@@ -32,12 +32,10 @@ class OpenedModel:
     ----------
     model : has been used once, so that nothing is left to compile or to load
     file : that it was read from
-    mirror : (V,) each vertex's mirror image, or None where the mesh has no two sides
     """
 
     model: PoseModel
     file: str
-    mirror: npt.NDArray[np.int32] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,14 +121,9 @@ def opened_model(name_or_path: str | Path) -> Work:
         model = PoseModel.load(path)
         cancel.raise_if_cancelled()
         warm_up(model)
-        return OpenedModel(model, str(path), mirror_of(model))
+        return OpenedModel(model, str(path))
 
     return work
-
-
-def mirror_of(model: PoseModel) -> npt.NDArray[np.int32] | None:
-    """Return (V,) each vertex's mirror image, or None where the mesh has no two sides."""
-    return mirror_vertices(model.reference, model.faces, model.up_axis)
 
 
 def warm_up(model: PoseModel) -> None:
@@ -140,7 +133,7 @@ def warm_up(model: PoseModel) -> None:
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
     shower.verdict(shower.frame(latent, 0))
-    _ = model.fingerprint, model.latent_space
+    _ = model.fingerprint, model.latent_space, model.symmetry
 
 
 def loaded_predictor(model: PoseModel) -> Work:
@@ -198,13 +191,16 @@ def encoded(model: PoseModel, path: Path) -> Work:
     return work
 
 
-def mirrored(model: PoseModel, latent: FloatArray, mirror: npt.NDArray[np.int32]) -> Work:
-    """Find the latent of the mirrored mesh."""
+def mirrored(model: PoseModel, state: DocumentState, locked: frozenset[int]) -> Work:
+    """Exchange left and right; what Resolve must move then leaves the locked domains."""
 
-    def work(_: Progress, cancel: CancelToken) -> FloatArray:
-        # Through any plane, as encoding finds the rigid motion.
-        image = model.decode(latent, n_threads=1)[mirror] * np.array([-1.0, 1.0, 1.0])
-        return model.encode(image, cancel=cancel).latent
+    def work(progress: Progress, cancel: CancelToken) -> MirroredPose:
+        from lcollision_core.resolve import ResolveOptions
+
+        options = ResolveOptions(locked_domains=locked)
+        return model.mirror(
+            state.latent, state.placement, state.mirror_of, options, progress, cancel
+        )
 
     return work
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lcollision_core.model import MirroredPose
 
 _FAR = 0.03
 """Heights by which a mesh is hardly ever off the pose nearest to it, unless it is another body."""
@@ -41,3 +45,20 @@ def fit_error(mean: float | None, most: float | None) -> str:
     mean, most = mean or 0.0, most or 0.0
     far = ", which is far: is it this body, in the model's vertex order?" if mean > _FAR else ""
     return f"fit error of {100.0 * mean:.3f} % of the height, at most {100.0 * most:.2f} %{far}"
+
+
+def mirrored_text(mirrored: MirroredPose) -> str:
+    """Say what became of a mirrored pose: how far off it is, and whether it collides."""
+    pairs = counted(mirrored.pairs_after, "pair of faces", "pairs of faces")
+    if mirrored.pairs_after == 0 < mirrored.pairs_mirrored:
+        resolved = counted(mirrored.pairs_mirrored, "pair of faces", "pairs of faces")
+        state = f"free, as {resolved} that collided in the mirror image only were resolved"
+    elif mirrored.lost_freedom:
+        state = f"colliding: {pairs}, which the pose before does not have"
+    elif mirrored.pairs_after:
+        state = f"colliding as before: {pairs}, before {mirrored.pairs_before}"
+    else:
+        state = "free"
+    if mirrored.restored:
+        return f"the pose that it was mirrored from, {state}"
+    return f"mirrored with a {fit_error(mirrored.fit_error_mean, mirrored.fit_error_max)}, {state}"

@@ -21,6 +21,7 @@ from app.cli import (
     edit,
     evaluate,
     label,
+    mirror,
     models,
     poses,
     resolve,
@@ -104,6 +105,7 @@ app.command("check")(check.check)
 app.command("encode")(poses.encode)
 app.command("decode")(poses.decode)
 app.command("sample")(poses.sample)
+app.command("mirror")(mirror.mirror)
 app.command("resolve")(resolve.resolve)
 app.command("label")(label.label)
 app.command("evaluate")(evaluate.evaluate)

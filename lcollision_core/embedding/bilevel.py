@@ -164,6 +164,8 @@ class Embedding:
         max_steps: int = MAX_STEPS,
         progress: Progress = no_progress,
         cancel: CancelToken | None = None,
+        *,
+        in_place: bool = False,
     ) -> LatentFit:
         """Find the latent codes of meshes in any rigid position.
 
@@ -176,6 +178,8 @@ class Embedding:
         max_steps : at most so many steps a mesh; 0 returns the guess
         progress : called with (meshes done, meshes in all)
         cancel : polled between meshes
+        in_place : the meshes lie in the reference's frame and stay there: the codes take up how a
+            mesh is turned against the training poses, as far as they can
 
         Returns
         -------
@@ -187,11 +191,13 @@ class Embedding:
         CancelledError : `cancel` was set.
         """
         vertices = self.topology.gathered(np.asarray(vertices, np.float64))
-        weights = np.zeros(self.topology.n_vertices)
-        weights[self.topology.picked] = self.alignment_weights[self.topology.picked]
-        rotations, translations = fit_rigid(vertices, self.rest_vertices, weights)
-        moved = np.asarray(vertices, np.float64) @ np.swapaxes(rotations, 1, 2)
-        guess = self.guess(self.codec.encode(moved + translations[:, None]).features)
+        aligned = vertices
+        if not in_place:
+            weights = np.zeros(self.topology.n_vertices)
+            weights[self.topology.picked] = self.alignment_weights[self.topology.picked]
+            rotations, translations = fit_rigid(vertices, self.rest_vertices, weights)
+            aligned = vertices @ np.swapaxes(rotations, 1, 2) + translations[:, None]
+        guess = self.guess(self.codec.encode(aligned).features)
         return fit_latent(
             self.decoder,
             self.codec,
@@ -201,6 +207,7 @@ class Embedding:
             max_steps,
             progress,
             cancel,
+            in_place=in_place,
         )
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:

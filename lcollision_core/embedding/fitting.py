@@ -77,6 +77,8 @@ def fit_latent(
     max_steps: int = MAX_STEPS,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
+    *,
+    in_place: bool = False,
 ) -> LatentFit:
     """Fit code and rigid motion together to each mesh.
 
@@ -95,6 +97,7 @@ def fit_latent(
     max_steps : at most so many steps a mesh; it stops earlier when a step gains under 2 %
     progress : called with (meshes done, meshes in all)
     cancel : polled before each mesh
+    in_place : the mesh stays where it is, and the codes alone are fitted
 
     Returns
     -------
@@ -112,7 +115,9 @@ def fit_latent(
     for pose, target in enumerate(targets):
         if cancel is not None:
             cancel.raise_if_cancelled()
-        best = _fit_one(decoder, codec, target, guess[pose], np.asarray(deviation), max_steps)
+        best = _fit_one(
+            decoder, codec, target, guess[pose], np.asarray(deviation), max_steps, in_place
+        )
         latent[pose] = best.latent
         rotations[pose], translations[pose] = best.rotation, best.translation
         distances = np.linalg.norm(best.decoded - best.aligned, axis=1)
@@ -128,6 +133,7 @@ def _fit_one(
     guess: npt.NDArray[Any],
     deviation: FloatArray,
     max_steps: int,
+    in_place: bool,
 ) -> _Candidate:
     inverse_variance = deviation.astype(np.float64) ** -2.0
     picked = codec.topology.picked
@@ -137,7 +143,9 @@ def _fit_one(
     def at(latent: npt.NDArray[Any]) -> _Candidate:
         code = latent.astype(np.float32)
         decoded = codec.decode(decoder.features(code[None]), n_threads=1)[0, picked]
-        rotation, translation = fit_rigid(target, decoded)
+        rotation, translation = np.eye(3), np.zeros(3)
+        if not in_place:
+            rotation, translation = fit_rigid(target, decoded)
         aligned = target @ rotation.T + translation
         misfit = float(((decoded - aligned) ** 2).sum() / n_vertices)
         return _Candidate(code, rotation, translation, decoded, aligned, misfit)
@@ -152,16 +160,16 @@ def _fit_one(
         start_cost = cost(best, stiffness)
         features = decoder.features(best.latent[None])[0]
         moved = codec.decode_jvp(features, decoder.tangents(best.latent))[:, picked]
-        # The mesh is free to turn and shift after the pose, so only what no small rigid motion
-        # could undo counts.
-        rigid = np.empty((n_vertices, 3, 6))
-        rigid[:, :, :3] = np.eye(3)
-        centred = best.decoded - best.decoded.mean(axis=0)
-        for axis in range(3):
-            rigid[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centred)
-        jacobian = np.concatenate(
-            [moved.reshape(len(moved), -1).T, rigid.reshape(3 * n_vertices, 6)], axis=1
-        )
+        jacobian = moved.reshape(len(moved), -1).T
+        if not in_place:
+            # The mesh is free to turn and shift after the pose, so only what no small rigid
+            # motion could undo counts.
+            rigid = np.empty((n_vertices, 3, 6))
+            rigid[:, :, :3] = np.eye(3)
+            centred = best.decoded - best.decoded.mean(axis=0)
+            for axis in range(3):
+                rigid[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centred)
+            jacobian = np.concatenate([jacobian, rigid.reshape(3 * n_vertices, 6)], axis=1)
         normal = jacobian.T @ jacobian / n_vertices
         slope = jacobian.T @ (best.decoded - best.aligned).ravel() / n_vertices
         n_codes = len(stiffness)

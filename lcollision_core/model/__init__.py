@@ -15,6 +15,7 @@ from lcollision_core.model.library import (
     model_destination,
     user_models_folder,
 )
+from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry
 from lcollision_core.model.pose_file import (
     NamedPose,
     OtherModelError,
@@ -35,11 +36,14 @@ __all__ = [
     "LatentGroup",
     "LatentSpace",
     "ListedModel",
+    "MirrorSource",
+    "MirroredPose",
     "ModelCard",
     "NamedPose",
     "OtherModelError",
     "PoseFile",
     "PoseModel",
+    "Symmetry",
     "change_model",
     "checkpoint_path",
     "export_mesh",

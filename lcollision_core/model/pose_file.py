@@ -18,6 +18,7 @@ from lcollision_core.meshes import RigidTransform, atomic_write
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.library import ListedModel, user_models_folder
+from lcollision_core.model.mirror import MirroredPose, MirrorSource
 from lcollision_core.model.pose_model import PoseModel
 
 POSES_FORMAT = "lcollision-poses"
@@ -41,8 +42,10 @@ class NamedPose:
     latent : (D,) float64 array
     placement : where the decoded pose belongs, for one that came in as a mesh; None leaves it in
         the reference's frame
-    fit_error_mean, fit_error_max : of one that came in as a mesh, in heights
+    fit_error_mean, fit_error_max : of one that was fitted to a mesh or a mirror image, in heights
     tags : under which it is found in a library
+    mirror_of : of a mirror image the pose that it was made from, which mirroring it again, while
+        it is unchanged, gives back to the bit
     """
 
     name: str
@@ -51,6 +54,7 @@ class NamedPose:
     fit_error_mean: float | None = None
     fit_error_max: float | None = None
     tags: tuple[str, ...] = ()
+    mirror_of: MirrorSource | None = None
 
     def same_as(self, other: NamedPose) -> bool:
         """Whether both have the same latent and placement, to the bit, whatever their names."""
@@ -63,6 +67,17 @@ class NamedPose:
         """Name an encoded mesh."""
         return cls(
             name, encoded.latent, encoded.placement, encoded.fit_error_mean, encoded.fit_error_max
+        )
+
+    def mirrored(self, image: MirroredPose) -> NamedPose:
+        """Return what mirroring this pose gave, under the same name and tags."""
+        return replace(
+            self,
+            latent=image.latent,
+            placement=image.placement,
+            fit_error_mean=None if image.restored else image.fit_error_mean,
+            fit_error_max=None if image.restored else image.fit_error_max,
+            mirror_of=image.source,
         )
 
 
@@ -295,16 +310,24 @@ def _other_model(
 
 def to_json(pose: NamedPose) -> dict[str, Any]:
     """Return what a file holds of a pose; equal for equal poses, to the bit."""
-    entry: dict[str, Any] = {"name": pose.name, "latent": pose.latent.tolist()}
+    entry: dict[str, Any] = {"name": pose.name} | _placed_to_json(pose)
+    if pose.fit_error_mean is not None and pose.fit_error_max is not None:
+        entry["fit_error"] = {"mean": pose.fit_error_mean, "max": pose.fit_error_max}
+    if pose.tags:
+        entry["tags"] = list(pose.tags)
+    source = pose.mirror_of
+    if source is not None and source.is_of(pose.latent, pose.placement):
+        entry["mirror_of"] = _placed_to_json(source) | {"image": source.image}
+    return entry
+
+
+def _placed_to_json(pose: NamedPose | MirrorSource) -> dict[str, Any]:
+    entry: dict[str, Any] = {"latent": pose.latent.tolist()}
     if pose.placement is not None:
         entry["placement"] = {
             "rotation": pose.placement.rotation.tolist(),
             "translation": pose.placement.translation.tolist(),
         }
-    if pose.fit_error_mean is not None and pose.fit_error_max is not None:
-        entry["fit_error"] = {"mean": pose.fit_error_mean, "max": pose.fit_error_max}
-    if pose.tags:
-        entry["tags"] = list(pose.tags)
     return entry
 
 
@@ -314,23 +337,37 @@ def _from_json(entry: Any, latent_size: int) -> NamedPose:
     reason = why_no_name(name if isinstance(name, str) else "")
     if reason or not isinstance(name, str):
         raise ValueError(reason)
-    latent = _numbers(pose.get("latent"), (latent_size,), "latent")
-    placement = None
-    if "placement" in pose:
-        held = _object(pose["placement"], "placement")
-        rotation = _numbers(held.get("rotation"), (3, 3), "rotation")
-        translation = _numbers(held.get("translation"), (3,), "translation")
-        turned = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
-            raise ValueError("its rotation is no rotation matrix")
-        placement = RigidTransform(rotation, translation)
-    mean = largest = None
+    latent, placement = _placed_from_json(pose, latent_size)
+    mean = largest = source = None
     if "fit_error" in pose:
         errors = _object(pose["fit_error"], "fit error")
         mean, largest = map(
             float, _numbers([errors.get("mean"), errors.get("max")], (2,), "fit error")
         )
-    return NamedPose(name, latent, placement, mean, largest, _tags(pose.get("tags", [])))
+    if "mirror_of" in pose:
+        held = _object(pose["mirror_of"], "mirror_of")
+        if not isinstance(held.get("image"), str):
+            raise ValueError("its mirror_of must have an image, which is a text")
+        found = MirrorSource(*_placed_from_json(held, latent_size), held["image"])
+        # A pose that was changed by hand is no longer that image.
+        source = found if found.is_of(latent, placement) else None
+    tags = _tags(pose.get("tags", []))
+    return NamedPose(name, latent, placement, mean, largest, tags, source)
+
+
+def _placed_from_json(
+    pose: dict[str, Any], latent_size: int
+) -> tuple[npt.NDArray[np.float64], RigidTransform | None]:
+    latent = _numbers(pose.get("latent"), (latent_size,), "latent")
+    if "placement" not in pose:
+        return latent, None
+    held = _object(pose["placement"], "placement")
+    rotation = _numbers(held.get("rotation"), (3, 3), "rotation")
+    translation = _numbers(held.get("translation"), (3,), "translation")
+    turned = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
+        raise ValueError("its rotation is no rotation matrix")
+    return latent, RigidTransform(rotation, translation)
 
 
 def _tags(value: Any) -> tuple[str, ...]:

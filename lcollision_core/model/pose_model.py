@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.metrics import EmbeddingMetrics
-from lcollision_core.errors import ModelFileError, ShapeError
+from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, RigidTransform, Topology, height, up_axis
 from lcollision_core.model.card import ModelCard
@@ -24,6 +24,13 @@ from lcollision_core.model.latent_identity import EMBEDDING, fingerprint_of
 from lcollision_core.model.latent_space import WHOLE_BODY, LatentGroup, LatentSpace
 from lcollision_core.model.library import find_model
 from lcollision_core.model.matching import checked_mesh, require_same_faces
+from lcollision_core.model.mirror import (
+    MirroredPose,
+    MirrorSource,
+    PoseMirror,
+    Symmetry,
+    find_symmetry,
+)
 from lcollision_core.model.naming import checked_name, names_from_labels, numbered_names
 from lcollision_core.model_file import Section, read_model_file, write_model_file
 
@@ -192,14 +199,7 @@ class PoseModel:
         ------
         ShapeError : another shape, or a number that is not finite.
         """
-        codes = np.asarray(latent, dtype=np.float64)
-        if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
-            raise ShapeError(
-                f"a latent pose of {self.name} has {self.latent_size} numbers, got an array of "
-                f"shape {codes.shape}"
-            )
-        if not np.isfinite(codes).all():
-            raise ShapeError("a latent pose has a number that is not finite")
+        codes = self._checked(latent)
         vertices = self.embedding.decode(codes.reshape(-1, self.latent_size), n_threads)
         vertices *= self.card.height
         return vertices[0] if codes.ndim == 1 else vertices
@@ -244,6 +244,34 @@ class PoseModel:
         CancelledError : `cancel` was set.
         """
         return self.resolver.resolve(latent, options, progress, cancel, placement)
+
+    def mirror(
+        self,
+        latent: npt.ArrayLike,
+        placement: RigidTransform | None = None,
+        source: MirrorSource | None = None,
+        options: ResolveOptions | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> MirroredPose:
+        """Exchange left and right of a pose: see `PoseMirror.mirror`.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        placement, source, options, progress, cancel : see there
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        LCollisionError : the model has no two sides, or a locked domain is unknown.
+        ModelFileError : the model's predictor is damaged.
+        CancelledError : `cancel` was set.
+        """
+        pose = self._checked(latent)
+        if pose.ndim != 1:
+            raise ShapeError(f"one pose is mirrored at a time, got an array of shape {pose.shape}")
+        return self.pose_mirror.mirror(pose, placement, source, options, progress, cancel)
 
     def encode(self, vertices: npt.ArrayLike, cancel: CancelToken | None = None) -> EncodedPose:
         """Find the latent pose whose mesh lies nearest to a given one, wherever that lies.
@@ -318,6 +346,17 @@ class PoseModel:
         """Return the same model with (F, D) poses that were found exactly free, F >= 0."""
         codes = np.asarray(latent, dtype=np.float32).reshape(-1, self.latent_size)
         return self._with_section(_FREE_POSES, Section({"latent": codes}))
+
+    def _checked(self, latent: npt.ArrayLike) -> FloatArray:
+        codes = np.asarray(latent, dtype=np.float64)
+        if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
+            raise ShapeError(
+                f"a latent pose of {self.name} has {self.latent_size} numbers, got an array of "
+                f"shape {codes.shape}"
+            )
+        if not np.isfinite(codes).all():
+            raise ShapeError("a latent pose has a number that is not finite")
+        return codes
 
     def _with_section(self, name: str, section: Section) -> PoseModel:
         sections = {**self._other_sections, name: section}
@@ -397,6 +436,28 @@ class PoseModel:
             self.free_latent,
             (box.low, box.high),
         )
+
+    @cached_property
+    def symmetry(self) -> Symmetry | None:
+        """Left and right of the mesh; None where its reference is not its own mirror image."""
+        return find_symmetry(self.reference, self.topology, self.up_axis)
+
+    @cached_property
+    def pose_mirror(self) -> PoseMirror:
+        """Exchanges left and right of this model's poses.
+
+        Raises
+        ------
+        LCollisionError : the mesh has no two sides.
+        ModelFileError : the model has a damaged predictor.
+        """
+        if self.symmetry is None:
+            raise LCollisionError(
+                f"poses of {self.name} cannot be mirrored: its first pose is not symmetric, so "
+                f"that left and right are unknown; train a model whose first pose is"
+            )
+        resolver = self.resolver if self.has_predictor else None
+        return PoseMirror(self.embedding, self.symmetry, self.detector, self.height, resolver)
 
     @cached_property
     def fingerprint(self) -> str:

@@ -1,4 +1,4 @@
-"""Settings, log and symmetry: the small parts under the document."""
+"""Settings, log: the small parts under the document."""
 
 from __future__ import annotations
 
@@ -8,27 +8,13 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import pytest
 from PySide6.QtCore import QSettings, QtMsgType, qInstallMessageHandler, qWarning
 
 from app import log
 from app.engine import Failure
 from app.settings import SETTINGS, Settings
-from app.start_up import DEFAULT_MODEL, last_model, opening_pose
-from app.symmetry import mirror_vertices
-from app.tasks import mirror_of, mirrored
-from lcollision_core.jobs import CancelToken, no_progress
-from lcollision_core.model import PoseModel
-
-OCTAHEDRON = np.array(
-    [[1.0, 0, 0], [-1, 0, 0], [0, 0.8, 0], [0, -0.8, 0], [0, 0, 1.5], [0, 0, -1.5]]
-)
-OCTAHEDRON_FACES = np.array(
-    [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]],
-    dtype=np.int32,
-)
+from app.start_up import DEFAULT_MODEL, last_model
 
 
 @pytest.fixture
@@ -152,70 +138,3 @@ def test_no_log_file_is_no_reason_not_to_start(logging_into: Path) -> None:
     log.start_logging()
     logging.getLogger("app").error("into the void")
     assert logging_into.parent.is_file()
-
-
-def test_the_two_sides_of_a_symmetric_mesh_are_found() -> None:
-    mirror = mirror_vertices(OCTAHEDRON, OCTAHEDRON_FACES, up_axis=2)
-    assert mirror is not None
-    assert mirror.tolist() == [1, 0, 2, 3, 4, 5]
-    # With x up, front and back of z or left and right of y are what is left to exchange.
-    across = mirror_vertices(OCTAHEDRON, OCTAHEDRON_FACES, up_axis=0)
-    assert across is not None
-    assert across.tolist() == [0, 1, 3, 2, 4, 5]
-
-
-def test_a_dented_mesh_has_no_two_sides() -> None:
-    dented = OCTAHEDRON.copy()
-    dented[0] *= 0.9
-    dented[2] *= 0.8
-    assert mirror_vertices(dented, OCTAHEDRON_FACES, up_axis=2) is None
-
-
-def test_symmetric_points_with_other_faces_have_no_two_sides() -> None:
-    turned = OCTAHEDRON_FACES.copy()
-    turned[0] = turned[0, ::-1]
-    assert mirror_vertices(OCTAHEDRON, turned, up_axis=2) is None
-
-
-@pytest.fixture(scope="module")
-def body() -> PoseModel:
-    return PoseModel.load("body")
-
-
-def mesh_distance(
-    model: PoseModel, vertices: npt.NDArray[np.float64], others: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    """Return the vertices' distances in heights, at the rigid motion that makes them least."""
-    a, b = vertices - vertices.mean(axis=0), others - others.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    u[:, -1] *= np.sign(np.linalg.det(u @ vt))
-    return np.linalg.norm(a @ u @ vt - b, axis=1) / model.height
-
-
-@pytest.mark.parametrize("name", ["kneeling guard", "rest", "right side lunge", "twist right"])
-def test_the_mirror_image_of_the_body_is_as_near_as_an_unseen_pose(
-    body: PoseModel, name: str
-) -> None:
-    """Mirrored poses are unseen ones: the model's held-out error is what it may be off by."""
-    if name in body.pose_names:
-        latent = body.training_latent[body.pose_names.index(name)]
-    else:
-        opening = opening_pose(body)
-        assert opening.name == name
-        latent = opening.latent
-    mirror, metrics = mirror_of(body), body.metrics
-    assert mirror is not None
-    assert metrics is not None
-    assert metrics.held_out_mean is not None
-    assert metrics.held_out_max is not None
-    once = mirrored(body, latent, mirror)(no_progress, CancelToken())
-    twice = mirrored(body, once, mirror)(no_progress, CancelToken())
-    posed = body.decode(latent)
-    image = posed[mirror] * np.array([-1.0, 1.0, 1.0])
-    for found, wanted in ((body.decode(once), image), (body.decode(twice), posed)):
-        distance = mesh_distance(body, found, wanted)
-        assert distance.mean() < metrics.held_out_mean
-        assert distance.max() < metrics.held_out_max
-    # The first mirroring did something, unless the pose has two equal sides.
-    moved = mesh_distance(body, body.decode(once), posed).mean()
-    assert (moved > 10.0 * metrics.held_out_mean) == (name != "rest")

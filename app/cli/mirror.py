@@ -1,0 +1,87 @@
+"""``lcollision mirror``: poses with left and right exchanged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli.console import ExitStatus, note, print_json, progress_bar
+from app.cli.interrupt import cancel_on_interrupt
+from app.cli.models import ModelArgument
+from app.cli.poses import PosesOutput
+from app.cli.results import OutputForm, note_near_exclusion, require_output, write_result
+from app.wording import counted, mirrored_text
+from lcollision_core.errors import ModelFileError
+
+if TYPE_CHECKING:
+    from lcollision_core.model import MirroredPose, PoseModel
+
+
+def mirror(
+    model_name: ModelArgument,
+    poses: Annotated[
+        Path, typer.Argument(metavar="POSES", readable=False, help="A .json file of poses.")
+    ],
+    output: PosesOutput,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+) -> None:
+    """Exchange left and right of poses, and mirror where they belong.
+
+    What comes back is the pose nearest to each mirror image, with its fit error, under the same
+    name. A pose that was mirrored before, and not changed since, comes back to the bit. A pose
+    that is free of collisions by the exact check, and whose image is not, is resolved; exits with
+    1 where that fails.
+    """
+    from lcollision_core.model import PoseModel, read_poses
+
+    require_output(output, ".json")
+    model = PoseModel.load(model_name)
+    named = read_poses(poses, model)
+    if not named:
+        raise ModelFileError(f"{poses} has no poses in it; name a file that has some")
+    # Asked first: a model without two sides is refused before the work.
+    _ = model.pose_mirror
+    found: list[MirroredPose] = []
+    with cancel_on_interrupt() as cancel, progress_bar("Mirroring poses") as progress:
+        for pose in named:
+            found.append(model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel))
+            progress(len(found), len(named))
+    images = [p.mirrored(m) for p, m in zip(named, found, strict=True)]
+    write_result(output, OutputForm.POSES, model, images).note()
+    sources = [f"{poses}: {pose.name}" for pose in named]
+    if as_json:
+        rows = zip(sources, found, strict=True)
+        print_json([_row(model, source, output, mirrored) for source, mirrored in rows])
+    else:
+        for source, mirrored in zip(sources, found, strict=True):
+            typer.echo(f"{source}: {mirrored_text(mirrored)}")
+        note_near_exclusion(model)
+    colliding = [s for s, mirrored in zip(sources, found, strict=True) if mirrored.lost_freedom]
+    if colliding:
+        offer = (
+            f"run `lcollision resolve {model_name} {output}` or change them"
+            if model.has_predictor
+            else "the model has no predictor to resolve them with; run `lcollision label` and "
+            "`lcollision train predictor`"
+        )
+        count = counted(len(colliding), "free pose collides", "free poses collide")
+        note(f"{count} in the mirror, such as {colliding[0]}; {offer}")
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+
+
+def _row(model: PoseModel, source: str, output: Path, mirrored: MirroredPose) -> dict[str, Any]:
+    return {
+        "source": source,
+        "output": str(output),
+        "restored": mirrored.restored,
+        "fit_error_mean": mirrored.fit_error_mean,
+        "fit_error_max": mirrored.fit_error_max,
+        "pairs_before": mirrored.pairs_before,
+        "pairs_mirrored": mirrored.pairs_mirrored,
+        "pairs_after": mirrored.pairs_after,
+        "exactly_free": mirrored.pairs_after == 0,
+        "resolved": mirrored.pairs_after == 0 < mirrored.pairs_mirrored,
+        "near_exclusion": model.near_exclusion,
+    }

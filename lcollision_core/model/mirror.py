@@ -1,0 +1,258 @@
+"""Left and right: a mesh's plane of symmetry, and the mirror images of its poses."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.embedding import Embedding
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes import RigidTransform, Topology
+
+if TYPE_CHECKING:
+    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
+
+FloatArray = npt.NDArray[np.float64]
+
+_TOLERANCE = 1e-3
+"""In heights: how far a vertex may lie from its partner's mirror image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """The plane that a mesh's reference is symmetric about.
+
+    Attributes
+    ----------
+    partner : (V,) int32 array, read-only, each vertex's mirror image, its own inverse
+    axis : 0, 1 or 2, from one side to the other
+    offset : of the plane along the axis, in the mesh's unit
+    """
+
+    partner: npt.NDArray[np.int32]
+    axis: int
+    offset: float
+
+    def image(self, vertices: npt.NDArray[Any]) -> FloatArray:
+        """Reflect (V, 3) vertices, and give each the number of its partner: (V, 3)."""
+        image = np.array(vertices, dtype=np.float64)[self.partner]
+        image[:, self.axis] = 2.0 * self.offset - image[:, self.axis]
+        return image
+
+    def image_of_placement(self, placement: RigidTransform) -> RigidTransform:
+        """Return the motion that takes a mesh's image to where the placed mesh's image is."""
+        flip, shift = np.ones(3), np.zeros(3)
+        flip[self.axis], shift[self.axis] = -1.0, 2.0 * self.offset
+        turned = placement.rotation @ shift + placement.translation
+        return RigidTransform(flip[:, None] * placement.rotation * flip, flip * turned + shift)
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorSource:
+    """The pose that another one is the mirror image of.
+
+    Attributes
+    ----------
+    latent : (D,) float64 array
+    placement : where the decoded pose belongs, None for the reference's frame
+    image : the fingerprint of the mirror image; any other pose has another source
+    """
+
+    latent: FloatArray
+    placement: RigidTransform | None
+    image: str
+
+    def is_of(self, latent: npt.NDArray[Any], placement: RigidTransform | None) -> bool:
+        """Whether a pose is the mirror image, unchanged to the bit."""
+        return self.image == fingerprint_of_pose(latent, placement)
+
+
+@dataclass(frozen=True, eq=False)
+class MirroredPose:
+    """A pose with left and right exchanged. Lengths are in heights.
+
+    Attributes
+    ----------
+    latent : (D,) float64 array
+    placement : where the decoded pose belongs, None for the reference's frame
+    fit_error_mean, fit_error_max : distance of the decoded vertices from the exact mirror image
+    restored : it is the pose that the given one was mirrored from, to the bit
+    pairs_before : colliding pairs of faces of the given pose, by the exact check
+    pairs_mirrored : of the pose that is nearest to the mirror image
+    pairs_after : of this pose
+    resolution : the Resolve of the collisions that mirroring brought, None where there was none
+    source : of this pose: the given one
+    """
+
+    latent: FloatArray
+    placement: RigidTransform | None
+    fit_error_mean: float
+    fit_error_max: float
+    restored: bool
+    pairs_before: int
+    pairs_mirrored: int
+    pairs_after: int
+    resolution: ResolveResult | None
+    source: MirrorSource
+
+    @property
+    def lost_freedom(self) -> bool:
+        """Whether a pose that was free collides now."""
+        return self.pairs_before == 0 < self.pairs_after
+
+
+def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | None) -> str:
+    """Return 16 hexadecimal digits that tell a pose and its place, to the bit.
+
+    Parameters
+    ----------
+    latent : (D,) array
+    placement : None for the reference's frame
+    """
+    digest = hashlib.sha256(np.asarray(latent, dtype="<f8").tobytes())
+    if placement is not None:
+        for array in (placement.rotation, placement.translation):
+            digest.update(np.asarray(array, dtype="<f8").tobytes())
+    return digest.hexdigest()[:16]
+
+
+class PoseMirror:
+    """Exchanges left and right of one model's poses; immutable, safe between threads.
+
+    Parameters
+    ----------
+    embedding : decodes latent poses, and finds those of meshes
+    symmetry : of the mesh, in the data's unit
+    detector : the exact check, in the data's unit
+    height : one height in the data's unit
+    resolver : of what collides in the mirror only; None leaves it colliding
+    """
+
+    def __init__(
+        self,
+        embedding: Embedding,
+        symmetry: Symmetry,
+        detector: CollisionDetector,
+        height: float,
+        resolver: PoseResolver | None,
+    ) -> None:
+        self._embedding = embedding
+        self._symmetry = symmetry
+        self._detector = detector
+        self._height = height
+        self._resolver = resolver
+
+    def mirror(
+        self,
+        latent: npt.NDArray[Any],
+        placement: RigidTransform | None = None,
+        source: MirrorSource | None = None,
+        options: ResolveOptions | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> MirroredPose:
+        """Find the pose nearest to the mirror image of one, in the mirrored place.
+
+        The plane is the reference's, for a placed pose too. Where the pose is free and what comes
+        of it is not, it is resolved; a pose that collides is mirrored as it is.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        placement : where the decoded pose belongs, None for the reference's frame
+        source : what the pose was mirrored from, or None: where it is still that image, what
+            comes back is the source, to the bit
+        options : of the Resolve; its locked domains keep what they have in the mirror
+        progress : called with (steps of the Resolve done, all steps)
+        cancel : polled between the steps
+
+        Raises
+        ------
+        ShapeError, LCollisionError, CancelledError : as of `PoseModel.resolve`.
+        """
+        from lcollision_core.resolve.exact import ExactCheck
+
+        pose = np.array(latent, dtype=np.float64)
+        check = ExactCheck(self._embedding, self._detector, self._height, placement)
+        decoded = check.decode(pose)[0]
+        pairs_before = len(check.find(decoded).pairs)
+        image = self._symmetry.image(decoded * self._height) / self._height
+        place = None if placement is None else self._symmetry.image_of_placement(placement)
+        restored = source is not None and source.is_of(pose, placement)
+        if source is not None and restored:
+            found, place = source.latent, source.placement
+        else:
+            # In its place: a rigid motion left to the fit would be one more thing to undo, and
+            # the codes hold it all but as well.
+            fit = self._embedding.encode(image[None], cancel=cancel, in_place=True)
+            found = fit.latent[0].astype(np.float64)
+        check = ExactCheck(self._embedding, self._detector, self._height, place)
+        mirrored = check.decode(found)[0]
+        pairs_mirrored = pairs_after = len(check.find(mirrored).pairs)
+        resolution = None
+        if not restored and pairs_before == 0 < pairs_mirrored and self._resolver is not None:
+            resolution = self._resolver.resolve(found, options, progress, cancel, place)
+            if resolution.exactly_free:
+                found, pairs_after = resolution.latent, 0
+                mirrored = check.decode(found)[0]
+        picked = self._embedding.topology.picked
+        distances = np.linalg.norm((mirrored - image)[picked], axis=1)
+        return MirroredPose(
+            latent=found,
+            placement=place,
+            fit_error_mean=float(distances.mean()),
+            fit_error_max=float(distances.max()),
+            restored=restored,
+            pairs_before=pairs_before,
+            pairs_mirrored=pairs_mirrored,
+            pairs_after=pairs_after,
+            resolution=resolution,
+            source=MirrorSource(pose, placement, fingerprint_of_pose(found, place)),
+        )
+
+
+def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int) -> Symmetry | None:
+    """Find each vertex's partner on the other side, where the mesh is its own mirror image.
+
+    Parameters
+    ----------
+    reference : (V, 3) array, a symmetric pose
+    topology : of the mesh; vertices that no face names are their own partners
+    up_axis : 0, 1 or 2; left and right are along one of the other two
+
+    Returns
+    -------
+    symmetry : that maps faces onto faces; None where there is none
+    """
+    from scipy.spatial import cKDTree
+
+    used, faces = topology.used_vertices, topology.faces
+    vertices = np.asarray(reference, dtype=np.float64)[used]
+    tolerance = _TOLERANCE * float(np.ptp(vertices, axis=0).max())
+    tree = cKDTree(vertices)
+    everyone = np.arange(len(vertices), dtype=np.int32)
+    for axis in range(3):
+        if axis == up_axis:
+            continue
+        offset = float(vertices[:, axis].min() + vertices[:, axis].max()) / 2.0
+        image = Symmetry(everyone, axis, offset).image(vertices)
+        distance, nearest = tree.query(image)
+        partner = np.arange(topology.n_vertices, dtype=np.int32)
+        partner[used] = used[nearest]
+        is_exchange = distance.max() < tolerance and (nearest[nearest] == everyone).all()
+        if is_exchange and _turned(partner[faces[:, ::-1]]) == _turned(faces):
+            partner.flags.writeable = False
+            return Symmetry(partner, axis, offset)
+    return None
+
+
+def _turned(faces: npt.NDArray[np.int32]) -> set[tuple[int, int, int]]:
+    """Return the faces as a set, each turned until its least vertex comes first."""
+    turns = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
+    rows = np.take_along_axis(faces, turns, axis=1)
+    return {(int(a), int(b), int(c)) for a, b, c in rows}
