@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+from vtkmodules.util.numpy_support import numpy_to_vtk
 from vtkmodules.vtkCommonCore import vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+from vtkmodules.vtkCommonDataModel import vtkPolyData
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
-from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper
 
 from app.camera import VIEW_ANGLE, View
+from app.drawing import actor_of, cells_of, share_of
+from app.outline import Outline
 from app.shading import COLLIDING_FACE, rgb
 from app.waiting import BACKGROUND
 
@@ -56,7 +57,7 @@ class Surface:
         points.SetData(numpy_to_vtk(self.vertices))
         self.polydata = vtkPolyData()
         self.polydata.SetPoints(points)
-        self.polydata.SetPolys(_cells(faces))
+        self.polydata.SetPolys(cells_of(faces))
         self._normals = numpy_to_vtk(self.normals)
         self._colours = numpy_to_vtk(self.colours)
         self.polydata.GetPointData().SetNormals(self._normals)
@@ -100,7 +101,7 @@ class Scene:
         self._up_axis = up_axis
         self._height = height
         self.surface = Surface(faces, n_vertices)
-        self.body = _actor(self.surface.polydata)
+        self.body = actor_of(self.surface.polydata)
         self.body.GetMapper().SetScalarVisibility(True)
         shine = self.body.GetProperty()
         shine.SetAmbient(0.22)
@@ -109,7 +110,7 @@ class Scene:
         shine.SetSpecularPower(18.0)
 
         self._ghost = Surface(faces, n_vertices, n_channels=4)
-        self._ghost_actor = _actor(self._ghost.polydata)
+        self._ghost_actor = actor_of(self._ghost.polydata)
         self._ghost_actor.GetMapper().SetScalarVisibility(True)
         self._ghost_actor.ForceTranslucentOn()
         self._ghost_actor.GetProperty().SetAmbient(0.4)
@@ -120,11 +121,11 @@ class Scene:
 
         self._crossing = vtkPolyData()
         self._crossing.SetPoints(self.surface.polydata.GetPoints())
-        self._crossing_actor = _actor(self._crossing)
+        self._crossing_actor = actor_of(self._crossing)
         self._crossing_actor.SetPickable(False)
         self._crossing_actor.SetVisibility(False)
         red = self._crossing_actor.GetProperty()
-        red.SetColor(*_share(COLLIDING_FACE))
+        red.SetColor(*share_of(COLLIDING_FACE))
         red.SetAmbient(0.55)
         red.SetDiffuse(0.5)
         # The same triangles are in the body: without an offset the two fight for each pixel.
@@ -133,20 +134,20 @@ class Scene:
         nearer.SetRelativeCoincidentTopologyPolygonOffsetParameters(-2.0, -4.0)
 
         # A collision on the far side, or inside a limb, shines through.
-        self._through_actor = _actor(self._crossing)
+        self._through_actor = actor_of(self._crossing)
         self._through_actor.SetPickable(False)
         self._through_actor.SetVisibility(False)
         through = self._through_actor.GetProperty()
-        through.SetColor(*_share(COLLIDING_FACE))
+        through.SetColor(*share_of(COLLIDING_FACE))
         through.SetOpacity(_THROUGH_OPACITY)
         through.LightingOff()
         foremost = self._through_actor.GetMapper()
         foremost.SetResolveCoincidentTopologyToPolygonOffset()
         foremost.SetRelativeCoincidentTopologyPolygonOffsetParameters(0.0, _TO_THE_FRONT)
 
-        self._floor_actor = _actor(_disc(up_axis, _FLOOR_RADIUS * height))
+        self._floor_actor = actor_of(_disc(up_axis, _FLOOR_RADIUS * height))
         self._floor_actor.GetProperty().BackfaceCullingOn()
-        self._shadow_actor = _actor(self.surface.polydata)
+        self._shadow_actor = actor_of(self.surface.polydata)
         self._lift = 2e-3 * height
         for actor in (self._floor_actor, self._shadow_actor):
             actor.GetProperty().LightingOff()
@@ -161,6 +162,7 @@ class Scene:
         )
         for actor in self._actors:
             self._renderer.AddActor(actor)
+        self.outline = Outline(self._renderer)
         self._floor_shown = True
         self.set_dark(dark)
 
@@ -168,16 +170,17 @@ class Scene:
         """Take everything out of the renderer, for another scene."""
         for actor in self._actors:
             self._renderer.RemoveActor(actor)
+        self.outline.remove()
 
     def set_dark(self, dark: bool) -> None:
         """Take the colours of the light or the dark theme."""
         bottom, top = BACKGROUND[dark]
-        self._renderer.SetBackground(*_share(bottom))
-        self._renderer.SetBackground2(*_share(top))
+        self._renderer.SetBackground(*share_of(bottom))
+        self._renderer.SetBackground2(*share_of(top))
         self._renderer.SetGradientBackground(True)
         floor, shadow = _FLOOR[dark]
-        self._floor_actor.GetProperty().SetColor(*_share(floor))
-        self._shadow_actor.GetProperty().SetColor(*_share(shadow))
+        self._floor_actor.GetProperty().SetColor(*share_of(floor))
+        self._shadow_actor.GetProperty().SetColor(*share_of(shadow))
         self._ghost.colours[:, :3] = rgb(_GHOST[dark])
         self._ghost.touch()
 
@@ -190,7 +193,7 @@ class Scene:
     def set_plain_background(self, colour: str) -> None:
         """Put one colour, "#rrggbb", behind everything, as pictures to be cut out need it."""
         self._renderer.SetGradientBackground(False)
-        self._renderer.SetBackground(*_share(colour))
+        self._renderer.SetBackground(*share_of(colour))
 
     def show(
         self,
@@ -239,10 +242,19 @@ class Scene:
         """
         chosen = np.unique(pairs) if pairs is not None else np.zeros(0, dtype=np.int32)
         if len(chosen):
-            self._crossing.SetPolys(_cells(self._faces[chosen]))
+            self._crossing.SetPolys(cells_of(self._faces[chosen]))
             self._crossing.Modified()
         self._crossing_actor.SetVisibility(len(chosen) > 0)
         self._through_actor.SetVisibility(len(chosen) > 0)
+
+    def fit_outline(self, sharpness: float) -> None:
+        """Let the outline follow the pose and the camera, just before a picture.
+
+        Parameters
+        ----------
+        sharpness : device pixels per device-independent one
+        """
+        self.outline.fit(self.surface.vertices, self.surface.normals, sharpness)
 
     def look_like(self, other: Scene) -> None:
         """Show what another scene of the same mesh shows, from where it is looked at."""
@@ -313,26 +325,6 @@ class Scene:
         self._shadow_actor.SetUserMatrix(flat)
 
 
-def _actor(polydata: vtkPolyData) -> vtkActor:
-    mapper = vtkPolyDataMapper()
-    mapper.SetInputData(polydata)
-    mapper.SetScalarVisibility(False)
-    actor = vtkActor()
-    actor.SetMapper(mapper)
-    return actor
-
-
-def _cells(faces: npt.NDArray[Any]) -> vtkCellArray:
-    cells = vtkCellArray()
-    offsets = np.arange(0, 3 * len(faces) + 1, 3, dtype=np.int64)
-    corners = np.ascontiguousarray(faces, dtype=np.int64).ravel()
-    # Copies, since VTK does not hold on to NumPy's memory.
-    cells.SetData(
-        numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(corners, deep=True)
-    )
-    return cells
-
-
 def _disc(up_axis: int, radius: float) -> vtkPolyData:
     angle = np.linspace(0.0, 2.0 * np.pi, _FLOOR_SIDES, endpoint=False)
     points = np.zeros((_FLOOR_SIDES + 1, 3), dtype=np.float32)
@@ -344,10 +336,5 @@ def _disc(up_axis: int, radius: float) -> vtkPolyData:
     held = vtkPoints()
     held.SetData(numpy_to_vtk(points, deep=True))
     disc.SetPoints(held)
-    disc.SetPolys(_cells(fan))
+    disc.SetPolys(cells_of(fan))
     return disc
-
-
-def _share(colour: str) -> tuple[float, float, float]:
-    red, green, blue = (rgb(colour) / 255.0).tolist()
-    return red, green, blue

@@ -33,7 +33,6 @@ _RAMPS = {
     "predicted": ("#f2a93b", "#cf3f6f", "#5b1a78"),
     "exact": ("#7fc4d6", "#2f7fb8", "#1d2c6b"),
 }
-_DIMMED = 0.45
 
 # Björn Ottosson, "A perceptual color space for image processing", 2020: Oklab.
 _LMS_OF_RGB = np.array(
@@ -122,16 +121,14 @@ class Shader:
         shading: Shading,
         domain_energy: FloatArray | None = None,
         vertex_energy: FloatArray | None = None,
-        highlight: int | None = None,
     ) -> ColourArray:
-        """Colour each vertex.
+        """Colour each vertex: by nothing but what is shown, so that a scale means one thing.
 
         Parameters
         ----------
         shading : what to show; a kind whose energy is not known is plain
         domain_energy : (K,) array, the prediction, in squared heights
         vertex_energy : (V,) array, the exact energy, in squared heights
-        highlight : the domain to bring out, all else steps back
 
         Returns
         -------
@@ -146,9 +143,7 @@ class Shader:
             colours = _on_ramp(np.sqrt(vertex_energy) / FULL_EXACT, self._ramp("exact"))
         else:
             colours = np.broadcast_to(rgb(self.skin), self._domains.shape)
-        if highlight is None:
-            return colours
-        return self._lit(colours, highlight)
+        return colours
 
     def legend(
         self,
@@ -195,13 +190,6 @@ class Shader:
                 ticks=_ticks(FULL_EXACT),
             )
         return Legend()
-
-    def _lit(self, colours: ColourArray, domain: int) -> ColourArray:
-        weight = self._mask[domain][:, None]
-        skin = rgb(self.skin).astype(np.float32)
-        rest = colours + _DIMMED * (skin - colours)
-        lit: ColourArray = (rest + weight * (rgb(self._colours[domain]) - rest)).astype(np.uint8)
-        return lit
 
     def _ramp(self, kind: str) -> ColourArray:
         return ramp((self.skin, *_RAMPS[kind]))

@@ -28,6 +28,7 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from app.canvas import Canvas
     from app.document import PoseDocument
+    from app.outline import PartShape
     from app.scene import Scene
     from app.turntable import Turntable
     from lcollision_core.resolve import ResolveResult
@@ -173,7 +174,7 @@ class Viewport(QWidget):
         self.shading_changed.emit(shading)
 
     def highlight_domain(self, domain: int | None) -> None:
-        """Bring out a domain, or none.
+        """Outline a domain, or none; the colours say what they said before.
 
         Parameters
         ----------
@@ -181,7 +182,9 @@ class Viewport(QWidget):
         """
         if domain != self._highlight:
             self._highlight = domain
-            self._recolour()
+            if self._scene is not None and self._canvas is not None:
+                self._scene.outline.show(None if domain is None else self._shape_of(domain))
+                self._canvas.redraw()
 
     # The camera.
 
@@ -402,6 +405,7 @@ class Viewport(QWidget):
             exact = self._document.exact
             shown = self._shading is Shading.EXACT and exact is not None
             scene.show_crossing(exact.pairs if exact is not None and shown else None)
+        scene.fit_outline(self.devicePixelRatioF())
 
     def _put(self, scene: Scene, frame: LiveFrame) -> None:
         before, self._shown = self._shown, frame
@@ -430,7 +434,13 @@ class Viewport(QWidget):
     def _paint(self, scene: Scene, frame: LiveFrame) -> None:
         assert self._shader is not None
         energies = self._energies(frame)
-        scene.paint(self._shader.colours(self._shading, *energies, highlight=self._highlight))
+        scene.paint(self._shader.colours(self._shading, *energies))
+
+    def _shape_of(self, domain: int) -> PartShape:
+        from app.outline import PartShape
+
+        model = self._document.model
+        return PartShape.of(model.attention_mask, model.faces, domain)
 
     def _energies(self, frame: LiveFrame) -> tuple[FloatArray | None, FloatArray | None]:
         predicted, exact = frame.prediction, self._document.exact

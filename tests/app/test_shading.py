@@ -93,23 +93,6 @@ def test_exact_energy_is_each_vertex_own_and_stops_at_full(shader: Shader) -> No
     assert (colours[1] == ramp_colours[127]).all()
 
 
-def test_a_highlight_brings_out_its_domain_and_dims_the_rest(shader: Shader) -> None:
-    plain = shader.colours(Shading.DOMAINS)
-    lit = shader.colours(Shading.DOMAINS, highlight=0)
-    assert (lit[0] == rgb(COLOURS[0])).all()
-    skin = rgb(shader.skin).astype(float)
-    before = np.abs(plain[3] - skin).sum()
-    assert 0 < np.abs(lit[3] - skin).sum() < 0.6 * before
-
-
-def test_colours_do_not_change_what_they_are_made_of(shader: Shader) -> None:
-    energy, vertex_energy = np.array([1e-4, 1e-5]), np.full(4, 1e-6)
-    for shading in Shading:
-        first = shader.colours(shading, energy, vertex_energy).copy()
-        shader.colours(shading, energy, vertex_energy, highlight=1)
-        assert (shader.colours(shading, energy, vertex_energy) == first).all()
-
-
 def test_every_step_of_a_scale_looks_alike(shader: Shader) -> None:
     for colours in ramps(shader):
         lab = np.array([cielab(colour) for colour in colours[::15]])

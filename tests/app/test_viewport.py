@@ -23,7 +23,7 @@ from app.document import PoseDocument
 from app.engine import Failure
 from app.legend import LegendCard
 from app.rendering import PoseRenderer
-from app.shading import Shading, rgb
+from app.shading import Shading
 from app.theme import DARK, LIGHT, apply_theme
 from app.viewport import Viewport
 from lcollision_core.errors import LCollisionError, MeshFileError
@@ -215,26 +215,70 @@ def test_after_many_frames_the_last_is_shown_and_few_are_drawn(
     assert viewport.n_painted - painted < 202
 
 
-def test_a_highlight_lights_its_domain_and_leaves_no_trace(
-    qtbot: QtBot, viewport: Viewport
+@pytest.mark.parametrize("shading", Shading)
+def test_a_highlight_outlines_its_domain_and_leaves_all_colours_as_they_are(
+    qtbot: QtBot,
+    document: PoseDocument,
+    viewport: Viewport,
+    colliding: npt.NDArray[np.float64],
+    shading: Shading,
 ) -> None:
-    model = viewport._document.model
-    plain = pixels(viewport)
+    document.set_latent(colliding, "Jump")
+    rest(qtbot, viewport)
+    qtbot.waitUntil(lambda: document.exact is not None)
+    viewport.set_shading(shading)
+    rest(qtbot, viewport)
+    scene, legend = viewport.scene, viewport.legend
+    assert scene is not None
+    before, colours = pixels(viewport), scene.surface.colours.copy()
     viewport.highlight_domain(1)
     rest(qtbot, viewport)
-    lit = changed(plain, pixels(viewport))
-    own, other = (place_of(viewport, seen_vertex(viewport, domain)) for domain in (1, 0))
-    assert lit[own.y() - 1 : own.y() + 2, own.x() - 1 : own.x() + 2].any()
-    assert not lit[other.y(), other.x()]
-    assert viewport.scene is not None
-    strongest = int(model.attention_mask[1].argmax())
-    difference = viewport.scene.surface.colours[strongest].astype(int) - rgb(
-        model.domain_colours[1]
-    )
-    assert np.abs(difference).max() < 60
+    assert scene.outline.is_shown
+    assert (scene.surface.colours == colours).all()
+    assert viewport.legend == legend
+    drawn = changed(before, pixels(viewport))
+    assert drawn.sum() > 100
+    # A line, no wash: the part itself is as it was.
+    leads = document.model.attention_mask.argmax(axis=0)
+    places = [place_of(viewport, vertex) for vertex in np.flatnonzero(leads == 1)]
+    assert np.mean([drawn[place.y(), place.x()] for place in places]) < 0.5
+    columns = np.array([place.x() for place in places])
+    beyond = np.flatnonzero(drawn.any(axis=0))
+    assert columns.min() - 12 <= beyond.min()
+    assert beyond.max() <= columns.max() + 12
     viewport.highlight_domain(None)
     rest(qtbot, viewport)
-    assert not changed(plain, pixels(viewport)).any()
+    assert not changed(before, pixels(viewport)).any()
+
+
+def test_an_outline_follows_the_pose_and_the_camera_in_one_width(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
+) -> None:
+    scene = viewport.scene
+    assert scene is not None
+
+    def outlined() -> npt.NDArray[np.bool_]:
+        pictures = []
+        for domain in (None, 1):
+            viewport.highlight_domain(domain)
+            rest(qtbot, viewport)
+            pictures.append(pixels(viewport))
+        return changed(*pictures)
+
+    straight = outlined()
+    document.set_latent(colliding, "Jump")
+    rest(qtbot, viewport)
+    bent = outlined()
+    viewport.set_camera("Back", glide=False)
+    rest(qtbot, viewport)
+    behind = outlined()
+    assert min(straight.sum(), bent.sum(), behind.sum()) > 100
+    assert (straight & ~bent).any()
+    assert (bent & ~behind).any()
+    view = scene.view
+    scene.view = View(view.focus + 0.5 * (view.position - view.focus), view.focus, view.up)
+    # From half as far a line is twice as long at most, and no wider.
+    assert outlined().sum() < 2.5 * behind.sum()
 
 
 def test_each_shading_looks_different_and_explains_itself(
