@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.formats.polygons import first_at_each_place
 from lcollision_core.meshes.pose_set import PoseSet, collect_poses, degenerate_faces
 from lcollision_core.meshes.topology import Topology
 
@@ -122,11 +123,8 @@ def _count(number: int, one: str, several: str) -> str:
 
 
 def _duplicates(points: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
-    order = np.lexsort(points.T)
-    ordered = points[order]
-    # lexsort is stable, so of equal vertices the lowest index comes first.
-    repeats = (ordered[1:] == ordered[:-1]).all(axis=1)
-    return np.sort(order[1:][repeats]).astype(np.int32)
+    first = first_at_each_place(points)
+    return np.flatnonzero(first != np.arange(len(first))).astype(np.int32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,10 @@ from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.files import READABLE_SUFFIXES, first_not_finite, read_mesh
 from lcollision_core.meshes.likeness import unlike_poses
+from lcollision_core.meshes.mesh_kernels import mark_flat_faces
 from lcollision_core.meshes.npz import MAX_ITEMS, read_npz, write_npz
 from lcollision_core.meshes.topology import Topology
+from lcollision_core.meshes.units import height
 
 FORMAT_VERSION = 1
 """The version that `write_pose_set` stores; later ones are refused."""
@@ -235,16 +237,12 @@ def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDAr
     (D,) indices of the faces whose height over their longest side is below 1e-12 of that side:
     float64's rounding, in any unit
     """
-    points = np.asarray(vertices, dtype=np.float64)
-    # About the origin, so that a mesh far from it keeps its digits; the first corner, as unused
-    # vertices may lie anywhere. At one, squares neither overflow nor vanish, whatever the unit.
-    points = 0.5 * points - 0.5 * points[topology.faces[0, 0]]
-    a, b, c = (points[corner] for corner in topology.faces.T)
-    largest = max(float(np.abs(corners).max()) for corners in (a, b, c))
-    a, b, c = (corners / max(largest, np.finfo(np.float64).tiny) for corners in (a, b, c))
-    longest_squared = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], 0)
-    twice_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return np.flatnonzero(twice_area <= 1e-12 * longest_squared).astype(np.int32)
+    points = np.ascontiguousarray(vertices, dtype=np.float64)
+    # At one, squares neither overflow nor vanish, whatever the unit.
+    extent = max(height(points, topology), np.finfo(np.float64).tiny)
+    is_flat = np.empty(topology.n_faces, dtype=np.bool_)
+    mark_flat_faces(points, topology.faces, 1.0 / extent, is_flat)
+    return np.flatnonzero(is_flat).astype(np.int32)
 
 
 def _collect_folder(

@@ -11,6 +11,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from lcollision_core.errors import PoseSetError, ShapeError
+from lcollision_core.meshes.mesh_kernels import count_fans, sort_edges, unique_edges
 
 IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
@@ -70,17 +71,20 @@ class Topology:
         return hash((self.n_vertices, self.faces.tobytes()))
 
     @cached_property
-    def _directed_edges(self) -> IntArray:
-        return np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]])
+    def _edge_order(self) -> IntArray:
+        """(3 F,) directed edges by their vertices, 3 f + c leading on from corner c of face f."""
+        order = np.empty(3 * self.n_faces, dtype=np.int32)
+        sort_edges(self.faces, self.n_vertices, order)
+        return order
 
     @cached_property
-    def _edges_and_counts(self) -> tuple[IntArray, npt.NDArray[np.intp]]:
-        ends = np.sort(self._directed_edges, axis=1).astype(np.int64)
-        # One integer an edge sorts many times faster than pairs do.
-        keys, counts = np.unique(ends[:, 0] * self.n_vertices + ends[:, 1], return_counts=True)
-        unique = np.stack(np.divmod(keys, self.n_vertices), axis=1).astype(np.int32)
+    def _edges_and_counts(self) -> tuple[IntArray, IntArray, bool]:
+        edges = np.empty((3 * self.n_faces, 2), dtype=np.int32)
+        counts = np.empty(3 * self.n_faces, dtype=np.int32)
+        n_edges, is_watertight = unique_edges(self.faces, self._edge_order, edges, counts)
+        unique = edges[:n_edges].copy()
         unique.flags.writeable = False
-        return unique, counts
+        return unique, counts[:n_edges].copy(), is_watertight
 
     @property
     def edges(self) -> IntArray:
@@ -101,32 +105,14 @@ class Topology:
     @property
     def pinched_vertices(self) -> IntArray:
         """Indices of the vertices whose faces form several fans that touch in the vertex alone."""
-        directed = self._directed_edges.astype(np.int64)
-        keys = directed.min(axis=1) * self.n_vertices + directed.max(axis=1)
-        order = np.argsort(keys, kind="stable")
-        followed = keys[order[:-1]] == keys[order[1:]]
-        # A node for each corner of each face; the faces at an edge join their corners at both ends.
-        corner = np.arange(3 * self.n_faces).reshape(self.n_faces, 3)
-        ends = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]])
-        ends = np.where((directed[:, 0] < directed[:, 1])[:, None], ends, ends[:, ::-1])
-        joined_a = ends[order[:-1][followed]].reshape(-1)
-        joined_b = ends[order[1:][followed]].reshape(-1)
-        graph = sparse.coo_matrix(
-            (np.ones(len(joined_a), dtype=np.int8), (joined_a, joined_b)), shape=2 * (corner.size,)
-        )
-        _, fan = csgraph.connected_components(graph, directed=False)
-        _, a_corner = np.unique(fan, return_index=True)
-        fans = np.bincount(self.faces.reshape(-1)[a_corner], minlength=self.n_vertices)
+        fans = np.empty(self.n_vertices, dtype=np.int32)
+        count_fans(self.faces, self._edge_order, fans)
         return np.flatnonzero(fans > 1).astype(np.int32)
 
-    @cached_property
+    @property
     def is_watertight(self) -> bool:
         """Whether every edge has two faces that run along it in opposite directions."""
-        if not bool((self._edges_and_counts[1] == 2).all()):
-            return False
-        directed = self._directed_edges.astype(np.int64)
-        keys = np.sort(directed[:, 0] * self.n_vertices + directed[:, 1])
-        return bool((keys[1:] != keys[:-1]).all())
+        return self._edges_and_counts[2]
 
     @cached_property
     def adjacency(self) -> sparse.csr_matrix:

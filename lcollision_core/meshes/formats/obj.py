@@ -6,6 +6,7 @@ texture coordinates or normals differ.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, BinaryIO
 
@@ -14,10 +15,16 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_few
-from lcollision_core.meshes.formats.text import decimals, normalised_text, plain_integers
+from lcollision_core.meshes.formats.text import (
+    decimals,
+    normalised_text,
+    plain_decimals,
+    plain_integers,
+)
 
 _SHORTEST_LINE = len(b"f 1 2 3\n")
 _BLOCK_LINES = 1 << 18
+_LARGEST = np.iinfo(np.int64).max
 
 
 def read(file: BinaryIO, size: int) -> Polygons:
@@ -44,6 +51,69 @@ def read(file: BinaryIO, size: int) -> Polygons:
     data = normalised_text(data)
     if b"\\" in data:
         data = data.replace(b"\\\n", b" ")
+    return _read_plain(data) or _read_any(data)
+
+
+def _read_plain(data: bytes) -> Polygons | None:
+    """Read what nearly all programs write, without a loop; None where anything else occurs."""
+    text = np.frombuffer(data, dtype=np.uint8)
+    starts = np.concatenate([[0], np.flatnonzero(text == ord("\n")) + 1])
+    starts = starts[starts < len(text)]
+    if not len(starts):
+        return None
+    first, second = text[starts], text[np.minimum(starts + 1, len(text) - 1)]
+    is_vertex, is_face = first == ord("v"), first == ord("f")
+    is_blank = (second <= ord(" ")) & (is_vertex | is_face)
+    if ((first <= ord(" ")) & (first != ord("\n"))).any() or (second[is_blank] != ord(" ")).any():
+        return None
+    kind = np.where(is_blank, first, 0)
+    bounds = np.concatenate([[0], np.flatnonzero(np.diff(kind)) + 1])
+    ends = np.append(starts[bounds[1:]], len(text))
+    lines = {
+        keyword: b"".join(
+            data[start:end]
+            for start, end, found in zip(starts[bounds], ends, kind[bounds], strict=True)
+            if found == ord(keyword)
+        )
+        for keyword in ("v", "f")
+    }
+    n_vertices, n_faces = (int(np.count_nonzero(kind == ord(keyword))) for keyword in ("v", "f"))
+    vertices = _plain_vertices(lines["v"], n_vertices)
+    faces = _plain_faces(lines["f"], n_faces)
+    if vertices is None or faces is None:
+        return None
+    return Polygons(vertices, *faces)
+
+
+def _plain_vertices(lines: bytes, n_vertices: int) -> npt.NDArray[np.float64] | None:
+    # A word that is no number for each keyword, at every row's start and nowhere else.
+    values = plain_decimals(lines.replace(b"v", b"nan"))
+    if values is None or n_vertices == 0 or len(values) % n_vertices:
+        return None
+    table = values.reshape(n_vertices, -1)
+    if table.shape[1] < 4 or not np.isnan(table[:, 0]).all() or np.isnan(table[:, 1:]).any():
+        return None
+    return np.ascontiguousarray(table[:, 1:4])
+
+
+def _plain_faces(
+    lines: bytes, n_faces: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+    has_more = b"/" in lines
+    if has_more:
+        lines = re.sub(rb"(?<=[0-9])/[^\s]*", b"", lines)
+    # OBJ counts from 1, so a zero for each keyword tells rows apart.
+    named = plain_integers(lines.replace(b"f", b" 0 "))
+    if named is None:
+        return None
+    rows = np.flatnonzero(named == 0)
+    if len(rows) != n_faces or named[0] != 0 or (has_more and named.max() == _LARGEST):
+        return None
+    return np.diff(np.append(rows, len(named))) - 1, named[named != 0] - 1
+
+
+def _read_any(data: bytes) -> Polygons:
+    """Read line by line, and say what is wrong with which."""
     vertex_lines: list[bytes] = []
     face_lines: list[bytes] = []
     vertices_before: list[int] = []
@@ -115,7 +185,7 @@ def _parse_faces(
     all_corners = [np.empty(0, dtype=np.int64)]
     for start in range(0, len(lines), _BLOCK_LINES):
         block = lines[start : start + _BLOCK_LINES]
-        sizes, named = _parse_plain_triangles(block) or _parse_any_faces(block, start)
+        sizes, named = _parse_any_faces(block, start)
         owner = np.repeat(np.arange(start, start + len(block)), sizes)
         zero = np.flatnonzero(named == 0)
         if len(zero):
@@ -134,19 +204,6 @@ def _parse_faces(
         all_sizes.append(sizes)
         all_corners.append(named - 1)
     return np.concatenate(all_sizes), np.concatenate(all_corners)
-
-
-def _parse_plain_triangles(
-    block: list[bytes],
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
-    """Parse the bulk of all files, `f 1 2 3` lines alone; None where anything else occurs."""
-    numbers = plain_integers(b" ".join(block).replace(b"f", b" 0 "))
-    # A zero for each keyword, at every row's start and nowhere else: no row is ragged.
-    if numbers is None or len(numbers) != 4 * len(block):
-        return None
-    if numbers[::4].any() or (numbers == 0).sum() != len(block):
-        return None
-    return np.full(len(block), 3, dtype=np.int64), numbers.reshape(-1, 4)[:, 1:].reshape(-1)
 
 
 def _parse_any_faces(

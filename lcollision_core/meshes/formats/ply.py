@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_plausible_count
-from lcollision_core.meshes.formats.text import numbers
+from lcollision_core.meshes.formats.text import numbers, plain_decimals
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -248,7 +248,8 @@ class _TextBody:
     """The rows of a text body, read from the front."""
 
     def __init__(self, data: bytes) -> None:
-        self._values = numbers(data.split(), "the rows")
+        plain = plain_decimals(data)
+        self._values = numbers(data.split(), "the rows") if plain is None else plain
         self._offset = 0
 
     def read(self, element: _Element) -> dict[str, _Column]:
@@ -270,6 +271,9 @@ class _TextBody:
                 item.name: _Column(table[:, index], None)
                 for index, item in enumerate(element.properties)
             }
+        alike = self._read_alike(element)
+        if alike is not None:
+            return alike
         for row in range(element.count):
             for index, item in enumerate(element.properties):
                 length = 1
@@ -297,6 +301,38 @@ class _TextBody:
             if item.name in _CORNER_NAMES:
                 _require_vertex_numbers(element, chosen, counts)
             columns[item.name] = _Column(chosen, None if item.count_dtype is None else counts)
+        return columns
+
+    def _read_alike(self, element: _Element) -> dict[str, _Column] | None:
+        """Read rows as one table, if every list is as long as in the first row; else None."""
+        counts, at = [], self._offset
+        for item in element.properties:
+            count = 1
+            if item.count_dtype is not None:
+                if at >= len(self._values) or not 0 <= self._values[at] <= len(self._values):
+                    return None
+                count = int(self._values[at])
+                at += 1
+            counts.append(count)
+            at += count
+        end = self._offset + (at - self._offset) * element.count
+        if end > len(self._values):
+            return None
+        table = self._values[self._offset : end].reshape(element.count, -1)
+        columns, at = {}, 0
+        for item, count in zip(element.properties, counts, strict=True):
+            sizes = None
+            if item.count_dtype is not None:
+                if (table[:, at] != count).any():
+                    return None
+                sizes = np.full(element.count, count, dtype=np.int64)
+                at += 1
+            chosen = table[:, at : at + count].reshape(-1)
+            at += count
+            if item.name in _CORNER_NAMES:
+                _require_vertex_numbers(element, chosen, np.full(element.count, count))
+            columns[item.name] = _Column(chosen, sizes)
+        self._offset = end
         return columns
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.mesh_kernels import find_equal_rows
 from lcollision_core.meshes.topology import Topology
 
 MAX_FACES = 5_000_000
@@ -76,6 +77,15 @@ def with_order_of(
     if not np.array_equal(vertices[order], corners):
         return None
     return Polygons.triangles(vertices, topology.faces.astype(np.int64), (note,))
+
+
+def first_at_each_place(points: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    """Return (n,) for each of (n, 3) points the index of the first at its coordinates."""
+    # -0.0 becomes 0.0: equal coordinates, equal bits.
+    places = np.ascontiguousarray(points, dtype=np.float64) + 0.0
+    first = np.empty(len(places), dtype=np.int32)
+    find_equal_rows(places.view(np.uint64), first)
+    return first
 
 
 def triangulate(polygons: Polygons) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import (
     Polygons,
+    first_at_each_place,
     read_rest,
     require_few,
     require_plausible_count,
@@ -65,7 +66,7 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
         )
     else:
         raise MeshFileError(f"it has {size} bytes, too few for an STL file; export the mesh again")
-    points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0: equal coordinates, equal bytes
+    points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0, as which corner is kept is chance
     return with_order_of(points, topology, _REORDERED) or _joined(points)
 
 
@@ -89,13 +90,10 @@ def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
 
 
 def _joined(points: npt.NDArray[np.float64]) -> Polygons:
-    keys = np.ascontiguousarray(points).view(np.dtype((np.void, points.itemsize * 3))).reshape(-1)
-    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    by_appearance = np.argsort(first, kind="stable")
-    number = np.empty(len(first), dtype=np.int64)
-    number[by_appearance] = np.arange(len(first))
-    faces = number[inverse.reshape(-1)].reshape(-1, 3)
-    return Polygons.triangles(points[first[by_appearance]], faces, (_JOINED,))
+    first = first_at_each_place(points)
+    is_first = first == np.arange(len(first))
+    number = np.cumsum(is_first) - 1
+    return Polygons.triangles(points[is_first], number[first].reshape(-1, 3), (_JOINED,))
 
 
 def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:

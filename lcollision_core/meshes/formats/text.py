@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -60,6 +61,25 @@ def plain_integers(text: bytes) -> npt.NDArray[np.int64] | None:
     if not text or text.isspace() or text.translate(None, b" \n0123456789"):
         return None
     return np.fromstring(text, dtype=np.int64, sep=" ")
+
+
+def plain_decimals(text: bytes) -> npt.NDArray[np.float64] | None:
+    """Parse blank-separated decimals quickly; None where there is anything else.
+
+    Besides decimals the text may hold the word `nan`.
+    """
+    if text.translate(None, b" \t\n\r0123456789+-.eEna"):
+        return None
+    blank = np.frombuffer(text, dtype=np.uint8) <= ord(" ")
+    n_words = int(np.count_nonzero(blank[:-1] & ~blank[1:])) + int(len(blank) > 0 and not blank[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            values = np.fromstring(text, dtype=np.float64, sep=" ")
+        except (DeprecationWarning, ValueError):  # something that is no number
+            return None
+    # "1.2.3" is read as two.
+    return values if len(values) == n_words else None
 
 
 def normalised_text(data: bytes) -> bytes:
