@@ -35,6 +35,7 @@ class DocumentState:
     ghost : (V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`
     outcome : of the Resolve that ended in this pose
     mirror_of : what the pose was mirrored from; once it is changed, of no meaning
+    outcome_seconds : from asking for that Resolve to its result, with all that it waited for
     """
 
     latent: npt.NDArray[np.float64]
@@ -44,6 +45,7 @@ class DocumentState:
     ghost: npt.NDArray[np.float32] | None = None
     outcome: ResolveResult | None = None
     mirror_of: MirrorSource | None = None
+    outcome_seconds: float = 0.0
 
     def same_as(self, other: DocumentState) -> bool:
         """Whether there is nothing to undo between two states: equal poses, to the bit."""

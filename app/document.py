@@ -89,6 +89,7 @@ class PoseDocument(PoseHistory):
         self._exact: ExactVerdict | None = None
 
         self._solve: int | None = None
+        self._solve_began = 0.0
         self._mirroring = self._incoming = self._loading = 0
         self._exports: list[int] = []
         self._closed = False
@@ -187,6 +188,7 @@ class PoseDocument(PoseHistory):
 
     def reset_all(self) -> None:
         """Set all numbers to 0, but for those of locked domains."""
+        self._tell_if_locked()
         self._edit("Reset all", self._with_locked(np.zeros_like(self.latent)))
 
     def randomise(self, amount: float, seed: int) -> None:
@@ -198,6 +200,7 @@ class PoseDocument(PoseHistory):
             range
         seed : equal seeds draw equal poses
         """
+        self._tell_if_locked()
         drawn = self.model.latent_space.sample(1, np.random.default_rng(seed))[0]
         latent = (1.0 - amount) * self.latent + amount * drawn
         self._edit("Randomise", self._with_locked(latent))
@@ -237,6 +240,11 @@ class PoseDocument(PoseHistory):
         from lcollision_core.model import NamedPose
 
         return NamedPose(self.model.pose_names[number], self.model.training_latent[number])
+
+    @property
+    def all_locked(self) -> bool:
+        """Whether every domain is locked, so that nothing but a slider can move the pose."""
+        return self.has_model and len(self._locked) == len(self.model.domain_names)
 
     # Models and files.
 
@@ -367,6 +375,7 @@ class PoseDocument(PoseHistory):
         self.cancel_resolve()
         chosen = replace(options or ResolveOptions(), locked_domains=self._locked)
         work = tasks.resolved(self.model, self.latent, self.placement, chosen)
+        self._solve_began = time.monotonic()
         self._solve = self._long.start("Resolving", work, self._on_resolved, self.cancel_resolve)
         self.solve_started.emit()
 
@@ -458,14 +467,15 @@ class PoseDocument(PoseHistory):
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
         result, self._solve = resolved.result, None
+        seconds = time.monotonic() - self._solve_began
         self.end_gesture()
         if np.array_equal(result.latent, self.latent):
             # Nothing to undo, but the reasons are worth seeing.
-            self._amend(replace(self._state, ghost=None, outcome=result))
+            self._amend(replace(self._state, ghost=None, outcome=result, outcome_seconds=seconds))
         else:
             latent = read_only(np.array(result.latent, dtype=np.float64))
-            after = replace(self._state, latent=latent, ghost=resolved.ghost, outcome=result)
-            self._push("Resolve", after)
+            found = replace(self._state, latent=latent, ghost=resolved.ghost, outcome=result)
+            self._push("Resolve", replace(found, outcome_seconds=seconds))
         self.solve_finished.emit(result)
 
     def _load_predictor(self) -> None:
@@ -506,6 +516,10 @@ class PoseDocument(PoseHistory):
         if self._exact is not None:
             self._exact = None
             self.exact_changed.emit()
+
+    def _tell_if_locked(self) -> None:
+        if self.all_locked:
+            self.message.emit("All body parts are locked; unlock one to move the pose")
 
     def _with_locked(self, latent: FloatArray) -> FloatArray:
         """Return the latent with the present codes of locked domains."""

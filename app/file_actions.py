@@ -12,6 +12,8 @@ from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
 from app.dialogs.forms import screenshot_form, turntable_form
 from app.dialogs.questions import Answer, ask_about_changes
+from app.panels.parts import plain_tip
+from app.wording import menu_text
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 
@@ -36,11 +38,6 @@ def _kinds(*wanted: str) -> str:
     if len(wanted) > 1:
         filters.insert(0, f"All that can be opened ({' '.join(masks[kind] for kind in wanted)})")
     return ";;".join(filters)
-
-
-def _plain(name: str) -> str:
-    """Return a name as a menu shows it to the letter."""
-    return name.replace("&", "&&")
 
 
 def _mesh_suffixes() -> tuple[str, ...]:
@@ -216,7 +213,7 @@ class FileActions(QObject):
         """Add a file to a menu, to be opened by a click."""
         action = menu.addAction(text)
         action.setData(path)
-        action.setToolTip(path)
+        action.setToolTip(plain_tip(path))
         action.triggered.connect(self._on_listed)
         return action
 
@@ -224,7 +221,7 @@ class FileActions(QObject):
     def _fill_recent(self) -> None:
         self.recent_menu.clear()
         for place, name in enumerate(self._settings["recent_files"], start=1):
-            self._list(self.recent_menu, f"&{place}  {_plain(Path(name).name)}", name)
+            self._list(self.recent_menu, f"&{place}  {menu_text(Path(name).name)}", name)
         if self.recent_menu.isEmpty():
             self.recent_menu.addAction("No files yet").setEnabled(False)
 
@@ -234,7 +231,7 @@ class FileActions(QObject):
 
         self.models_menu.clear()
         for model in list_models():
-            action = self._list(self.models_menu, _plain(model.name), str(model.path))
+            action = self._list(self.models_menu, menu_text(model.name), str(model.path))
             action.setCheckable(True)
             action.setChecked(model.path.absolute() == Path(self._document.model_file))
 

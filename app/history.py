@@ -100,6 +100,11 @@ class PoseHistory(QObject):
         """What the Resolve that ended in this pose reported."""
         return self._state.outcome
 
+    @property
+    def outcome_seconds(self) -> float:
+        """From asking for the Resolve of `outcome` to its result, with all that it waited for."""
+        return self._state.outcome_seconds
+
     def show_ghost(self, shown: bool) -> None:
         """Draw or hide the mesh before Resolve."""
         if shown != self._ghost_shown:

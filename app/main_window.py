@@ -57,6 +57,7 @@ from app.shortcuts import WindowShortcuts
 from app.status_bar import StatusBar
 from app.theme import apply_theme, wanted_theme
 from app.viewport import Viewport
+from app.wording import menu_text
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -336,6 +337,7 @@ class MainWindow(QMainWindow):
         self.library.chosen_changed.connect(self._update_actions)
         self.library.list.itemActivated.connect(self.library.load_chosen)
         self.randomise.wanted.connect(document.randomise)
+        self.randomise.refused.connect(self._status.tell)
         document.model_changed.connect(self._on_model)
         document.frame_changed.connect(self._on_frame)
         document.file_changed.connect(self._update_title)
@@ -429,7 +431,9 @@ class MainWindow(QMainWindow):
             ("undo", "Undo", stack.undoText()),
             ("redo", "Redo", stack.redoText()),
         ):
-            self.actions_by_key[key].setText(f"&{name} {text[:1].lower() + text[1:]}".rstrip())
+            self.actions_by_key[key].setText(
+                f"&{name} {menu_text(text[:1].lower() + text[1:])}".rstrip()
+            )
         for action in (*self._shadings.values(), *self._cameras.values()):
             action.setEnabled(has_model)
         self._shadings[Shading.PREDICTED].setEnabled(document.can_resolve)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from PySide6.QtCore import Slot
-from PySide6.QtWidgets import QLabel, QProgressBar, QStatusBar
+from PySide6.QtWidgets import QProgressBar, QStatusBar
 
+from app.panels.parts import labelled
 from app.theme import NORMAL
 
 _MESSAGE_MILLISECONDS = 8000
@@ -16,12 +17,11 @@ class StatusBar(QStatusBar):
     def __init__(self) -> None:
         super().__init__()
         self._work = self._reason = ""
-        self.busy = QLabel()
+        self.busy = labelled("")
         self._bar = QProgressBar()
         self._bar.setFixedWidth(120)
         self._bar.setTextVisible(False)
-        self._facts = QLabel()
-        self._facts.setObjectName("caption")
+        self._facts = labelled("", "caption")
         for widget in (self.busy, self._bar, self._facts):
             self.addPermanentWidget(widget)
         self.setSizeGripEnabled(False)

@@ -264,6 +264,7 @@ QFrame#truth[verdict="free"] {{ border-left-color: {theme.free}; }}
 QFrame#truth[verdict="colliding"] {{ border-left-color: {theme.colliding}; }}
 QLabel#title {{ font-weight: 600; }}
 QLabel#caption {{ color: {theme.muted}; }}
+QLabel#refusal {{ color: {theme.colliding}; }}
 QLabel#caption:disabled {{ color: {faded}; }}
 QLabel#verdict {{ font-weight: 600; font-size: 14px; }}
 QLabel#headline {{ font-weight: 600; font-size: 15px; }}
@@ -298,6 +299,7 @@ QLineEdit, QPlainTextEdit {{
 QLineEdit:focus, QPlainTextEdit:focus {{
     border-color: {theme.accent};
 }}
+QAbstractSpinBox[verdict="outside"] {{ color: {theme.colliding}; font-weight: 600; }}
 QAbstractSpinBox QLineEdit {{ border: none; padding: 0 2px; background: transparent; }}
 QDialogButtonBox {{ dialogbuttonbox-buttons-have-icons: 0; }}
 QMessageBox QLabel#qt_msgbox_label {{ font-weight: 600; }}

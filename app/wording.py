@@ -40,6 +40,11 @@ def seconds_text(seconds: float) -> str:
     return f"{1000 * seconds:.0f} ms" if seconds < 0.95 else f"{seconds:.1f} s"
 
 
+def menu_text(name: str) -> str:
+    """Write a name so that a menu, a button or a form's label shows it to the letter."""
+    return name.replace("&", "&&")
+
+
 def fit_error(mean: float | None, most: float | None) -> str:
     """Say how far off the nearest pose of a mesh is, in heights; None is not off at all."""
     mean, most = mean or 0.0, most or 0.0

@@ -18,6 +18,7 @@ from PySide6.QtWidgets import (
 from app.engine import Failure
 from app.icons import pixmap
 from app.log import log_file
+from app.panels.parts import labelled
 from app.theme import NORMAL, WIDE, current_theme
 
 
@@ -38,10 +39,9 @@ class FailureDialog(QDialog):
         what, advice = split_sentence(failure.sentence)
         sign = QLabel()
         sign.setPixmap(pixmap("warning", current_theme().colliding, 36, self.devicePixelRatioF()))
-        self.what = QLabel(what)
-        self.what.setObjectName("verdict")
+        self.what = labelled(what, "verdict")
         self.what.setWordWrap(True)
-        self.advice = QLabel(advice or "Nothing was changed.")
+        self.advice = labelled(advice or "Nothing was changed.")
         self.advice.setWordWrap(True)
         self.details = QPlainTextEdit(failure.details or failure.sentence)
         self.details.setReadOnly(True)

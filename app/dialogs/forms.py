@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from PySide6.QtCore import Slot
 from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
@@ -12,7 +13,8 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from app.panels.parts import QuietIntegerBox, QuietSpinBox, labelled
+from app.panels.number_box import QuietIntegerBox, QuietSpinBox
+from app.panels.parts import labelled
 from app.settings import SETTINGS, Settings
 from app.theme import NORMAL, WIDE
 
@@ -33,23 +35,35 @@ class Form(QDialog):
         self.setWindowTitle(title)
         self.setMinimumWidth(380)
         self._settings = settings
+        self._refused = False
         self._fields: dict[str, QuietIntegerBox | QuietSpinBox | QCheckBox | QComboBox] = {}
         self._form = QFormLayout()
         self._form.setHorizontalSpacing(WIDE)
         self._form.setVerticalSpacing(NORMAL)
         self._buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
         accept = self._buttons.addButton(action, QDialogButtonBox.ButtonRole.AcceptRole)
-        accept.setDefault(True)
         column = QVBoxLayout(self)
         column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
         column.setSpacing(WIDE)
+        self._refusal = labelled("", "refusal")
+        self._refusal.setWordWrap(True)
+        self._refusal.hide()
         column.addLayout(self._form)
+        column.addWidget(self._refusal)
         column.addWidget(self._buttons)
         self._buttons.accepted.connect(self.accept)
         self._buttons.rejected.connect(self.reject)
+        # Only now that it is the dialog's: or else Enter would cancel.
+        accept.setDefault(True)
 
     def accept(self) -> None:
-        """Remember what the fields say, and close."""
+        """Remember what the fields say, and close, unless one has just been refused."""
+        for field in self._fields.values():
+            if isinstance(field, QuietIntegerBox | QuietSpinBox):
+                field.interpretText()
+        if self._refused:
+            self._refused = False
+            return
         for key, field in self._fields.items():
             if isinstance(field, QCheckBox):
                 self._settings[key] = field.isChecked()
@@ -105,6 +119,19 @@ class Form(QDialog):
     def _add(self, key: str, label: str, field: QuietIntegerBox | QuietSpinBox | QComboBox) -> None:
         self._fields[key] = field
         self._form.addRow(label, field)
+        if not isinstance(field, QComboBox):
+            field.refused.connect(lambda sentence: self._on_refused(label, sentence))
+            field.lineEdit().textEdited.connect(self._on_edited)
+
+    def _on_refused(self, label: str, sentence: str) -> None:
+        self._refused = True
+        self._refusal.setText(f"{label}: {sentence}")
+        self._refusal.show()
+
+    @Slot()
+    def _on_edited(self) -> None:
+        self._refused = False
+        self._refusal.hide()
 
 
 def screenshot_form(settings: Settings, parent: QWidget) -> Form:

@@ -17,6 +17,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from app.actions import ACTIONS
 from app.icons import program_icon
 from app.panels.parts import labelled, scrolling
 from app.theme import CLOSE, NORMAL, WIDE
@@ -88,7 +89,10 @@ class ShortcutsDialog(QDialog):
             for action in actions:
                 native = QKeySequence.SequenceFormat.NativeText
                 keys = " or ".join(key.toString(native) for key in action.shortcuts())
-                name = action.text().replace("&", "").removesuffix("…")
+                # Undo names its step in the menu only.
+                spec = ACTIONS.get(action.objectName())
+                text = spec.text if spec is not None else action.text()
+                name = text.replace("&", "").removesuffix("…")
                 grid.addWidget(QLabel(name), line, 0)
                 grid.addWidget(labelled(keys, "caption"), line, 1)
                 line += 1

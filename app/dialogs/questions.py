@@ -6,10 +6,12 @@ from datetime import datetime
 from enum import Enum
 from typing import TYPE_CHECKING
 
+from PySide6.QtCore import Qt
 from PySide6.QtWidgets import (
     QDialog,
     QGridLayout,
     QInputDialog,
+    QLabel,
     QMessageBox,
     QPushButton,
     QSpacerItem,
@@ -18,6 +20,7 @@ from PySide6.QtWidgets import (
 
 from app.icons import pixmap
 from app.theme import WIDE, current_theme
+from app.wording import menu_text
 
 if TYPE_CHECKING:
     from app.recovery import LostPose
@@ -70,7 +73,10 @@ def ask_for_name(parent: QWidget, title: str, label: str, proposed: str) -> str 
     """Ask what something is to be called; None where the user gives up."""
     dialog = QInputDialog(parent)
     dialog.setWindowTitle(title)
-    dialog.setLabelText(label)
+    dialog.setLabelText(menu_text(label))
+    # A label of names, such as "<b>", is no HTML.
+    for held in dialog.findChildren(QLabel):
+        held.setTextFormat(Qt.TextFormat.PlainText)
     dialog.setTextValue(proposed)
     dialog.resize(_WIDTH, dialog.sizeHint().height())
     accepted = dialog.exec() == QDialog.DialogCode.Accepted
@@ -81,6 +87,7 @@ def ask_for_name(parent: QWidget, title: str, label: str, proposed: str) -> str 
 def _box(parent: QWidget, title: str) -> QMessageBox:
     box = QMessageBox(parent)
     box.setWindowTitle(title)
+    box.setTextFormat(Qt.TextFormat.PlainText)
     box.setIconPixmap(pixmap("question", current_theme().accent, 36, parent.devicePixelRatioF()))
     return box
 

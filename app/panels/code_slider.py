@@ -6,10 +6,22 @@ from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QKeyEvent, QMouseEvent
 from PySide6.QtWidgets import QHBoxLayout, QWidget
 
-from app.panels.parts import NAME_SHARE, ElidedLabel, HoverRow, QuietSpinBox, Slider, silent
+from app.panels.number_box import QuietSpinBox
+from app.panels.parts import (
+    NAME_SHARE,
+    ElidedLabel,
+    HoverRow,
+    Slider,
+    plain_tip,
+    show_verdict,
+    silent,
+)
 from app.theme import CLOSE, ROW_HEIGHT, TIGHT
 
 _STEPS = 1000
+
+_FIELD_WIDTH = 78
+"""Of a number of seven signs and its two arrows, in device-independent pixels."""
 
 _BEYOND = 1.5
 """Widths of a slider's range that a number may be typed beyond either end of it."""
@@ -97,6 +109,7 @@ class CodeRow(HoverRow):
     -------
     number_changed : int and float, the code and its number, by the slider or in the field
     reset_wanted : int, the code
+    refused : str, why a number that was typed is not taken
 
     Parameters
     ----------
@@ -110,6 +123,7 @@ class CodeRow(HoverRow):
 
     number_changed = Signal(int, float)
     reset_wanted = Signal(int)
+    refused = Signal(str)
 
     def __init__(
         self,
@@ -134,16 +148,17 @@ class CodeRow(HoverRow):
         self.field.setRange(*self._limits)
         self.field.setSingleStep((high - low) / 100)
         self.field.setAlignment(Qt.AlignmentFlag.AlignRight)
-        self.field.setFixedWidth(62)
+        self.field.setFixedWidth(_FIELD_WIDTH)
         self.slider.setAccessibleName(name)
         self.field.setAccessibleName(f"{name}, number")
         self.slider.setToolTip(
-            f"{name}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
+            plain_tip(
+                f"{name}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
+            )
         )
-        least, most = (self.field.textFromValue(limit) for limit in self._limits)
-        self.field.setToolTip(
-            f"{name}: type a number from {least} to {most}; the arrow keys change it in small steps"
-        )
+        self._name = name
+        self._trained = low, high
+        self._explain(0.0)
         row = QHBoxLayout(self)
         row.setContentsMargins(TIGHT, 0, TIGHT, 0)
         row.setSpacing(CLOSE)
@@ -154,6 +169,7 @@ class CodeRow(HoverRow):
         self.slider.valueChanged.connect(self._on_slider)
         self.slider.reset_wanted.connect(self._on_reset)
         self.field.valueChanged.connect(self._on_field)
+        self.field.refused.connect(self._on_refused)
 
     def show_number(self, number: float) -> None:
         """Follow the document, also beyond what can be typed."""
@@ -162,12 +178,36 @@ class CodeRow(HoverRow):
         with silent(self.field):
             self.field.setRange(min(low, number), max(high, number))
             self.field.setValue(number)
+        self._explain(number)
+
+    @property
+    def is_outside(self) -> bool:
+        """Whether the number is outside the range that the slider reaches."""
+        return self.field.property("verdict") == "outside"
+
+    def _explain(self, number: float) -> None:
+        """Mark a number outside the trained range, and say what can be typed."""
+        low, high = self._trained
+        # Half of the last digit, as the end of the range is seldom a round number.
+        slack = 0.5 * 10.0 ** -self.field.decimals()
+        outside = not low - slack <= number <= high + slack
+        if outside == self.is_outside and self.field.toolTip():
+            return
+        show_verdict(self.field, "outside" if outside else "")
+        least, most, *limits = map(self.field.textFromValue, (low, high, *self._limits))
+        words = f"type a number from {limits[0]} to {limits[1]}"
+        if outside:
+            words += f"; this one is outside the trained range, {least} to {most}"
+        self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
 
     def _on_slider(self) -> None:
         self.number_changed.emit(self.code, self.slider.number)
 
     def _on_field(self, number: float) -> None:
         self.number_changed.emit(self.code, number)
+
+    def _on_refused(self, sentence: str) -> None:
+        self.refused.emit(f"{self._name}: {sentence}")
 
     def _on_reset(self) -> None:
         self.reset_wanted.emit(self.code)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from html import escape
 
 from PySide6.QtCore import QEvent, QObject, QPointF, QRectF, QSize, Qt, Signal
 from PySide6.QtGui import (
     QColor,
     QEnterEvent,
-    QKeyEvent,
-    QKeySequence,
     QMouseEvent,
     QPainter,
     QPaintEvent,
@@ -19,14 +18,12 @@ from PySide6.QtGui import (
     QWheelEvent,
 )
 from PySide6.QtWidgets import (
-    QDoubleSpinBox,
     QFrame,
     QHBoxLayout,
     QLabel,
     QScrollArea,
     QSizePolicy,
     QSlider,
-    QSpinBox,
     QVBoxLayout,
     QWidget,
 )
@@ -69,6 +66,7 @@ class ElidedLabel(QLabel):
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
+        self.setTextFormat(Qt.TextFormat.PlainText)
         self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
 
     def setText(self, text: str) -> None:  # noqa: N802
@@ -95,7 +93,7 @@ class ElidedLabel(QLabel):
         return self.fontMetrics().elidedText(self.text(), Qt.TextElideMode.ElideRight, self.width())
 
     def _offer_whole(self) -> None:
-        self.setToolTip("" if self._fitting() == self.text() else self.text())
+        self.setToolTip("" if self._fitting() == self.text() else plain_tip(self.text()))
 
 
 def longest_name(widget: QWidget, names: Iterable[str]) -> int:
@@ -137,42 +135,6 @@ class HoverRow(QWidget):
         """Tell that the pointer left."""
         self.hovered.emit(None)
         super().leaveEvent(event)
-
-
-class QuietSpinBox(QDoubleSpinBox):
-    """A number that the wheel changes only when it has the focus."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-        self.setKeyboardTracking(False)
-        self.setButtonSymbols(QDoubleSpinBox.ButtonSymbols.NoButtons)
-
-    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
-        """Leave the wheel to the panel's scrolling unless focused."""
-        wheel_if_focused(self, event, super().wheelEvent)
-
-    def event(self, event: QEvent) -> bool:
-        """Leave Undo and Redo to the pose: what is typed is a step of it."""
-        if event.type() is QEvent.Type.ShortcutOverride and isinstance(event, QKeyEvent):
-            kinds = (QKeySequence.StandardKey.Undo, QKeySequence.StandardKey.Redo)
-            if any(event.matches(kind) for kind in kinds):
-                event.ignore()
-                return False
-        return super().event(event)
-
-
-class QuietIntegerBox(QSpinBox):
-    """A whole number that the wheel changes only when it has the focus."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-        self.setButtonSymbols(QSpinBox.ButtonSymbols.NoButtons)
-
-    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
-        """Leave the wheel to the panel's scrolling unless focused."""
-        wheel_if_focused(self, event, super().wheelEvent)
 
 
 class Slider(QSlider):
@@ -252,9 +214,10 @@ class Slider(QSlider):
             painter.drawRect(QRectF(start - 0.5, middle - 5, 1, 10))
         handle = self._handle_x()
         lively = self.isEnabled()
-        filled = visible_colour(self._colour or theme.accent) if lively else QColor(theme.track)
-        painter.setBrush(filled)
-        painter.drawRect(QRectF(min(start, handle), middle - 2, abs(handle - start), 4))
+        filled = self._colour or theme.accent if lively else theme.track
+        bar = QRectF(min(start, handle), middle - 2.5, abs(handle - start), 5)
+        if bar.width() > 0.0:
+            fill_with(painter, bar, filled, 0.0)
         if self.hasFocus():
             halo = QColor(theme.accent)
             halo.setAlpha(90)
@@ -283,6 +246,21 @@ def wheel_if_focused(widget: QWidget, event: QWheelEvent, handle: object) -> Non
         event.ignore()
 
 
+def fill_with(painter: QPainter, area: QRectF, colour: str, radius: float) -> None:
+    """Fill an area with a body part's own colour, edged where it would not be seen otherwise."""
+    edge = visible_colour(colour)
+    painter.setBrush(QColor(colour))
+    painter.setPen(QPen(edge, 1.0) if edge != QColor(colour) else Qt.PenStyle.NoPen)
+    inset = 0.5 if painter.pen().style() is not Qt.PenStyle.NoPen else 0.0
+    painter.drawRoundedRect(area.adjusted(inset, inset, -inset, -inset), radius, radius)
+    painter.setPen(Qt.PenStyle.NoPen)
+
+
+def plain_tip(text: str) -> str:
+    """Return a tool tip that shows a text to the letter, also one that looks like HTML."""
+    return f"<span>{escape(text)}</span>" if "<" in text else text
+
+
 @contextmanager
 def silent(*widgets: QObject) -> Iterator[None]:
     """Change widgets without their signals, as they follow the document."""
@@ -295,8 +273,12 @@ def silent(*widgets: QObject) -> Iterator[None]:
 
 
 def labelled(text: str, kind: str = "") -> QLabel:
-    """Return a label of a kind that the style knows: title, caption, verdict, headline, aside."""
+    """Return a label of a kind that the style knows: title, caption, verdict, headline, aside.
+
+    It shows its text to the letter, as a name in it may look like HTML.
+    """
     label = QLabel(text)
+    label.setTextFormat(Qt.TextFormat.PlainText)
     label.setObjectName(kind)
     return label
 

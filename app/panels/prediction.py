@@ -15,14 +15,16 @@ from app.panels.parts import (
     Card,
     ElidedLabel,
     HoverRow,
+    fill_with,
     labelled,
     longest_name,
+    plain_tip,
     show_verdict,
     silent,
     title_row,
 )
 from app.shading import FULL_PREDICTED
-from app.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme, visible_colour
+from app.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme
 from app.wording import heading, overlap_text
 
 if TYPE_CHECKING:
@@ -136,9 +138,8 @@ class EnergyBar(QWidget):
         painter.setBrush(QColor(current_theme().track))
         painter.drawRoundedRect(bar, 4, 4)
         if self._share > 0.0:
-            painter.setBrush(visible_colour(self._colour))
             painter.setClipRect(QRectF(0, 0, self._share * self.width(), self.height()))
-            painter.drawRoundedRect(bar, 4, 4)
+            fill_with(painter, bar, self._colour, 4)
 
 
 class DomainRow(HoverRow):
@@ -189,10 +190,12 @@ class DomainRow(HoverRow):
         theme = current_theme()
         self.lock.setIcon(icon("lock" if locked else "unlock", None if locked else theme.muted))
         self.lock.setToolTip(
-            f"{self._name} keeps its numbers: click to let it move again"
-            if locked
-            else f"Lock {self._name}: Resolve, Randomise, Reset all and blending leave its numbers "
-            "alone"
+            plain_tip(
+                f"{self._name} keeps its numbers: click to let it move again"
+                if locked
+                else f"Lock {self._name}: Resolve, Randomise, Reset all and blending leave its "
+                "numbers alone"
+            )
         )
 
     def show_energy(self, energy: float | None) -> None:
@@ -200,7 +203,7 @@ class DomainRow(HoverRow):
         self.bar.setVisible(energy is not None)
         if energy is not None:
             self.bar.show_energy(energy)
-            self.setToolTip(f"{self._name}: predicted overlap {overlap_text(energy)}")
+            self.setToolTip(plain_tip(f"{self._name}: predicted overlap {overlap_text(energy)}"))
 
     @property
     def is_lit(self) -> bool:
@@ -223,8 +226,7 @@ class DomainRow(HoverRow):
             wash.setAlpha(60 if self._lit else 36)
             painter.setBrush(wash)
             painter.drawRoundedRect(self.rect(), 5, 5)
-        painter.setBrush(visible_colour(self._colour))
-        painter.drawRoundedRect(QRectF(TIGHT, self.height() / 2 - 6, 12, 12), 3, 3)
+        fill_with(painter, QRectF(TIGHT, self.height() / 2 - 6, 12, 12), self._colour, 3)
 
     def _on_lock(self, locked: bool) -> None:
         self.lock_toggled.emit(self._index, locked)

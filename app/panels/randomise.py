@@ -7,7 +7,8 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QGridLayout, QPushButton
 
 from app.icons import icon
-from app.panels.parts import Card, QuietIntegerBox, Slider, labelled
+from app.panels.number_box import QuietIntegerBox
+from app.panels.parts import Card, Slider, labelled
 from app.theme import CLOSE
 
 _LARGEST_SEED = 999_999
@@ -19,6 +20,7 @@ class RandomiseCard(Card):
     Signals
     -------
     wanted : float and int, amount from 0 to 1 and seed
+    refused : str, why a seed that was typed is not taken
 
     Parameters
     ----------
@@ -27,6 +29,7 @@ class RandomiseCard(Card):
     """
 
     wanted = Signal(float, int)
+    refused = Signal(str)
 
     def __init__(self, action: QAction, amount: float) -> None:
         super().__init__()
@@ -59,6 +62,7 @@ class RandomiseCard(Card):
         self.column.addLayout(grid)
         self.amount.valueChanged.connect(self._on_amount)
         self.button.clicked.connect(action.trigger)
+        self.seed.refused.connect(self.refused)
         self._on_amount(self.amount.value())
         self.refresh_icons()
 

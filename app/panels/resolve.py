@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import Qt, Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import (
+    QApplication,
     QGridLayout,
     QHBoxLayout,
     QLabel,
@@ -26,6 +27,9 @@ from app.wording import heading, height_text, overlap_text, seconds_text
 if TYPE_CHECKING:
     from app.document import PoseDocument
     from lcollision_core.resolve import ResolveResult
+
+_WAITED = 0.5
+"""Seconds of waiting before the search that are worth telling."""
 
 _SIGNS = {True: "check", False: "error", None: "info"}
 _INKS = {"check": "free", "error": "colliding", "info": "muted"}
@@ -134,8 +138,11 @@ class ResolveCard(Card):
         self.stack = QStackedWidget()
         self.stack.addWidget(self.resting)
         self.stack.addWidget(self.working)
+        self._locked = labelled("All body parts are locked: unlock one to resolve", "caption")
+        self._locked.setWordWrap(True)
         self.stack.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self.column.addWidget(self.stack)
+        self.column.addWidget(self._locked)
         self.column.addWidget(self.outcome)
         self.button.clicked.connect(resolve_action.trigger)
         self.cancel.clicked.connect(document.cancel_resolve)
@@ -145,7 +152,9 @@ class ResolveCard(Card):
         document.solve_progressed.connect(self._on_progressed)
         document.solve_finished.connect(self._on_finished)
         document.outcome_changed.connect(self._on_outcome)
+        document.locks_changed.connect(self._on_locks)
         self._on_action()
+        self._on_locks()
         self._on_outcome()
 
     def refresh_icons(self) -> None:
@@ -178,6 +187,9 @@ class ResolveCard(Card):
             "The exact check of the mesh: this alone tells whether the pose collides",
         )
         self._energy, self._moved, self._took = (QLabel() for _ in range(3))
+        self._took.setToolTip(
+            "The search, and the wait before it: what it needs is loaded and compiled once"
+        )
         self._note = labelled("", "caption")
         self._note.setWordWrap(True)
         column = QVBoxLayout(self.outcome)
@@ -205,17 +217,26 @@ class ResolveCard(Card):
 
     @Slot()
     def _on_action(self) -> None:
-        self.button.setEnabled(self._action.isEnabled())
+        # Hidden while it works, it keeps ready to have the keyboard again.
+        self.button.setEnabled(self._action.isEnabled() or self._document.solving)
         self.button.setToolTip(self._action.toolTip())
         theme = current_theme()
         self.button.setIcon(icon("resolve", theme.on_accent))
 
     @Slot()
     def _on_started(self) -> None:
-        self.stack.setCurrentWidget(self.working)
+        self._go_to(self.working, self.cancel)
         self.outcome.hide()
         # Until the first report there is no telling how far it is.
         self.bar.setRange(0, 0)
+
+    def _go_to(self, page: QWidget, button: QPushButton) -> None:
+        """Show another page; the keyboard follows from one to the other, or stays elsewhere."""
+        focused = QApplication.focusWidget()
+        had_focus = focused is not None and self.stack.isAncestorOf(focused)
+        self.stack.setCurrentWidget(page)
+        if had_focus:
+            button.setFocus()
 
     @Slot(object)
     def _on_progressed(self, status: object) -> None:
@@ -226,10 +247,14 @@ class ResolveCard(Card):
 
     @Slot(object)
     def _on_finished(self, result: object) -> None:  # noqa: ARG002
-        self.stack.setCurrentWidget(self.resting)
+        self._go_to(self.resting, self.button)
         # An endless bar is animated even while nobody sees it.
         self.bar.setRange(0, 1)
         self._on_outcome()
+
+    @Slot()
+    def _on_locks(self) -> None:
+        self._locked.setVisible(self._document.all_locked)
 
     @Slot()
     def _on_outcome(self) -> None:
@@ -239,15 +264,20 @@ class ResolveCard(Card):
             self._show(result)
 
     def _show(self, result: ResolveResult) -> None:
+        from lcollision_core.resolve import ALL_LOCKED, Step
+
         ran = result.solver_status != "not run"
         exactly_free, predicted_free = result.exactly_free, result.predicted_free
         self.exactly_free.show_truth(exactly_free)
         # A search that was cut short has done its work where its pose is free.
-        self.converged.show_truth(
-            result.converged if ran else None,
-            "The search ended at a free pose" if ran and exactly_free else "",
-            sign="check",
-        )
+        instead, sign = "", "info"
+        if ran and exactly_free:
+            instead, sign = "The search ended at a free pose", "check"
+        elif not ran and ALL_LOCKED in (result.note or ""):
+            instead = "No search: all body parts are locked"
+        elif not ran and result.step != Step.UNCHANGED:
+            instead = "No search: the time was over before"
+        self.converged.show_truth(result.converged if ran else None, instead, sign)
         overruled = exactly_free is not None and exactly_free != predicted_free
         word = "clear" if predicted_free else "colliding"
         self.predicted_free.show_truth(
@@ -263,6 +293,13 @@ class ResolveCard(Card):
         moved = f"{height_text(mean)} of the height,\nat most {height_text(largest)}"
         self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
         self._moved.setToolTip("On average, and where it moved furthest")
-        self._took.setText(seconds_text(result.seconds))
+        self._took.setText(_times(result.seconds, self._document.outcome_seconds))
         self._note.setText(heading(result.note or ""))
         self._note.setVisible(bool(result.note))
+
+
+def _times(searched: float, in_all: float) -> str:
+    """Say how long the search took, and how long it was waited for where that is longer."""
+    waited = in_all - searched
+    took = seconds_text(searched)
+    return f"{took}, after {seconds_text(waited)} of preparation" if waited > _WAITED else took

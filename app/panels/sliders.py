@@ -11,8 +11,8 @@ from PySide6.QtWidgets import QAbstractButton, QLineEdit, QVBoxLayout, QWidget
 
 from app.icons import pixmap
 from app.panels.code_slider import CodeRow, tab_order
-from app.panels.parts import labelled, longest_name, scrolling
-from app.theme import CLOSE, NORMAL, TIGHT, current_theme, visible_colour
+from app.panels.parts import fill_with, labelled, longest_name, plain_tip, scrolling
+from app.theme import CLOSE, NORMAL, TIGHT, current_theme
 from app.wording import heading
 
 if TYPE_CHECKING:
@@ -44,9 +44,10 @@ class GroupHeader(QAbstractButton):
         self._colour = colour
         self._lit = False
         self._arrows: tuple[str, list[QPixmap]] | None = None
-        self.setText(name)
+        # Not as the button's own text, in which "&" makes a shortcut.
+        self._name = name
         self.setAccessibleName(name)
-        self.setToolTip(f"Show or hide the sliders of {name.lower()}")
+        self.setToolTip(plain_tip(f"Show or hide the sliders of {name.lower()}"))
         self.setCheckable(True)
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.setCursor(Qt.CursorShape.PointingHandCursor)
@@ -97,8 +98,7 @@ class GroupHeader(QAbstractButton):
         painter.drawPixmap(TIGHT, middle - 7, self._arrow())
         left = TIGHT + 14 + CLOSE
         if self._colour is not None:
-            painter.setBrush(visible_colour(self._colour))
-            painter.drawRoundedRect(QRectF(left, middle - 6, 12, 12), 3, 3)
+            fill_with(painter, QRectF(left, middle - 6, 12, 12), self._colour, 3)
             left += 12 + CLOSE
         font = self.font()
         font.setBold(True)
@@ -106,7 +106,7 @@ class GroupHeader(QAbstractButton):
         painter.setPen(QColor(theme.text))
         room = self.rect().adjusted(left, 0, -TIGHT, 0)
         name = painter.fontMetrics().elidedText(
-            self.text(), Qt.TextElideMode.ElideRight, room.width()
+            self._name, Qt.TextElideMode.ElideRight, room.width()
         )
         painter.drawText(room, Qt.AlignmentFlag.AlignVCenter | Qt.AlignmentFlag.AlignLeft, name)
 
@@ -203,6 +203,7 @@ class SliderGroup(QWidget):
             row.hovered.connect(self._panel.domain_hovered)
             row.number_changed.connect(document.set_code)
             row.reset_wanted.connect(document.reset_code)
+            row.refused.connect(document.message)
             row.slider.drag_started.connect(self._panel.begin_drag)
             row.slider.drag_ended.connect(document.end_gesture)
             row.slider.drag_abandoned.connect(document.cancel_gesture)

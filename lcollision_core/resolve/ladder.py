@@ -32,7 +32,8 @@ _REMEMBERED, _POLISHED = 8, 3
 
 _ITERATIONS_ALONE = 60
 
-_ALL_LOCKED = "every domain is locked, so the pose stays as it is; unlock one"
+ALL_LOCKED = "all body parts are locked, so the pose stays as it is; unlock one"
+"""The note of a result that no lock let move."""
 
 
 class Ladder:
@@ -76,7 +77,7 @@ class Ladder:
         if not before.colliding:
             return self._result(problem.target, Step.UNCHANGED, before)
         if not problem.movable.any():
-            return self._result(problem.target, Step.NONE, before, _ALL_LOCKED)
+            return self._result(problem.target, Step.NONE, before, ALL_LOCKED)
         for done, (step, latent) in enumerate(self._steps(), 1):
             self._progress(done, self._n_steps)
             if latent is not None:
@@ -90,7 +91,7 @@ class Ladder:
             excess, _ = problem.excess(problem.target[None])
             if excess[0] + margin <= 0.0:
                 return self._result(problem.target, Step.UNCHANGED, None)
-            return self._result(problem.target, Step.NONE, None, _ALL_LOCKED)
+            return self._result(problem.target, Step.NONE, None, ALL_LOCKED)
         outcome = self._solve(margin)
         self._keep(outcome)
         moved = not np.array_equal(outcome.latent, problem.target)

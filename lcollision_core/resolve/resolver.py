@@ -94,7 +94,8 @@ class PoseResolver:
         correction = None if near is None else self._checked(near)
         outside = int(np.count_nonzero((target < self._low) | (target > self._high)))
         remark = (
-            f"{outside} of {len(target)} sliders are beyond the poses that the model learnt from"
+            f"{outside} of {len(target)} sliders {'is' if outside == 1 else 'are'} outside the "
+            f"trained range"
         )
         ladder = Ladder(
             problem,

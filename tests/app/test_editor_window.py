@@ -253,9 +253,9 @@ def test_nothing_on_the_screen_speaks_of_the_mathematics(
         window.actions_by_key["resolve"].trigger()
     rest(qtbot, window)
     assert document.outcome is not None
-    assert "beyond the poses that the model learnt from" in (document.outcome.note or "")
+    assert "outside the trained range" in (document.outcome.note or "")
     words = list(words_on_the_screen(window))
-    assert any("beyond the poses" in text for text in words)
+    assert any("outside the trained range" in text for text in words)
     assert [text for text in words if JARGON.search(text)] == []
 
 

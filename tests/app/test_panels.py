@@ -201,8 +201,9 @@ def test_what_can_be_typed_is_near_the_sliders_range(qtbot: QtBot, window: MainW
 
     for wanted in (high + 0.9 * beyond, low - 0.9 * beyond):
         assert type_in(f"{wanted:.3f}") == pytest.approx(wanted, abs=1e-3)
-    for far in ("9999", "-9999", "1e9"):
-        assert low - beyond <= type_in(far) <= high + beyond
+    before = float(document.latent[1])
+    for far in ("9999", "-9999"):
+        assert type_in(far) == before
     for limit in (low - beyond, high + beyond):
         assert f"{limit:.3f}" in row.field.toolTip()
     # What comes from a file may be further away: it is shown as it is, and stays so.
@@ -216,7 +217,7 @@ def test_what_can_be_typed_is_near_the_sliders_range(qtbot: QtBot, window: MainW
     window.viewport.setFocus()
     assert document.latent.tobytes() == pose.tobytes()
     assert low - beyond <= type_in("0.125") <= high + beyond
-    assert low - beyond <= type_in("9999") <= high + beyond
+    assert type_in("9999") == 0.125
 
 
 def name_label(row: QWidget) -> QLabel:

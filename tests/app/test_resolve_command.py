@@ -313,7 +313,7 @@ def test_all_domains_locked_leaves_poses_colliding(
     out = tmp_path / "same.json"
     result = lcollision("resolve", model_file, poses, "-o", out, "--lock", "1", "--lock", "2")
     assert result.exit_code == 1
-    assert result.stderr.count("every domain is locked") == 4
+    assert result.stderr.count("all body parts are locked") == 4
     assert result.stdout.count("still colliding") == 4
     for before, after in zip(read_poses(poses, model), read_poses(out, model), strict=True):
         assert after.latent.tolist() == before.latent.tolist()

@@ -1,0 +1,144 @@
+"""What is typed into a field is taken as it is and marked, or refused in a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import QPoint, Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QDialogButtonBox, QLabel, QToolTip, QWidget
+from pytestqt.qtbot import QtBot
+
+from app.dialogs.forms import Form, resolve_form, screenshot_form, turntable_form
+from app.main_window import MainWindow
+from app.panels.number_box import QuietIntegerBox, QuietSpinBox
+from app.settings import SETTINGS, Settings
+from app.theme import current_theme
+from tests.app.windows import settings_in
+
+LEFT = Qt.MouseButton.LeftButton
+
+
+def type_in(field: QuietSpinBox | QuietIntegerBox, text: str) -> None:
+    field.setFocus()
+    field.selectAll()
+    QTest.keyClicks(field, text)
+    QTest.keyClick(field, Qt.Key.Key_Return)
+
+
+def test_a_number_outside_the_trained_range_is_kept_and_marked(window: MainWindow) -> None:
+    document, row = window.document, window.sliders.row_of(1)
+    space = document.model.latent_space
+    low, high = float(space.low[1]), float(space.high[1])
+    for wanted in (high + 0.4 * (high - low), low - 0.4 * (high - low)):
+        type_in(row.field, f"{wanted:.3f}")
+        assert document.latent[1] == pytest.approx(wanted, abs=1e-3)
+        assert row.is_outside
+        assert "outside the trained range" in row.field.toolTip()
+        ink = row.field.palette().color(row.field.foregroundRole()).name()
+        assert ink == current_theme().colliding
+    for wanted in (high, low, 0.5 * high, 0.0):
+        type_in(row.field, f"{wanted:.3f}")
+        assert not row.is_outside
+        assert "outside" not in row.field.toolTip()
+    assert window.statusBar().currentMessage() == ""
+
+
+@pytest.mark.parametrize("text", ["9999", "-9999", "123456789"])
+def test_a_number_that_is_too_far_is_refused_in_a_sentence(window: MainWindow, text: str) -> None:
+    document, row = window.document, window.sliders.row_of(1)
+    document.set_code(1, 0.125)
+    before = document.latent
+    type_in(row.field, text)
+    assert document.latent is before
+    assert row.field.value() == 0.125
+    told = window.statusBar().currentMessage()
+    assert f"{text} is outside what can be typed here: type a number from" in told
+    assert told.startswith(row.slider.accessibleName())
+    assert QToolTip.text() in told
+    # By leaving the field too.
+    window.statusBar().clearMessage()
+    row.field.setFocus()
+    row.field.selectAll()
+    QTest.keyClicks(row.field, text)
+    window.sliders.filter.setFocus()
+    assert document.latent is before
+    assert text in window.statusBar().currentMessage()
+
+
+def test_the_seed_is_not_cut_to_another(window: MainWindow) -> None:
+    seed = window.randomise.seed
+    type_in(seed, "123")
+    assert seed.value() == 123
+    assert window.statusBar().currentMessage() == ""
+    type_in(seed, "12345678")
+    assert seed.value() == 123
+    assert "12345678" in window.statusBar().currentMessage()
+    assert "999999" in window.statusBar().currentMessage()
+
+
+@pytest.mark.parametrize("make", [screenshot_form, turntable_form, resolve_form])
+@pytest.mark.parametrize("how", ["enter", "click"])
+def test_a_form_refuses_a_number_visibly_and_stays(
+    qtbot: QtBot,
+    window: MainWindow,
+    tmp_path: Path,
+    make: Callable[[Settings, QWidget], Form],
+    how: str,
+) -> None:
+    settings = settings_in(tmp_path)
+    form = make(settings, window)
+    qtbot.addWidget(form)
+    form.show()
+    boxes = form.findChild(QDialogButtonBox)
+    accept = next(b for b in boxes.buttons() if b.isDefault())
+    fields = {
+        key: field
+        for key, field in form._fields.items()
+        if isinstance(field, QuietSpinBox | QuietIntegerBox)
+    }
+    assert fields
+    for field in fields.values():
+        before = field.value()
+        field.setFocus()
+        field.selectAll()
+        QTest.keyClicks(field, "99999")
+        if how == "enter":
+            QTest.keyClick(field, Qt.Key.Key_Return)
+        else:
+            QTest.mouseClick(accept, LEFT, pos=QPoint(5, 5))
+        assert form.isVisible()
+        assert field.value() == before
+        told = [label.text() for label in form.findChildren(QLabel) if label.isVisible()]
+        assert any("99999 is outside what can be typed here" in text for text in told)
+    QApplication.processEvents()
+    QTest.mouseClick(accept, LEFT)
+    if form.isVisible():
+        QTest.mouseClick(accept, LEFT)
+    assert not form.isVisible()
+    for key in fields:
+        assert settings[key] == SETTINGS[key].default
+
+
+def test_the_arrows_of_a_field_are_seen_and_step(window: MainWindow) -> None:
+    row = window.sliders.row_of(1)
+    for theme in ("light", "dark"):
+        window.set_theme(theme)
+        for field in (row.field, window.randomise.seed):
+            picture = field.grab().toImage()
+            ratio = picture.devicePixelRatio()
+            middle = field.height() // 2
+            for top, bottom in ((2, middle), (middle, field.height() - 2)):
+                inks = {
+                    picture.pixelColor(int((field.width() - x) * ratio), int(y * ratio)).lightness()
+                    for x in range(5, 16)
+                    for y in range(top, bottom)
+                }
+                assert max(inks) - min(inks) > 60, (theme, field.accessibleName())
+    before = window.document.latent[1]
+    QTest.mouseClick(row.field, LEFT, pos=QPoint(row.field.width() - 8, 6))
+    assert window.document.latent[1] > before
+    QTest.mouseClick(row.field, LEFT, pos=QPoint(row.field.width() - 8, row.field.height() - 6))
+    assert window.document.latent[1] == pytest.approx(before, abs=1e-3)

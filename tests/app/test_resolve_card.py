@@ -1,0 +1,116 @@
+"""What the card of Resolve says where nothing could be done, and how long it really took."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PySide6.QtWidgets import QLabel, QWidget
+from pytestqt.qtbot import QtBot
+
+from app import tasks
+from app.main_window import MainWindow
+from app.tasks import Resolved
+from app.wording import seconds_text
+from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.resolve import ResolveResult, Step
+from tests.app.windows import PATIENCE, rest
+
+LOCKED = "No search: all body parts are locked"
+
+
+@pytest.fixture(scope="module")
+def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
+    return sample_poses(editor_model, 1, 0, colliding=True)[0]
+
+
+def resolve(qtbot: QtBot, window: MainWindow) -> ResolveResult:
+    with qtbot.waitSignal(window.document.solve_finished, timeout=PATIENCE):
+        window.actions_by_key["resolve"].trigger()
+    rest(qtbot, window)
+    assert window.document.outcome is not None
+    return window.document.outcome
+
+
+def texts(widget: QWidget) -> list[str]:
+    return [label.text() for label in widget.findChildren(QLabel) if label.isVisible()]
+
+
+def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
+) -> None:
+    document, card = window.document, window.collision.resolve
+    document.set_latent(colliding, "Test")
+    for domain in (0, 1):
+        assert "All body parts are locked: unlock one to resolve" not in texts(card)
+        document.set_locked(domain, True)
+    assert "All body parts are locked: unlock one to resolve" in texts(card)
+    for key in ("reset", "randomise"):
+        window.actions_by_key[key].trigger()
+        assert "All body parts are locked" in window.statusBar().currentMessage()
+        window.statusBar().clearMessage()
+    assert document.latent.tobytes() == colliding.tobytes()
+    assert not resolve(qtbot, window).exactly_free
+    assert LOCKED in texts(card)
+    assert "No search was needed" not in texts(card)
+    assert card.converged.sign == "info"
+    # A free pose needs none, locked or not.
+    document.set_latent(np.zeros_like(colliding), "Test")
+    assert resolve(qtbot, window).exactly_free
+    assert "No search was needed" in texts(card)
+    assert LOCKED not in texts(card)
+    document.set_locked(0, False)
+    assert "All body parts are locked: unlock one to resolve" not in texts(card)
+
+
+def test_a_search_that_had_no_time_is_not_called_needless(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
+) -> None:
+    document, card = window.document, window.collision.resolve
+    document.set_latent(colliding, "Test")
+    outcome = resolve(qtbot, window)
+    for free in (True, False):
+        rushed = replace(
+            outcome, solver_status="not run", step=Step.WALK_BACK, exactly_free=free, note=None
+        )
+        document._amend(replace(document._state, outcome=rushed))
+        assert "No search: the time was over before" in texts(card)
+
+
+def test_the_time_told_is_what_was_waited_as_well(
+    qtbot: QtBot,
+    window: MainWindow,
+    colliding: npt.NDArray[np.float64],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    real = tasks.resolved
+
+    def slow(*arguments: object) -> object:
+        work = real(*arguments)  # type: ignore[arg-type]
+
+        def prepared(progress: Progress, cancel: CancelToken) -> Resolved:
+            time.sleep(0.8)
+            found = work(progress, cancel)
+            return replace(found, result=replace(found.result, seconds=0.194))
+
+        return prepared
+
+    card = window.collision.resolve
+    window.document.set_latent(colliding, "Test")
+    resolve(qtbot, window)
+    assert not any("of preparation" in text for text in texts(card))
+    window.document.undo()
+    monkeypatch.setattr(tasks, "resolved", slow)
+    resolve(qtbot, window)
+    (told,) = (text for text in texts(card) if "of preparation" in text)
+    assert told.startswith("194 ms, after ")
+    assert told.endswith(f" {seconds_text(window.document.outcome_seconds - 0.194)} of preparation")
+    assert window.document.outcome_seconds >= 0.8
+    # Undo and redo bring the same times back.
+    window.document.undo()
+    window.document.redo()
+    assert told in texts(card)
