@@ -16,15 +16,14 @@ from PySide6.QtGui import (
     QDragEnterEvent,
     QDropEvent,
     QGuiApplication,
+    QResizeEvent,
     QShowEvent,
 )
 from PySide6.QtWidgets import (
     QApplication,
     QDialog,
-    QDockWidget,
     QMainWindow,
     QMenu,
-    QToolButton,
     QWidget,
 )
 
@@ -44,8 +43,9 @@ from app.dialogs.failure import FailureDialog
 from app.engine import Failure
 from app.file_actions import FileActions
 from app.icons import icon, program_icon
-from app.menus import fill_menus, make_bar
+from app.menus import fill_menus, make_bar, refresh_bar
 from app.panels.collision import CollisionPanel
+from app.panels.dock import Panel
 from app.panels.library import LibraryPanel
 from app.panels.parts import silent
 from app.panels.randomise import RandomiseCard
@@ -68,7 +68,12 @@ _log = logging.getLogger(__name__)
 
 _LAYOUT_VERSION = 1
 _SIZE = QSize(1440, 900)
-_SIDE_WIDTHS = {"sliders": 330, "collision": 312}
+_SIDE_SHARES = {"sliders": (0.25, 330, 440), "collision": (0.22, 312, 380)}
+"""Of the window's width, at least and at most, in device-independent pixels."""
+_NARROW = 1100
+"""A window narrower than this has no room for the poses between the panels at its sides."""
+_VIEW_WIDTH = 400
+"""Of the view, before the panels beside it get more than they need."""
 _AREAS = {
     "sliders": Qt.DockWidgetArea.LeftDockWidgetArea,
     "collision": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -106,11 +111,11 @@ class MainWindow(QMainWindow):
         self.setDockNestingEnabled(True)
         for corner in (Qt.Corner.TopLeftCorner, Qt.Corner.BottomLeftCorner):
             self.setCorner(corner, Qt.DockWidgetArea.LeftDockWidgetArea)
-        for corner in (Qt.Corner.TopRightCorner, Qt.Corner.BottomRightCorner):
-            self.setCorner(corner, Qt.DockWidgetArea.RightDockWidgetArea)
+        self.setCorner(Qt.Corner.TopRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
 
         self.files = FileActions(self, document, settings, self.attempt)
         self.viewport = Viewport(document)
+        self.viewport.setMinimumSize(160, 120)
         self.setCentralWidget(self.viewport)
         self.actions_by_key = {key: self._action(key, spec) for key, spec in ACTIONS.items()}
         self._shadings = self._choices(
@@ -210,9 +215,7 @@ class MainWindow(QMainWindow):
                 self.actions_by_key[key].setIcon(icon(spec.icon))
         for action in self._cameras.values():
             action.setIcon(icon("camera"))
-        button = self._bar.findChild(QToolButton, "cameras")
-        if isinstance(button, QToolButton):
-            button.setIcon(icon("camera"))
+        refresh_bar(self._bar)
         self.collision.refresh_icons()
         self.randomise.refresh_icons()
         self.library.redraw()
@@ -235,6 +238,11 @@ class MainWindow(QMainWindow):
             self.viewport.setFocus()
         if self.settings["window_layout"].isEmpty():
             QTimer.singleShot(0, self, self._size_docks)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Let the poses have the corner where the window is narrow."""
+        super().resizeEvent(event)
+        self._share_corner()
 
     def close_unasked(self) -> None:
         """Close at once; what is not saved is offered at the next start."""
@@ -317,10 +325,8 @@ class MainWindow(QMainWindow):
         menu.addActions(list(actions))
         return menu
 
-    def _dock(self, key: str, title: str, content: QWidget) -> QDockWidget:
-        dock = QDockWidget(title, self)
-        dock.setObjectName(key)
-        dock.setWidget(content)
+    def _dock(self, key: str, title: str, content: QWidget) -> Panel:
+        dock = Panel(key, title, content, self)
         equip_action(dock.toggleViewAction(), DOCKS[key])
         self.addDockWidget(_AREAS[key], dock)
         return dock
@@ -361,11 +367,25 @@ class MainWindow(QMainWindow):
         self.resize(_SIZE.boundedTo(screen))
         self.restoreGeometry(self.settings["window_geometry"])
         self.restoreState(self.settings["window_layout"], _LAYOUT_VERSION)
+        self._share_corner()
+
+    def _share_corner(self) -> None:
+        corner, area = Qt.Corner.BottomRightCorner, Qt.DockWidgetArea.RightDockWidgetArea
+        if self.width() < _NARROW:
+            area = Qt.DockWidgetArea.BottomDockWidgetArea
+        if self.corner(corner) is not area:
+            self.setCorner(corner, area)
 
     @Slot()
     def _size_docks(self) -> None:
-        sides = [self.docks[key] for key in _SIDE_WIDTHS]
-        self.resizeDocks(sides, list(_SIDE_WIDTHS.values()), Qt.Orientation.Horizontal)
+        sides = [self.docks[key] for key in _SIDE_SHARES]
+        widths = [
+            round(min(max(share * self.width(), least), most))
+            for share, least, most in _SIDE_SHARES.values()
+        ]
+        if sum(widths) + _VIEW_WIDTH > self.width():
+            widths = [side.minimumSizeHint().width() for side in sides]
+        self.resizeDocks(sides, widths, Qt.Orientation.Horizontal)
         self.resizeDocks(
             [self.docks["library"]],
             [self.library.sizeHint().height()],

@@ -118,7 +118,18 @@ def make_bar(
             bar.addAction(actions[key])
     for button in bar.findChildren(QToolButton):
         button.setFocusPolicy(Qt.FocusPolicy.TabFocus)
+    refresh_bar(bar)
     return bar
+
+
+def refresh_bar(bar: QToolBar) -> None:
+    """Draw in the theme that has come what is no action's: the cameras, and the way to the rest."""
+    # Qt's own button for what a narrow bar has no room for; its arrow is black in both themes.
+    for name, drawing in (("cameras", "camera"), ("qt_toolbar_ext_button", "more")):
+        button = bar.findChild(QToolButton, name)
+        if isinstance(button, QToolButton):
+            button.setIcon(icon(drawing))
+            button.setToolTip(button.toolTip() or "More actions")
 
 
 def _spring() -> QWidget:

@@ -224,6 +224,7 @@ QToolButton:pressed {{ background: {pressed}; }}
 QToolButton:focus {{ border-color: {theme.accent}; }}
 QToolButton:checked {{ background: {pressed}; }}
 QToolButton::menu-indicator {{ image: none; }}
+QToolButton#qt_toolbar_ext_button {{ border: none; padding: 0; }}
 QToolButton#segment {{
     border: 1px solid {theme.border}; border-radius: 0; padding: 4px 10px;
     background: {theme.card}; margin-left: -1px;

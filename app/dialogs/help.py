@@ -22,6 +22,9 @@ from app.icons import program_icon
 from app.panels.parts import labelled, scrolling
 from app.theme import CLOSE, NORMAL, WIDE
 
+_TITLE_BAR = 60
+"""Of a dialog and what the desktop keeps for itself, in device-independent pixels."""
+
 
 class AboutDialog(QDialog):
     """Name, version, licence and origin of the program and of the model."""
@@ -76,7 +79,8 @@ class ShortcutsDialog(QDialog):
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle("Keyboard and mouse")
-        self.resize(560, 620)
+        room = self.screen().availableSize()
+        self.resize(560, min(620, room.height() - _TITLE_BAR))
         page = QWidget()
         grid = QGridLayout(page)
         grid.setContentsMargins(0, 0, NORMAL, 0)

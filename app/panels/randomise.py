@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from PySide6.QtCore import Qt, Signal, Slot
 from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QGridLayout, QPushButton
+from PySide6.QtWidgets import QHBoxLayout, QPushButton
 
 from app.icons import icon
 from app.panels.number_box import QuietIntegerBox
@@ -12,6 +12,7 @@ from app.panels.parts import Card, Slider, labelled
 from app.theme import CLOSE
 
 _LARGEST_SEED = 999_999
+_SEED_WIDTH = 76
 
 
 class RandomiseCard(Card):
@@ -44,22 +45,21 @@ class RandomiseCard(Card):
         self._percent.setMinimumWidth(self.fontMetrics().horizontalAdvance("100 %"))
         self._percent.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         self.seed = QuietIntegerBox()
+        self.seed.setMinimumWidth(_SEED_WIDTH)
         self.seed.setRange(0, _LARGEST_SEED)
         self.seed.setAccessibleName("Seed")
         self.seed.setToolTip("Equal numbers draw equal poses; it counts up by itself")
         self.button = QPushButton("Randomise")
         self.button.setToolTip(action.toolTip())
-        grid = QGridLayout()
-        grid.setHorizontalSpacing(CLOSE)
-        grid.setVerticalSpacing(CLOSE)
-        grid.addWidget(labelled("Amount", "caption"), 0, 0)
-        grid.addWidget(self.amount, 0, 1)
-        grid.addWidget(self._percent, 0, 2)
-        grid.addWidget(labelled("Seed", "caption"), 1, 0)
-        grid.addWidget(self.seed, 1, 1)
-        grid.addWidget(self.button, 1, 2)
-        grid.setColumnStretch(1, 1)
-        self.column.addLayout(grid)
+        for widgets in (
+            (labelled("Amount", "caption"), self.amount, self._percent),
+            (labelled("Seed", "caption"), self.seed, self.button),
+        ):
+            row = QHBoxLayout()
+            row.setSpacing(CLOSE)
+            for widget in widgets:
+                row.addWidget(widget, 1 if widget in (self.amount, self.button) else 0)
+            self.column.addLayout(row)
         self.amount.valueChanged.connect(self._on_amount)
         self.button.clicked.connect(action.trigger)
         self.seed.refused.connect(self.refused)

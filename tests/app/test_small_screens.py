@@ -1,0 +1,201 @@
+"""From 800 x 600 up everything can be reached, panels float beside, and tracks grow."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import QPoint, QRect, QSize, Qt
+from PySide6.QtGui import QScreen
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import (
+    QAbstractButton,
+    QDialog,
+    QDockWidget,
+    QScrollArea,
+    QToolButton,
+    QWidget,
+)
+from pytestqt.qtbot import QtBot
+
+from app.dialogs.failure import FailureDialog
+from app.dialogs.forms import resolve_form, screenshot_form, turntable_form
+from app.dialogs.help import AboutDialog
+from app.document import PoseDocument
+from app.engine import Failure
+from app.main_window import MainWindow
+from app.panels.dock import beside
+from tests.app.windows import close_window, open_window, rest, settings_in
+
+SMALL = QSize(800, 600)
+
+
+@pytest.fixture
+def small(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> MainWindow:
+    held = open_window(qtbot, document, settings_in(tmp_path), (SMALL.width(), SMALL.height()))
+    # Below a width the poses get the corner, which makes still narrower possible.
+    held.resize(SMALL)
+    qtbot.wait(50)
+    return held
+
+
+def lies_in(widget: QWidget, around: QWidget) -> bool:
+    return around.rect().contains(QRect(widget.mapTo(around, QPoint(0, 0)), widget.size()))
+
+
+def test_everything_is_reached_at_800_by_600(qtbot: QtBot, small: MainWindow) -> None:
+    assert small.size() == SMALL
+    assert small.viewport.width() >= 160
+    for dock in small.docks.values():
+        assert lies_in(dock, small)
+        for button in dock.findChildren(QToolButton):
+            assert not button.isVisible() or lies_in(button, small) or _scrolls(button)
+    for button in small._bar.findChildren(QToolButton):
+        assert not button.isVisible() or lies_in(button, small)
+    # What does not fit is in an area that scrolls there.
+    card = small.collision.resolve
+    area = small.collision.findChild(QScrollArea)
+    area.ensureWidgetVisible(card.button)
+    assert lies_in(card.button, small)
+    group = small.sliders.groups[-1]
+    group.set_open(True)
+    qtbot.wait(50)
+    for row in group.rows:
+        area = _area_of(row)
+        area.ensureWidgetVisible(row)
+        assert lies_in(row.slider, area.viewport())
+        assert lies_in(row.field, area.viewport())
+    close_window(small)
+
+
+def _area_of(widget: QWidget) -> QScrollArea:
+    above = widget.parentWidget()
+    while above is not None and not isinstance(above, QScrollArea):
+        above = above.parentWidget()
+    assert above is not None
+    return above
+
+
+def _scrolls(widget: QWidget) -> bool:
+    try:
+        return _area_of(widget).verticalScrollBar().maximum() > 0
+    except AssertionError:
+        return False
+
+
+def test_what_a_narrow_tool_bar_leaves_out_is_behind_its_arrow(
+    qtbot: QtBot, small: MainWindow
+) -> None:
+    bar = small._bar
+    for dock in small.docks.values():
+        dock.hide()
+    more = bar.findChild(QToolButton, "qt_toolbar_ext_button")
+    qtbot.wait(50)
+    small.resize(420, 600)
+    qtbot.waitUntil(more.isVisible)
+    for theme in ("light", "dark"):
+        small.set_theme(theme)
+        picture = more.grab().toImage()
+        light = [
+            picture.pixelColor(x, y).lightness()
+            for x in range(picture.width())
+            for y in range(picture.height())
+        ]
+        assert max(light) - min(light) > 120, theme
+    assert more.toolTip()
+    close_window(small)
+
+
+@pytest.mark.parametrize("kind", ["resolve", "screenshot", "turntable", "shortcuts", "about", "no"])
+def test_dialogs_fit_800_by_600(
+    small: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(QScreen, "availableSize", lambda _: SMALL)
+    settings = settings_in(tmp_path)
+    dialog: QDialog
+    if kind == "shortcuts":
+        small.actions_by_key["shortcuts"].trigger()
+        dialog = next(d for d in small.findChildren(QDialog) if d.isVisible())
+    elif kind == "about":
+        dialog = AboutDialog(["a model", "of long " * 8 + "origin"], small)
+    elif kind == "no":
+        dialog = FailureDialog(
+            Failure("no such file; " + "look elsewhere " * 40, "x\n" * 99), small
+        )
+        dialog.show()
+        dialog.unfold.click()
+    else:
+        forms = {
+            "resolve": resolve_form,
+            "screenshot": screenshot_form,
+            "turntable": turntable_form,
+        }
+        dialog = forms[kind](settings, small)
+    dialog.show()
+    room = SMALL - QSize(0, 40)
+    assert dialog.width() <= room.width()
+    assert dialog.height() <= room.height()
+    dialog.close()
+    close_window(small)
+
+
+def test_tracks_of_sliders_grow_with_their_panel(qtbot: QtBot, window: MainWindow) -> None:
+    dock, row = window.docks["sliders"], window.sliders.row_of(1)
+    widths = []
+    for width in (330, 430, 530):
+        window.resizeDocks([dock], [width], Qt.Orientation.Horizontal)
+        qtbot.wait(50)
+        widths.append((dock.width(), row.slider.width(), window.randomise.amount.width()))
+    for (before, *tracks), (after, *others) in pairwise(widths):
+        assert after - before >= 90
+        for track, other in zip(tracks, others, strict=True):
+            assert other - track >= 0.9 * (after - before)
+
+
+def test_a_wide_window_has_wider_panels(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    wide = open_window(qtbot, document, settings_in(tmp_path), (1580, 900))
+    qtbot.waitUntil(lambda: wide.docks["sliders"].width() > 380)
+    assert wide.docks["collision"].width() > 330
+    close_window(wide)
+
+
+def test_a_panel_floats_beside_the_window(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    held = open_window(qtbot, document, settings_in(tmp_path), (900, 700))
+    held.move(10, 40)
+    for key in ("sliders", "collision"):
+        dock = held.docks[key]
+        button = dock.findChild(QAbstractButton, "qt_dockwidget_floatbutton")
+        QTest.mouseClick(button, Qt.MouseButton.LeftButton)
+        qtbot.waitUntil(dock.isFloating)
+        qtbot.waitUntil(lambda dock=dock: not overlaps(dock, held))
+        assert held.screen().availableGeometry().contains(dock.frameGeometry())
+        dock.setFloating(False)
+        rest(qtbot, held)
+    close_window(held)
+
+
+def overlaps(dock: QDockWidget, window: MainWindow) -> bool:
+    return dock.frameGeometry().intersects(window.frameGeometry())
+
+
+def test_where_there_is_no_room_beside_a_panel_hides_no_body() -> None:
+    room, panel = QRect(0, 0, 1000, 800), QRect(400, 100, 300, 500)
+    body = QRect(300, 0, 300, 800)
+    for window in (QRect(0, 0, 1000, 800), QRect(100, 0, 800, 800)):
+        place = QRect(beside(panel, window, body, room), panel.size())
+        assert room.contains(place)
+        assert not place.intersects(body)
+    # The screen of the window need not begin at 0.
+    second = QRect(2000, 0, 1000, 800)
+    place = QRect(beside(panel, QRect(2000, 0, 600, 800), body, second), panel.size())
+    assert place.left() > 2600
+    assert second.contains(place)
+    # Larger than the screen, its title bar stays in reach.
+    vast = QRect(0, 0, 1200, 900)
+    corner = beside(vast, QRect(0, 0, 1000, 800), body, room)
+    assert room.contains(corner)
