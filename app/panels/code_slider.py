@@ -183,7 +183,7 @@ class CodeRow(HoverRow):
     @property
     def is_outside(self) -> bool:
         """Whether the number is outside the range that the slider reaches."""
-        return self.field.property("verdict") == "outside"
+        return bool(self.field.property("verdict") == "outside")
 
     def _explain(self, number: float) -> None:
         """Mark a number outside the trained range, and say what can be typed."""

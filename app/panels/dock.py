@@ -45,10 +45,10 @@ class Panel(QDockWidget):
 
     @Slot()
     def _place_beside(self) -> None:
-        if not (self.isFloating() and self.isVisible()):
+        view = self._window.centralWidget()
+        if view is None or not (self.isFloating() and self.isVisible()):
             return
         room = self._window.screen().availableGeometry()
-        view = self._window.centralWidget()
         # The body stands in the middle of the view.
         body = QRect(0, 0, view.width() // 2, view.height())
         body.moveCenter(QRect(view.mapToGlobal(QPoint(0, 0)), view.size()).center())

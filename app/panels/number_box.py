@@ -39,13 +39,14 @@ class QuietSpinBox(QDoubleSpinBox):
                 return False
         return super().event(event)
 
-    def validate(self, text: str, place: int) -> object:
+    def validate(self, text: str, place: int) -> tuple[QValidator.State, str, int]:
         """Let any number be typed; whether it can be taken is told when it is there."""
         return _validated(self, super().validate(text, place), text, place)
 
     def fixup(self, text: str) -> str:
         """Refuse a number beyond the field's range."""
-        _refuse_beyond(self, text)
+        limits = self.textFromValue(self.minimum()), self.textFromValue(self.maximum())
+        _refuse_beyond(self, text, *limits)
         return text
 
 
@@ -62,13 +63,14 @@ class QuietIntegerBox(QSpinBox):
         """Leave the wheel to the panel's scrolling unless focused."""
         wheel_if_focused(self, event, super().wheelEvent)
 
-    def validate(self, text: str, place: int) -> object:
+    def validate(self, text: str, place: int) -> tuple[QValidator.State, str, int]:
         """Let any number be typed; whether it can be taken is told when it is there."""
         return _validated(self, super().validate(text, place), text, place)
 
     def fixup(self, text: str) -> str:
         """Refuse a number beyond the field's range."""
-        _refuse_beyond(self, text)
+        limits = self.textFromValue(self.minimum()), self.textFromValue(self.maximum())
+        _refuse_beyond(self, text, *limits)
         return text
 
 
@@ -84,19 +86,21 @@ def _is_beyond(field: QuietSpinBox | QuietIntegerBox, text: str) -> bool:
 
 
 def _validated(
-    field: QuietSpinBox | QuietIntegerBox, found: object, text: str, place: int
-) -> object:
+    field: QuietSpinBox | QuietIntegerBox,
+    found: tuple[QValidator.State, str, int],
+    text: str,
+    place: int,
+) -> tuple[QValidator.State, str, int]:
     """Turn Qt's refusal of a key into a wait for the rest, where the text is a number."""
-    if isinstance(found, tuple) and found[0] is QValidator.State.Invalid:
-        return (QValidator.State.Intermediate, text, place) if _is_beyond(field, text) else found
+    if found[0] is QValidator.State.Invalid and _is_beyond(field, text):
+        return QValidator.State.Intermediate, text, place
     return found
 
 
-def _refuse_beyond(field: QuietSpinBox | QuietIntegerBox, text: str) -> None:
+def _refuse_beyond(field: QuietSpinBox | QuietIntegerBox, text: str, least: str, most: str) -> None:
     if not _is_beyond(field, text):
         return
     typed = text.removesuffix(field.suffix()).strip()[:20]
-    least, most = (field.textFromValue(limit) for limit in (field.minimum(), field.maximum()))
     sentence = f"{typed} is outside what can be typed here: type a number from {least} to {most}"
     field.refused.emit(sentence)
     if field.isVisible():
