@@ -11,7 +11,7 @@ from app.cli.console import ExitStatus, note, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.poses import PosesOutput
-from app.cli.results import OutputForm, note_near_exclusion, require_output, write_result
+from app.cli.results import note_near_exclusion, require_output, write_result
 from app.wording import counted, mirrored_text
 from lcollision_core.errors import ModelFileError
 
@@ -36,7 +36,7 @@ def mirror(
     """
     from lcollision_core.model import PoseModel, read_poses
 
-    require_output(output, ".json")
+    destination = require_output(output, ".json")
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
     if not named:
@@ -49,11 +49,12 @@ def mirror(
             found.append(model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel))
             progress(len(found), len(named))
     images = [p.mirrored(m) for p, m in zip(named, found, strict=True)]
-    write_result(output, OutputForm.POSES, model, images).note()
+    written = write_result(destination, model, images)
+    written.note()
     sources = [f"{poses}: {pose.name}" for pose in named]
     if as_json:
         rows = zip(sources, found, strict=True)
-        print_json([_row(model, source, output, mirrored) for source, mirrored in rows])
+        print_json([_row(model, source, written.output, mirrored) for source, mirrored in rows])
     else:
         for source, mirrored in zip(sources, found, strict=True):
             typer.echo(f"{source}: {mirrored_text(mirrored)}")

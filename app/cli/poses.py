@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,8 +10,10 @@ import typer
 
 from app.cli.console import progress_bar
 from app.cli.inputs import expanded
+from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
-from app.cli.results import MeshFormat, OutputForm, output_form, require_output, write_result
+from app.cli.results import MeshFormat, output_named, require_output, write_result
+from app.cli.unfinished import unfinished_poses
 from app.wording import fit_error
 from lcollision_core.errors import PoseSetError
 
@@ -31,26 +34,41 @@ def encode(
     ],
     output: PosesOutput,
 ) -> None:
-    """Turn meshes into latent poses, and say how well each fits."""
+    """Turn meshes into latent poses, and say how well each fits.
+
+    What is done when it is stopped is kept beside the output, and the same command goes on.
+    """
+    import numpy as np
+
     from lcollision_core.meshes import read_mesh
     from lcollision_core.model import NamedPose, PoseModel, name_of_file, unique_names
 
-    require_output(output, ".json")
+    destination = require_output(output, ".json")
     model = PoseModel.load(model_name)
     files = [read_mesh(path, topology=model.topology) for path in expanded(meshes)]
     for mesh in files:
         model.require_topology(mesh.topology, str(mesh.source))
     names = unique_names(name_of_file(mesh.source) for mesh in files)
-    poses = []
-    with progress_bar("Encoding meshes") as progress:
-        for name, mesh in zip(names, files, strict=True):
-            try:
-                encoded = model.encode(mesh.vertices)
-            except PoseSetError as error:
-                raise PoseSetError(f"{mesh.source} cannot be encoded: {error}") from error
-            poses.append(NamedPose.of_mesh(name, encoded))
-            progress(len(poses), len(files))
-    written = write_result(output, OutputForm.POSES, model, poses)
+    vertices = np.stack([mesh.vertices for mesh in files])
+    with (
+        unfinished_poses(
+            output, model, {"vertices": vertices}, {"command": "encode"}, len(files)
+        ) as unfinished,
+        cancel_on_interrupt() as cancel,
+    ):
+        with progress_bar("Encoding meshes") as progress:
+            for place, (name, mesh) in enumerate(zip(names, files, strict=True)):
+                if place not in unfinished.finished:
+                    try:
+                        encoded = model.encode(mesh.vertices, cancel)
+                    except PoseSetError as error:
+                        raise PoseSetError(f"{mesh.source} cannot be encoded: {error}") from error
+                    unfinished.keep(place, NamedPose.of_mesh(name, encoded), {})
+                progress(place + 1, len(files))
+        poses = [
+            replace(unfinished.finished[place][0], name=name) for place, name in enumerate(names)
+        ]
+        written = write_result(destination, model, poses)
     for pose in poses:
         typer.echo(f"{pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}")
     written.note()
@@ -62,7 +80,7 @@ def decode(
         Path, typer.Argument(metavar="POSES", readable=False, help="A .json file of poses.")
     ],
     output: Annotated[
-        Path,
+        str,
         typer.Option(
             "--output",
             "-o",
@@ -77,10 +95,10 @@ def decode(
     """Turn latent poses into meshes; one that came in as a mesh returns to its place."""
     from lcollision_core.model import PoseModel, read_poses
 
-    form = output_form(output)
+    destination = output_named(output)
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
-    write_result(output, form, model, named, mesh_format).note()
+    write_result(destination, model, named, mesh_format).note()
 
 
 def sample(
@@ -96,10 +114,10 @@ def sample(
     """Draw latent poses from the box of 1.2 times the training range."""
     from lcollision_core.model import NamedPose, PoseModel, sample_poses
 
-    require_output(output, ".json")
+    destination = require_output(output, ".json")
     model = PoseModel.load(model_name)
     with progress_bar("Drawing poses") as progress:
         latent = sample_poses(model, count, seed, colliding, progress)
     width = len(str(count))
     poses = [NamedPose(f"sample {place + 1:0{width}d}", row) for place, row in enumerate(latent)]
-    write_result(output, OutputForm.POSES, model, poses).note()
+    write_result(destination, model, poses).note()

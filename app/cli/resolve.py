@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,13 +15,15 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import (
     MeshFormat,
+    Output,
     OutputForm,
     WrittenPoses,
     note_near_exclusion,
-    output_form,
+    output_named,
     require_one_mesh,
     write_result,
 )
+from app.cli.unfinished import UnfinishedPoses, unfinished_poses
 from app.wording import counted, fit_error
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from lcollision_core.model import NamedPose, PoseModel
-    from lcollision_core.resolve import ResolveResult
+    from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 _Detailed = Mapping[int, "npt.NDArray[np.float32]"]
 """Meshes with what encoding lost of them, (V, 3), by the place of their request."""
@@ -73,7 +75,7 @@ def resolve(
         ),
     ],
     output: Annotated[
-        Path,
+        str,
         typer.Option(
             "--output",
             "-o",
@@ -131,7 +133,8 @@ def resolve(
 
     Exits with 0 when every pose ends free by the exact check (with --no-verify: by the
     prediction), with 1 when one does not. A pose that is free already comes back unchanged. Of a
-    mesh, what comes back is its nearest pose; --keep-detail adds what that lacks.
+    mesh, what comes back is its nearest pose; --keep-detail adds what that lacks. What is done
+    when it is stopped is kept in a file beside the output, and the same command goes on from there.
 
     What freed a pose is told as a step: solver, the paper's problem; margin, the same with more
     distance from collision; polish, of shallow contacts; start, from elsewhere; walk-back, towards
@@ -155,22 +158,33 @@ def resolve(
         seed=seed,
     )
     resolver = model.resolver
-    form = output_form(output)
-    if keep_detail and form is OutputForm.POSES:
+    target = output_named(output)
+    if keep_detail and target.form is OutputForm.POSES:
         raise LCollisionError(
             f"{output} would hold codes, which have no room for --keep-detail; name a mesh or a "
             f"folder"
         )
     files = expanded(inputs)
     if len(files) > 1:
-        require_one_mesh(output, form, len(files))
+        require_one_mesh(target, len(files))
     requests, failed = _read(model, files)
     if not requests:
         raise typer.Exit(ExitStatus.BAD_INPUT)
-    require_one_mesh(output, form, len(requests))
-    finished: dict[int, ResolveResult] = {}
-    try:
-        with cancel_on_interrupt() as cancel, progress_bar("Resolving poses") as progress:
+    require_one_mesh(target, len(requests))
+    with (
+        unfinished_poses(
+            target.path, model, *_depends_on(model, requests, options, sequence), len(requests)
+        ) as unfinished,
+        cancel_on_interrupt() as cancel,
+    ):
+        finished = _results(unfinished)
+
+        def keep(place: int, result: ResolveResult) -> None:
+            finished[place] = result
+            pose = replace(requests[place].pose, latent=result.latent)
+            unfinished.keep(place, pose, _facts(result))
+
+        with progress_bar("Resolving poses") as progress:
             resolver.resolve_many(
                 np.array([request.pose.latent for request in requests]),
                 options,
@@ -179,18 +193,13 @@ def resolve(
                 cancel,
                 placements=[request.pose.placement for request in requests],
                 sequence=sequence,
-                keep=finished.__setitem__,
+                done=dict(finished),
+                keep=keep,
             )
-    except LCollisionError:
-        if finished:
-            detailed = _detailed(model, requests, finished) if keep_detail else {}
-            _write(output, form, model, requests, finished, mesh_format, detailed)
-            note(f"stopped; {output} has {len(finished)} of {counted(len(requests), 'pose')}")
-        raise
-    detailed = _detailed(model, requests, finished) if keep_detail else {}
-    written = _write(output, form, model, requests, finished, mesh_format, detailed)
+        results = [finished[place] for place in range(len(requests))]
+        detailed = _detailed(model, requests, results) if keep_detail else {}
+        written = _write(target, model, requests, results, mesh_format, detailed)
     written.note()
-    results = [finished[place] for place in range(len(requests))]
     _report(model, requests, results, written.files, detailed, as_json)
     if sequence:
         before = np.array([request.pose.latent for request in requests])
@@ -286,27 +295,78 @@ def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
     yield _Request(str(path), pose, mesh.vertices)
 
 
+def _depends_on(
+    model: PoseModel, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
+) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """Return what the results follow from: arrays, and JSON values."""
+    import numpy as np
+
+    predictor = model.require_predictor().to_section()
+    placed = [request.pose.placement for request in requests]
+    frames = [[*p.rotation.ravel(), *p.translation] if p else [np.nan] * 12 for p in placed]
+    arrays = {
+        **{f"predictor/{name}": array for name, array in predictor.arrays.items()},
+        "free": model.free_latent,
+        "latent": np.array([request.pose.latent for request in requests]),
+        "placement": np.array(frames),
+    }
+    locked = sorted(options.locked_domains)
+    values = {
+        "command": "resolve",
+        **asdict(replace(options, locked_domains=frozenset())),
+        "locked_domains": locked,
+        "predictor": dict(predictor.metadata),
+        "height": model.height,
+        "near_exclusion": model.near_exclusion,
+        "sequence": sequence,
+    }
+    return arrays, values
+
+
+def _facts(result: ResolveResult) -> dict[str, Any]:
+    """Return all of a result but its latent, as JSON values."""
+    return {
+        field.name: getattr(result, field.name)
+        for field in fields(result)
+        if field.name != "latent"
+    }
+
+
+def _results(unfinished: UnfinishedPoses) -> dict[int, ResolveResult]:
+    """Return the results of an earlier run, by place."""
+    from lcollision_core.resolve import ResolveResult, Step
+
+    try:
+        return {
+            place: ResolveResult(pose.latent, **{**facts, "step": Step(facts["step"])})
+            for place, (pose, facts) in unfinished.finished.items()
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise unfinished.damaged() from error
+
+
 def _write(
-    output: Path,
-    form: OutputForm,
+    output: Output,
     model: PoseModel,
     requests: Sequence[_Request],
-    finished: dict[int, ResolveResult],
+    results: Sequence[ResolveResult],
     mesh_format: MeshFormat,
     detailed: _Detailed,
 ) -> WrittenPoses:
-    """Write what is finished, in the order of the requests."""
-    places = sorted(finished)
-    poses = [replace(requests[place].pose, latent=finished[place].latent) for place in places]
-    meshes = [detailed.get(place) for place in places]
-    return write_result(output, form, model, poses, mesh_format, meshes)
+    poses = [
+        replace(request.pose, latent=result.latent)
+        for request, result in zip(requests, results, strict=True)
+    ]
+    meshes = [detailed.get(place) for place in range(len(requests))]
+    return write_result(output, model, poses, mesh_format, meshes)
 
 
 def _detailed(
-    model: PoseModel, requests: Sequence[_Request], finished: Mapping[int, ResolveResult]
+    model: PoseModel, requests: Sequence[_Request], results: Sequence[ResolveResult]
 ) -> _Detailed:
     """Return the fixed meshes that are free with what encoding lost of them, by place."""
-    made = {place: _with_detail(model, requests[place], finished[place]) for place in finished}
+    pairs = enumerate(zip(requests, results, strict=True))
+    made = {place: _with_detail(model, request, result) for place, (request, result) in pairs}
     return {place: mesh for place, mesh in made.items() if mesh is not None}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import os
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from pathlib import Path
@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from lcollision_core.meshes import FileStamp
     from lcollision_core.model import NamedPose, PoseModel
-
-
-_MAX_FILE_NAME = 100
 
 
 class MeshFormat(StrEnum):
@@ -40,6 +38,22 @@ class OutputForm(Enum):
     POSES = auto()
     MESH = auto()
     FOLDER = auto()
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where a command is to put poses or meshes.
+
+    Attributes
+    ----------
+    path : as it was named
+    form : what it is to be
+    before : what was there when the command began, by `file_stamp`
+    """
+
+    path: Path
+    form: OutputForm
+    before: FileStamp | None
 
 
 @dataclass(frozen=True)
@@ -66,18 +80,19 @@ class WrittenPoses:
         note(told)
 
 
-def require_output(path: Path, suffix: str) -> None:
-    """Refuse an output before the work for it is done.
+def require_output(path: Path, suffix: str) -> Output:
+    """Refuse an output that is not one file of a kind, before the work for it is done.
 
     Raises
     ------
     LCollisionError : another extension, or the file could not be written.
     """
-    from lcollision_core.meshes import require_writable
+    from lcollision_core.meshes import file_stamp, require_writable
 
     if path.suffix.lower() != suffix:
         raise LCollisionError(f"{path} cannot be written: it must be a {suffix} file; rename it")
     require_writable(path)
+    return Output(path, OutputForm.POSES, file_stamp(path))
 
 
 def note_near_exclusion(model: PoseModel) -> None:
@@ -89,49 +104,61 @@ def note_near_exclusion(model: PoseModel) -> None:
         )
 
 
-def output_form(output: Path) -> OutputForm:
+def output_named(name: str) -> Output:
     """Say what an output is to be, before the work for it is done.
 
-    An existing folder is one whatever it is called; else the extension decides, and a name without
-    one is a folder that is yet to be made.
+    An existing folder and what ends in a slash are folders whatever they are called; else the
+    extension decides. A name without one, or with what is no kind of file, as in "results_v0.9",
+    is a folder that is yet to be made.
 
     Raises
     ------
-    LCollisionError : an unknown extension, or the file or folder could not be written.
+    LCollisionError : the extension is of files that are not written here, or the file or folder
+        could not be written.
     """
-    from lcollision_core.meshes import WRITABLE_SUFFIXES, require_writable
+    from lcollision_core.meshes import (
+        WRITABLE_SUFFIXES,
+        file_stamp,
+        has_known_suffix,
+        require_writable,
+    )
 
-    suffix = output.suffix.lower()
-    if output.is_dir():
-        require_writable(output / f"pose.{MeshFormat.OBJ}")
-        return OutputForm.FOLDER
-    if suffix not in {"", ".json", *WRITABLE_SUFFIXES}:
+    path = Path(name)
+    suffix = path.suffix.lower()
+    if os.path.isdir(name):  # noqa: PTH112 - a name that is too long is none, and no error
+        require_writable(path / f"pose.{MeshFormat.OBJ}")
+        return Output(path, OutputForm.FOLDER, None)
+    must_be_folder = name.endswith(("/", os.sep))
+    if not must_be_folder and suffix in {".json", *WRITABLE_SUFFIXES}:
+        require_writable(path)
+        form = OutputForm.POSES if suffix == ".json" else OutputForm.MESH
+        return Output(path, form, file_stamp(path))
+    if not must_be_folder and has_known_suffix(path):
         raise LCollisionError(
-            f"{output} cannot be written: {suffix} is no format known here; use one of "
+            f"{path} cannot be written: {suffix} is no format known here; use one of "
             f"{', '.join(WRITABLE_SUFFIXES)}, .json or a folder"
         )
-    require_writable(output)
-    if suffix:
-        return OutputForm.POSES if suffix == ".json" else OutputForm.MESH
-    if output.exists():
-        raise MeshFileError(f"the folder {output} cannot be made: it is a file; name another")
-    return OutputForm.FOLDER
+    require_writable(path)
+    if path.exists():
+        raise MeshFileError(f"the folder {path} cannot be made: it is a file; name another")
+    return Output(path, OutputForm.FOLDER, None)
 
 
-def require_one_mesh(output: Path, form: OutputForm, n_poses: int) -> None:
+def require_one_mesh(output: Output, n_poses: int) -> None:
     """Refuse to write any other number of poses than one as one mesh.
 
     Raises
     ------
     LCollisionError : they are not one.
     """
-    if form is OutputForm.MESH and n_poses != 1:
-        raise LCollisionError(f"{output} is one mesh, but there are {n_poses} poses; name a folder")
+    if output.form is OutputForm.MESH and n_poses != 1:
+        raise LCollisionError(
+            f"{output.path} is one mesh, but there are {n_poses} poses; name a folder"
+        )
 
 
 def write_result(
-    output: Path,
-    form: OutputForm,
+    output: Output,
     model: PoseModel,
     poses: Sequence[NamedPose],
     mesh_format: MeshFormat = MeshFormat.OBJ,
@@ -139,10 +166,12 @@ def write_result(
 ) -> WrittenPoses:
     """Write poses as a .json file, one pose as a mesh, or each as a mesh of a folder.
 
+    All of them come into a folder, or none. A file that others have written since the command
+    began stays, and the poses go beside it.
+
     Parameters
     ----------
     output : a folder is made where there is none
-    form : of `output`, by `output_form`
     model : of the poses
     poses : a pose with a placement returns to it
     mesh_format : of the meshes in a folder
@@ -152,35 +181,37 @@ def write_result(
     ------
     LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
+    from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, spare_name
     from lcollision_core.model import export_mesh, write_poses
     from lcollision_core.resolve import exported_vertices
 
-    if form is OutputForm.POSES:
-        written = WrittenPoses(output, (output,) * len(poses), int(output.exists()))
-        write_poses(output, model, poses)
-        return written
-    require_one_mesh(output, form, len(poses))
-    files = [output]
-    if form is OutputForm.FOLDER:
-        files = [output / f"{name}.{mesh_format}" for name in _file_names(poses)]
-        try:
-            output.mkdir(exist_ok=True)
-        except OSError as error:
-            raise MeshFileError(
-                f"the folder {output} cannot be made: {error.strerror or error}; name another"
-            ) from error
-    n_replaced = sum(file.exists() for file in files)
+    require_one_mesh(output, len(poses))
     given = [None] * len(poses) if vertices is None else vertices
-    for file, pose, mesh in zip(files, poses, given, strict=True):
-        if mesh is None:
-            mesh = exported_vertices(model.decode(pose.latent), pose.placement)
-        # OBJ and OFF would get float32's short decimals, which float64 readers take for others.
-        export_mesh(file, model, mesh.astype(float), pose.placement)
-    return WrittenPoses(output, tuple(files), n_replaced)
 
+    def write(files: Sequence[Path]) -> None:
+        for file, pose, mesh in zip(files, poses, given, strict=True):
+            if mesh is None:
+                mesh = exported_vertices(model.decode(pose.latent), pose.placement)
+            # OBJ and OFF would get float32's short decimals, which float64 readers take for others.
+            export_mesh(file, model, mesh.astype(float), pose.placement)
 
-def _file_names(poses: Sequence[NamedPose]) -> list[str]:
-    from lcollision_core.model import unique_names
-
-    safe = (re.sub(r'[\x00-\x1f<>:"/\\|?*]+', "_", pose.name).strip(" .") for pose in poses)
-    return unique_names(name[:_MAX_FILE_NAME] or "pose" for name in safe)
+    path = output.path
+    if output.form is OutputForm.FOLDER:
+        names = [f"{stem}.{mesh_format}" for stem in file_stems(pose.name for pose in poses)]
+        n_replaced = sum((path / name).exists() for name in names)
+        with atomic_files(path) as unfinished:
+            write([unfinished / name for name in names])
+        return WrittenPoses(path, tuple(path / name for name in names), n_replaced)
+    with locked(path):
+        n_replaced = int(path.exists())
+        if n_replaced and file_stamp(path) != output.before:
+            path, n_replaced = spare_name(path), 0
+            note(
+                f"{output.path} was changed by another command meanwhile and stays as it is; the "
+                f"result goes to {path}"
+            )
+        if output.form is OutputForm.POSES:
+            write_poses(path, model, poses)
+        else:
+            write([path])
+    return WrittenPoses(path, (path,) * len(poses), n_replaced)

@@ -3,6 +3,7 @@
 from lcollision_core.meshes.alignment import Alignment, RigidTransform, align_rigid, fit_rigid
 from lcollision_core.meshes.atomic import (
     FileStamp,
+    atomic_files,
     atomic_write,
     file_stamp,
     require_writable,
@@ -14,6 +15,7 @@ from lcollision_core.meshes.audit import (
     audit_mesh,
     inspect_pose_set,
 )
+from lcollision_core.meshes.file_names import file_stem, file_stems, has_known_suffix
 from lcollision_core.meshes.files import (
     MAX_FACES,
     READABLE_SUFFIXES,
@@ -45,10 +47,14 @@ __all__ = [
     "RigidTransform",
     "Topology",
     "align_rigid",
+    "atomic_files",
     "atomic_write",
     "audit_mesh",
     "file_stamp",
+    "file_stem",
+    "file_stems",
     "fit_rigid",
+    "has_known_suffix",
     "height",
     "inspect_pose_set",
     "locked",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import shutil
 import stat
 import sys
 import time
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.locks import is_named, lock_open_file, shortened
+from lcollision_core.meshes.locks import is_named, lock_open_file, locked, shortened
 
 _MAX_NAME_BYTES = 100
 """Of the name that a file has while it is written, but for what marks it so."""
@@ -72,6 +73,73 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
                 unfinished.unlink(missing_ok=True)
 
 
+@contextmanager
+def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a folder for files that come into `folder` together, once all are complete.
+
+    Files of the same names are replaced, others stay. When the block raises, nothing comes, and a
+    `folder` that was not there before is none again; what a killed process left is removed by the
+    next one.
+
+    Parameters
+    ----------
+    folder : made if there is none; its parent must exist
+
+    Yields
+    ------
+    the folder to write into, on the same disk
+
+    Raises
+    ------
+    MeshFileError : `folder` cannot be made or written to.
+    """
+    target = Path(folder)
+    is_new = not os.path.lexists(target)
+    unfinished = target / f".{secrets.token_hex(6)}.part"
+    try:
+        target.mkdir(exist_ok=True)
+        _remove_dead_folders(target)
+        with locked(unfinished):
+            unfinished.mkdir()
+            try:
+                yield unfinished
+                _move_all(unfinished, target)
+            finally:
+                shutil.rmtree(unfinished, ignore_errors=True)
+    except OSError as error:
+        raise MeshFileError(
+            f"the folder {folder} cannot be written to: {error.strerror or error}; name another"
+        ) from error
+    except MeshFileError as error:
+        raise MeshFileError(str(error).replace(str(unfinished), str(target))) from error
+    finally:
+        if is_new:
+            with suppress(OSError):  # it is not empty: all is well
+                target.rmdir()
+
+
+def _move_all(folder: Path, target: Path) -> None:
+    names = [file.name for file in folder.iterdir()]
+    for name in names:
+        if (target / name).is_dir():
+            raise MeshFileError(f"{target / name} cannot be written: it is a folder; move it away")
+    try:
+        for name in names:
+            (folder / name).replace(os.path.realpath(target / name))
+    except KeyboardInterrupt:
+        # Half of it would be neither what was there nor what is to be.
+        _move_all(folder, target)
+        raise
+
+
+def _remove_dead_folders(target: Path) -> None:
+    """Remove what processes that are no more were to move into a folder."""
+    for unfinished in target.iterdir():
+        if re.fullmatch(r"\.[0-9a-f]{12}\.part", unfinished.name) and unfinished.is_dir():
+            with suppress(MeshFileError), locked(unfinished, wait=0.0):  # unless it is alive
+                shutil.rmtree(unfinished)
+
+
 def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
     """Return what tells a file from any that is later in its place; None where there is none.
 
@@ -110,7 +178,7 @@ def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
     target = Path(os.path.realpath(path))
     try:
         mode = target.stat().st_mode
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         mode = None
     except OSError as error:
         raise MeshFileError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -129,6 +129,7 @@ def write_poses(
     model: PoseModel,
     poses: Sequence[NamedPose],
     working: NamedPose | None = None,
+    extra: Mapping[str, Any] | None = None,
 ) -> None:
     """Write latent poses, whole or not at all.
 
@@ -140,6 +141,7 @@ def write_poses(
     model : whose latent space they are in
     poses : names all different
     working : the pose that is being edited, kept apart from `poses`
+    extra : further JSON values by name, which `read_poses` leaves aside
 
     Raises
     ------
@@ -168,6 +170,7 @@ def write_poses(
         "model": {"name": model.name, "fingerprint": model.fingerprint},
         **({} if working is None else {"working": entries[-1]}),
         "poses": entries[: len(poses)],
+        **(extra or {}),
     }
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
     try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from itertools import pairwise, repeat
@@ -119,6 +119,7 @@ class PoseResolver:
         *,
         placements: Sequence[RigidTransform | None] | None = None,
         sequence: bool = False,
+        done: Mapping[int, ResolveResult] | None = None,
         keep: Callable[[int, ResolveResult], None] | None = None,
     ) -> list[ResolveResult]:
         """Resolve (B, D) poses on several threads.
@@ -134,8 +135,9 @@ class PoseResolver:
         sequence : the poses are the frames of a motion: a frame starts from the correction of the
             one before, so that the motion does not flicker. Frames that collide in a row are one
             thread's work.
-        keep : called with each result and its place as soon as it is there, from one thread at a
-            time: what was done is known whatever interrupts the rest
+        done : results of an earlier run by place, which are not sought again
+        keep : called with each further result and its place as soon as it is there, from one
+            thread at a time: what was done is known whatever interrupts the rest
 
         Returns
         -------
@@ -149,19 +151,20 @@ class PoseResolver:
         placed = [None] * len(rows) if placements is None else placements
         # Built once, before several threads would each begin to.
         _ = self._eye, self._embedding.codec, self._embedding.decoder
+        known = done or {}
         results: dict[int, ResolveResult] = {}
         guard = Lock()
 
         def solve(run: range) -> None:
             near = None
             for place in run:
-                result = self.resolve(
+                result = known.get(place) or self.resolve(
                     rows[place], options, no_progress, cancel, placed[place], near
                 )
                 near = result.latent - rows[place] if sequence else None
                 with guard:
                     results[place] = result
-                    if keep is not None:
+                    if keep is not None and place not in known:
                         keep(place, result)
                     progress(len(results), len(rows))
 

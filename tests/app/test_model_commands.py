@@ -330,25 +330,32 @@ def test_form_of_the_output_decides_what_decode_writes(
     for output, sentence in (
         (tmp_path / "both.obj", "2 poses; name a folder"),
         (tmp_path / "both.xyz", ".xyz is no format"),
+        (tmp_path / ("x" * 300), "File name too long"),
         (tmp_path / "none" / "folder", "there is no folder"),
         (one / "folder", "there is no folder"),
     ):
         assert sentence in _refusal(lcollision, "decode", tube, two, "-o", output)
-        assert not output.exists()
+        assert not os.path.lexists(output)
 
 
 def test_pose_names_that_are_no_file_names_are_made_safe(
     lcollision: Lcollision, tube: Path, tmp_path: Path
 ) -> None:
     poses, folder = tmp_path / "poses.json", tmp_path / "meshes"
-    lcollision("sample", tube, "-n", 4, "-o", poses)
+    given = ("../up", "A", "a", ". .", "\N{DANCER}" * 100, "con", "two\nlines", "\u00e9", "e\u0301")
+    lcollision("sample", tube, "-n", len(given), "-o", poses)
     document = json.loads(poses.read_text())
-    for pose, name in zip(document["poses"], ("../up", "A", "a", ". ."), strict=True):
+    for pose, name in zip(document["poses"], given, strict=True):
         pose["name"] = name
     poses.write_text(json.dumps(document))
     assert lcollision("decode", tube, poses, "-o", folder, "--format", "off").exit_code == 0
     names = sorted(path.name for path in folder.iterdir())
-    assert names == ["A.off", "_up.off", "a 2.off", "pose.off"]
+    assert names == sorted(
+        [
+            *("A.off", "_up.off", "a 2.off", "pose.off", "_con.off", "two_lines.off"),
+            *("\u00e9.off", "e\u0301 2.off", "\N{DANCER}" * 32 + ".off"),
+        ]
+    )
     assert not (tmp_path / "up.off").exists()
 
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-import threading
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from lcollision_core.contact import DEPTH_TOLERANCE
-from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh, write_pose_set
+from lcollision_core.meshes import RigidTransform, locked, read_mesh, write_mesh, write_pose_set
 from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
-from lcollision_core.resolve import find_free_poses
+from lcollision_core.resolve import PoseResolver, find_free_poses
 from lcollision_core.resolve.exact import ExactCheck
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
@@ -415,6 +416,11 @@ def test_an_output_that_cannot_be_is_refused_first(
     for out, sentence in (
         (tmp_path / "no" / "free.json", "there is no folder"),
         (tmp_path / "free.docx", ".docx is no format known here"),
+        (tmp_path / "free.fbx", ".fbx is no format known here"),
+        (tmp_path / "free.txt", ".txt is no format known here"),
+        (tmp_path / ("x" * 300 + ".json"), "File name too long"),
+        (tmp_path / ("x" * 300), "File name too long"),
+        (f"{tmp_path / 'free'}/", "cannot be made: it is a file; name another"),
         (tmp_path / "free", "cannot be made: it is a file; name another"),
         (tmp_path / "free.obj", "is one mesh, but there are 5 poses"),
     ):
@@ -434,26 +440,140 @@ def test_a_model_without_a_predictor_is_refused(
     assert "has no predictor" in result.stderr
 
 
-def test_an_interrupted_batch_keeps_what_is_finished(
+@pytest.mark.parametrize("name", ["results_v0.9", "o_1.05", "new.obj/", "a.v2"])
+def test_a_name_with_a_dot_that_is_no_format_is_a_folder(
+    lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path, name: str
+) -> None:
+    result = lcollision("resolve", model_file, poses, "-o", f"{tmp_path}/{name}")
+    assert result.exit_code == 0, result.stderr
+    assert len(list((tmp_path / name).glob("*.obj"))) == 5
+
+
+_STOP_AFTER_TWO = """
+import os, signal, sys
+from app.cli import main, unfinished
+how = getattr(signal, sys.argv.pop(1))
+unfinished._SECONDS_BETWEEN_WRITES, unfinished._LARGEST_SHARE = 0.0, 1.0
+keep = unfinished.UnfinishedPoses.keep
+def keep_two(self, *arguments):
+    keep(self, *arguments)
+    if len(self.finished) >= 2:
+        os.kill(os.getpid(), how)
+unfinished.UnfinishedPoses.keep = keep_two
+main.main()
+"""
+
+
+def stopped(how: str, *arguments: object) -> str:
+    """Run a command, stop it by a signal once two poses are done, and return what it said."""
+    process = subprocess.run(
+        [sys.executable, "-c", _STOP_AFTER_TWO, how, *map(str, arguments), "--workers", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.returncode == (-9 if how == "SIGKILL" else 130), process.stderr
+    assert process.stdout == ""
+    return process.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+@pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGKILL"])
+@pytest.mark.parametrize("form", ["free.json", "free"])
+def test_a_stopped_run_replaces_nothing_and_goes_on(
     lcollision: Lcollision,
     model: PoseModel,
     model_file: Path,
-    colliding: np.ndarray,
+    poses: Path,
     tmp_path: Path,
+    how: str,
+    form: str,
 ) -> None:
-    path, out = tmp_path / "many.json", tmp_path / "free.json"
-    many = [NamedPose(f"pose {i}", colliding[i % 4] * (1.0 - 1e-5 * i)) for i in range(2000)]
-    write_poses(path, model, many)
-    interrupt = threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT))
-    interrupt.start()
-    result = lcollision("resolve", model_file, path, "-o", out)
-    interrupt.cancel()
-    assert result.exit_code == 130
-    kept = read_poses(out, model)
-    assert f"stopped; {out} has {len(kept)} of 2000 poses" in result.stderr
-    assert 0 < len(kept) < 2000
-    vertices = model.decode(np.stack([pose.latent for pose in kept[:50]])).astype(np.float32)
-    assert not model.detector.are_colliding(vertices).any()
+    whole, out, kept = tmp_path / "whole", tmp_path / form, tmp_path / "free.partial.json"
+    options = ("--sequence", "--seed", "3")
+    lcollision("resolve", model_file, poses, "-o", whole.with_suffix(out.suffix), *options)
+    older = [replace(pose, latent=0.0 * pose.latent) for pose in read_poses(poses, model)]
+    if form == "free":
+        out.mkdir()
+        for pose in older:
+            (out / f"{pose.name}.obj").write_text("older")
+    else:
+        write_poses(out, model, older)
+    before = contents(out)
+    said = stopped(how, "resolve", model_file, poses, "-o", out, *options)
+    assert contents(out) == before
+    done = read_poses(kept, model)
+    assert len(done) == 2
+    if how != "SIGKILL":
+        assert f"stopped; {kept} has 2 of 5 poses, run the same command again to go on" in said
+    result = lcollision("resolve", model_file, poses, "-o", out, *options)
+    assert result.exit_code == 0, result.stderr
+    assert f"going on from {kept}, which has 2 of 5 poses" in result.stderr
+    assert contents(out) == contents(whole.with_suffix(out.suffix))
+    assert not list(tmp_path.glob("*partial*"))
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """Return the bytes of a file or of all files of a folder."""
+    files = list(path.iterdir()) if path.is_dir() else [path]
+    return {file.name if path.is_dir() else "": file.read_bytes() for file in files}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+def test_what_another_run_left_is_neither_used_nor_lost(
+    lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    out, kept = tmp_path / "free.json", tmp_path / "free.partial.json"
+    stopped("SIGINT", "resolve", model_file, poses, "-o", out)
+    left = kept.read_bytes()
+    result = lcollision("resolve", model_file, poses, "-o", out, "--metric", "latent")
+    assert result.exit_code == 2
+    assert f"{kept} has poses of another run" in result.stderr
+    assert kept.read_bytes() == left
+    assert not out.exists()
+    document = json.loads(left)
+    document["unfinished"]["done"][0]["step"] = "flying"
+    kept.write_text(json.dumps(document))
+    result = lcollision("resolve", model_file, poses, "-o", out)
+    assert result.exit_code == 2
+    assert f"{kept} is damaged; delete it" in result.stderr
+    # Renaming a part changes no result.
+    kept.write_bytes(left)
+    lcollision("domains", model_file, "--name", "1=somewhere")
+    assert lcollision("resolve", model_file, poses, "-o", out).exit_code == 0
+
+
+def test_two_runs_to_one_output_are_refused(
+    lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    with locked(tmp_path / "free.partial.json"):
+        result = lcollision("resolve", model_file, poses, "-o", tmp_path / "free.json")
+    assert result.exit_code == 2
+    assert "is being written by another command" in result.stderr
+
+
+def test_an_output_that_others_wrote_meanwhile_stays(
+    lcollision: Lcollision,
+    model: PoseModel,
+    model_file: Path,
+    poses: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As when the editor saves the poses that are being resolved in place."""
+    resolve_many = PoseResolver.resolve_many
+
+    def save_then_resolve(self: PoseResolver, *arguments: Any, **options: Any) -> Any:
+        write_poses(poses, model, [NamedPose("saved meanwhile", np.zeros(model.latent_size))])
+        return resolve_many(self, *arguments, **options)
+
+    monkeypatch.setattr(PoseResolver, "resolve_many", save_then_resolve)
+    result = lcollision("resolve", model_file, poses, "-o", poses, "--json")
+    assert result.exit_code == 0, result.stderr
+    beside = poses.with_name("poses 2.json")
+    assert f"stays as it is; the result goes to {beside}" in result.stderr
+    assert [row["output"] for row in json.loads(result.stdout)] == [str(beside)] * 5
+    assert [pose.name for pose in read_poses(poses, model)] == ["saved meanwhile"]
+    assert len(read_poses(beside, model)) == 5
 
 
 def test_benchmark_compares_the_solvers_with_bisection(

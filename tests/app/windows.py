@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import PySide6
 from PySide6.QtCore import QEvent, QMimeData, QPoint, QPointF, QSettings, Qt, QTimer, QUrl
 from PySide6.QtGui import QDragEnterEvent, QDropEvent, QMouseEvent
 from PySide6.QtTest import QTest
@@ -142,7 +143,9 @@ def drop(window: QWidget, *paths: Path) -> None:
     dropped.setUrls([QUrl.fromLocalFile(str(path)) for path in paths])
     buttons, keys = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
     place, action = QPoint(400, 300), Qt.DropAction.CopyAction
-    entering = QDragEnterEvent(place, action, dropped, buttons, keys)
+    # From 6.12 on another constructor, the one before being deprecated.
+    where = QPointF(place) if PySide6.__version_info__ >= (6, 12) else place
+    entering = QDragEnterEvent(where, action, dropped, buttons, keys)
     QApplication.sendEvent(window, entering)
     assert entering.isAccepted()
     QApplication.sendEvent(window, QDropEvent(QPointF(place), action, dropped, buttons, keys))

@@ -1,0 +1,152 @@
+"""What an interrupted command has done, kept beside its output for the same command to go on."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from app.cli.console import note
+from app.wording import counted
+from lcollision_core.errors import CancelledError, LCollisionError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from lcollision_core.model import NamedPose, PoseModel
+
+_SECONDS_BETWEEN_WRITES = 5.0
+_MAX_STEM_BYTES = 200
+_LARGEST_SHARE = 0.05
+"""Of a command's time, what writing may take when there are many poses."""
+
+
+class UnfinishedPoses:
+    """The poses that a command has finished, in an ordinary file of poses beside its output.
+
+    Make one with `unfinished_poses`.
+
+    Attributes
+    ----------
+    path : the file, "free.partial.json" beside "free.json" or the folder "free"
+    finished : what is done, by place: a pose, and JSON values that come with it
+    """
+
+    def __init__(self, path: Path, model: PoseModel, key: str, total: int) -> None:
+        self.path = path
+        self.finished: dict[int, tuple[NamedPose, Mapping[str, Any]]] = {}
+        self._model, self._key, self._total = model, key, total
+        self._seconds = 0.0
+        self._written = time.monotonic()
+        if path.exists():
+            self._go_on()
+
+    def keep(self, place: int, pose: NamedPose, facts: Mapping[str, Any]) -> None:
+        """Remember a pose that is done; write the file when the last time is long past."""
+        self.finished[place] = (pose, facts)
+        pause = max(_SECONDS_BETWEEN_WRITES, self._seconds / _LARGEST_SHARE)
+        if time.monotonic() - self._written > pause:
+            self.write()
+
+    def write(self) -> None:
+        """Write all that is done."""
+        from lcollision_core.model import write_poses
+
+        started = time.monotonic()
+        places = sorted(self.finished)
+        record = {
+            "key": self._key,
+            "of": self._total,
+            "done": [{"place": place, **self.finished[place][1]} for place in places],
+        }
+        poses = [self.finished[place][0] for place in places]
+        write_poses(self.path, self._model, poses, extra={"unfinished": record})
+        self._written = time.monotonic()
+        self._seconds = self._written - started
+
+    def stop(self) -> None:
+        """Write what is done, and say how to go on."""
+        if not self.finished:
+            return
+        try:
+            self.write()
+        except LCollisionError as error:  # a full disk must not hide what stopped the command
+            note(str(error))
+        note(f"stopped; {self.path} has {self._told}, run the same command again to go on")
+
+    def damaged(self) -> LCollisionError:
+        """Return the error for a file whose facts are not those that were kept."""
+        return LCollisionError(f"{self.path} is damaged; delete it to begin anew")
+
+    def _go_on(self) -> None:
+        from lcollision_core.model import read_poses
+
+        poses = read_poses(self.path, self._model)
+        record = json.loads(self.path.read_bytes()).get("unfinished")
+        if not isinstance(record, dict) or record.get("key") != self._key:
+            raise LCollisionError(
+                f"{self.path} has poses of another run (its model, options, inputs or program "
+                f"differ); move or delete it, or name another output"
+            )
+        try:
+            for pose, facts in zip(poses, record["done"], strict=True):
+                self.finished[int(facts.pop("place"))] = (pose, facts)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise self.damaged() from error
+        note(f"going on from {self.path}, which has {self._told}")
+
+    @property
+    def _told(self) -> str:
+        return f"{len(self.finished)} of {counted(self._total, 'pose')}"
+
+
+@contextmanager
+def unfinished_poses(
+    output: Path,
+    model: PoseModel,
+    arrays: Mapping[str, npt.NDArray[np.generic]],
+    options: Mapping[str, Any],
+    total: int,
+) -> Iterator[UnfinishedPoses]:
+    """Keep what is finished beside an output until the block ends, and go on from an earlier run.
+
+    Parameters
+    ----------
+    output : what the command is to write in the end
+    model : of the poses
+    arrays, options : all that the results depend on but the program; options are JSON values
+    total : how many poses there are to be
+
+    Raises
+    ------
+    LCollisionError : another command writes to this output, or an earlier one left poses there
+        that are not of the same run.
+    """
+    from importlib.metadata import version
+
+    from lcollision_core.embedding.checkpoint import run_key
+    from lcollision_core.meshes import locked
+    from lcollision_core.meshes.locks import shortened
+
+    stem = output.stem if output.suffix.lower() == ".json" else output.name
+    path = output.with_name(f"{shortened(stem, _MAX_STEM_BYTES)}.partial.json")
+    key = run_key(arrays, {**options, "model": model.fingerprint, "version": version("lcollision")})
+    with locked(path, wait=0.0):
+        held = UnfinishedPoses(path, model, key, total)
+        try:
+            yield held
+        except LCollisionError as error:
+            # What the command cannot do it could not do the next time either.
+            if isinstance(error, CancelledError) or len(held.finished) == total:
+                held.stop()
+            else:
+                path.unlink(missing_ok=True)
+            raise
+        except BaseException:
+            held.stop()
+            raise
+        path.unlink(missing_ok=True)

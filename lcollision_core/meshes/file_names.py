@@ -1,0 +1,66 @@
+"""File names: what an extension says, and what a pose's name is as the name of a file."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Iterable
+from mimetypes import MimeTypes
+from pathlib import PurePath
+
+from lcollision_core.meshes.locks import shortened
+
+MAX_STEM_BYTES = 130
+"""Of a file's name without its extension; file systems allow 143 to 255 for all of it."""
+
+_OF_OTHER_PROGRAMS = re.compile(
+    r"\.(3dm|3ds|3mf|7z|abc|blend|bvh|bz2|c4d|dae|docx?|dxf|fbx|gltf|gz|iges|igs|ini|jsonl|log|lwo|ma|max"
+    r"|mb|md|mdd|msh|npy|npz|od[pst]|pc2|pickle|pkl|pptx|pt|pth|rar|safetensors|skp|step|stp|toml|usd[acz]?"
+    r"|vrml|vtk|vtp|vtu|wrl|x3d|xlsx|xyz|xz|ya?ml|zip|zst|ztl)"
+)
+_MEDIA = MimeTypes()
+"""The extensions that the standard library knows, whatever the machine's own lists say."""
+
+_NOT_IN_NAMES = re.compile(r'[\x00-\x1f\x7f-\x9f\u2028\u2029<>:"/\\|?*]+')
+_RESERVED = re.compile(r"(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³])\s*(\.|$)", re.I)
+"""What Windows takes for a device, with any extension."""
+
+
+def has_known_suffix(path: PurePath) -> bool:
+    """Whether a name ends in the extension of some kind of file; ".9" in "walk_v0.9" is none."""
+    suffix = path.suffix.lower()
+    return bool(_OF_OTHER_PROGRAMS.fullmatch(suffix)) or suffix in _MEDIA.types_map[True]
+
+
+def file_stem(name: str) -> str:
+    """Return a name as that of a file, without extension, on every common file system."""
+    stem = _cut(_NOT_IN_NAMES.sub("_", name), MAX_STEM_BYTES) or "pose"
+    return f"_{_cut(stem, MAX_STEM_BYTES - 1)}" if _RESERVED.match(stem) else stem
+
+
+def file_stems(names: Iterable[str]) -> list[str]:
+    """Return each name's `file_stem`, numbered where an earlier one is the same file: "a", "A 2".
+
+    Neither case nor the way in which an accent is encoded tells files apart everywhere.
+    """
+    taken: set[str] = set()
+    counts: Counter[str] = Counter()
+    stems = []
+    for stem in map(file_stem, names):
+        candidate, base = stem, _folded(stem)
+        while (key := _folded(candidate)) in taken:
+            counts[base] += 1
+            ending = f" {counts[base] + 1}"
+            candidate = _cut(stem, MAX_STEM_BYTES - len(ending)) + ending
+        taken.add(key)
+        stems.append(candidate)
+    return stems
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def _cut(name: str, n_bytes: int) -> str:
+    return shortened(name.strip(" ."), n_bytes).strip(" .")
