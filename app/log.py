@@ -14,6 +14,7 @@ from types import TracebackType
 from PySide6.QtCore import QMessageLogContext, QtMsgType, qInstallMessageHandler
 
 from app.engine import Failure
+from lcollision_core.regular_files import require_regular
 
 _MAX_BYTES = 1_000_000
 _N_OLD_FILES = 2
@@ -89,6 +90,9 @@ def _handler(path: Path) -> logging.Handler:
         handler: logging.Handler = logging.handlers.RotatingFileHandler(
             path, maxBytes=_MAX_BYTES, backupCount=_N_OLD_FILES, encoding="utf-8", delay=True
         )
+        # Opening a pipe would wait for its reader for ever.
+        if path.exists():
+            require_regular(path)
         path.open("a").close()
     except OSError:
         return logging.NullHandler()

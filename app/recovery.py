@@ -21,7 +21,9 @@ from PySide6.QtCore import QLockFile, QObject, QThread, QTimer, Signal, Slot
 
 from app.document import PoseDocument
 from app.engine import Failure, end_thread, single_shot, started_thread
+from lcollision_core.json_values import parse_json
 from lcollision_core.meshes import atomic_write
+from lcollision_core.regular_files import read_regular, require_regular
 
 if TYPE_CHECKING:
     from lcollision_core.model import NamedPose, PoseModel
@@ -34,6 +36,7 @@ AUTOSAVE_SECONDS = 3.0
 _LOCK = "lock"
 _POSES = "poses.json"
 _SESSION = "session.json"
+_MAX_SESSION_BYTES = 2**20
 
 
 def sessions_folder() -> Path:
@@ -67,7 +70,17 @@ class Session:
 
     @classmethod
     def held(cls, folder: Path) -> Session | None:
-        """Take a session over, or return None where a living process holds it."""
+        """Take a session over, or return None where a living process holds it.
+
+        Nor is one taken whose lock is no plain file: Qt would wait for a pipe for ever.
+        """
+        try:
+            require_regular(folder / _LOCK)
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            _log.warning("%s is no session: %s", folder, error)
+            return None
         lock = QLockFile(str(folder / _LOCK))
         # A lock never grows too old: only the death of its process frees it.
         lock.setStaleLockTime(0)
@@ -129,7 +142,7 @@ def _lost(parent: Path) -> Iterator[LostPose]:
         if session is None:
             continue
         try:
-            held = json.loads((folder / _SESSION).read_text(encoding="utf-8"))
+            held = parse_json(read_regular(folder / _SESSION, _MAX_SESSION_BYTES))
             yield LostPose(
                 session=session,
                 model=str(held["model"]),
@@ -138,7 +151,7 @@ def _lost(parent: Path) -> Iterator[LostPose]:
                 locked=tuple(map(int, held.get("locked", ()))),
                 saved=(folder / _POSES).stat().st_mtime,
             )
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
             _log.info("nothing to recover in %s: %s", folder, error)
             session.discard()
 

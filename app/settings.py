@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import QByteArray, QSettings
+from PySide6.QtCore import QByteArray, QSettings, QStandardPaths
+
+from lcollision_core.regular_files import require_regular
+
+_log = logging.getLogger(__name__)
 
 ORGANISATION = "lcollision"
 APPLICATION = "editor"
@@ -62,7 +69,7 @@ class Settings:
     """
 
     def __init__(self, store: QSettings | None = None) -> None:
-        self._store = QSettings(ORGANISATION, APPLICATION) if store is None else store
+        self._store = _own_store() if store is None else store
 
     def __getitem__(self, key: str) -> Any:
         setting = SETTINGS[key]
@@ -83,6 +90,23 @@ class Settings:
     def forget_file(self, path: str) -> None:
         """Drop a file that is gone from the recent ones."""
         self["recent_files"] = tuple(name for name in self["recent_files"] if name != path)
+
+
+def _own_store() -> QSettings:
+    """Return the user's own store, or an empty one where Qt would wait for a pipe for ever."""
+    folder = Path(
+        QStandardPaths.writableLocation(QStandardPaths.StandardLocation.GenericConfigLocation)
+    )
+    for name in (f"{ORGANISATION}/{APPLICATION}.conf", f"{ORGANISATION}.conf"):
+        try:
+            require_regular(folder / name)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            _log.warning("%s is not used, settings are not kept: %s", folder / name, error)
+            unused = Path(tempfile.mkdtemp(prefix="lcollision-")) / f"{APPLICATION}.ini"
+            return QSettings(str(unused), QSettings.Format.IniFormat)
+    return QSettings(ORGANISATION, APPLICATION)
 
 
 def _accepted(setting: Setting, value: Any) -> Any:

@@ -10,10 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, BinaryIO, NoReturn
 
@@ -21,7 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ModelFileError
+from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.regular_files import open_regular
 
 FORMAT_VERSION = 1
 """The version that `write_model_file` stores; later ones are refused."""
@@ -121,13 +121,8 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
     ModelFileError : the file is missing, empty, truncated, damaged, no model of this program, of
         a later version, or larger than `MAX_FILE_BYTES`.
     """
-    source = Path(path)
     try:
-        # Opening a pipe would block, and a folder's own error is a riddle.
-        if not stat.S_ISREG(source.stat().st_mode):
-            kind = "a folder" if source.is_dir() else "not a plain file"
-            raise ModelFileError(f"{path} is no model: it is {kind}; name a model file")
-        with source.open("rb") as file:
+        with open_regular(path) as file:
             return _read_open_file(file, path)
     except FileNotFoundError as error:
         raise ModelFileError(f"{path} does not exist; check the name") from error
@@ -240,16 +235,16 @@ def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _He
     if len(text) < length:
         raise ModelFileError(f"{path} was truncated at {size} bytes; copy or train the model again")
     try:
-        header = _parse_json(text.decode("utf-8"))
+        header = parse_json(text)
         metadata = header.pop("__metadata__", {})
         if _METADATA_KEY not in metadata:
             raise foreign
-        document = _parse_json(metadata[_METADATA_KEY])
+        document = parse_json(metadata[_METADATA_KEY].encode())
         version = document["format_version"]
         if isinstance(version, int) and version > FORMAT_VERSION:
             raise ModelFileError(
-                f"{path} has format version {version}, this program reads up to "
-                f"{FORMAT_VERSION}; update the program"
+                f"{path} has format version {quoted(version)}, this program reads up "
+                f"to {FORMAT_VERSION}; update the program"
             )
         if version != FORMAT_VERSION or isinstance(version, bool):
             _refuse_damaged(path)
@@ -259,20 +254,15 @@ def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _He
         if unknown or not isinstance(document["sha256"], str):
             _refuse_damaged(path)
         ends = [int(tensor["data_offsets"][1]) for tensor in header.values()]
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        if not all(0 <= end <= MAX_FILE_BYTES for end in ends):
+            _refuse_damaged(path)
+    except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
         _refuse_damaged(path, error)
     return _Header(document, 8 + length + max(ends, default=0))
 
 
 def _refuse_damaged(path: str | os.PathLike[str], cause: Exception | None = None) -> NoReturn:
     raise ModelFileError(f"{path} is damaged; copy or train the model again") from cause
-
-
-def _parse_json(text: str) -> Any:
-    def refuse(word: str) -> NoReturn:
-        raise ValueError(f"{word} is no JSON number")
-
-    return json.loads(text, parse_constant=refuse)
 
 
 def _canonical_json(value: Any) -> str:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import note, print_json, status_bar
+from app.cli.console import ExitStatus, note, print_json, progress_bar, status_bar
+from app.cli.evaluate import require_store_of
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from app.wording import counted
@@ -18,19 +19,28 @@ from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionEr
 
 if TYPE_CHECKING:
     from lcollision_core.labels import LabelStatus, StatusCallback
+    from lcollision_core.model import PoseModel
+
+_LISTED = 5
+"""Stretches of damaged rows that are told one by one."""
 
 
 def label(
     model_name: ModelArgument,
-    count: Annotated[
-        int, typer.Option("-n", min=1, max=1_000_000_000, help="Samples the store is to hold.")
-    ],
     output: Annotated[
         Path,
         typer.Option(
             "--output", "-o", metavar="STORE", help="The Zarr store to make or to go on with."
         ),
     ],
+    count: Annotated[
+        int | None,
+        typer.Option("-n", min=1, max=1_000_000_000, help="Samples the store is to hold."),
+    ] = None,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Label nothing: read the store, and tell what is damaged."),
+    ] = False,
     workers: Annotated[
         int | None,
         typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one for each core."),
@@ -45,7 +55,8 @@ def label(
     """Draw poses from the model's latent box and find their exact collisions.
 
     However it is stopped, the store keeps the chunks that are finished, and the same command goes
-    on from there. The rows do not depend on who labels them.
+    on from there. The rows do not depend on who labels them. Rows that are damaged are labelled
+    again.
     """
     from lcollision_core.labels import Labeller, LabelStore, label_poses
     from lcollision_core.model import PoseModel
@@ -54,7 +65,12 @@ def label(
         raise LCollisionError(
             "--workers and --scheduler exclude each other; the cluster has its own workers"
         )
+    if check == (count is not None):
+        raise LCollisionError("give either -n N, the samples that the store is to hold, or --check")
     model = PoseModel.load(model_name)
+    if count is None:
+        _check(model, output, as_json)
+        return
     labeller = Labeller(model.embedding, model.height, model.near_exclusion, model.fingerprint)
     started = time.monotonic()
     try:
@@ -96,6 +112,38 @@ def label(
         f"({watched.labelled} labelled now, {watched.labelled / seconds:.0f}/s)"
     )
     typer.echo(f"  {measured_model_sentence(model)}")
+
+
+def _check(model: PoseModel, path: Path, as_json: bool) -> None:
+    """Say whether all rows of a store read back as they were labelled."""
+    from lcollision_core.labels import LabelStore
+
+    store = LabelStore.open(path)
+    require_store_of(store, model)
+    with cancel_on_interrupt() as cancel, progress_bar("Reading") as progress:
+        found = store.check(progress, cancel)
+    if not found.has_checksum:
+        note(
+            f"{path} was made by an older version: its rows were verified, but its description "
+            f"has no checksum to be verified by"
+        )
+    if as_json:
+        print_json(
+            {
+                "store": str(path),
+                "rows": found.n_rows,
+                "damaged": [list(stretch) for stretch in found.damaged],
+                "description_verified": found.has_checksum,
+            }
+        )
+    elif found.damaged:
+        listed = ", ".join(f"{first} to {last}" for first, last in found.damaged[:_LISTED])
+        more = f" and {len(found.damaged) - _LISTED} more" if found.damaged[_LISTED:] else ""
+        typer.echo(f"{path}: damaged, rows {listed}{more}; {store.repair_advice}")
+    else:
+        typer.echo(f"{path}: sound, {counted(found.n_rows, 'row')} of {model.name}")
+    if found.damaged:
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
 class _Watched:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import secrets
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -80,6 +82,7 @@ def create_store(path: Path, identity: StoreIdentity) -> None:
             "kind": KIND,
             "format_version": FORMAT_VERSION,
             "labels": asdict(identity),
+            "sha256": description_digest(asdict(identity)),
         }
         for name, column in columns_of(identity).items():
             group.create_array(
@@ -113,3 +116,28 @@ def chunk_digest(chunk: int, rows: LabelRows) -> bytes:
     for array in columns:
         digest.update(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
     return digest.digest()
+
+
+def description_digest(labels: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of what a store says that it labels, JSON values, as hexadecimal."""
+    return hashlib.sha256(json.dumps(labels, sort_keys=True).encode()).hexdigest()
+
+
+def crc32c(data: bytes) -> int:
+    """Return the CRC-32C (Castagnoli) of some bytes, as Zarr appends it."""
+    remainder = 0xFFFFFFFF
+    for byte in data:
+        remainder = _CRC_TABLE[(remainder ^ byte) & 0xFF] ^ (remainder >> 8)
+    return remainder ^ 0xFFFFFFFF
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = (value >> 1) ^ (0x82F63B78 if value & 1 else 0)
+        table.append(value)
+    return tuple(table)
+
+
+_CRC_TABLE = _crc_table()

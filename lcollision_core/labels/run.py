@@ -63,8 +63,8 @@ def label_poses(
     """Bring a store to at least `n_rows` labelled samples of a model's latent box.
 
     Goes on where an earlier run ended, however that ended; rows that were cut off or damaged are
-    labelled again. Sample i of (model, seed) has the same labels to the last bit on any number of
-    workers and on a cluster.
+    labelled again, those beyond `n_rows` too. Sample i of (model, seed) has the same labels to the
+    last bit on any number of workers and on a cluster.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def label_poses(
     token = cancel or CancelToken()
     identity = StoreIdentity.of(labeller, seed)
     with LabelStore.open_to_append(path, identity, n_rows, token) as store:
-        _append(store, labeller, n_rows, seed, workers, scheduler, progress, token)
+        _append(store, labeller, store.n_wanted, seed, workers, scheduler, progress, token)
     return store
 
 

@@ -22,6 +22,7 @@ from lcollision_core.meshes.formats.polygons import (
     triangulate,
 )
 from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.regular_files import open_regular
 
 READABLE_SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
 """Extensions that `read_mesh` reads, in lower case."""
@@ -105,11 +106,7 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
 def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
     suffix = path.suffix.lower()
     try:
-        # A pipe would block on opening, a folder's own error is a riddle.
-        if path.exists() and not path.is_file():
-            kind = "a folder" if path.is_dir() else "not a plain file"
-            raise MeshFileError(f"it is {kind}; name a mesh file")
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             if suffix not in READABLE_SUFFIXES:
                 raise MeshFileError(
                     f"{suffix or 'a name without extension'} is no mesh format known here; "

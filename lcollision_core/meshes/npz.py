@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import struct
+import math
+import re
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
@@ -13,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.regular_files import open_regular
 
 MAX_ITEMS = 1_000_000_000
 """The most numbers that one array may hold: 8 GB of float64."""
@@ -20,39 +22,66 @@ MAX_ITEMS = 1_000_000_000
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
-    struct.error,
     EOFError,
     KeyError,
     NotImplementedError,  # a compression method that zipfile lacks
     RuntimeError,  # an encrypted entry
-    ValueError,  # numpy's words for a damaged header; UnicodeDecodeError too
+    ValueError,  # UnicodeDecodeError too
+    TypeError,  # numpy's word for a type that there is not
     OverflowError,
 )
 
+_MAGIC = b"\x93NUMPY"
+_MAX_HEADER_BYTES = 10_000
+_DESCR = re.compile(rb"'descr': *'([<>|=]?)([a-zA-Z])([0-9]{0,9})'")
+_ORDER = re.compile(rb"'fortran_order': *(True|False)")
+_SHAPE = re.compile(rb"'shape': *\(([0-9, ]*)\)")
+_PLAIN_KINDS = "biufSU"
+_MOST_DEFLATED = 1032
+"""A byte of a compressed entry stands for so many bytes at most."""
 
-def read_npz(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Read all arrays of an .npz archive; one that holds Python objects is refused.
+_CHUNK_BYTES = 1 << 24
+
+
+def read_npz(
+    path: Path, wanted: Iterable[Sequence[str]]
+) -> tuple[dict[str, npt.NDArray[Any]], tuple[str, ...]]:
+    """Read some arrays of an .npz archive; one that holds Python objects is refused.
+
+    What is not wanted takes no memory, whatever it is.
 
     Parameters
     ----------
     path : the archive
+    wanted : for each array its names, of which the first that is there counts
 
     Returns
     -------
-    arrays by name
+    arrays : those that are wanted and there, by the first of their names
+    names : of all arrays in the archive
 
     Raises
     ------
-    MeshFileError : the file is missing, damaged or no archive of arrays, or an array is larger
-        than `MAX_ITEMS` or than its header says. The sentence does not name the file.
+    MeshFileError : the file is missing, damaged or no archive of arrays, or a wanted array is
+        larger than `MAX_ITEMS` or than the file can hold. The sentence does not name the file.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            return {
-                info.filename.removesuffix(".npy"): _read_array(archive, info)
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+            entries = {
+                info.filename.removesuffix(".npy"): info
                 for info in archive.infolist()
                 if info.filename.endswith(".npy")
             }
+            found = {
+                names[0]: next((name for name in names if name in entries), None)
+                for names in wanted
+            }
+            arrays = {
+                known: _read_array(archive, name, entries[name])
+                for known, name in found.items()
+                if name is not None
+            }
+            return arrays, tuple(entries)
     except FileNotFoundError as error:
         raise MeshFileError("there is no such file; check the name") from error
     except OSError as error:
@@ -63,37 +92,63 @@ def read_npz(path: Path) -> dict[str, npt.NDArray[Any]]:
         raise MeshFileError("it needs more memory than there is; keep fewer poses") from error
 
 
-def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> npt.NDArray[Any]:
-    name = info.filename.removesuffix(".npy")
+def _read_array(
+    archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo
+) -> npt.NDArray[Any]:
     with archive.open(info) as file:
-        shape, dtype = _read_header(file)
-        if dtype.hasobject:
-            raise MeshFileError(
-                f"its array {name!r} holds Python objects, which are not loaded because that can "
-                f"run code; save plain numbers"
-            )
+        dtype, in_fortran_order, shape = _read_header(file, name)
         # Python's integers, because a product of damaged sizes can overflow numpy's.
-        n_items = 1
-        for size in shape:
-            n_items *= size
-        if n_items > MAX_ITEMS or info.file_size > 8 * MAX_ITEMS:
+        n_items = math.prod(shape)
+        if n_items > MAX_ITEMS:
+            count = n_items if n_items < 10**15 else "over 10**15"
             raise MeshFileError(
-                f"its array {name!r} holds {n_items} numbers, at most {MAX_ITEMS} can be read"
+                f"its array {name!r} holds {count} numbers, at most {MAX_ITEMS} can be read"
             )
-    with archive.open(info) as file:
-        # read_array reads in chunks, so that a header that lies runs out of data, not of memory.
-        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+        # Of a size that nothing bears out no memory is taken.
+        if n_items * dtype.itemsize > min(info.file_size, _MOST_DEFLATED * info.compress_size):
+            raise EOFError
+        array = np.empty(n_items, dtype)
+        _fill(file, array)
+    order = "F" if in_fortran_order else "C"
+    return array.reshape(shape, order=order)
 
 
-def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    version = np.lib.format.read_magic(file)
-    reader = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, _, dtype = reader(file)
-    return shape, dtype
+def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple[int, ...]]:
+    """Read a header as NumPy writes it, whose own reader evaluates it, and warns."""
+    start = file.read(8)
+    n_length_bytes = 2 if start[6:7] == b"\1" else 4
+    length = int.from_bytes(file.read(n_length_bytes), "little")
+    if not start.startswith(_MAGIC) or length > _MAX_HEADER_BYTES:
+        raise ValueError("no array")
+    header = file.read(length)
+    descr, order, shape = (part.search(header) for part in (_DESCR, _ORDER, _SHAPE))
+    if descr is None or order is None or shape is None:
+        raise ValueError("no plain array")
+    byte_order, kind, size = (part.decode() for part in descr.groups())
+    if kind == "O":
+        raise MeshFileError(
+            f"its array {name!r} holds Python objects, which are not loaded because that can "
+            f"run code; save plain numbers"
+        )
+    if kind not in _PLAIN_KINDS:
+        raise MeshFileError(f"its array {name!r} is of type {kind + size!r}; save plain numbers")
+    dtype = np.dtype(f"{byte_order}{kind}{size}")
+    if not dtype.itemsize:
+        raise ValueError("items without a size")
+    sizes = tuple(int(part) for part in shape[1].split(b",") if part.strip())
+    return dtype, order[1] == b"True", sizes
+
+
+def _fill(file: IO[bytes], array: npt.NDArray[Any]) -> None:
+    """Read an array's bytes in chunks, so that a file that ends early takes little memory."""
+    data = memoryview(array.view(np.uint8) if array.size else b"")
+    done = 0
+    while done < len(data):
+        chunk = file.read(min(_CHUNK_BYTES, len(data) - done))
+        if not chunk:
+            raise EOFError
+        data[done : done + len(chunk)] = chunk
+        done += len(chunk)
 
 
 def write_npz(file: BinaryIO, arrays: Mapping[str, npt.NDArray[Any]]) -> None:

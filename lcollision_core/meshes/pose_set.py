@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,10 @@ from lcollision_core.meshes.units import height
 
 FORMAT_VERSION = 1
 """The version that `write_pose_set` stores; later ones are refused."""
+
+_MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
+_EXTRA_ARRAYS = ("format_version", "names", "notes", "near_exclusion", "up_axis", "vertex_labels")
+_MAX_TEXT_LENGTH = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,8 +348,8 @@ def _collect_npz(
 ) -> Collected:
     nothing = Collected(None, 0, same_topology=False)
     try:
-        arrays = read_npz(path)
-        vertices, faces = _meshes_of(arrays)
+        arrays, held = read_npz(path, (*_MESH_ARRAYS, *((name,) for name in _EXTRA_ARRAYS)))
+        vertices, faces = _meshes_of(arrays, held)
         topology = Topology(faces, vertices.shape[1])
         extras = _extras_of(arrays, vertices.shape)
     except LCollisionError as error:
@@ -373,13 +377,14 @@ def _collect_npz(
     )
 
 
-def _meshes_of(arrays: dict[str, npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+def _meshes_of(
+    arrays: dict[str, npt.NDArray[Any]], held: Sequence[str]
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     found = []
-    for names in (("vertices", "V"), ("faces", "F")):
-        name = next((name for name in names if name in arrays), None)
-        if name is None:
-            held = ", ".join(sorted(arrays)[:8]) or "nothing"
-            raise MeshFileError(f"it has no array {names[0]!r} or {names[1]!r}, it holds {held}")
+    for name, short_name in _MESH_ARRAYS:
+        if name not in arrays:
+            others = ", ".join(sorted(held)[:8])[:_MAX_TEXT_LENGTH] or "nothing"
+            raise MeshFileError(f"it has no array {name!r} or {short_name!r}, it holds {others}")
         found.append(arrays[name])
     vertices, faces = found
     if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:
@@ -397,13 +402,18 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
             raise MeshFileError(f"{name} must be one number, got {value.dtype} {value.shape}")
         return value.item()
 
-    def strings(name: str, length: int) -> npt.NDArray[Any]:
+    def strings(name: str, length: int) -> list[str]:
         value = arrays[name]
         if value.shape != (length,) or value.dtype.kind != "U":
             raise MeshFileError(
                 f"{name} must be ({length},) strings, got {value.dtype} {value.shape}"
             )
-        return value
+        try:
+            texts = value.tolist()
+        except ValueError as error:
+            raise MeshFileError(f"{name} holds a character that there is not") from error
+        # Half a character, of a file name that was no text, cannot be printed.
+        return [text[:_MAX_TEXT_LENGTH].encode(errors="replace").decode() for text in texts]
 
     extras: dict[str, Any] = {"names": None}
     if "format_version" in arrays and scalar("format_version", "iu") > FORMAT_VERSION:
@@ -412,9 +422,9 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
             f"{FORMAT_VERSION}; update the program"
         )
     if "names" in arrays:
-        extras["names"] = tuple(strings("names", shape[0]).tolist())
+        extras["names"] = tuple(strings("names", shape[0]))
     if "notes" in arrays:
-        extras["notes"] = tuple(strings("notes", arrays["notes"].size).tolist())
+        extras["notes"] = tuple(strings("notes", arrays["notes"].size))
     if "near_exclusion" in arrays:
         extras["near_exclusion"] = float(scalar("near_exclusion", "fiu"))
         if not 0.0 <= extras["near_exclusion"] < 1.0:
@@ -424,7 +434,7 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
         if extras["up_axis"] not in (0, 1, 2):
             raise MeshFileError(f"up_axis must be 0, 1 or 2, got {extras['up_axis']}")
     if "vertex_labels" in arrays:
-        extras["vertex_labels"] = strings("vertex_labels", shape[1])
+        extras["vertex_labels"] = np.array(strings("vertex_labels", shape[1]))
         _require_labels(extras["vertex_labels"])
     return extras
 

@@ -8,28 +8,34 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ModelFileError
+from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes import RigidTransform, atomic_write
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.library import ListedModel, user_models_folder
 from lcollision_core.model.mirror import MirroredPose, MirrorSource
 from lcollision_core.model.pose_model import PoseModel
+from lcollision_core.regular_files import read_regular
 
 POSES_FORMAT = "lcollision-poses"
 POSES_VERSION = 2
 """The latest version that is read; version 1 has neither a working pose nor tags."""
 
-MAX_FILE_BYTES = 2**30
+MAX_FILE_BYTES = 2**28
+"""Of some 80 000 poses of 110 numbers; reading takes some four times that in memory."""
+
 MAX_NAME_LENGTH = 200
 MAX_TAGS = 50
 
 _NOT_ROTATED = 1e-6
+_LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e30
+"""Far beyond any pose and any unit; what is larger overflows somewhere."""
 
 
 @dataclass(frozen=True)
@@ -172,10 +178,15 @@ def write_poses(
         "poses": entries[: len(poses)],
         **(extra or {}),
     }
-    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+    content = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False).encode()
+    if len(content) >= MAX_FILE_BYTES:
+        raise ModelFileError(
+            f"{path} cannot be written: {len(poses)} poses take more than the {MAX_FILE_BYTES} "
+            f"bytes that can be read again; write several files"
+        )
     try:
         with atomic_write(path) as file:
-            file.write(text.encode())
+            file.write(content)
             file.write(b"\n")
     except MeshFileError as error:
         raise ModelFileError(str(error)) from error
@@ -200,20 +211,18 @@ def read_pose_file(path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
     OtherModelError : the poses are another model's.
     ModelFileError : the file is missing, cannot be read, or is of a later version.
     """
-    source = Path(path)
     try:
-        if not source.is_file():
-            kind = "it is not a plain file" if source.exists() else "there is no such file"
-            raise ModelFileError(f"{path} cannot be read: {kind}; name a .json file of poses")
-        if source.stat().st_size > MAX_FILE_BYTES:
-            raise ModelFileError(f"{path} is larger than {MAX_FILE_BYTES} bytes; split it")
-        content = source.read_bytes()
+        content = read_regular(path, MAX_FILE_BYTES)
+    except FileNotFoundError as error:
+        raise ModelFileError(
+            f"{path} cannot be read: there is no such file; name a .json file of poses"
+        ) from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ModelFileError(f"{path} cannot be read: {reason}; check the file") from error
     try:
-        document = json.loads(content.decode("utf-8-sig"), parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
+        document = parse_json(content)
+    except ValueError as error:
         raise DamagedPosesError(
             f"{path} is no JSON ({error}); name a file of poses that lcollision wrote"
         ) from error
@@ -261,8 +270,8 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> Pos
     version = document.get("format_version")
     if isinstance(version, int) and version > POSES_VERSION:
         raise ModelFileError(
-            f"{path} has format version {version}, this program reads up to {POSES_VERSION}; "
-            f"update the program"
+            f"{path} has format version {quoted(version)}, this program reads up to "
+            f"{POSES_VERSION}; update the program"
         )
     owner, entries = document.get("model"), document.get("poses")
     if version not in range(1, POSES_VERSION + 1) or isinstance(version, bool | float):
@@ -344,9 +353,8 @@ def _from_json(entry: Any, latent_size: int) -> NamedPose:
     mean = largest = source = None
     if "fit_error" in pose:
         errors = _object(pose["fit_error"], "fit error")
-        mean, largest = map(
-            float, _numbers([errors.get("mean"), errors.get("max")], (2,), "fit error")
-        )
+        both = [errors.get("mean"), errors.get("max")]
+        mean, largest = map(float, _numbers(both, (2,), "fit error", _LARGEST_PLACE))
     if "mirror_of" in pose:
         held = _object(pose["mirror_of"], "mirror_of")
         if not isinstance(held.get("image"), str):
@@ -361,12 +369,12 @@ def _from_json(entry: Any, latent_size: int) -> NamedPose:
 def _placed_from_json(
     pose: dict[str, Any], latent_size: int
 ) -> tuple[npt.NDArray[np.float64], RigidTransform | None]:
-    latent = _numbers(pose.get("latent"), (latent_size,), "latent")
+    latent = _numbers(pose.get("latent"), (latent_size,), "latent", _LARGEST_CODE)
     if "placement" not in pose:
         return latent, None
     held = _object(pose["placement"], "placement")
-    rotation = _numbers(held.get("rotation"), (3, 3), "rotation")
-    translation = _numbers(held.get("translation"), (3,), "translation")
+    rotation = _numbers(held.get("rotation"), (3, 3), "rotation", 2.0)
+    translation = _numbers(held.get("translation"), (3,), "translation", _LARGEST_PLACE)
     turned = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
         raise ValueError("its rotation is no rotation matrix")
@@ -398,7 +406,9 @@ def _object(value: Any, name: str) -> dict[str, Any]:
     return value
 
 
-def _numbers(value: Any, shape: tuple[int, ...], name: str) -> npt.NDArray[np.float64]:
+def _numbers(
+    value: Any, shape: tuple[int, ...], name: str, largest: float
+) -> npt.NDArray[np.float64]:
     try:
         array = np.array(value)
     except ValueError:
@@ -409,8 +419,6 @@ def _numbers(value: Any, shape: tuple[int, ...], name: str) -> npt.NDArray[np.fl
     numbers = array.astype(np.float64)
     if not np.isfinite(numbers).all():
         raise ValueError(f"its {name} has a number that is not finite")
+    if np.abs(numbers).max() > largest:
+        raise ValueError(f"its {name} has a number beyond {largest:g}")
     return numbers
-
-
-def _refuse_constant(word: str) -> NoReturn:
-    raise ValueError(f"{word} is no JSON number")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from lcollision_core.labels import (
     label_poses,
     store,
 )
+from lcollision_core.labels.store import StoreCheck
 from lcollision_core.model import PoseModel
 from tests.core.labelled import as_bytes, labeller_of
 
@@ -107,17 +109,95 @@ def test_a_chunk_that_is_not_whole_is_noticed_and_redone(
     file = path / column / "c" / "1"
     damage(file / "0" if file.is_dir() else file)
     opened = LabelStore.open(path)
-    if column == "chunks":
-        assert opened.n_rows == ROWS_A_CHUNK
-        assert as_bytes(opened.load()) == as_bytes(truth.head(ROWS_A_CHUNK))
-    else:
+    for read in (opened.load, lambda: opened.load(N_ROWS), lambda: list(opened.chunks())):
         with pytest.raises(LabelStoreError) as excinfo:
-            opened.load()
-        assert f"rows {ROWS_A_CHUNK} to {2 * ROWS_A_CHUNK - 1} are damaged" in _sentence(excinfo)
-    mended: list[int] = []
-    label_poses(labeller, path, N_ROWS, progress=lambda status: mended.append(status.done))
-    assert mended[0] == N_ROWS - ROWS_A_CHUNK
+            read()
+        assert f"rows {ROWS_A_CHUNK} to {2 * ROWS_A_CHUNK - 1} are " in _sentence(excinfo)
+        assert f"run `lcollision label M -n {N_ROWS} -o {path}`" in _sentence(excinfo)
+    assert as_bytes(opened.load(ROWS_A_CHUNK)) == as_bytes(truth.head(ROWS_A_CHUNK))
+    assert opened.check() == StoreCheck(
+        N_ROWS - ROWS_A_CHUNK, ((ROWS_A_CHUNK, 2 * ROWS_A_CHUNK - 1),), has_checksum=True
+    )
+    repaired: list[int] = []
+    # However few are asked for: what was there before is there again.
+    label_poses(labeller, path, 5, progress=lambda status: repaired.append(status.done))
+    assert repaired[0] == N_ROWS - ROWS_A_CHUNK
     assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+    assert LabelStore.open(path).check() == StoreCheck(N_ROWS, (), has_checksum=True)
+
+
+def test_every_flipped_bit_is_noticed_or_harmless(
+    labeller: Labeller, truth: LabelRows, tmp_path: Path
+) -> None:
+    """Of the journal and of all descriptions, where a bit made rows vanish without a word."""
+    path, n_rows = tmp_path / "store", ROWS_A_CHUNK + 40
+    label_poses(labeller, path, n_rows)
+    noticed = 0
+    for file in (*path.rglob("zarr.json"), *path.glob("chunks/c/*/0")):
+        content = file.read_bytes()
+        for place in range(0, len(content), 3 if file.suffix else 1):
+            damaged = bytearray(content)
+            damaged[place] ^= 1 << place % 7
+            file.write_bytes(damaged)
+            try:
+                opened = LabelStore.open(path)
+                opened.require(StoreIdentity.of(labeller, opened.identity.seed))
+                rows = opened.load()
+            except LabelStoreError:
+                noticed += 1
+            else:
+                assert as_bytes(rows) == as_bytes(truth.head(n_rows)), (file, place)
+        file.write_bytes(content)
+    assert noticed > 300
+
+
+def test_a_store_of_an_older_version_is_read_and_its_check_says_so(
+    path: Path, truth: LabelRows
+) -> None:
+    group = zarr.open_group(str(path), mode="r+")
+    attributes = dict(group.attrs["lcollision"])
+    del attributes["sha256"]
+    group.attrs["lcollision"] = attributes
+    assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+    assert LabelStore.open(path).check() == StoreCheck(N_ROWS, (), has_checksum=False)
+    attributes["sha256"] = "0" * 64
+    group.attrs["lcollision"] = attributes
+    with pytest.raises(LabelStoreError, match="is damaged: its description"):
+        LabelStore.open(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["zarr.json", "latent/zarr.json", "chunks/c/1/0", "energy/c/1", "latent/c/1/0"]
+)
+def test_a_pipe_inside_a_store_is_not_waited_for(
+    name: str, path: Path, labeller: Labeller, truth: LabelRows
+) -> None:
+    (path / name).unlink()
+    os.mkfifo(path / name)
+    with pytest.raises(LabelStoreError, match=r"is damaged|is no label store") as excinfo:
+        LabelStore.open(path).load()
+    assert str(path) in _sentence(excinfo)
+    if "/c/" in name:
+        label_poses(labeller, path, N_ROWS)
+        assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+
+
+def test_a_store_that_announces_many_rows_opens_at_once(path: Path, truth: LabelRows) -> None:
+    group = zarr.open_group(str(path), mode="r+")
+    for name in ("chunks", "latent", "domain_energy", "energy", "n_pairs", "n_near_pairs"):
+        group[name].resize((10**12, *group[name].shape[1:]))
+    started = time.monotonic()
+    assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+    assert time.monotonic() - started < 20.0
+
+
+def test_the_journal_is_read_as_zarr_writes_it(path: Path) -> None:
+    journal = zarr.open_group(str(path), mode="r")["chunks"]
+    opened = LabelStore.open(path)
+    for chunk, words in enumerate(journal[:]):
+        entry = opened._journal[chunk]
+        assert entry.as_bytes() == (path / "chunks" / "c" / str(chunk) / "0").read_bytes()
+        assert [entry.n_rows, entry.n_colliding] == words[:2].tolist()
 
 
 def test_rows_of_another_chunk_are_noticed(path: Path) -> None:

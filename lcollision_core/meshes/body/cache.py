@@ -16,6 +16,7 @@ from lcollision_core.errors import LCollisionError, MissingExtraError
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.body.skeleton import Skeleton
 from lcollision_core.meshes.body.template import Template, build_template
+from lcollision_core.regular_files import open_regular
 
 _MAKERS = ("template.py", "decimate.py", "skeleton.py", "cache.py")
 
@@ -61,7 +62,7 @@ def _read_only(template: Template) -> Template:
 
 
 def _read(path: Path) -> Template:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+    with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
         names = [str(name) for name in arrays["zero_names"]]
         zeros = dict(zip(names, arrays["zero_rotations"], strict=True))
         return Template(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -11,13 +10,16 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes.formats.polygons import (
+    MAX_FILE_BYTES,
     Polygons,
     read_rest,
     require_plausible_count,
     with_order_of,
 )
 from lcollision_core.meshes.topology import Topology
+from lcollision_core.regular_files import read_regular
 
 _GLB_MAGIC = b"glTF"
 _REORDERED = "vertices that had been split were put back into the set's vertex order"
@@ -44,7 +46,18 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
     import trimesh
     from trimesh.resolvers import FilePathResolver
 
-    data = read_rest(file)
+    class BuffersBeside(FilePathResolver):  # type: ignore[misc]
+        """Reads regular files in the scene's own folder."""
+
+        def get(self, name: str) -> bytes:
+            try:
+                return read_regular(self.absolute(name), MAX_FILE_BYTES)
+            except (OSError, ValueError) as error:
+                reason = getattr(error, "strerror", None) or "it is not beside the file"
+                raise MeshFileError(f"its buffer {quoted(name)} cannot be read: {reason}") from error
+
+    # Before a mark trimesh would look for its text elsewhere.
+    data = read_rest(file).removeprefix(b"\xef\xbb\xbf")
     _require_one_mesh(data)
     kind = "glb" if data.startswith(_GLB_MAGIC) else "gltf"
     try:
@@ -52,12 +65,14 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
             scene = trimesh.load_scene(
                 BytesIO(data),
                 file_type=kind,
-                resolver=FilePathResolver(path),
+                resolver=BuffersBeside(path),
                 process=False,
                 skip_materials=True,
             )
             shown = [scene.graph[node] for node in scene.graph.nodes_geometry]
             meshes = [(place, scene.geometry[name]) for place, name in shown]
+    except MeshFileError:
+        raise
     # On a damaged file trimesh raises whatever its line at hand raises; nothing of ours runs here.
     except Exception as error:
         raise MeshFileError("it is a damaged or unsupported glTF file; export it again") from error
@@ -66,9 +81,12 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
     transform, mesh = meshes[0]
     vertices = np.array(mesh.vertices, dtype=np.float64)
     if not np.array_equal(transform, np.eye(4)):
-        vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
+        # A coordinate that is not finite is refused with all others.
+        with np.errstate(all="ignore"):
+            vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
     faces = np.array(mesh.faces, dtype=np.int64)
-    if topology is not None and len(vertices) != topology.n_vertices:
+    in_range = faces.size and 0 <= faces.min() and faces.max() < len(vertices)
+    if in_range and topology is not None and len(vertices) != topology.n_vertices:
         joined = with_order_of(vertices[faces.reshape(-1)], topology, _REORDERED)
         if joined is not None:
             return joined
@@ -84,7 +102,7 @@ def _require_one_mesh(data: bytes) -> None:
         if len(text) < max(length, 1):
             raise MeshFileError("it is a truncated GLB file; export it again")
     try:
-        scene = json.loads(text)
+        scene = parse_json(text)
         counts = [int(accessor.get("count", 0)) for accessor in scene.get("accessors", [])]
         n_primitives = sum(len(mesh["primitives"]) for mesh in scene.get("meshes", []))
     except (
@@ -93,7 +111,6 @@ def _require_one_mesh(data: bytes) -> None:
         AttributeError,
         TypeError,
         KeyError,
-        RecursionError,
     ) as error:
         raise MeshFileError("it holds no readable glTF description; export it again") from error
     for count in counts:
