@@ -8,7 +8,17 @@ from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
-from typing import Any, Literal, NoReturn, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    Literal,
+    NoReturn,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 MAX_MEMORY = 2**29
 """What the values of one document may take, in bytes."""
@@ -57,7 +67,7 @@ def from_json(cls: type[T], values: Any, name: str) -> T:
     if not isinstance(values, Mapping):
         raise ValueError(f"{name} must be an object, got {quoted(values)}")
     given = {}
-    for field_name, (hint, required) in _field_hints(cls).items():
+    for field_name, (hint, required) in _field_hints(cast(Any, cls)).items():
         if field_name in values:
             given[field_name] = _converted(values[field_name], hint, f"{name}.{field_name}")
         elif required:

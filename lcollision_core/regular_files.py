@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from pathlib import Path
 from typing import BinaryIO
 
 _KINDS = (
@@ -25,7 +26,7 @@ def require_regular(path: str | os.PathLike[str]) -> int:
     OSError : there is no such file, or it is something else; `strerror` says what.
     ValueError : the name holds a NUL byte.
     """
-    status = os.stat(path)
+    status = Path(path).stat()
     if stat.S_ISREG(status.st_mode):
         return status.st_size
     kind = next((name for is_kind, name in _KINDS if is_kind(status.st_mode)), "a device")
@@ -40,7 +41,7 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     OSError, ValueError : as for `require_regular`, or it may not be read.
     """
     require_regular(path)
-    return open(path, "rb")
+    return Path(path).open("rb")
 
 
 def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:

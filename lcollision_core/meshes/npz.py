@@ -92,9 +92,7 @@ def read_npz(
         raise MeshFileError("it needs more memory than there is; keep fewer poses") from error
 
 
-def _read_array(
-    archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo
-) -> npt.NDArray[Any]:
+def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> npt.NDArray[Any]:
     with archive.open(info) as file:
         dtype, in_fortran_order, shape = _read_header(file, name)
         # Python's integers, because a product of damaged sizes can overflow numpy's.
@@ -109,8 +107,8 @@ def _read_array(
             raise EOFError
         array = np.empty(n_items, dtype)
         _fill(file, array)
-    order = "F" if in_fortran_order else "C"
-    return array.reshape(shape, order=order)
+    shaped: npt.NDArray[Any] = array.reshape(shape, order="F" if in_fortran_order else "C")
+    return shaped
 
 
 def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple[int, ...]]:
@@ -141,14 +139,13 @@ def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple
 
 def _fill(file: IO[bytes], array: npt.NDArray[Any]) -> None:
     """Read an array's bytes in chunks, so that a file that ends early takes little memory."""
-    data = memoryview(array.view(np.uint8) if array.size else b"")
-    done = 0
-    while done < len(data):
-        chunk = file.read(min(_CHUNK_BYTES, len(data) - done))
-        if not chunk:
+    data = array.view(np.uint8)
+    for start in range(0, len(data), _CHUNK_BYTES):
+        part = data[start : start + _CHUNK_BYTES]
+        chunk = file.read(len(part))
+        if len(chunk) < len(part):
             raise EOFError
-        data[done : done + len(chunk)] = chunk
-        done += len(chunk)
+        part[:] = np.frombuffer(chunk, np.uint8)
 
 
 def write_npz(file: BinaryIO, arrays: Mapping[str, npt.NDArray[Any]]) -> None:

@@ -172,7 +172,6 @@ HEADER = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1, 4, 3), }\n"
         HEADER.replace(b"'shape'", b"'shapes'"),
         HEADER[:30],
         b"{" * 3000,
-        b"'\\d" + HEADER,
         b"\xff" * 60,
         b"",
     ],
@@ -188,13 +187,11 @@ def test_a_damaged_npz_header_is_one_sentence(header: bytes, tmp_path: Path) -> 
                 if info.filename != f"{name}.npy":
                     archive.writestr(info, held.read(info))
             archive.writestr(f"{name}.npy", entry)
-        try:
-            # Of an unusual but sound header, such as one of text before it, nothing is lost.
-            assert len(read_pose_set(path)) == 1
-        except LCollisionError as error:
-            assert str(path) in str(error)
-            assert "\n" not in str(error)
-            assert len(str(error)) < 400
+        with pytest.raises(LCollisionError) as caught:
+            read_pose_set(path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 400
 
 
 def _peak(work: Callable[[], object]) -> int:

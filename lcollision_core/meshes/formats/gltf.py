@@ -54,7 +54,9 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
                 return read_regular(self.absolute(name), MAX_FILE_BYTES)
             except (OSError, ValueError) as error:
                 reason = getattr(error, "strerror", None) or "it is not beside the file"
-                raise MeshFileError(f"its buffer {quoted(name)} cannot be read: {reason}") from error
+                raise MeshFileError(
+                    f"its buffer {quoted(name)} cannot be read: {reason}"
+                ) from error
 
     # Before a mark trimesh would look for its text elsewhere.
     data = read_rest(file).removeprefix(b"\xef\xbb\xbf")
@@ -85,7 +87,7 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
         with np.errstate(all="ignore"):
             vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
     faces = np.array(mesh.faces, dtype=np.int64)
-    in_range = faces.size and 0 <= faces.min() and faces.max() < len(vertices)
+    in_range = faces.size and faces.min() >= 0 and faces.max() < len(vertices)
     if in_range and topology is not None and len(vertices) != topology.n_vertices:
         joined = with_order_of(vertices[faces.reshape(-1)], topology, _REORDERED)
         if joined is not None:
