@@ -60,6 +60,46 @@ class Section:
         object.__setattr__(self, "metadata", MappingProxyType(dict(self.metadata)))
 
 
+def required_array(
+    arrays: Mapping[str, npt.NDArray[Any]],
+    name: str,
+    dtype: npt.DTypeLike,
+    shape: tuple[int | None, ...],
+    largest: float = np.inf,
+) -> npt.NDArray[Any]:
+    """Return an array of a section that has the type and shape which its room relies on.
+
+    Parameters
+    ----------
+    arrays : of the section
+    name : of the array
+    dtype, shape : what it must have; None stands for any size but 0
+    largest : beyond which no number of it may lie, on either side of 0
+
+    Raises
+    ------
+    ValueError : there is none, or it has another type or shape or a larger number.
+    """
+    array = arrays.get(name)
+    if array is None:
+        raise ValueError(f"its array {name} is missing")
+    fits = array.ndim == len(shape) and all(
+        size == wanted or (wanted is None and size > 0)
+        for size, wanted in zip(array.shape, shape, strict=True)
+    )
+    if array.dtype != dtype or not fits:
+        needed = " x ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(
+            f"its array {name} must be {needed} numbers of {np.dtype(dtype)}, got {array.dtype} "
+            f"of shape {quoted(array.shape)}"
+        )
+    if array.size and largest < np.inf:
+        extreme = max(float(array.max()), -float(array.min()))
+        if not extreme <= largest:
+            raise ValueError(f"its array {name} holds {extreme:.3g}, at most {largest:g} can be")
+    return array
+
+
 def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Section]) -> None:
     """Write a model file, whole or not at all; equal sections give equal bytes.
 
@@ -146,16 +186,13 @@ def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
     """
     from safetensors import SafetensorError, safe_open
 
-    source = Path(path)
     try:
-        if not stat.S_ISREG(source.stat().st_mode):
-            raise ModelFileError(f"{path} is no model: it is not a plain file; name a model file")
-        with source.open("rb") as file:
+        with open_regular(path) as file:
             header = _read_header(file, os.fstat(file.fileno()).st_size, path)
         metadata = header.document["sections"].get(name)
         if metadata is None:
             return None
-        with safe_open(source, "numpy") as tensors:
+        with safe_open(path, "numpy") as tensors:
             arrays = {
                 full_name.removeprefix(f"{name}/"): tensors.get_tensor(full_name)
                 for full_name in tensors.keys()  # noqa: SIM118 - no mapping

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.regular_files import require_regular
 
 _LOCKED_BYTE = 1 << 30
 """Far beyond the file's end: Windows keeps others from reading what is locked."""
@@ -94,6 +95,9 @@ def shortened(name: str, n_bytes: int) -> str:
 def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
     """Open and lock the lock's file, or return None where another holds it."""
     try:
+        # Opening a pipe would wait for its reader for ever.
+        if lock.exists():
+            require_regular(lock)
         file = lock.open("ab", buffering=0)
     except OSError as error:
         raise MeshFileError(

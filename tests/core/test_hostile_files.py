@@ -209,7 +209,7 @@ def test_of_an_npz_only_what_is_wanted_is_read(tmp_path: Path) -> None:
     unused = {f"unused{i}": np.zeros(5_000_000) for i in range(2)}
     np.savez_compressed(path, vertices=VERTICES[None], faces=FACES, V=unused["unused0"], **unused)
     assert path.stat().st_size < 10**6
-    assert _peak(lambda: read_pose_set(path)) < 2 * 10**6
+    assert _peak(lambda: read_pose_set(path)) < 10**7
 
 
 def test_an_npz_size_that_the_file_cannot_hold_takes_no_memory(tmp_path: Path) -> None:
