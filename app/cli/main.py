@@ -30,6 +30,9 @@ from app.cli import (
 from app.cli.console import ExitStatus, tell_what_takes_time
 from lcollision_core.errors import CancelledError, LCollisionError
 
+# Small products take microseconds, which threads that share them out multiply on a busy machine.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 """What typer raises for wrong words; typer itself gives only this child a public name."""
 

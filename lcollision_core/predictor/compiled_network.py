@@ -1,10 +1,8 @@
-"""The default network on the CPU by compiled loops: a few poses without torch, or many with it.
+"""The default network on the CPU by compiled loops, in single precision, without torch.
 
 `GeometricNetwork` spends most of a single pose's time on passing from one operation of torch to the
-next, a third of a batch's on new memory, and a program that only drags sliders would spend seconds
-on importing it. Here the same loops are called one after the other on arrays that are used again,
-and back again for the gradients. Of many poses the products are torch's, which take a third of the
-time, and the skin has loops of its own, see `compiled_skin`.
+next, and a program that only drags sliders would spend seconds on importing it. Here the same loops
+are called one after the other on arrays that are used again, and back again for the gradients.
 """
 
 from __future__ import annotations
@@ -21,20 +19,18 @@ import numpy.typing as npt
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor import field_kernels, network_kernels
-from lcollision_core.predictor.compiled_skin import SkinMap, SkinOfFew, SkinOfMany, SkinOfPoses
+from lcollision_core.predictor.compiled_skin import PosedSkin, SkinMap
 from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
 from lcollision_core.predictor.network_kernels import SQUASHED
 from lcollision_core.predictor.skin_geometry import SkinGeometry
 
 State = Mapping[str, npt.NDArray[Any]]
-Array = npt.NDArray[np.floating[Any]]
-Float32Array = npt.NDArray[np.float32]
+Array = npt.NDArray[np.float32]
 
-_ROWS_IN_SINGLE, _ROWS_IN_DOUBLE = 256, 64
-"""Poses that are taken together: each time, hundreds of small products cost like ten poses, but
-in double precision, and with a way back, a pose needs a megabyte of room."""
+_ROWS_AT_ONCE = 64
+"""Poses that are computed together: their arrays, half a megabyte a pose, stay in the caches."""
 
-_SPARE_ROOMS = 2
+_SPARE_WORKSPACES = 2
 """Kept for later calls: of the editor's one pose and the solver's few, or of two threads."""
 
 
@@ -47,9 +43,6 @@ class CompiledNetwork:
     ----------
     embedding : of the body
     state : the state dict of a `GeometricNetwork`, as arrays
-    kind : what it computes in: double precision for a few poses, or float32 for many, which has no
-        derivatives
-    skin : of the embedding and the state's sites, where that is known already
 
     Raises
     ------
@@ -60,34 +53,24 @@ class CompiledNetwork:
     skin : what it looks at
     """
 
-    def __init__(
-        self,
-        embedding: Embedding,
-        state: State,
-        kind: type[np.floating[Any]] = np.float64,
-        skin: SkinGeometry | None = None,
-    ) -> None:
+    def __init__(self, embedding: Embedding, state: State) -> None:
         sites = state["site_vertices"].astype(np.int64)
         _, n_points = state["body.points"].shape
-        self._kind = kind
-        self.skin = skin = skin or SkinGeometry.of(embedding, sites, n_points)
+        self.skin = skin = SkinGeometry.of(embedding, sites, n_points)
         n_points, n_sites = skin.n_points, len(sites)
-        weight = _shaped(state["body.points"], (3 * n_points, n_points), np.float32)
-        self._skin_map = SkinMap(skin, weight, _shaped(state["body.origin"], (3, n_points), kind))
-        self._skin_of: type[SkinOfFew | SkinOfMany]
-        self._skin_of = SkinOfMany if kind == np.float32 else SkinOfFew
-        self._reach = np.array(REACHES, dtype=kind)
-        self._steepness = (1.0 / np.square(REACHES)).astype(kind)
-        # Loops over numbers of two sizes are slow.
-        self._apart = field_kernels.by_blocks(skin.apart.astype(kind), skin.order)
+        weight = _shaped(state["body.points"], (3 * n_points, n_points))
+        self._skin_map = SkinMap(skin, weight, _shaped(state["body.origin"], (3, n_points)))
+        self._reach = np.array(REACHES, dtype=np.float32)
+        self._steepness = (1.0 / np.square(REACHES)).astype(np.float32)
+        self._apart = field_kernels.by_blocks(skin.apart, skin.order)
         n_members = sites.shape[1]
         n_sums = SUMS_A_REACH * len(REACHES)
-        self._patch = _Network.read(state, "patch", n_points, n_sums, 2, kind)
-        self._fold = _Network.read(state, "fold", n_sites, 9 * n_members, 2, kind)
+        self._patch = _Network.read(state, "patch", n_points, n_sums, 2)
+        self._fold = _Network.read(state, "fold", n_sites, 9 * n_members, 2)
         sizes = 2 * (n_points + n_sites), embedding.n_domains + 2
-        self._head = _Network(list(_read_layers(state, "head", None, *sizes, kind)))
-        self._any_hit = _shaped(state["any_hit"], (2,), kind)
-        self._spare_rooms: list[_Trace] = []
+        self._head = _Network(list(_read_layers(state, "head", None, *sizes)))
+        self._any_hit = _shaped(state["any_hit"], (2,))
+        self._spare_workspaces: list[_Trace] = []
         self._guard = Lock()
 
     def outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
@@ -101,12 +84,7 @@ class CompiledNetwork:
         return energy, logit
 
     def logit_and_gradient(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (B,) logits of (B, D) poses, and each one's (B, D) derivative by its codes.
-
-        Raises
-        ------
-        TypeError : it computes in single precision.
-        """
+        """Return (B,) logits of (B, D) poses, and each one's (B, D) derivative by its codes."""
         logit, gradient = np.empty(len(latent)), np.empty(latent.shape)
         for rows, codes, trace in self._parts(latent):
             logit[rows] = self._forward(codes, trace)
@@ -114,47 +92,47 @@ class CompiledNetwork:
         return logit, gradient
 
     def _parts(self, latent: npt.NDArray[Any]) -> Iterator[tuple[slice, Array, _Trace]]:
-        """Yield parts of some poses, all of one size, their codes, and room that all share."""
+        """Yield parts of some poses, all of one size, their codes, and a workspace for each."""
         n_rows = len(latent)
         if not n_rows:
             return
-        codes = latent.astype(self._kind)
-        n_parts = -(-n_rows // (_ROWS_IN_SINGLE if self._kind == np.float32 else _ROWS_IN_DOUBLE))
+        codes = latent.astype(np.float32)
+        n_parts = -(-n_rows // _ROWS_AT_ONCE)
         size = -(-n_rows // n_parts)
-        trace = self._take_room(size)
+        trace = self._take_workspace(size)
         for part in range(n_parts):
             # The last part has some rows of the one before.
             start = min(part * size, n_rows - size)
             rows = slice(start, start + size)
             yield rows, codes[rows], trace
         with self._guard:
-            self._spare_rooms = [trace, *self._spare_rooms[: _SPARE_ROOMS - 1]]
+            self._spare_workspaces = [trace, *self._spare_workspaces[: _SPARE_WORKSPACES - 1]]
 
-    def _take_room(self, n_rows: int) -> _Trace:
+    def _take_workspace(self, n_rows: int) -> _Trace:
         """Take what an earlier call left, as new memory costs as much as filling it, or make it."""
         with self._guard:
-            for place, trace in enumerate(self._spare_rooms):
+            for place, trace in enumerate(self._spare_workspaces):
                 if len(trace.hits) == n_rows:
-                    return self._spare_rooms.pop(place)
-        return self._room(n_rows)
+                    return self._spare_workspaces.pop(place)
+        return self._workspace(n_rows)
 
-    def _room(self, n_rows: int) -> _Trace:
+    def _workspace(self, n_rows: int) -> _Trace:
         skin = self.skin
 
         def empty(*shape: int) -> Array:
-            return np.empty(shape, dtype=self._kind)
+            return np.empty(shape, dtype=np.float32)
 
         n_hits = skin.n_points + len(skin.members)
         return _Trace(
-            skin=self._skin_of(self._skin_map, n_rows),
+            skin=PosedSkin(self._skin_map, n_rows),
             sums=empty(skin.n_points, n_rows, len(REACHES), SUMS_A_REACH),
             field=empty(skin.n_points, n_rows, len(REACHES), SUMS_A_REACH),
-            patch=self._patch.room(n_rows),
-            fold=self._fold.room(n_rows),
+            patch=self._patch.workspace(n_rows),
+            fold=self._fold.workspace(n_rows),
             hits=empty(n_rows, n_hits),
             share=empty(n_rows, n_hits),
             values=empty(1, n_rows, 2 * n_hits),
-            head=self._head.room(n_rows),
+            head=self._head.workspace(n_rows),
         )
 
     def _forward(self, latent: Array, trace: _Trace) -> Array:
@@ -186,26 +164,26 @@ class CompiledNetwork:
 
     def _backward(self, trace: _Trace) -> Array:
         skin, posed = self.skin, trace.skin
-        if not isinstance(posed, SkinOfFew):
-            raise TypeError("derivatives are taken in double precision")
         n_points, n_hits = skin.n_points, trace.hits.shape[1]
-        by_head = np.zeros_like(trace.head.outputs)
-        by_head[..., 0] = 1.0
-        by_values = self._head.backward(trace.head, by_head)[0]
-        by_hits = by_values[:, :n_hits] * (
+        grad_head = np.zeros_like(trace.head.outputs)
+        grad_head[..., 0] = 1.0
+        grad_values = self._head.backward(trace.head, grad_head)[0]
+        grad_hits = grad_values[:, :n_hits] * (
             (1.0 - np.square(trace.values[0, :, :n_hits])) / SQUASHED
         )
-        by_hits += self._any_hit[0] * trace.share
-        by_both = np.stack([by_hits, by_values[:, n_hits:]], axis=2).transpose(1, 0, 2)
-        by_patch, by_fold = map(np.ascontiguousarray, np.split(by_both, [n_points]))
-        by_field = self._patch.backward(trace.patch, by_patch).reshape(trace.sums.shape)
-        by_view = self._fold.backward(trace.fold, by_fold)
-        by_sums = np.empty_like(trace.sums)
-        by_frame, by_places = np.zeros_like(posed.frame), np.zeros_like(posed.places)
-        field_kernels.normalised_backward(trace.sums, self._reach, by_field, FULL, SOME, by_sums)
-        given = posed.frame, posed.places, skin.order, self._apart, self._steepness, by_sums
-        field_kernels.contact_field_backward(*given, by_frame, by_places)
-        return posed.by_codes(by_frame, by_places, by_view)
+        grad_hits += self._any_hit[0] * trace.share
+        grad_both = np.stack([grad_hits, grad_values[:, n_hits:]], axis=2).transpose(1, 0, 2)
+        grad_patch, grad_fold = map(np.ascontiguousarray, np.split(grad_both, [n_points]))
+        grad_field = self._patch.backward(trace.patch, grad_patch).reshape(trace.sums.shape)
+        grad_view = self._fold.backward(trace.fold, grad_fold)
+        grad_sums = np.empty_like(trace.sums)
+        grad_frame, grad_places = np.zeros_like(posed.frame), np.zeros_like(posed.places)
+        field_kernels.normalised_backward(
+            trace.sums, self._reach, grad_field, FULL, SOME, grad_sums
+        )
+        given = posed.frame, posed.places, skin.order, self._apart, self._steepness, grad_sums
+        field_kernels.contact_field_backward(*given, grad_frame, grad_places)
+        return posed.grad_codes(grad_frame, grad_places, grad_view)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +200,7 @@ class _Trace:
     values : (1, B, 2 (P + S)) the squashed logits, then the roots of the energies
     """
 
-    skin: SkinOfPoses
+    skin: PosedSkin
     sums: Array
     field: Array
     patch: _Activations
@@ -242,35 +220,24 @@ class _Layer:
     bias : (n, n_out) array
     """
 
-    def __init__(self, weight: Float32Array, bias: Array) -> None:
+    def __init__(self, weight: Array, bias: Array) -> None:
         self.weight, self.bias = weight, bias
-        of_many = bias.dtype == np.float32
-        self._product = _products_of_many if of_many else network_kernels.stacked_products
 
     def multiply(self, inputs: Array, outputs: Array) -> None:
         """Fill in (n, B, n_out) outputs of (n, B, n_in) inputs, without the bias.
 
         Both may be wider; what is beyond is left alone.
         """
-        self._product(inputs, self.weight, outputs)
+        network_kernels.multiply(inputs, self.weight, outputs)
 
-    def multiply_back(self, by_outputs: Array, by_inputs: Array) -> None:
+    def multiply_back(self, grad_outputs: Array, grad_inputs: Array) -> None:
         """Fill in derivatives by the inputs."""
-        self._product(by_outputs, self._transposed, by_inputs)
+        network_kernels.multiply(grad_outputs, self._transposed, grad_inputs)
 
     @cached_property
-    def _transposed(self) -> Float32Array:
+    def _transposed(self) -> Array:
         """Of which the way back reads rows, too."""
         return np.ascontiguousarray(self.weight.transpose(0, 2, 1))
-
-
-def _products_of_many(inputs: Array, weight: Float32Array, outputs: Array) -> None:
-    """Do what `stacked_products` does, of many rows in a third of the time."""
-    import torch
-
-    _, n_in, n_out = weight.shape
-    given, table, filled = map(torch.from_numpy, (inputs, weight, outputs))
-    torch.bmm(given[..., :n_in], table, out=filled[..., :n_out])
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,13 +246,10 @@ class _Activations:
 
     Attributes
     ----------
-    inputs : (n, B, n_in) standardised; None of networks that take them as they come
-    before, after : (n, B, width) of each hidden layer, before and after the silu; in single
-        precision the last of several in the same room
+    before, after : (n, B, width) of each hidden layer, before and after the silu
     outputs : (n, B, n_out)
     """
 
-    inputs: Array | None
     before: list[Array]
     after: list[Array]
     outputs: Array
@@ -297,82 +261,65 @@ class _Network:
     Parameters
     ----------
     layers : one after the other, with silu between them
-    mean, inverse : (n, 1, n_in) of the inputs, and of their deviations; None to take inputs as they
-        come
     """
 
-    def __init__(
-        self, layers: list[_Layer], mean: Array | None = None, inverse: Array | None = None
-    ) -> None:
-        self._layers, self._mean, self._inverse = layers, mean, inverse
-        self._terms = network_kernels.power_terms(layers[0].bias.dtype.type)
+    def __init__(self, layers: list[_Layer]) -> None:
+        self._layers = layers
         self.n_in, self.n_out = layers[0].weight.shape[1], layers[-1].weight.shape[2]
 
     @classmethod
-    def read(
-        cls, state: State, name: str, n: int, n_in: int, n_out: int, kind: type[np.floating[Any]]
-    ) -> _Network:
+    def read(cls, state: State, name: str, n: int, n_in: int, n_out: int) -> _Network:
         """Take n networks, with the means and deviations of their inputs, from a state dict."""
-        layers = list(_read_layers(state, f"{name}.layers", n, n_in, n_out, kind))
+        layers = list(_read_layers(state, f"{name}.layers", n, n_in, n_out))
         mean, deviation = (
             _shaped(state[f"{name}.{what}"], (n, 1, n_in), np.float64)
             for what in ("mean", "deviation")
         )
-        if kind != np.float32:
-            return cls(layers, mean, 1.0 / deviation)
-        # Single precision has no more to lose: the first layer does it, which saves a pass.
+        # The first layer standardises the inputs.
         weight = layers[0].weight / deviation.transpose(0, 2, 1)
         bias = layers[0].bias - (mean @ weight)[:, 0]
-        return cls([_Layer(weight.astype(kind), bias.astype(kind)), *layers[1:]])
+        return cls([_Layer(weight.astype(np.float32), bias.astype(np.float32)), *layers[1:]])
 
-    def room(self, n_rows: int) -> _Activations:
-        """Return room for what B poses need."""
-        n, kind = len(self._layers[0].weight), self._layers[0].bias.dtype
-        widths = [layer.weight.shape[2] for layer in self._layers[:-1]]
+    def workspace(self, n_rows: int) -> _Activations:
+        """Return memory for what B poses need."""
+        n, hidden = len(self._layers[0].weight), self._layers[:-1]
 
-        def hidden() -> list[Array]:
-            if kind != np.float32:
-                return [np.empty((n, n_rows, width), dtype=kind) for width in widths]
-            # Without a way back, layers of one width share their room, which stays in the caches.
-            rooms = {width: np.empty((n, n_rows, width), dtype=kind) for width in widths}
-            return [rooms[width] for width in widths]
+        def empty(layer: _Layer) -> Array:
+            return np.empty((n, n_rows, layer.weight.shape[2]), dtype=np.float32)
 
-        inputs = None if self._mean is None else np.empty((n, n_rows, self.n_in), dtype=kind)
-        outputs = np.empty((n, n_rows, self.n_out), dtype=kind)
-        return _Activations(inputs, hidden(), hidden(), outputs)
+        return _Activations(
+            [empty(layer) for layer in hidden],
+            [empty(layer) for layer in hidden],
+            empty(self._layers[-1]),
+        )
 
-    def forward(self, inputs: Array, room: _Activations) -> Array:
+    def forward(self, inputs: Array, workspace: _Activations) -> Array:
         """Apply to (n, B, n_in) inputs, and return the (n, B, n_out) outputs."""
-        if self._mean is not None and self._inverse is not None:
-            inputs = np.subtract(inputs, self._mean, out=room.inputs)
-            inputs *= self._inverse
-        for layer, before, after in zip(self._layers[:-1], room.before, room.after, strict=True):
+        for layer, before, after in zip(
+            self._layers[:-1], workspace.before, workspace.after, strict=True
+        ):
             layer.multiply(inputs, before)
-            network_kernels.add_and_silu(before, layer.bias, self._terms, after)
+            network_kernels.add_and_silu(before, layer.bias, after)
             inputs = after
         last = self._layers[-1]
-        last.multiply(inputs, room.outputs)
-        room.outputs[:] += last.bias[:, None]
-        return room.outputs
+        last.multiply(inputs, workspace.outputs)
+        workspace.outputs[:] += last.bias[:, None]
+        return workspace.outputs
 
-    def backward(self, room: _Activations, by_outputs: Array) -> Array:
+    def backward(self, workspace: _Activations, grad_outputs: Array) -> Array:
         """Pull derivatives by the outputs back to the inputs."""
-        by = by_outputs
-        for layer, before in zip(self._layers[:0:-1], room.before[::-1], strict=True):
-            by_hidden = np.empty_like(before)
-            layer.multiply_back(by, by_hidden)
-            network_kernels.silu_backward(before.reshape(-1), self._terms, by_hidden.reshape(-1))
-            by = by_hidden
-        by_inputs = np.empty((*by.shape[:2], self.n_in), dtype=by.dtype)
-        self._layers[0].multiply_back(by, by_inputs)
-        if self._inverse is not None:
-            by_inputs *= self._inverse
-        return by_inputs
+        by = grad_outputs
+        for layer, before in zip(self._layers[:0:-1], workspace.before[::-1], strict=True):
+            grad_hidden = np.empty_like(before)
+            layer.multiply_back(by, grad_hidden)
+            network_kernels.silu_backward(before.reshape(-1), grad_hidden.reshape(-1))
+            by = grad_hidden
+        grad_inputs = np.empty((*by.shape[:2], self.n_in), dtype=by.dtype)
+        self._layers[0].multiply_back(by, grad_inputs)
+        return grad_inputs
 
 
-def _read_layers(
-    state: State, name: str, n: int | None, n_in: int, n_out: int, kind: type[np.floating[Any]]
-) -> Iterator[_Layer]:
+def _read_layers(state: State, name: str, n: int | None, n_in: int, n_out: int) -> Iterator[_Layer]:
     """Yield the layers of n networks, or of one that is not stacked."""
     stacked, of_bias = ((), ()) if n is None else ((n,), (n, 1))
     n_layers = sum(key.startswith(name) for key in state) // 2
@@ -380,14 +327,14 @@ def _read_layers(
         weight, bias = (state[f"{name}.{number}.{what}"] for what in ("weight", "bias"))
         width = n_out if number == n_layers - 1 else weight.shape[-1]
         yield _Layer(
-            _shaped(weight, (*stacked, n_in, width), np.float32).reshape(-1, n_in, width),
-            _shaped(bias, (*of_bias, width), kind).reshape(-1, width),
+            _shaped(weight, (*stacked, n_in, width)).reshape(-1, n_in, width),
+            _shaped(bias, (*of_bias, width)).reshape(-1, width),
         )
         n_in = width
 
 
 def _shaped(
-    values: npt.NDArray[Any], shape: tuple[int, ...], kind: npt.DTypeLike
+    values: npt.NDArray[Any], shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32
 ) -> npt.NDArray[Any]:
     """Copy an array to a type, or raise ValueError where its shape is another.
 
@@ -395,4 +342,4 @@ def _shaped(
     """
     if values.shape != shape:
         raise ValueError(f"expected an array of shape {shape}, got {values.shape}")
-    return np.array(values, dtype=kind, order="C")
+    return np.array(values, dtype=dtype, order="C")

@@ -43,9 +43,9 @@ class Decoding(NamedTuple):
             torch.mm(latent[:, codes], table, out=result[:, columns])
         return result
 
-    def products_backward(self, by_products: torch.Tensor) -> torch.Tensor:
+    def products_backward(self, grad_products: torch.Tensor) -> torch.Tensor:
         """Pull derivatives by the products back to the codes."""
-        parts = [by_products[:, columns] @ table.T for (_, columns), table in self._groups()]
+        parts = [grad_products[:, columns] @ table.T for (_, columns), table in self._groups()]
         return torch.cat(parts, dim=1)
 
     def grouped(self, outputs: torch.Tensor) -> torch.Tensor:
@@ -227,18 +227,18 @@ class _Features(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_features: torch.Tensor) -> tuple[torch.Tensor, None]:
+    def backward(ctx: Any, grad_features: torch.Tensor) -> tuple[torch.Tensor, None]:
         (outputs,) = ctx.saved_tensors
         decoding: Decoding = ctx.decoding
         grouped = decoding.grouped(outputs)
         if outputs.device.type != "cpu":
-            by_outputs = by_features[:, decoding.target.long()] * decoding.scale
-            by_inputs = by_outputs * (1.0 - grouped.square())
+            grad_outputs = grad_features[:, decoding.target.long()] * decoding.scale
+            grad_inputs = grad_outputs * (1.0 - grouped.square())
         else:
-            by_inputs = torch.empty_like(grouped)
-            given = grouped, decoding.target, decoding.scale, by_features, by_inputs
+            grad_inputs = torch.empty_like(grouped)
+            given = grouped, decoding.target, decoding.scale, grad_features, grad_inputs
             skin_kernels.add_features_backward(*_arrays(*given))
-        return decoding.products_backward(by_inputs.flatten(1)), None
+        return decoding.products_backward(grad_inputs.flatten(1)), None
 
 
 class _Deform(torch.autograd.Function):
@@ -256,12 +256,14 @@ class _Deform(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, by_frame: torch.Tensor, by_rows: torch.Tensor
+        ctx: Any, grad_frame: torch.Tensor, grad_rows: torch.Tensor
     ) -> tuple[torch.Tensor, None]:
         features, rest_frame = ctx.saved_tensors
-        by_features = torch.empty_like(features, memory_format=torch.contiguous_format)
-        skin_kernels.deform_backward(*_arrays(features, rest_frame, by_frame, by_rows, by_features))
-        return by_features, None
+        grad_features = torch.empty_like(features, memory_format=torch.contiguous_format)
+        skin_kernels.deform_backward(
+            *_arrays(features, rest_frame, grad_frame, grad_rows, grad_features)
+        )
+        return grad_features, None
 
 
 class _ContactField(torch.autograd.Function):
@@ -283,14 +285,14 @@ class _ContactField(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, by_sums: torch.Tensor
+        ctx: Any, grad_sums: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, None, None, None]:
         frame, places = ctx.saved_tensors
-        by_frame, by_places = _zeros_like(frame), _zeros_like(places)
+        grad_frame, grad_places = _zeros_like(frame), _zeros_like(places)
         field_kernels.contact_field_backward(
-            *_arrays(frame, places), *ctx.fixed, *_arrays(by_sums, by_frame, by_places)
+            *_arrays(frame, places), *ctx.fixed, *_arrays(grad_sums, grad_frame, grad_places)
         )
-        return by_frame, by_places, None, None, None
+        return grad_frame, grad_places, None, None, None
 
 
 class _Normalised(torch.autograd.Function):
@@ -307,15 +309,15 @@ class _Normalised(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_inputs: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
+    def backward(ctx: Any, grad_inputs: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
         sums, reach = ctx.saved_tensors
-        by_sums = torch.empty_like(sums)
-        seen_sums, seen_reach, given, filled = _arrays(sums, reach, by_inputs, by_sums)
+        grad_sums = torch.empty_like(sums)
+        seen_sums, seen_reach, given, filled = _arrays(sums, reach, grad_inputs, grad_sums)
         constants = ctx.constants
         field_kernels.normalised_backward(
             seen_sums, seen_reach, given, constants[0], constants[1], filled
         )
-        return by_sums, None, None, None
+        return grad_sums, None, None, None
 
 
 class _FoldView(torch.autograd.Function):
@@ -330,20 +332,20 @@ class _FoldView(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None]:
+    def backward(ctx: Any, grad_inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None]:
         frame, rows, members = ctx.saved_tensors
-        by_frame, by_rows = _zeros_like(frame), _zeros_like(rows)
+        grad_frame, grad_rows = _zeros_like(frame), _zeros_like(rows)
         skin_kernels.fold_view_backward(
             *_arrays(
                 frame,
                 _gradients(rows),
                 members,
-                by_inputs,
-                by_frame,
-                _gradients(by_rows),
+                grad_inputs,
+                grad_frame,
+                _gradients(grad_rows),
             )
         )
-        return by_frame, by_rows, None
+        return grad_frame, grad_rows, None
 
 
 def _fixed(order: torch.Tensor, apart: torch.Tensor, reach: torch.Tensor) -> list[Any]:

@@ -207,9 +207,9 @@ def contact_field_backward(
     order: npt.NDArray[np.int32],
     apart: Array,
     steepness: Array,
-    by_sums: Array,
-    by_frame: Array,
-    by_places: Array,
+    grad_sums: Array,
+    grad_frame: Array,
+    grad_places: Array,
 ) -> None:
     """Pull derivatives by `contact_field`'s sums back, adding to frames and places."""
     n_points, n_ordered = places.shape[2], len(order)
@@ -239,7 +239,7 @@ def contact_field_backward(
             _copy_blocks(pairs, BLOCK * place, n_ordered, near, n_seen, away)
             px, py, pz = ordered[0, place], ordered[1, place], ordered[2, place]
             own_x, own_y, own_z = ordered[3, place], ordered[4, place], ordered[5, place]
-            _turn_back(frame[b, p], by_sums[p, b], given)
+            _turn_back(frame[b, p], grad_sums[p, b], given)
             w0, h0, x0, y0 = given[0, 0], given[0, 1], given[0, 2], given[0, 3]
             z0, a0, b0, c0 = given[0, 4], given[0, 5], given[0, 6], given[0, 7]
             w1, h1, x1, y1 = given[1, 0], given[1, 1], given[1, 2], given[1, 3]
@@ -261,10 +261,10 @@ def contact_field_backward(
                 t = t if t > zero else zero
                 cube = t * t * t
                 weight = facing * cube
-                by_weight = w0 - h0 * above + x0 * dx + y0 * dy + z0 * dz
-                by_weight += a0 * qx + b0 * qy + c0 * qz
-                by_facing = by_weight * cube
-                by_squared = by_weight * t * t * inner
+                grad_weight = w0 - h0 * above + x0 * dx + y0 * dy + z0 * dz
+                grad_weight += a0 * qx + b0 * qy + c0 * qz
+                by_facing = grad_weight * cube
+                by_squared = grad_weight * t * t * inner
                 by_above = weight * h0
                 by_dx, by_dy, by_dz = weight * x0, weight * y0, weight * z0
                 by_qx, by_qy, by_qz = weight * a0, weight * b0, weight * c0
@@ -278,10 +278,10 @@ def contact_field_backward(
                 t = t if t > zero else zero
                 cube = t * t * t
                 weight = facing * cube
-                by_weight = w1 - h1 * above + x1 * dx + y1 * dy + z1 * dz
-                by_weight += a1 * qx + b1 * qy + c1 * qz
-                by_facing += by_weight * cube
-                by_squared += by_weight * t * t * outer
+                grad_weight = w1 - h1 * above + x1 * dx + y1 * dy + z1 * dz
+                grad_weight += a1 * qx + b1 * qy + c1 * qz
+                by_facing += grad_weight * cube
+                by_squared += grad_weight * t * t * outer
                 by_above += weight * h1
                 by_dx += weight * x1
                 by_dy += weight * y1
@@ -319,20 +319,20 @@ def contact_field_backward(
                     for c in range(6):
                         for i in range(BLOCK):
                             by_ordered[c, start + i] += by_seen[c, BLOCK * n + i]
-            by_places[b, 0, p] += at_x
-            by_places[b, 1, p] += at_y
-            by_places[b, 2, p] += at_z
-            by = by_frame[b, p]
+            grad_places[b, 0, p] += at_x
+            grad_places[b, 1, p] += at_y
+            grad_places[b, 2, p] += at_z
+            by = grad_frame[b, p]
             by[0, 0] += own_a
             by[1, 0] += own_b
             by[2, 0] += own_c
-            _add_turn(by_sums[p, b, 0], dx0, dy0, dz0, nx0, ny0, nz0, by)
-            _add_turn(by_sums[p, b, 1], dx1, dy1, dz1, nx1, ny1, nz1, by)
+            _add_turn(grad_sums[p, b, 0], dx0, dy0, dz0, nx0, ny0, nz0, by)
+            _add_turn(grad_sums[p, b, 1], dx1, dy1, dz1, nx1, ny1, nz1, by)
         for i in range(n_ordered):
             q = order[i]
             for c in range(3):
-                by_places[b, c, q] += by_ordered[c, i]
-                by_frame[b, q, c, 0] += by_ordered[3 + c, i]
+                grad_places[b, c, q] += by_ordered[c, i]
+                grad_frame[b, q, c, 0] += by_ordered[3 + c, i]
 
 
 @compiled
@@ -400,36 +400,36 @@ def _copy_blocks(
 
 
 @compiled
-def _turn_back(frame: Array, by_sums: Array, given: Array) -> None:
+def _turn_back(frame: Array, grad_sums: Array, given: Array) -> None:
     """Turn the derivatives by a point's sums (2, 8) from its frame into the world."""
     for k in range(2):
-        given[k, 0], given[k, 1] = by_sums[k, 0], by_sums[k, 1]
+        given[k, 0], given[k, 1] = grad_sums[k, 0], grad_sums[k, 1]
         for i in range(3):
             for start in (2, 5):
                 given[k, start + i] = (
-                    frame[i, 0] * by_sums[k, start]
-                    + frame[i, 1] * by_sums[k, start + 1]
-                    + frame[i, 2] * by_sums[k, start + 2]
+                    frame[i, 0] * grad_sums[k, start]
+                    + frame[i, 1] * grad_sums[k, start + 1]
+                    + frame[i, 2] * grad_sums[k, start + 2]
                 )
 
 
 @compiled
 def _add_turn(
-    by_sums: Array,
+    grad_sums: Array,
     x: Number,
     y: Number,
     z: Number,
     normal_x: Number,
     normal_y: Number,
     normal_z: Number,
-    by_frame: Array,
+    grad_frame: Array,
 ) -> None:
     """Add derivatives by the frame that turned a point's offsets and normals."""
     for c in range(3):
-        by_offset, by_normal = by_sums[2 + c], by_sums[5 + c]
-        by_frame[0, c] += x * by_offset + normal_x * by_normal
-        by_frame[1, c] += y * by_offset + normal_y * by_normal
-        by_frame[2, c] += z * by_offset + normal_z * by_normal
+        grad_offset, grad_normal = grad_sums[2 + c], grad_sums[5 + c]
+        grad_frame[0, c] += x * grad_offset + normal_x * grad_normal
+        grad_frame[1, c] += y * grad_offset + normal_y * grad_normal
+        grad_frame[2, c] += z * grad_offset + normal_z * grad_normal
 
 
 @compiled
@@ -451,17 +451,17 @@ def normalised(sums: Array, reach: Array, full: float, some: float, inputs: Arra
 
 @compiled
 def normalised_backward(
-    sums: Array, reach: Array, by_inputs: Array, full: float, some: float, by_sums: Array
+    sums: Array, reach: Array, grad_inputs: Array, full: float, some: float, grad_sums: Array
 ) -> None:
     """Pull derivatives by `normalised`'s inputs back to the sums."""
     for p in range(sums.shape[0]):
         for b in range(sums.shape[1]):
             for k in range(sums.shape[2]):
-                own, given, out = sums[p, b, k], by_inputs[p, b, k], by_sums[p, b, k]
+                own, given, out = sums[p, b, k], grad_inputs[p, b, k], grad_sums[p, b, k]
                 share = 1.0 / (own[0] + some)
-                by_weight = given[0] * full / (own[0] + full) ** 2
+                grad_weight = given[0] * full / (own[0] + full) ** 2
                 for c in range(1, 8):
                     unit = reach[k] if c < 5 else 1.0
                     out[c] = given[c] * share / unit
-                    by_weight -= out[c] * own[c] * share
-                out[0] = by_weight
+                    grad_weight -= out[c] * own[c] * share
+                out[0] = grad_weight

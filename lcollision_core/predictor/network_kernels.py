@@ -3,45 +3,48 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.compiled import compiled, compiled_sums
 
-Array = npt.NDArray[np.floating[Any]]
-Number = np.floating[Any]
+Array = npt.NDArray[np.float32]
 
 SQUASHED = 4.0
 """A patch's logit is divided by this and squashed before the head sees it."""
 
+_LOG2_E = np.float32(1.0 / math.log(2.0))
+_POWER = tuple(np.float32(math.log(2.0) ** n / math.factorial(n)) for n in range(6, -1, -1))
+"""Taylor's coefficients of 2^r, the highest first: enough for single precision up to 1/2."""
+
 _AT_ONCE = 4
 """Inputs whose products are summed up before the outputs are touched again."""
 
-_LOG2_E = 1.0 / math.log(2.0)
-_POWER = tuple(math.log(2.0) ** n / math.factorial(n) for n in range(12, -1, -1))
-"""Taylor's coefficients of 2^r, the highest first: enough for double precision up to 1/2."""
+_FEW_ROWS = 8
+"""Up to so many, reading the weights takes the time, and a library's threads would take more."""
 
 
-def power_terms(kind: type[np.floating[Any]]) -> tuple[Number, ...]:
-    """Return so many of Taylor's coefficients, the highest first, as the type has use for."""
-    return tuple(kind(term) for term in (_POWER[-7:] if kind == np.float32 else _POWER))
+def multiply(inputs: Array, weight: Array, outputs: Array) -> None:
+    """Fill in n products: (n, B, n_in) inputs times (n, n_in, n_out) weights.
+
+    Inputs and outputs may be wider; what is beyond is left alone.
+    """
+    if inputs.shape[1] <= _FEW_ROWS:
+        _multiply_few(inputs, weight, outputs)
+    else:
+        _, n_in, n_out = weight.shape
+        np.matmul(inputs[..., :n_in], weight, out=outputs[..., :n_out])
 
 
 @compiled
-def stacked_products(inputs: Array, weight: npt.NDArray[np.float32], outputs: Array) -> None:
-    """Fill in n products: (n, B, n_in) inputs times (n, n_in, n_out) weights.
-
-    Inputs and outputs may be wider; what is beyond is left alone. The weights stay in single
-    precision: of few rows, reading them takes the time.
-    """
+def _multiply_few(inputs: Array, weight: Array, outputs: Array) -> None:
     n_rows, n_in, n_out = inputs.shape[1], weight.shape[1], weight.shape[2]
     whole = n_in - n_in % _AT_ONCE
     for n in range(weight.shape[0]):
         for b in range(n_rows):
             for j in range(n_out):
-                outputs[n, b, j] = inputs.dtype.type(0.0)
+                outputs[n, b, j] = np.float32(0.0)
         for i in range(0, whole, _AT_ONCE):
             for b in range(0, n_rows - 1, 2):
                 x0, x1 = inputs[n, b, i], inputs[n, b, i + 1]
@@ -68,41 +71,35 @@ def stacked_products(inputs: Array, weight: npt.NDArray[np.float32], outputs: Ar
 
 
 @compiled_sums
-def add_and_silu(values: Array, bias: Array, terms: tuple[Number, ...], outputs: Array) -> None:
-    """Add biases (n, m) to (n, B, m) values in place, and fill in x sigmoid(x) of the sums.
-
-    `terms` are `power_terms` of their type.
-    """
-    one = values.dtype.type(1.0)
+def add_and_silu(values: Array, bias: Array, outputs: Array) -> None:
+    """Add biases (n, m) to (n, B, m) values in place, and fill in x sigmoid(x) of the sums."""
+    one = np.float32(1.0)
     for n in range(values.shape[0]):
         for b in range(values.shape[1]):
             for i in range(values.shape[2]):
                 x = values[n, b, i] + bias[n, i]
                 values[n, b, i] = x
-                outputs[n, b, i] = x / (one + _exponential(-x, terms))
+                outputs[n, b, i] = x / (one + _exponential(-x))
 
 
 @compiled_sums
-def silu_backward(values: Array, terms: tuple[Number, ...], by: Array) -> None:
+def silu_backward(values: Array, by: Array) -> None:
     """Turn derivatives by the outputs x sigmoid(x) into those by flat values x, in place."""
-    one = values.dtype.type(1.0)
+    one = np.float32(1.0)
     for n in range(len(values)):
         x = values[n]
-        sigmoid = one / (one + _exponential(-x, terms))
+        sigmoid = one / (one + _exponential(-x))
         by[n] *= sigmoid * (one + x * (one - sigmoid))
 
 
 @compiled_sums
-def _exponential(x: Number, terms: tuple[Number, ...]) -> Number:
+def _exponential(x: np.float32) -> np.float32:
     """Return exp(x), between those of +-87.3: several at a time, as the library's is not."""
-    kind = type(x)
-    y = min(max(x * kind(_LOG2_E), kind(-126.0)), kind(126.0))
-    whole = np.floor(y + kind(0.5))
+    y = min(max(x * _LOG2_E, np.float32(-126.0)), np.float32(126.0))
+    whole = np.floor(y + np.float32(0.5))
     rest = y - whole
-    power = kind(0.0)
-    for term in terms:
+    power = np.float32(0.0)
+    for term in _POWER:
         power = power * rest + term
     # A power of two by its bits.
-    return power * kind(
-        np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
-    )
+    return power * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 BATCH_ROWS = 500
 """Rows that are predicted at a time: their hidden layers stay in the caches."""
 
-_FEW_ROWS = 8
-"""Up to so many poses take less time without torch."""
-
 _ROWS_A_THREAD = 64
 """Fewer poses than this are not worth a thread."""
 
@@ -144,7 +141,7 @@ class CollisionPredictor:
     """Predicts energy per domain and collision from latent codes.
 
     Immutable, and safe to share between threads. Made by `train_predictor` or `from_section`. The
-    default preset needs torch for many poses at a time only, and on a GPU.
+    default preset computes in single precision on the CPU, where it needs no torch.
 
     Parameters
     ----------
@@ -181,8 +178,8 @@ class CollisionPredictor:
 
     @property
     def needs_torch(self) -> bool:
-        """Whether a few poses do."""
-        return self._few is None
+        """Whether predictions do."""
+        return self._compiled is None
 
     @property
     def preset(self) -> str:
@@ -229,34 +226,10 @@ class CollisionPredictor:
         codes = np.ascontiguousarray(latent, dtype=np.float32)
         n_outputs = self.n_domains if self.config.by_domain else 1
         domain_energy, logit = np.empty((len(codes), n_outputs)), np.empty(len(codes))
-        if len(codes) <= _FEW_ROWS and self._few is not None:
-            domain_energy[:], logit[:] = self._few.outputs(codes.astype(np.float64))
-        else:
-            self._predict_many(codes, domain_energy, logit)
-        logit += self.facts.logit_shift
-        return domain_energy, logit
-
-    def _predict_many(
-        self, codes: npt.NDArray[np.float32], domain_energy: FloatArray, logit: FloatArray
-    ) -> None:
-        """Fill in what is predicted, on all cores or on the GPU."""
-        import torch
-
-        # Made before several threads would each begin to.
-        many = self._many
-        network = self._network if many is None else None
+        compute = self._torch_outputs if self._compiled is None else self._compiled.outputs
 
         def fill(start: int, stop: int) -> None:
-            if many is not None:
-                domain_energy[start:stop], logit[start:stop] = many.outputs(codes[start:stop])
-            if network is None:
-                return
-            with torch.inference_mode():
-                for first in range(start, stop, BATCH_ROWS):
-                    rows = slice(first, min(first + BATCH_ROWS, stop))
-                    output = network(torch.tensor(codes[rows], device=self.device))
-                    domain_energy[rows] = output.domain_energy.double().cpu().numpy()
-                    logit[rows] = output.logit.double().cpu().numpy()
+            domain_energy[start:stop], logit[start:stop] = compute(codes[start:stop])
 
         n_threads = 1
         if self.device == "cpu":
@@ -264,18 +237,27 @@ class CollisionPredictor:
         cuts = np.linspace(0, len(codes), n_threads + 1).astype(int).tolist()
         if n_threads == 1:
             fill(0, len(codes))
-            return
-        # Each thread has a core to itself, and torch must not share out its work again.
-        torch_threads = torch.get_num_threads()
-        try:
-            with ThreadPoolExecutor(n_threads, "predict", torch.set_num_threads, (1,)) as pool:
+        else:
+            with ThreadPoolExecutor(n_threads, "predict") as pool:
                 for _ in pool.map(fill, cuts[:-1], cuts[1:]):
                     pass
-        finally:
-            torch.set_num_threads(torch_threads)
+        logit += self.facts.logit_shift
+        return domain_energy, logit
+
+    def _torch_outputs(self, codes: npt.NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
+        """Return the network's own scaled energies and logits, by torch."""
+        import torch
+
+        with torch.inference_mode():
+            parts = [
+                self._network(torch.tensor(codes[start : start + BATCH_ROWS], device=self.device))
+                for start in range(0, max(len(codes), 1), BATCH_ROWS)
+            ]
+        energy = np.concatenate([part.domain_energy.double().cpu().numpy() for part in parts])
+        return energy, np.concatenate([part.logit.double().cpu().numpy() for part in parts])
 
     def logit_and_gradient(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-        """Return the logit of the collision probability and its derivative, in double precision.
+        """Return the logit of the collision probability and its derivative.
 
         Parameters
         ----------
@@ -293,8 +275,8 @@ class CollisionPredictor:
         self._require(latent)
         # Never read-only: the loops would be compiled for that, too.
         poses = np.array(latent, dtype=np.float64)
-        if self._few is not None:
-            logit, gradient = self._few.logit_and_gradient(poses)
+        if self._compiled is not None:
+            logit, gradient = self._compiled.logit_and_gradient(poses)
         else:
             logit, gradient = self._differentiated(poses)
         return logit + self.facts.logit_shift, gradient
@@ -368,23 +350,15 @@ class CollisionPredictor:
         return predictor
 
     def __getstate__(self) -> dict[str, Any]:
-        networks = ("_few", "_many", "_network", "_exact_network")
+        networks = ("_compiled", "_network", "_exact_network")
         return {name: value for name, value in vars(self).items() if name not in networks}
 
     @cached_property
-    def _few(self) -> CompiledNetwork | None:
-        """What computes a few poses without torch, if that is possible."""
+    def _compiled(self) -> CompiledNetwork | None:
+        """What predicts on the CPU without torch; None for the preset `paper` and on a GPU."""
         if self.preset != "default" or self.device != "cpu":
             return None
         return CompiledNetwork(self._embedding, self._arrays)
-
-    @cached_property
-    def _many(self) -> CompiledNetwork | None:
-        """What computes many poses, on the CPU faster than the network itself."""
-        if self._few is None:
-            return None
-        skin = self._few.skin
-        return CompiledNetwork(self._embedding, self._arrays, np.float32, skin)
 
     @cached_property
     def _network(self) -> PredictorNetwork:

@@ -61,7 +61,7 @@ def products(latent: Array, tables: Array, blocks: npt.NDArray[np.int64], output
 
 @compiled_sums
 def products_backward(
-    by_outputs: Array, tables: Array, blocks: npt.NDArray[np.int64], by_latent: Array
+    grad_outputs: Array, tables: Array, blocks: npt.NDArray[np.int64], grad_latent: Array
 ) -> None:
     """Pull derivatives by `products`' outputs back to the codes (B, D)."""
     table = 0
@@ -70,12 +70,12 @@ def products_backward(
         width = right - left
         for k in range(last - first):
             row = tables[table + k * width : table + (k + 1) * width]
-            for b in range(by_outputs.shape[0]):
-                given = by_outputs[b, left:right]
-                total = by_outputs.dtype.type(0.0)
+            for b in range(grad_outputs.shape[0]):
+                given = grad_outputs[b, left:right]
+                total = grad_outputs.dtype.type(0.0)
                 for n in range(width):
                     total += given[n] * row[n]
-                by_latent[b, first + k] = total
+                grad_latent[b, first + k] = total
         table += (last - first) * width
 
 
@@ -113,8 +113,8 @@ def add_features_backward(
     outputs: Array,
     target: npt.NDArray[np.int32],
     scale: Array,
-    by_features: Array,
-    by_inputs: Array,
+    grad_features: Array,
+    grad_inputs: Array,
 ) -> None:
     """Pull derivatives by `add_features`' features back to what the tanh was taken of."""
     one = outputs.dtype.type(1.0)
@@ -123,7 +123,7 @@ def add_features_backward(
             p = target[n]
             for c in range(9):
                 slope = one - outputs[b, n, c] * outputs[b, n, c]
-                by_inputs[b, n, c] = by_features[b, p, c] * scale[c] * slope
+                grad_inputs[b, n, c] = grad_features[b, p, c] * scale[c] * slope
 
 
 @compiled
@@ -157,7 +157,7 @@ def deform(features: Array, rest_frame: Array, frame: Array, rows: Array) -> Non
 
 @compiled
 def deform_backward(
-    features: Array, rest_frame: Array, by_frame: Array, by_rows: Array, by_features: Array
+    features: Array, rest_frame: Array, grad_frame: Array, grad_rows: Array, grad_features: Array
 ) -> None:
     """Pull derivatives by `deform`'s results back to its (B, Q, 9) features."""
     turns = np.empty((4, features.shape[1]), dtype=features.dtype)
@@ -170,22 +170,22 @@ def deform_backward(
             yy, yz, zz = features[b, p, 6], features[b, p, 7], features[b, p, 8]
             s, v, c, squared = turns[0, p], turns[1, p], turns[2, p], turns[3, p]
             r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(x, y, z, s, v, c)
-            b00, b01, b02 = by_rows[b, 0, p, 0], by_rows[b, 0, p, 1], by_rows[b, 0, p, 2]
-            b10, b11, b12 = by_rows[b, 1, p, 0], by_rows[b, 1, p, 1], by_rows[b, 1, p, 2]
-            b20, b21, b22 = by_rows[b, 2, p, 0], by_rows[b, 2, p, 1], by_rows[b, 2, p, 2]
+            b00, b01, b02 = grad_rows[b, 0, p, 0], grad_rows[b, 0, p, 1], grad_rows[b, 0, p, 2]
+            b10, b11, b12 = grad_rows[b, 1, p, 0], grad_rows[b, 1, p, 1], grad_rows[b, 1, p, 2]
+            b20, b21, b22 = grad_rows[b, 2, p, 0], grad_rows[b, 2, p, 1], grad_rows[b, 2, p, 2]
             # By S: R^T times what is given, both of its halves.
-            by_features[b, p, 3] = r00 * b00 + r10 * b10 + r20 * b20
-            by_features[b, p, 4] = (
+            grad_features[b, p, 3] = r00 * b00 + r10 * b10 + r20 * b20
+            grad_features[b, p, 4] = (
                 (r00 * b01 + r10 * b11 + r20 * b21) + (r01 * b00 + r11 * b10 + r21 * b20)
             )  # fmt: skip
-            by_features[b, p, 5] = (
+            grad_features[b, p, 5] = (
                 (r00 * b02 + r10 * b12 + r20 * b22) + (r02 * b00 + r12 * b10 + r22 * b20)
             )  # fmt: skip
-            by_features[b, p, 6] = r01 * b01 + r11 * b11 + r21 * b21
-            by_features[b, p, 7] = (
+            grad_features[b, p, 6] = r01 * b01 + r11 * b11 + r21 * b21
+            grad_features[b, p, 7] = (
                 (r01 * b02 + r11 * b12 + r21 * b22) + (r02 * b01 + r12 * b11 + r22 * b21)
             )  # fmt: skip
-            by_features[b, p, 8] = r02 * b02 + r12 * b12 + r22 * b22
+            grad_features[b, p, 8] = r02 * b02 + r12 * b12 + r22 * b22
             # By R: what is given times S, and for the frames times F^T.
             g00, g01, g02 = _times_symmetric(b00, b01, b02, xx, xy, xz, yy, yz, zz)
             g10, g11, g12 = _times_symmetric(b10, b11, b12, xx, xy, xz, yy, yz, zz)
@@ -193,8 +193,8 @@ def deform_backward(
             if p < len(rest_frame):
                 for j in range(3):
                     e, f, g = rest_frame[p, 0, j], rest_frame[p, 1, j], rest_frame[p, 2, j]
-                    first, second = by_frame[b, p, 0, j], by_frame[b, p, 1, j]
-                    third = by_frame[b, p, 2, j]
+                    first, second = grad_frame[b, p, 0, j], grad_frame[b, p, 1, j]
+                    third = grad_frame[b, p, 2, j]
                     g00, g01, g02 = g00 + first * e, g01 + first * f, g02 + first * g
                     g10, g11, g12 = g10 + second * e, g11 + second * f, g12 + second * g
                     g20, g21, g22 = g20 + third * e, g21 + third * f, g22 + third * g
@@ -206,9 +206,9 @@ def deform_backward(
             along = curl_x * x + curl_y * y + curl_z * z
             across = (twice_x * x + twice_y * y + twice_z * z) / two
             radial = ((c - s) * along + (s - two * v) * across) / squared - s * (g00 + g11 + g22)
-            by_features[b, p, 0] = radial * x + s * curl_x + v * twice_x
-            by_features[b, p, 1] = radial * y + s * curl_y + v * twice_y
-            by_features[b, p, 2] = radial * z + s * curl_z + v * twice_z
+            grad_features[b, p, 0] = radial * x + s * curl_x + v * twice_x
+            grad_features[b, p, 1] = radial * y + s * curl_y + v * twice_y
+            grad_features[b, p, 2] = radial * z + s * curl_z + v * twice_z
 
 
 @compiled
@@ -295,9 +295,9 @@ def fold_view_backward(
     frame: Array,
     rows: Array,
     members: npt.NDArray[np.int32],
-    by_inputs: Array,
-    by_frame: Array,
-    by_rows: Array,
+    grad_inputs: Array,
+    grad_frame: Array,
+    grad_rows: Array,
 ) -> None:
     """Pull derivatives by `fold_view`'s inputs back, adding to frames and gradients."""
     zero = frame.dtype.type(0.0)
@@ -313,16 +313,16 @@ def fold_view_backward(
                 p = members[s, m]
                 for j in range(3):
                     x, y, z = rows[b, 0, p, j], rows[b, 1, p, j], rows[b, 2, p, j]
-                    first = by_inputs[s, b, 9 * m + j]
-                    second = by_inputs[s, b, 9 * m + 3 + j]
-                    third = by_inputs[s, b, 9 * m + 6 + j]
+                    first = grad_inputs[s, b, 9 * m + j]
+                    second = grad_inputs[s, b, 9 * m + 3 + j]
+                    third = grad_inputs[s, b, 9 * m + 6 + j]
                     b00, b01, b02 = b00 + x * first, b01 + x * second, b02 + x * third
                     b10, b11, b12 = b10 + y * first, b11 + y * second, b12 + y * third
                     b20, b21, b22 = b20 + z * first, b21 + z * second, b22 + z * third
-                    by_rows[b, 0, p, j] += f00 * first + f01 * second + f02 * third
-                    by_rows[b, 1, p, j] += f10 * first + f11 * second + f12 * third
-                    by_rows[b, 2, p, j] += f20 * first + f21 * second + f22 * third
-            by = by_frame[b, q]
+                    grad_rows[b, 0, p, j] += f00 * first + f01 * second + f02 * third
+                    grad_rows[b, 1, p, j] += f10 * first + f11 * second + f12 * third
+                    grad_rows[b, 2, p, j] += f20 * first + f21 * second + f22 * third
+            by = grad_frame[b, q]
             by[0, 0], by[0, 1], by[0, 2] = by[0, 0] + b00, by[0, 1] + b01, by[0, 2] + b02
             by[1, 0], by[1, 1], by[1, 2] = by[1, 0] + b10, by[1, 1] + b11, by[1, 2] + b12
             by[2, 0], by[2, 1], by[2, 2] = by[2, 0] + b20, by[2, 1] + b21, by[2, 2] + b22

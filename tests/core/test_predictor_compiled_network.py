@@ -34,62 +34,41 @@ def _arrays(network: GeometricNetwork) -> dict[str, np.ndarray]:
     return {name: values.numpy() for name, values in network.state_dict().items()}
 
 
-@pytest.mark.parametrize("n_poses", [0, 1, 5])
-def test_it_says_what_the_torch_network_says(
+@pytest.mark.parametrize("n_poses", [0, 1, 5, 9, 64, 65, 150])
+def test_it_agrees_with_the_torch_network(
     tube_model: PoseModel, network: GeometricNetwork, n_poses: int
 ) -> None:
-    few = CompiledNetwork(tube_model.embedding, _arrays(network))
+    compiled = CompiledNetwork(tube_model.embedding, _arrays(network))
     latent = tube_model.latent_space.sample(n_poses, np.random.default_rng(2))
+    if not n_poses:
+        assert compiled.outputs(latent)[1].shape == (0,)
+        assert compiled.logit_and_gradient(latent)[1].shape == latent.shape
+        return
     codes = torch.tensor(latent, requires_grad=True)
     exact = GeometricNetwork.restore(tube_model.embedding, None, network.state_dict()).double()  # type: ignore[arg-type]
-    if not n_poses:
-        assert few.logit_and_gradient(latent)[1].shape == latent.shape
-        return
     output = exact(codes)
     (gradient,) = torch.autograd.grad(output.logit.sum(), codes)
-    energy, logit = few.outputs(latent)
-    # Its reaches, frames and offsets are rounded to single precision.
-    np.testing.assert_allclose(energy, output.domain_energy.detach(), rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(logit, output.logit.detach(), rtol=1e-6, atol=1e-6)
-    again, slope = few.logit_and_gradient(latent)
+    energy, logit = compiled.outputs(latent)
+    # Single against double precision.
+    np.testing.assert_allclose(energy, output.domain_energy.detach(), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(logit, output.logit.detach(), rtol=1e-4, atol=1e-4)
+    again, slope = compiled.logit_and_gradient(latent)
     np.testing.assert_array_equal(again, logit)
     scale = gradient.abs().max().item()
     assert scale > 1e-3
-    np.testing.assert_allclose(slope, gradient, atol=1e-5 * scale)
+    np.testing.assert_allclose(slope, gradient, atol=1e-3 * scale)
 
 
-@pytest.mark.parametrize("n_poses", [0, 1, 9, 64, 65, 150])
-def test_single_precision_says_nearly_the_same(
-    tube_model: PoseModel, network: GeometricNetwork, n_poses: int
-) -> None:
-    many = CompiledNetwork(tube_model.embedding, _arrays(network), np.float32)
-    exact = CompiledNetwork(tube_model.embedding, _arrays(network), skin=many.skin)
-    latent = tube_model.latent_space.sample(n_poses, np.random.default_rng(4))
-    for found, known in zip(many.outputs(latent), exact.outputs(latent), strict=True):
-        np.testing.assert_allclose(found, known, rtol=1e-3, atol=1e-3)
-    with torch.no_grad():
-        output = network(torch.tensor(latent, dtype=torch.float32))
-    np.testing.assert_allclose(many.outputs(latent)[1], output.logit, rtol=1e-3, atol=1e-3)
-
-
-def test_single_precision_takes_no_derivatives(
+def test_a_pose_gets_the_same_alone_and_with_others_but_for_rounding(
     tube_model: PoseModel, network: GeometricNetwork
 ) -> None:
-    many = CompiledNetwork(tube_model.embedding, _arrays(network), np.float32)
-    with pytest.raises(TypeError, match="double precision"):
-        many.logit_and_gradient(np.zeros((1, tube_model.latent_size)))
-
-
-def test_a_pose_gets_the_same_numbers_alone_and_with_others(
-    tube_model: PoseModel, network: GeometricNetwork
-) -> None:
-    few = CompiledNetwork(tube_model.embedding, _arrays(network))
+    compiled = CompiledNetwork(tube_model.embedding, _arrays(network))
     latent = tube_model.latent_space.sample(4, np.random.default_rng(2))
-    logit, slope = few.logit_and_gradient(latent)
+    logit, slope = compiled.logit_and_gradient(latent)
     for row in range(4):
-        alone = few.logit_and_gradient(latent[row : row + 1])
-        np.testing.assert_array_equal(alone[0], logit[row : row + 1])
-        np.testing.assert_array_equal(alone[1], slope[row : row + 1])
+        alone = compiled.logit_and_gradient(latent[row : row + 1])
+        np.testing.assert_allclose(alone[0], logit[row : row + 1], rtol=1e-6)
+        np.testing.assert_allclose(alone[1][0], slope[row], atol=1e-4 * np.abs(slope[row]).max())
 
 
 def test_arrays_of_another_network_are_refused(
@@ -102,7 +81,7 @@ def test_arrays_of_another_network_are_refused(
             wrong[name] = arrays[name] + 10**6
             if not arrays[name].size:
                 continue
-        with pytest.raises(ValueError, match=r"."):
+        with pytest.raises(ValueError, match=r"shape|sites"):
             CompiledNetwork(tube_model.embedding, wrong)
         with pytest.raises((KeyError, ValueError)):
             CompiledNetwork(
