@@ -171,27 +171,8 @@ def between(start: View, end: View, share: float) -> View:
 
 
 def front_direction(vertices: npt.NDArray[Any], up_axis: int) -> FloatArray:
-    """Guess the direction in which a body looks: across its flat side, where its toes point.
+    """Guess the direction in which a body looks: see `lcollision_core.meshes`."""
+    # Loads SciPy: not before the window is on the screen.
+    from lcollision_core.meshes import front_direction as guessed
 
-    Parameters
-    ----------
-    vertices : (V, 3) array, the reference
-    up_axis : 0, 1 or 2
-
-    Returns
-    -------
-    direction : (3,) float64 array, of length 1, along an axis
-    """
-    levels = [axis for axis in range(3) if axis != up_axis]
-    depth = min(levels, key=lambda axis: float(np.ptp(vertices[:, axis])))
-    height = vertices[:, up_axis]
-    direction: FloatArray = np.eye(3)[depth]
-    lowest = vertices[height < height.min() + 0.04 * np.ptp(height), depth]
-    ankles = vertices[
-        (height > height.min() + 0.06 * np.ptp(height))
-        & (height < height.min() + 0.12 * np.ptp(height)),
-        depth,
-    ]
-    if len(lowest) and len(ankles) and lowest.mean() < ankles.mean():
-        direction = -direction
-    return direction
+    return guessed(vertices, up_axis)

@@ -336,9 +336,17 @@ class PoseDocument(PoseHistory):
         work = tasks.encoded(self.model, Path(path))
         self._bring(f"Importing {Path(path).name}", work, self._on_encoded, ask=False)
 
-    def export_mesh(self, path: str | Path) -> None:
-        """Write the mesh on the screen, back in its place, in the format that `path` says."""
-        work = tasks.exported(self.model, self.latent, self.placement, Path(path))
+    def export_mesh(
+        self, path: str | Path, axes: str = "model", scale: float | None = None
+    ) -> None:
+        """Write the mesh on the screen, back in its place, in the format that `path` says.
+
+        Parameters
+        ----------
+        path : of the file
+        axes, scale : see `export_frame`
+        """
+        work = tasks.exported(self.model, self.latent, self.placement, Path(path), axes, scale)
         self._exports.append(self._long.start(f"Exporting {Path(path).name}", work, self._tell))
 
     def finish_exports(self) -> None:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from app.camera import front_direction
 from app.shading import mask_colours
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ def _two_sides(
     surface = pv.PolyData.from_regular_faces(model.reference.astype(np.float32), model.faces)
     surface.point_data["colours"] = colours
     up = np.eye(3)[model.up_axis]
-    front = front_direction(model.reference, model.up_axis)
+    front = model.front
     centre = 0.5 * (model.reference.min(axis=0) + model.reference.max(axis=0))
     views = []
     for direction in (front, -front):

@@ -10,7 +10,7 @@ from PySide6.QtCore import QObject, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
-from app.dialogs.forms import screenshot_form, turntable_form
+from app.dialogs.forms import export_form, screenshot_form, turntable_form
 from app.dialogs.questions import Answer, ask_about_changes
 from app.panels.parts import plain_tip
 from app.wording import menu_text
@@ -158,11 +158,18 @@ class FileActions(QObject):
         return True
 
     def export(self) -> None:
-        """Ask for a file, and write the mesh on the screen."""
-        proposed = self._folder() / f"{self._document.pose_name}.obj"
-        path = self._ask_save("Export the mesh", proposed, _EXPORTS)
-        if path is not None:
-            self._document.export_mesh(path)
+        """Ask for axes, scale and file, and write the mesh on the screen."""
+
+        def write() -> None:
+            proposed = self._folder() / f"{self._document.pose_name}.obj"
+            path = self._ask_save("Export the mesh", proposed, _EXPORTS)
+            if path is not None:
+                settings = self._settings
+                self._document.export_mesh(path, settings["export_axes"], settings["export_scale"])
+
+        model = self._document.model
+        form = export_form(self._settings, self._window, model.up_axis, model.front)
+        self._after(form, write)
 
     def screenshot(self, viewport: Viewport) -> None:
         """Ask for size and file, and save a picture of the viewport."""

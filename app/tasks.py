@@ -210,16 +210,22 @@ def exported(
     latent: FloatArray,
     placement: RigidTransform | None,
     path: Path,
+    axes: str,
+    scale: float | None,
 ) -> Work:
-    """Write the mesh that is drawn of a pose, moved back to where it came from, and check it."""
+    """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
+
+    The check is of what the file holds, in its axes and unit.
+    """
 
     def work(_: Progress, __: CancelToken) -> Exported:
-        from lcollision_core.model import export_mesh
+        from lcollision_core.model import detector_of, export_frame, export_mesh
         from lcollision_core.resolve import exported_vertices
 
         vertices = exported_vertices(model.decode(latent, n_threads=1), placement)
-        export_mesh(path, model, vertices, placement)
-        return Exported(path, len(model.detector.detect(vertices).pairs))
+        frame = export_frame(model, axes, path, scale)
+        written = export_mesh(path, model, vertices, placement, frame)
+        return Exported(path, len(detector_of(model, frame).detect(written).pairs))
 
     return work
 

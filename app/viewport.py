@@ -14,7 +14,7 @@ from PySide6.QtGui import QCloseEvent, QResizeEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QStackedLayout, QWidget
 
-from app.camera import View, front_direction, kept_in_view, preset_view
+from app.camera import View, kept_in_view, preset_view
 from app.frames import LiveFrame, PoseShower
 from app.legend import DomainTag, LegendCard
 from app.motion import CameraTurn, Glide
@@ -332,7 +332,7 @@ class Viewport(QWidget):
             current_theme().is_dark,
         )
         self._shower = PoseShower(model)
-        self._front = front_direction(model.reference, model.up_axis)
+        self._front = model.front
         self._tag.hide()
         self._legend.set_legend(Legend())
         self._shader = Shader.of(self._document.model, current_theme().is_dark)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from PySide6.QtCore import Slot
 from PySide6.QtWidgets import (
     QCheckBox,
@@ -9,6 +11,7 @@ from PySide6.QtWidgets import (
     QDialog,
     QDialogButtonBox,
     QFormLayout,
+    QLabel,
     QVBoxLayout,
     QWidget,
 )
@@ -17,6 +20,22 @@ from app.panels.number_box import QuietIntegerBox, QuietSpinBox
 from app.panels.parts import labelled
 from app.settings import SETTINGS, Settings
 from app.theme import NORMAL, WIDE
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+
+_WIDTH, _BORDER = 400, WIDE + 4
+
+EXPORT_NAMES = {
+    "model": "As the model's",
+    "y-up": "Y up",
+    "blender": "Blender",
+    "maya": "Maya",
+    "unreal": "Unreal",
+}
+"""What the export's axes are called, by `ExportAxes`."""
 
 
 class Form(QDialog):
@@ -33,7 +52,7 @@ class Form(QDialog):
     def __init__(self, title: str, action: str, settings: Settings, parent: QWidget) -> None:
         super().__init__(parent)
         self.setWindowTitle(title)
-        self.setMinimumWidth(380)
+        self.setFixedWidth(_WIDTH)
         self._settings = settings
         self._refused = False
         self._fields: dict[str, QuietIntegerBox | QuietSpinBox | QCheckBox | QComboBox] = {}
@@ -43,7 +62,7 @@ class Form(QDialog):
         self._buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
         accept = self._buttons.addButton(action, QDialogButtonBox.ButtonRole.AcceptRole)
         column = QVBoxLayout(self)
-        column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
+        column.setContentsMargins(_BORDER, _BORDER, _BORDER, WIDE)
         column.setSpacing(WIDE)
         self._refusal = labelled("", "refusal")
         self._refusal.setWordWrap(True)
@@ -82,19 +101,22 @@ class Form(QDialog):
         field.setValue(self._settings[key])
         self._add(key, label, field)
 
-    def add_number(self, key: str, label: str, suffix: str, step: float, tip: str = "") -> None:
-        """Add a field for a number."""
+    def add_number(
+        self, key: str, label: str, suffix: str, step: float, tip: str = "", decimals: int = 0
+    ) -> QuietSpinBox:
+        """Add a field for a number, with decimals that follow the step where none are given."""
         field = QuietSpinBox()
         setting = SETTINGS[key]
-        field.setDecimals(2 if step < 0.1 else 1)
+        field.setDecimals(decimals or (2 if step < 0.1 else 1))
         field.setRange(setting.low or 0.0, setting.high or 0.0)
         field.setSingleStep(step)
         field.setSuffix(suffix)
         field.setValue(self._settings[key])
         field.setToolTip(tip)
         self._add(key, label, field)
+        return field
 
-    def add_choice(self, key: str, label: str, names: dict[str, str], tip: str) -> None:
+    def add_choice(self, key: str, label: str, names: dict[str, str], tip: str) -> QComboBox:
         """Add a field for one of several values, by what they are called."""
         field = QComboBox()
         for value, name in names.items():
@@ -102,6 +124,7 @@ class Form(QDialog):
         field.setCurrentIndex(list(names).index(self._settings[key]))
         field.setToolTip(tip)
         self._add(key, label, field)
+        return field
 
     def add_check(self, key: str, label: str) -> None:
         """Add a box to tick."""
@@ -110,11 +133,20 @@ class Form(QDialog):
         self._fields[key] = field
         self._form.addRow("", field)
 
-    def add_note(self, text: str) -> None:
-        """Add a line of explanation."""
-        note = labelled(text, "caption")
+    def add_note(self, text: str) -> QLabel:
+        """Add some lines of explanation."""
+        note = labelled("", "caption")
         note.setWordWrap(True)
         self._form.addRow(note)
+        self.explain(note, text)
+        return note
+
+    def explain(self, note: QLabel, text: str) -> None:
+        """Put another text into a note, and make room for it."""
+        note.setText(text)
+        # A form asks for one line of it, however narrow.
+        note.setFixedHeight(note.heightForWidth(_WIDTH - 2 * _BORDER))
+        self.adjustSize()
 
     def _add(self, key: str, label: str, field: QuietIntegerBox | QuietSpinBox | QComboBox) -> None:
         self._fields[key] = field
@@ -140,6 +172,48 @@ def screenshot_form(settings: Settings, parent: QWidget) -> Form:
     form.add_whole_number("screenshot_width", "Width", " px")
     form.add_whole_number("screenshot_height", "Height", " px")
     form.add_check("screenshot_transparent", "Transparent background")
+    return form
+
+
+def export_form(
+    settings: Settings, parent: QWidget, up_axis: int, front: npt.NDArray[np.float64]
+) -> Form:
+    """Ask in which axes and unit a mesh is to be written.
+
+    Parameters
+    ----------
+    settings, parent : see `Form`
+    up_axis : of the model, 0, 1 or 2
+    front : (3,) direction along an axis in which the model looks
+    """
+    from lcollision_core.model import EXPORT_SCALES, ExportAxes
+
+    looks = int(abs(front).argmax())
+    own = f"{'xyz'[up_axis]} is up, front is {'-' if front[looks] < 0.0 else '+'}{'xyz'[looks]}"
+    meanings = {
+        ExportAxes.MODEL: f"As the model's: {own}.",
+        ExportAxes.Y_UP: "y is up, front is +z, in the model's unit.",
+        ExportAxes.BLENDER: "Upright and facing you in Blender's front view, with the settings "
+        "that its importers begin with.",
+        ExportAxes.MAYA: "y is up, front is +z; 100 turns metres into Maya's centimetres.",
+        ExportAxes.UNREAL: "z is up, front is +x once imported; 100 turns metres into Unreal's "
+        "centimetres.",
+    }
+    form = Form("Export mesh", "Choose file…", settings, parent)
+    axes = form.add_choice("export_axes", "Axes", EXPORT_NAMES, "Which way is up in the file")
+    scale = form.add_number(
+        "export_scale", "Scale by", "", 1.0, "How many units of the file make one of the model", 6
+    )
+    # Six decimals are for those who type them.
+    scale.setStepType(QuietSpinBox.StepType.AdaptiveDecimalStepType)
+    meaning = form.add_note(meanings[axes.currentData()])
+    form.add_note("A GLB file is always y up and not scaled, as its standard fixes both.")
+
+    def follow() -> None:
+        scale.setValue(EXPORT_SCALES[axes.currentData()])
+        form.explain(meaning, meanings[axes.currentData()])
+
+    axes.currentIndexChanged.connect(follow)
     return form
 
 

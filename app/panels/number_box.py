@@ -26,6 +26,13 @@ class QuietSpinBox(QDoubleSpinBox):
         super().__init__()
         _make_quiet(self)
 
+    def textFromValue(self, value: float) -> str:  # noqa: N802
+        """Write many decimals only where they say something."""
+        text = super().textFromValue(value)
+        if self.decimals() <= 3:
+            return text
+        return text.rstrip("0").rstrip(self.locale().decimalPoint())
+
     def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
         """Leave the wheel to the panel's scrolling unless focused."""
         wheel_if_focused(self, event, super().wheelEvent)

@@ -32,7 +32,7 @@ from lcollision_core.meshes.pose_set import (
     write_pose_set,
 )
 from lcollision_core.meshes.topology import Topology
-from lcollision_core.meshes.units import height, up_axis
+from lcollision_core.meshes.units import front_direction, height, up_axis
 
 __all__ = [
     "MAX_FACES",
@@ -54,6 +54,7 @@ __all__ = [
     "file_stem",
     "file_stems",
     "fit_rigid",
+    "front_direction",
     "has_known_suffix",
     "height",
     "inspect_pose_set",

@@ -54,3 +54,29 @@ def up_axis(vertices: npt.NDArray[Any], topology: Topology | None = None) -> int
     ShapeError : `vertices` is not (V, 3), or empty.
     """
     return int(_sides(vertices, topology).argmax())
+
+
+def front_direction(vertices: npt.NDArray[Any], up_axis: int) -> npt.NDArray[np.float64]:
+    """Guess the direction in which a body looks: across its flat side, where its toes point.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array, the reference mesh, upright
+    up_axis : 0, 1 or 2
+
+    Returns
+    -------
+    direction : (3,) float64 array, of length 1, along an axis
+    """
+    level_axes = [axis for axis in range(3) if axis != up_axis]
+    depth = min(level_axes, key=lambda axis: float(np.ptp(vertices[:, axis])))
+    level = vertices[:, up_axis]
+    direction: npt.NDArray[np.float64] = np.eye(3)[depth]
+    lowest = vertices[level < level.min() + 0.04 * np.ptp(level), depth]
+    ankles = vertices[
+        (level > level.min() + 0.06 * np.ptp(level)) & (level < level.min() + 0.12 * np.ptp(level)),
+        depth,
+    ]
+    if len(lowest) and len(ankles) and lowest.mean() < ankles.mean():
+        direction = -direction
+    return direction

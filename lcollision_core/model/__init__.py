@@ -2,7 +2,16 @@
 
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.encoded_pose import EncodedPose
-from lcollision_core.model.export import export_mesh
+from lcollision_core.model.export import (
+    EXPORT_SCALES,
+    LARGEST_SCALE,
+    LEAST_SCALE,
+    ExportAxes,
+    ExportFrame,
+    detector_of,
+    export_frame,
+    export_mesh,
+)
 from lcollision_core.model.keeping import change_model, save_trained
 from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace
@@ -31,8 +40,13 @@ from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.model.sampling import sample_poses
 
 __all__ = [
+    "EXPORT_SCALES",
+    "LARGEST_SCALE",
+    "LEAST_SCALE",
     "MODEL_SUFFIX",
     "EncodedPose",
+    "ExportAxes",
+    "ExportFrame",
     "LatentGroup",
     "LatentSpace",
     "ListedModel",
@@ -46,6 +60,8 @@ __all__ = [
     "Symmetry",
     "change_model",
     "checkpoint_path",
+    "detector_of",
+    "export_frame",
     "export_mesh",
     "find_latent_space",
     "find_model",

@@ -1,15 +1,109 @@
-"""Poses as mesh files."""
+"""Poses as mesh files: in which axes and unit, and what exactly is written."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.contact import CollisionDetector
 from lcollision_core.meshes import RigidTransform, write_mesh
 from lcollision_core.model.pose_model import PoseModel
+
+_AXES = np.eye(3)
+_X, _Y, _Z = _AXES
+
+
+class ExportAxes(StrEnum):
+    """For which program a mesh is written: its axes, and its unit for a model in metres.
+
+    Each is what the program's own importer, with its default settings, puts upright and facing
+    its front: Blender's turns an OBJ file from y up to z up and leaves PLY and STL as they are;
+    Maya takes y up and centimetres; Unreal takes centimetres and z up, x forward, and itself
+    turns y round, as its axes are left-handed.
+    """
+
+    MODEL = "model"
+    Y_UP = "y-up"
+    BLENDER = "blender"
+    MAYA = "maya"
+    UNREAL = "unreal"
+
+
+EXPORT_SCALES = {
+    ExportAxes.MODEL: 1.0,
+    ExportAxes.Y_UP: 1.0,
+    ExportAxes.BLENDER: 1.0,
+    ExportAxes.MAYA: 100.0,
+    ExportAxes.UNREAL: 100.0,
+}
+"""The file's units in a metre, which is the unit that models are taken to be in."""
+
+LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6
+_ALREADY_FIXED = ".glb"
+"""glTF's own axes and unit are y up, z forward and the metre."""
+
+_ROUNDED = (".stl", ".glb")
+
+
+@dataclass(frozen=True, eq=False)
+class ExportFrame:
+    """Axes and unit of a file, against those of the model.
+
+    Attributes
+    ----------
+    turn : (3, 3) float64 array, by right angles
+    scale : the file's units in one of the model's
+    """
+
+    turn: npt.NDArray[np.float64]
+    scale: float
+
+    def apply(self, vertices: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+        """Bring (..., 3) vertices into the file's axes and unit.
+
+        A scale of few digits is exact for float32 vertices.
+        """
+        turned: npt.NDArray[np.float64] = np.asarray(vertices, np.float64) @ self.turn.T
+        return turned * self.scale
+
+
+def export_frame(
+    model: PoseModel, axes: str, path: str | os.PathLike[str], scale: float | None = None
+) -> ExportFrame:
+    """Return the axes and the unit that a file gets.
+
+    Parameters
+    ----------
+    model : of the poses
+    axes : one of `ExportAxes`
+    path : its extension says the format: a GLB file is never turned or scaled here, as
+        `write_mesh` does it
+    scale : the file's units in one of the model's; that of the axes, for a model in metres, if
+        None
+    """
+    chosen = ExportAxes(axes)
+    suffix = Path(path).suffix.lower()
+    if suffix == _ALREADY_FIXED:
+        return ExportFrame(np.eye(3), 1.0)
+    factor = EXPORT_SCALES[chosen] if scale is None else scale
+    if chosen is ExportAxes.MODEL:
+        return ExportFrame(np.eye(3), factor)
+    up, front = _Y, _Z
+    if chosen is ExportAxes.UNREAL:
+        up, front = _Z, _X
+    elif chosen is ExportAxes.BLENDER and suffix != ".obj":
+        up, front = _Z, -_Y
+    own_up, own_front = _AXES[model.up_axis], model.front
+    own = np.stack([own_up, own_front, np.cross(own_up, own_front)])
+    turn = np.stack([up, front, np.cross(up, front)]).T @ own
+    # Adding 0 leaves no -0 behind.
+    return ExportFrame(turn + 0.0, factor)
 
 
 def export_mesh(
@@ -17,7 +111,8 @@ def export_mesh(
     model: PoseModel,
     vertices: npt.NDArray[Any],
     placement: RigidTransform | None = None,
-) -> None:
+    frame: ExportFrame | None = None,
+) -> npt.NDArray[Any]:
     """Write a pose's mesh, upright where the format says which way is up, unless it has a place.
 
     Parameters
@@ -26,10 +121,29 @@ def export_mesh(
     model : of the pose
     vertices : (V, 3) array, in the data's unit, in the place that they are exported to
     placement : what brought them there, for a mesh that came in from somewhere; else None
+    frame : the file's axes and unit, by `export_frame`; the model's if None. A mesh that has a
+        place is turned like all others.
+
+    Returns
+    -------
+    written : (V, 3) array as the file holds it, but for the turn of a GLB file, which is exact
 
     Raises
     ------
     MeshFileError, ShapeError : as for `write_mesh`.
     """
+    written = vertices if frame is None else frame.apply(vertices)
+    if Path(path).suffix.lower() in _ROUNDED:
+        written = written.astype(np.float32)
     up = np.eye(3)[model.up_axis] if placement is None else None
-    write_mesh(path, vertices, model.faces, up=up)
+    write_mesh(path, written, model.faces, up=up)
+    return written
+
+
+def detector_of(model: PoseModel, frame: ExportFrame | None) -> CollisionDetector:
+    """Return what checks meshes as `export_mesh` has written them, in the file's unit."""
+    if frame is None or frame.scale == 1.0:
+        return model.detector
+    return CollisionDetector(
+        model.topology, frame.apply(model.reference), near_exclusion=model.near_exclusion
+    )

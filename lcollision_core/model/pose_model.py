@@ -16,7 +16,14 @@ from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import PoseSet, RigidTransform, Topology, height, up_axis
+from lcollision_core.meshes import (
+    PoseSet,
+    RigidTransform,
+    Topology,
+    front_direction,
+    height,
+    up_axis,
+)
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.colours import domain_colours
 from lcollision_core.model.encoded_pose import EncodedPose
@@ -522,6 +529,11 @@ class PoseModel:
     def up_axis(self) -> int:
         """0, 1 or 2 for x, y or z."""
         return self.card.up_axis
+
+    @cached_property
+    def front(self) -> FloatArray:
+        """(3,) direction along an axis in which the reference looks, as far as its shape tells."""
+        return _read_only(front_direction(self.reference, self.up_axis))
 
     @property
     def near_exclusion(self) -> float:
