@@ -1,12 +1,17 @@
-"""Numbers as people read them."""
+"""Numbers and names as people read them."""
 
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from lcollision_core.model import MirroredPose
+
+_NOT_IN_A_LINE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 
 _FAR = 0.03
 """Heights by which a mesh is hardly ever off the pose nearest to it, unless it is another body."""
@@ -43,6 +48,11 @@ def seconds_text(seconds: float) -> str:
 def menu_text(name: str) -> str:
     """Write a name so that a menu, a button or a form's label shows it to the letter."""
     return name.replace("&", "&&")
+
+
+def one_line(text: str) -> str:
+    """Write a name, or what has names in it, with escapes for what would end or turn its line."""
+    return _NOT_IN_A_LINE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def fit_error(mean: float | None, most: float | None) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.console import print_json, progress_bar
+from app.cli.console import print_json, progress_bar, tell
 
 
 def editor(
@@ -31,7 +31,7 @@ def editor(
         return
     for row in rows:
         predict = "-" if row.predict_ms is None else f"{row.predict_ms:.2f} ms"
-        typer.echo(
+        tell(
             f"{row.model}, {row.vertices} vertices: decode {row.decode_ms:.2f} ms, predict "
             f"{predict}, update {row.update_ms:.1f} ms, render {row.render_ms:.1f} ms; a slider's "
             f"move is seen after {row.event_p50_ms:.0f} ms (95 %: {row.event_p95_ms:.0f}), the "
@@ -41,9 +41,9 @@ def editor(
         )
         if row.actions:
             right = "right" if row.mesh_is_right else "WRONG"
-            typer.echo(
+            tell(
                 f"{row.actions} random actions: {row.exceptions} exceptions, "
                 f"{row.leak_mb:+.0f} MB, the mesh at the end is {right}"
             )
             for error in row.errors:
-                typer.echo(f"  {error}")
+                tell(f"  {error}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.console import note, print_json, progress_bar
+from app.cli.console import note, print_json, progress_bar, tell
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import measured_model, measured_model_sentence
 
@@ -43,10 +43,10 @@ def predictor(
     if as_json:
         print_json([measured_model(model) | asdict(row) for row in rows])
         return
-    typer.echo(f"{model.name}: {measured_model_sentence(model)}")
+    tell(f"{model.name}: {measured_model_sentence(model)}")
     _print_exact(rows[0])
     for row in rows:
-        typer.echo(
+        tell(
             f"{row.device}, preset {row.preset}, batches of {row.batch}: {row.us_per_pose:.0f} us "
             f"per pose, {row.predicted_seconds:.2f} s for {row.table_poses}; "
             f"{row.speedup:.1f} times as fast as decode and exact; one pose with gradient "
@@ -57,7 +57,7 @@ def predictor(
 
 
 def _print_exact(row: PredictorTiming) -> None:
-    typer.echo(
+    tell(
         f"exact to the first hit on {row.cores} cores: {row.exact_ms_per_pose:.3f} ms per pose and "
         f"{row.decode_ms_per_pose:.3f} ms to decode it, {row.exact_seconds:.1f} s for "
         f"{row.table_poses} (scaled up from {row.exact_poses}, "
@@ -66,7 +66,7 @@ def _print_exact(row: PredictorTiming) -> None:
     if row.fcl_seconds is None:
         note("python-fcl is not installed and left out; pip install 'lcollision[bench]' brings it")
     else:
-        typer.echo(
+        tell(
             f"python-fcl, every contact: {row.fcl_seconds:.0f} s for {row.table_poses}, scaled up "
             f"from {row.fcl_poses} poses on one core as if it spread over {row.cores} without loss"
         )

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar
+from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
 from app.cli.inputs import expanded
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
@@ -53,7 +53,7 @@ def check(
             continue
         reports.append(report)
         if not as_json:
-            typer.echo(_sentence(report))
+            tell(_sentence(report))
     if as_json:
         print_json(reports)
     if failed:

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import typer
 
+from app.wording import one_line
 from lcollision_core.jobs import Progress, no_progress
 
 SECONDS_BETWEEN_LINES = 30.0
@@ -43,9 +44,14 @@ def print_json(document: Any) -> None:
     typer.echo(json.dumps(document, indent=2, allow_nan=False))
 
 
+def tell(line: str) -> None:
+    """Print a line of the answer; line breaks in names are escaped."""
+    typer.echo(one_line(line))
+
+
 def note(sentence: str) -> None:
-    """Tell the user something beside the answer, on standard error."""
-    typer.echo(f"lcollision: {sentence}", err=True)
+    """Tell the user something beside the answer, on standard error, as `tell` does."""
+    typer.echo(f"lcollision: {one_line(sentence)}", err=True)
 
 
 class _Notes(logging.Handler):

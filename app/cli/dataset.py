@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar
+from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
 from app.wording import counted
 
 app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no_args_is_help=True)
@@ -93,16 +93,16 @@ def check(
 
 def _print(path: Path, report: dict[str, Any]) -> None:
     surface = "watertight" if report["watertight"] else "not watertight"
-    typer.echo(
+    tell(
         f"{path}: {counted(report['poses'], 'pose')} of {report['vertices']} vertices and "
         f"{report['faces']} faces, {surface}"
     )
     for problem in report["problems"]:
-        typer.echo(f"  problem: {problem}")
+        tell(f"  problem: {problem}")
     n_colliding = report["colliding_poses"]
-    typer.echo(f"  {counted(n_colliding, 'pose intersects itself', 'poses intersect themselves')}")
+    tell(f"  {counted(n_colliding, 'pose intersects itself', 'poses intersect themselves')}")
     for pose in report["colliding"]:
-        typer.echo(
+        tell(
             f"    {pose['pose']}: {counted(pose['pairs'], 'pair')}, "
             f"energy {pose['energy']:.3g} squared heights"
         )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.console import print_json, progress_bar
+from app.cli.console import print_json, progress_bar, tell
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from app.wording import counted
@@ -64,22 +64,20 @@ def evaluate(
         print_json(measured_model(model) | share | {"threshold": threshold} | metrics.to_metadata())
         return
     called = "" if threshold == 0.5 else f", called from a probability of {threshold:g} on"
-    typer.echo(f"{model.name}, preset {trained.preset}{called}: {scores_sentence(metrics)}")
-    typer.echo(
+    tell(f"{model.name}, preset {trained.preset}{called}: {scores_sentence(metrics)}")
+    tell(
         f"  {measured_model_sentence(model)}; {_percent(rows.colliding.mean())} of these "
         f"{counted(len(rows), 'sample')} collide"
     )
-    typer.echo(
+    tell(
         f"  MSE {_number(metrics.energy_mse)}, RANK {_number(metrics.ranking_margin)}, "
         f"Spearman {_number(metrics.spearman)}, calibration error "
         f"{_number(metrics.calibration_error)}"
     )
-    typer.echo("  predicted probability: share that collides (samples)")
+    tell("  predicted probability: share that collides (samples)")
     for entry in metrics.calibration:
         if entry.probability is not None and entry.colliding_share is not None:
-            typer.echo(
-                f"    {entry.probability:.2f}: {entry.colliding_share:.2f} ({entry.samples})"
-            )
+            tell(f"    {entry.probability:.2f}: {entry.colliding_share:.2f} ({entry.samples})")
 
 
 def require_store_of(store: LabelStore, model: PoseModel) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar, status_bar
+from app.cli.console import ExitStatus, note, print_json, progress_bar, status_bar, tell
 from app.cli.evaluate import require_store_of
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
@@ -106,12 +106,12 @@ def label(
     if as_json:
         print_json(report)
         return
-    typer.echo(
+    tell(
         f"{output}: {counted(store.n_rows, 'row')} of {model.name}, "
         f"{100.0 * report['colliding_share']:.1f} % collide "
         f"({watched.labelled} labelled now, {watched.labelled / seconds:.0f}/s)"
     )
-    typer.echo(f"  {measured_model_sentence(model)}")
+    tell(f"  {measured_model_sentence(model)}")
 
 
 def _check(model: PoseModel, path: Path, as_json: bool) -> None:
@@ -139,9 +139,9 @@ def _check(model: PoseModel, path: Path, as_json: bool) -> None:
     elif found.damaged:
         listed = ", ".join(f"{first} to {last}" for first, last in found.damaged[:_LISTED])
         more = f" and {len(found.damaged) - _LISTED} more" if found.damaged[_LISTED:] else ""
-        typer.echo(f"{path}: damaged, rows {listed}{more}; {store.repair_advice}")
+        tell(f"{path}: damaged, rows {listed}{more}; {store.repair_advice}")
     else:
-        typer.echo(f"{path}: sound, {counted(found.n_rows, 'row')} of {model.name}")
+        tell(f"{path}: sound, {counted(found.n_rows, 'row')} of {model.name}")
     if found.damaged:
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 

@@ -27,7 +27,7 @@ from app.cli import (
     resolve,
     train,
 )
-from app.cli.console import ExitStatus, tell_what_takes_time
+from app.cli.console import ExitStatus, note, tell_what_takes_time
 from lcollision_core.errors import CancelledError, LCollisionError
 
 # Small products take microseconds, which threads that share them out multiply on a busy machine.
@@ -58,13 +58,13 @@ class _Commands(TyperGroup):
         except CancelledError:
             raise typer.Exit(ExitStatus.INTERRUPTED) from None
         except LCollisionError as error:
-            typer.echo(f"lcollision: {error}", err=True)
+            note(str(error))
             raise typer.Exit(ExitStatus.BAD_INPUT) from None
         except KeyboardInterrupt:
-            typer.echo("lcollision: interrupted", err=True)
+            note("interrupted")
             raise typer.Exit(ExitStatus.INTERRUPTED) from None
         except MemoryError:
-            typer.echo("lcollision: out of memory; give it smaller meshes or fewer poses", err=True)
+            note("out of memory; give it smaller meshes or fewer poses")
             raise typer.Exit(ExitStatus.BAD_INPUT) from None
         except BrokenPipeError:
             # The reader left, as `head` does; typer's own status 1 would be an answer.
@@ -72,9 +72,12 @@ class _Commands(TyperGroup):
             raise typer.Exit(ExitStatus.INTERRUPTED) from None
         except OSError as error:
             if error.errno != errno.ENOSPC:
-                raise
+                if error.filename is None:
+                    raise
+                note(f"{error.filename}: {error.strerror}; choose another name or place")
+                raise typer.Exit(ExitStatus.BAD_INPUT) from None
             _drop_what_is_buffered()
-            typer.echo("lcollision: the answer cannot be written: the disk is full", err=True)
+            note("the answer cannot be written: the disk is full")
             raise typer.Exit(ExitStatus.BAD_INPUT) from None
 
 
@@ -88,7 +91,7 @@ def _refuse_usage(error: Any) -> NoReturn:
     if "\n" in sentence:  # a group without a command: its help, not an error
         raise error
     program = error.ctx.command_path if error.ctx else "lcollision"
-    typer.echo(f"lcollision: {sentence}; see {program} --help", err=True)
+    note(f"{sentence}; see {program} --help")
     raise typer.Exit(ExitStatus.BAD_INPUT)
 
 
@@ -143,5 +146,5 @@ def main() -> None:
         app()
     except Exception:  # the last resort: a bug must not look like an answer
         traceback.print_exc()
-        typer.echo("lcollision: this is a bug in lcollision; please report it", err=True)
+        note("this is a bug in lcollision; please report it")
         sys.exit(ExitStatus.BUG)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar
+from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.poses import PosesOutput
@@ -57,7 +57,7 @@ def mirror(
         print_json([_row(model, source, written.output, mirrored) for source, mirrored in rows])
     else:
         for source, mirrored in zip(sources, found, strict=True):
-            typer.echo(f"{source}: {mirrored_text(mirrored)}")
+            tell(f"{source}: {mirrored_text(mirrored)}")
         note_near_exclusion(model)
     colliding = [s for s, mirrored in zip(sources, found, strict=True) if mirrored.lost_freedom]
     if colliding:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json
+from app.cli.console import ExitStatus, note, print_json, tell
 from app.cli.results import require_output
 from app.wording import counted
 from lcollision_core.errors import LCollisionError, ModelFileError
@@ -40,11 +40,11 @@ def models(
     else:
         for report in reports:
             origin = "bundled" if report["bundled"] else "your own"
-            typer.echo(f"{report['name']}: {_size_sentence(report)} ({origin})")
-            typer.echo(f"  {error_sentence(report)}")
-            typer.echo(f"  {_predictor_sentence(report)}")
+            tell(f"{report['name']}: {_size_sentence(report)} ({origin})")
+            tell(f"  {error_sentence(report)}")
+            tell(f"  {_predictor_sentence(report)}")
         if not reports and not failed:
-            typer.echo(
+            tell(
                 f"there are no models yet; `lcollision train embedding` makes one, and those in "
                 f"{user_models_folder()} are listed here"
             )
@@ -75,12 +75,12 @@ def info(
     if as_json:
         print_json(report)
         return
-    typer.echo(f"{report['name']}: {_size_sentence(report)}")
-    typer.echo(f"  trained on {report['source']}, licence {report['licence']}")
-    typer.echo(f"  {error_sentence(report)}")
-    typer.echo(f"  {_predictor_sentence(report)}")
+    tell(f"{report['name']}: {_size_sentence(report)}")
+    tell(f"  trained on {report['source']}, licence {report['licence']}")
+    tell(f"  {error_sentence(report)}")
+    tell(f"  {_predictor_sentence(report)}")
     if report["near_exclusion"]:
-        typer.echo(f"  pairs of faces within {report['near_exclusion']} heights count apart")
+        tell(f"  pairs of faces within {report['near_exclusion']} heights count apart")
     _print_domains(report)
 
 
@@ -264,7 +264,7 @@ def _percent(heights: float) -> str:
 
 def _print_domains(report: dict[str, Any]) -> None:
     for number, domain in enumerate(report["domains"], start=1):
-        typer.echo(
+        tell(
             f"  {number:2d}  {domain['name']}  ({domain['vertices']} vertices, "
             f"{domain['codes']} numbers)"
         )

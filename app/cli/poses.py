@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.console import progress_bar
+from app.cli.console import progress_bar, tell
 from app.cli.inputs import expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -70,7 +70,7 @@ def encode(
         ]
         written = write_result(destination, model, poses)
     for pose in poses:
-        typer.echo(f"{pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}")
+        tell(f"{pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}")
     written.note()
 
 

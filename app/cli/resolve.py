@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar
+from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
 from app.cli.inputs import expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -407,7 +407,7 @@ def _report(
         named = {"source": request.source, "output": str(files[place])}
         rows.append(named | facts | {"near_exclusion": model.near_exclusion})
         if not as_json:
-            typer.echo(f"{request.source}: {_sentence(request, result, place in detailed)}")
+            tell(f"{request.source}: {_sentence(request, result, place in detailed)}")
     if as_json:
         print_json(rows)
     else:

@@ -84,6 +84,7 @@ def embedding(
         poses = replace(poses, near_exclusion=near_exclusion)
     config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)
     checkpoint = checkpoint_path(destination)
+    require_writable(checkpoint)
     if checkpoint.exists():
         note(f"going on from {checkpoint}")
     try:

@@ -91,11 +91,13 @@ def predictor(
     from lcollision_core.labels import LabelStore
     from lcollision_core.meshes import file_stamp, locked, require_writable
     from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
-    from lcollision_core.predictor import PRESETS, has_begun, train_predictor
+    from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
     from lcollision_core.resolve import find_free_poses
 
     destination = model_destination(output)
     require_writable(destination)
+    checkpoint = checkpoint_path(destination)
+    require_writable(patches_path(checkpoint))
     before = file_stamp(destination)
     model = PoseModel.load(model_name)
     store = LabelStore.open(store_path)
@@ -103,7 +105,6 @@ def predictor(
     config = PRESETS[preset.value].with_loss(loss.value)
     # torchrun starts this command many times; the first process writes for all.
     leads = os.environ.get("RANK", "0") == "0"
-    checkpoint = checkpoint_path(destination)
     if leads and has_begun(checkpoint):
         note(f"going on from {checkpoint}")
     try:

@@ -15,6 +15,7 @@ from lcollision_core.predictor.training import (
     StatusCallback,
     has_begun,
     no_status,
+    patches_path,
     train_predictor,
 )
 
@@ -35,5 +36,6 @@ __all__ = [
     "has_begun",
     "held_out_rows",
     "no_status",
+    "patches_path",
     "train_predictor",
 ]

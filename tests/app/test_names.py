@@ -1,0 +1,96 @@
+"""Names that break lines or are too long: shown in one line, refused in one sentence."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from app.wording import one_line
+from lcollision_core.meshes import write_pose_set
+from lcollision_core.model import NamedPose, PoseModel, write_poses
+from tests.app.support import STABBED, Lcollision
+from tests.bending_tube import bending_tube
+
+LONG = "x" * 300
+TWO_LINES = "two\nlines\u2028\x1b[31m"
+SHOWN = r"two\nlines\u2028\x1b[31m"
+
+
+@pytest.fixture(scope="module")
+def model_file(editor_model: PoseModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "tube.safetensors"
+    editor_model.save(path)
+    return path
+
+
+@pytest.fixture
+def work(
+    editor_model: PoseModel, model_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """Return the current folder, with a model, its poses, a pose set and a mesh."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    shutil.copy(model_file, "m.safetensors")
+    write_poses("p.json", editor_model, [NamedPose(TWO_LINES, editor_model.free_latent[:1].sum(0))])
+    write_pose_set("set.npz", bending_tube())
+    Path("mesh.obj").write_text(STABBED)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        f"sample m.safetensors -n 1 -o {LONG}.json",
+        f"encode m.safetensors mesh.obj -o {LONG}.json",
+        f"decode m.safetensors p.json -o {LONG}",
+        f"decode m.safetensors p.json -o {LONG}.obj",
+        f"decode m.safetensors {LONG}.json -o out",
+        f"resolve m.safetensors {LONG} -o out",
+        f"resolve m.safetensors p.json -o {LONG}.json",
+        f"label m.safetensors -n 1 -o {LONG}",
+        f"train embedding set.npz -o {LONG}",
+        f"train embedding set.npz -o {LONG}.safetensors",
+        # The model's name would fit, that of its checkpoint would not.
+        f"train embedding set.npz -o {'x' * 236}.safetensors",
+        f"train predictor m.safetensors store -o {'x' * 236}.safetensors",
+        f"info m.safetensors --figure {LONG}.png",
+        f"info {LONG}",
+        f"check {LONG}.obj",
+        f"dataset check {LONG}",
+        f"dataset make body -o {LONG}.npz",
+        f"edit {LONG}.json",
+    ],
+)
+def test_a_name_that_is_too_long_is_one_sentence(
+    lcollision: Lcollision, work: Path, command: str
+) -> None:
+    before = sorted(work.iterdir())
+    result = lcollision(*command.split())
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert "too long" in line
+    assert [path for path in sorted(work.iterdir()) if path.name != "data"] == before
+
+
+@pytest.mark.usefixtures("work")
+def test_line_breaks_in_names_are_shown_escaped(lcollision: Lcollision) -> None:
+    assert one_line(TWO_LINES) == SHOWN
+    Path(f"{TWO_LINES}.obj").write_text(STABBED)
+    (line,) = lcollision("check", f"{TWO_LINES}.obj").stdout.splitlines()
+    assert line.startswith(f"{SHOWN}.obj: colliding, 1 pair of faces")
+    result = lcollision("decode", "m.safetensors", f"{TWO_LINES}.json", "-o", "out")
+    (line,) = result.stderr.splitlines()
+    assert line.startswith(f"lcollision: {SHOWN}.json cannot be read")
+    result = lcollision("resolve", "m.safetensors", "p.json", "-o", TWO_LINES)
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith(f"p.json: {SHOWN}: ")
+    assert result.stdout.count("\n") == 1
+    assert f"wrote 1 pose to {SHOWN}\n" in result.stderr
+
+
+def test_plain_names_are_shown_as_they_are() -> None:
+    for name in ("hand on hip", "Größe \N{DANCER}", "a\\nb", "\u5de6\u624b", "e\u0301"):
+        assert one_line(name) == name
