@@ -12,10 +12,17 @@ from app.cli.console import progress_bar, tell
 from app.cli.inputs import expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
-from app.cli.results import MeshFormat, output_named, require_output, write_result
+from app.cli.results import (
+    MeshAxes,
+    MeshFormat,
+    OutputForm,
+    output_named,
+    require_output,
+    write_result,
+)
 from app.cli.unfinished import unfinished_poses
 from app.wording import fit_error
-from lcollision_core.errors import PoseSetError
+from lcollision_core.errors import LCollisionError, PoseSetError
 
 PosesOutput = Annotated[
     Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
@@ -91,14 +98,37 @@ def decode(
     mesh_format: Annotated[
         MeshFormat, typer.Option("--format", help="Of the meshes in a folder.")
     ] = MeshFormat.OBJ,
+    axes: Annotated[
+        MeshAxes,
+        typer.Option(help="For which program: its axes, and its unit for a model in metres."),
+    ] = MeshAxes.MODEL,
+    scale: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-6,
+            max=1e6,
+            metavar="X",
+            help="The file's units in one of the model's. By default 100 for maya and unreal.",
+        ),
+    ] = None,
 ) -> None:
-    """Turn latent poses into meshes; one that came in as a mesh returns to its place."""
+    """Turn latent poses into meshes; one that came in as a mesh returns to its place.
+
+    With --axes they come in upright, facing the front, with the settings that the program's own
+    importer begins with: y-up; blender; maya and unreal, in centimetres. A GLB file is y up and
+    in the model's unit whatever is asked for, as its standard fixes both.
+    """
     from lcollision_core.model import PoseModel, read_poses
 
     destination = output_named(output)
+    if destination.form is OutputForm.POSES and (axes is not MeshAxes.MODEL or scale is not None):
+        raise LCollisionError(
+            f"{output} would hold codes, which have neither --axes nor --scale; name a mesh or a "
+            f"folder"
+        )
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
-    write_result(destination, model, named, mesh_format).note()
+    write_result(destination, model, named, mesh_format, axes=axes, scale=scale).note()
 
 
 def sample(

@@ -32,6 +32,16 @@ class MeshFormat(StrEnum):
     GLB = "glb"
 
 
+class MeshAxes(StrEnum):
+    """The axes that a mesh may be written in: `ExportAxes`, which takes long to import."""
+
+    MODEL = "model"
+    Y_UP = "y-up"
+    BLENDER = "blender"
+    MAYA = "maya"
+    UNREAL = "unreal"
+
+
 class OutputForm(Enum):
     """What an output is to be."""
 
@@ -163,6 +173,8 @@ def write_result(
     poses: Sequence[NamedPose],
     mesh_format: MeshFormat = MeshFormat.OBJ,
     vertices: Sequence[npt.NDArray[np.float32] | None] | None = None,
+    axes: str = "model",
+    scale: float | None = None,
 ) -> WrittenPoses:
     """Write poses as a .json file, one pose as a mesh, or each as a mesh of a folder.
 
@@ -176,13 +188,14 @@ def write_result(
     poses : a pose with a placement returns to it
     mesh_format : of the meshes in a folder
     vertices : of each pose, (V, 3) to write in the place of what it decodes to, or None
+    axes, scale : of meshes, see `export_frame`
 
     Raises
     ------
     LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
     from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, spare_name
-    from lcollision_core.model import export_mesh, write_poses
+    from lcollision_core.model import export_frame, export_mesh, write_poses
     from lcollision_core.resolve import exported_vertices
 
     require_one_mesh(output, len(poses))
@@ -193,7 +206,8 @@ def write_result(
             if mesh is None:
                 mesh = exported_vertices(model.decode(pose.latent), pose.placement)
             # OBJ and OFF would get float32's short decimals, which float64 readers take for others.
-            export_mesh(file, model, mesh.astype(float), pose.placement)
+            frame = export_frame(model, axes, file, scale)
+            export_mesh(file, model, mesh.astype(float), pose.placement, frame)
 
     path = output.path
     if output.form is OutputForm.FOLDER:
