@@ -89,10 +89,13 @@ SHADINGS: dict[Shading, ActionSpec] = {
         "&Body parts", "Ctrl+2", "Each part in its colour, darker where it acts alone", "", True
     ),
     Shading.PREDICTED: ActionSpec(
-        "P&redicted", "Ctrl+3", "Where the model believes it collides, and how deep", "", True
+        "&Estimate", "Ctrl+3", "Where the model estimates that it collides, and how deep", "", True
     ),
     Shading.EXACT: ActionSpec(
-        "E&xact", "Ctrl+4", "Where it collides in truth; crossing triangles in red", "", True
+        "E&xact", "Ctrl+4", "Where the check finds collisions; crossing triangles in red", "", True
+    ),
+    Shading.MOVEMENT: ActionSpec(
+        "Mo&vement", "Ctrl+5", "How far Resolve has moved each point of the body", "", True
     ),
 }
 """The ways to colour the body."""

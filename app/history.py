@@ -91,6 +91,11 @@ class PoseHistory(QObject):
         return self._state.ghost if self._ghost_shown else None
 
     @property
+    def vertices_before(self) -> npt.NDArray[np.float32] | None:
+        """(V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`."""
+        return self._state.ghost
+
+    @property
     def ghost_shown(self) -> bool:
         """Whether a ghost is drawn where there is one."""
         return self._ghost_shown

@@ -1,32 +1,46 @@
-"""What lies over the mesh: the legend, and the name of the domain under the pointer."""
+"""What explains the mesh: the legend beneath it, and the name of the domain under the pointer."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from PySide6.QtCore import QEvent, QPointF, QRectF, QSize, Qt
-from PySide6.QtGui import QColor, QFont, QFontMetricsF, QLinearGradient, QPainter, QPaintEvent, QPen
-from PySide6.QtWidgets import QWidget
+from PySide6.QtGui import (
+    QColor,
+    QFont,
+    QFontMetricsF,
+    QLinearGradient,
+    QPainter,
+    QPaintEvent,
+    QPen,
+    QResizeEvent,
+)
+from PySide6.QtWidgets import QSizePolicy, QWidget
 
 from app.shading import Legend
-from app.theme import CLOSE, NORMAL, RADIUS, TIGHT, current_theme
+from app.theme import CLOSE, NORMAL, RADIUS, TIGHT, WIDE, current_theme
+from app.waiting import BACKGROUND
 
 _SWATCH = 11
-_RAMP_WIDTH, _RAMP_HEIGHT = 168, 10
+_RAMP_WIDTHS, _RAMP_HEIGHT = (168, 132, 100), 10
 _OPACITY = 225
 
 
-class LegendCard(QWidget):
-    """Draws a `Legend`; as large as that needs.
+class LegendStrip(QWidget):
+    """Explains the colours beneath the mesh, in blocks that go on below where a row is full.
+
+    Its height is kept while only numbers change, so that the mesh beside it stays in its place.
 
     Parameters
     ----------
-    parent : over which it lies
+    parent : beneath whose mesh it lies
     """
 
     def __init__(self, parent: QWidget) -> None:
         super().__init__(parent)
-        self.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
+        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
         self._legend = Legend()
-        self.hide()
+        self._n_rows = 1
 
     @property
     def legend(self) -> Legend:
@@ -37,85 +51,105 @@ class LegendCard(QWidget):
         """Explain something else."""
         if legend == self._legend:
             return
+        is_other = legend.title != self._legend.title
         self._legend = legend
-        self.resize(self.sizeHint())
-        self.setAccessibleName(legend.title)
-        self.setVisible(bool(legend.title))
+        self.setAccessibleName(" ".join((legend.title, legend.note)))
+        self._fit(anew=is_other)
         self.update()
 
     def sizeHint(self) -> QSize:  # noqa: N802 - Qt's name
-        """Return the size that the whole legend needs."""
-        title, text = self._fonts()
-        wide, line = QFontMetricsF(title), QFontMetricsF(text)
-        legend = self._legend
-        width = max(wide.horizontalAdvance(legend.title), line.horizontalAdvance(legend.note))
-        height = wide.height()
-        if legend.note:
-            height += line.height()
-        if legend.ramp:
-            beyond = 0.5 * line.horizontalAdvance(legend.ticks[-1][1])
-            width = max(width, _RAMP_WIDTH + (beyond if len(legend.ticks) > 2 else 0.0))
-            height += CLOSE + _RAMP_HEIGHT + TIGHT + line.height()
-        if legend.swatches:
-            height += CLOSE + len(legend.swatches) * self._row(line)
-            longest = max(line.horizontalAdvance(name) for name, _ in legend.swatches)
-            width = max(width, _SWATCH + CLOSE + longest)
-        return QSize(round(width + 2 * NORMAL + 1), round(height + 2 * NORMAL))
+        """Return the size that all rows need."""
+        return QSize(0, round(self._n_rows * (self._row_height() + CLOSE) + CLOSE))
 
-    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802 - Qt's names
-        """Draw the card."""
-        theme = current_theme()
-        painter = QPainter(self)
-        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-        _draw_card(painter, QRectF(self.rect()))
-        title, text = self._fonts()
-        line = QFontMetricsF(text)
-        x, y = float(NORMAL), float(NORMAL)
-        y = self._write(painter, x, y, self._legend.title, title, theme.text)
-        if self._legend.note:
-            y = self._write(painter, x, y, self._legend.note, text, theme.muted)
-        if self._legend.ramp:
-            y = self._draw_ramp(painter, x, y + CLOSE, text)
-        painter.setFont(text)
-        y += CLOSE
-        for name, colour in self._legend.swatches:
-            row = self._row(line)
-            painter.setPen(Qt.PenStyle.NoPen)
-            painter.setBrush(QColor(colour))
-            painter.drawRoundedRect(QRectF(x, y + 0.5 * (row - _SWATCH), _SWATCH, _SWATCH), 3, 3)
-            painter.setPen(QColor(theme.text))
-            place = QRectF(x + _SWATCH + CLOSE, y, self.width(), row)
-            painter.drawText(place, Qt.AlignmentFlag.AlignVCenter, name)
-            y += row
-        painter.end()
+    def minimumSizeHint(self) -> QSize:  # noqa: N802 - Qt's name
+        """Allow any width."""
+        return self.sizeHint()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Fit the blocks into the width that there is."""
+        super().resizeEvent(event)
+        if event.size().width() != event.oldSize().width():
+            self._fit(anew=True)
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
         """Fit another font."""
         super().changeEvent(event)
         if event.type() in (QEvent.Type.FontChange, QEvent.Type.ApplicationFontChange):
-            self.resize(self.sizeHint())
+            self._fit(anew=True)
 
-    def _fonts(self) -> tuple[QFont, QFont]:
-        title = QFont(self.font())
-        title.setBold(True)
-        text = QFont(self.font())
-        text.setPointSizeF(0.92 * text.pointSizeF())
-        return title, text
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802 - Qt's names
+        """Draw the blocks on what is the foot of the mesh's background."""
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.fillRect(self.rect(), QColor(BACKGROUND[current_theme().is_dark][0]))
+        if self._legend.title:
+            for draw, place in self._placed():
+                draw(painter, place)
+        painter.end()
 
-    def _row(self, line: QFontMetricsF) -> float:
-        return max(line.height(), _SWATCH) + 3.0
+    def _fit(self, anew: bool) -> None:
+        """Take the rows that are needed; unless `anew`, no fewer than before."""
+        rows = {place.y() for _, place in self._placed()} if self._legend.title else set()
+        needed = max(1, len(rows), 1 if anew else self._n_rows)
+        if needed != self._n_rows:
+            self._n_rows = needed
+            self.updateGeometry()
 
-    def _write(
-        self, painter: QPainter, x: float, y: float, words: str, font: QFont, colour: str
-    ) -> float:
-        painter.setFont(font)
-        painter.setPen(QColor(colour))
-        height = QFontMetricsF(font).height()
-        painter.drawText(QRectF(x, y, self.width(), height), Qt.AlignmentFlag.AlignVCenter, words)
-        return y + height
+    def _placed(self) -> list[tuple[Callable[[QPainter, QRectF], None], QRectF]]:
+        """Return what draws each block and where it stands: in few rows, the scale as wide then."""
+        tried = [self._flowed(ramp_width) for ramp_width in _RAMP_WIDTHS]
+        return min(tried, key=lambda placed: placed[-1][1].y())
 
-    def _draw_ramp(self, painter: QPainter, x: float, y: float, font: QFont) -> float:
-        bar = QRectF(x, y, _RAMP_WIDTH, _RAMP_HEIGHT)
+    def _flowed(self, ramp_width: float) -> list[tuple[Callable[[QPainter, QRectF], None], QRectF]]:
+        height = self._row_height()
+        x, y = float(NORMAL), float(CLOSE)
+        placed = []
+        for width, draw in self._blocks(ramp_width):
+            if x > NORMAL and x + width > self.width() - CLOSE:
+                x, y = float(NORMAL), y + height + CLOSE
+            placed.append((draw, QRectF(x, y, width, height)))
+            x += width + WIDE
+        return placed
+
+    def _blocks(self, ramp_width: float) -> list[tuple[float, Callable[[QPainter, QRectF], None]]]:
+        title, text = self._fonts()
+        wide, line = QFontMetricsF(title), QFontMetricsF(text)
+        legend = self._legend
+        words = max(wide.horizontalAdvance(legend.title), line.horizontalAdvance(legend.note))
+        blocks: list[tuple[float, Callable[[QPainter, QRectF], None]]] = [
+            (words + 1.0, self._draw_words)
+        ]
+        if legend.ramp:
+            blocks.append((ramp_width + self._beyond(), self._draw_ramp))
+        if legend.swatches:
+            longest = max(line.horizontalAdvance(name) for name, _ in legend.swatches)
+            blocks.append((_SWATCH + CLOSE + longest + 1.0, self._draw_swatches))
+        return blocks
+
+    def _beyond(self) -> float:
+        """Return how far the last number reaches beyond the scale; short words end with it."""
+        ticks = self._legend.ticks
+        width = QFontMetricsF(self._fonts()[1]).horizontalAdvance(ticks[-1][1])
+        return 0.5 * width if len(ticks) > 2 else 0.0
+
+    def _draw_words(self, painter: QPainter, place: QRectF) -> None:
+        theme = current_theme()
+        title, text = self._fonts()
+        half = 0.5 * place.height()
+        for words, font, colour, top in (
+            (self._legend.title, title, theme.text, place.top()),
+            (self._legend.note, text, theme.muted, place.top() + half),
+        ):
+            painter.setFont(font)
+            painter.setPen(QColor(colour))
+            row = QRectF(place.left(), top, place.width(), half)
+            painter.drawText(row, Qt.AlignmentFlag.AlignVCenter, words)
+
+    def _draw_ramp(self, painter: QPainter, place: QRectF) -> None:
+        _, font = self._fonts()
+        half = 0.5 * place.height()
+        top = place.top() + 0.5 * (half - _RAMP_HEIGHT)
+        bar = QRectF(place.left(), top, place.width() - self._beyond(), _RAMP_HEIGHT)
         gradient = QLinearGradient(bar.topLeft(), bar.topRight())
         for step, colour in enumerate(self._legend.ramp):
             gradient.setColorAt(step / (len(self._legend.ramp) - 1), QColor(colour))
@@ -125,17 +159,36 @@ class LegendCard(QWidget):
         painter.setFont(font)
         painter.setPen(QColor(current_theme().muted))
         line = QFontMetricsF(font)
-        top = bar.bottom() + TIGHT
-        for place, words in self._legend.ticks:
+        for share, words in self._legend.ticks:
             width = line.horizontalAdvance(words)
-            middle = x + place * _RAMP_WIDTH
-            # Short words end with the scale, long ones reach beyond it.
-            flush = 1.0 if place == 1.0 and len(self._legend.ticks) == 2 else 0.5
-            left = middle - (0.0 if place == 0.0 else flush) * width
-            painter.drawText(
-                QRectF(left, top, width + 2, line.height()), Qt.AlignmentFlag.AlignVCenter, words
-            )
-        return top + line.height()
+            flush = 1.0 if share == 1.0 and len(self._legend.ticks) == 2 else 0.5
+            left = bar.left() + share * bar.width() - (0.0 if share == 0.0 else flush) * width
+            row = QRectF(left, place.top() + half, width + 2, half)
+            painter.drawText(row, Qt.AlignmentFlag.AlignVCenter, words)
+
+    def _draw_swatches(self, painter: QPainter, place: QRectF) -> None:
+        _, font = self._fonts()
+        painter.setFont(font)
+        height = 0.5 * place.height()
+        for number, (name, colour) in enumerate(self._legend.swatches):
+            top = place.top() + number * height
+            painter.setPen(Qt.PenStyle.NoPen)
+            painter.setBrush(QColor(colour))
+            square = QRectF(place.left(), top + 0.5 * (height - _SWATCH), _SWATCH, _SWATCH)
+            painter.drawRoundedRect(square, 3, 3)
+            painter.setPen(QColor(current_theme().text))
+            row = QRectF(square.right() + CLOSE, top, place.width(), height)
+            painter.drawText(row, Qt.AlignmentFlag.AlignVCenter, name)
+
+    def _fonts(self) -> tuple[QFont, QFont]:
+        title = QFont(self.font())
+        title.setBold(True)
+        text = QFont(self.font())
+        text.setPointSizeF(0.92 * text.pointSizeF())
+        return title, text
+
+    def _row_height(self) -> float:
+        return 2.0 * QFontMetricsF(self._fonts()[0]).height()
 
 
 class DomainTag(QWidget):

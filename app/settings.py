@@ -14,6 +14,8 @@ from lcollision_core.regular_files import require_regular
 
 _log = logging.getLogger(__name__)
 
+from app.shading import Shading
+
 ORGANISATION = "lcollision"
 APPLICATION = "editor"
 
@@ -37,7 +39,7 @@ class Setting:
 
 SETTINGS: dict[str, Setting] = {
     "theme": Setting("system", choices=("system", "light", "dark")),
-    "shading": Setting("domains", choices=("plain", "domains", "predicted", "exact")),
+    "shading": Setting("domains", choices=tuple(shading.name.lower() for shading in Shading)),
     "show_ghost": Setting(True),
     "model": Setting("body"),
     "recent_files": Setting(()),

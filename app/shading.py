@@ -28,10 +28,12 @@ COLLIDING_FACE = "#e0191f"
 
 _SKIN = {False: "#e9e5df", True: "#d3d1ce"}
 _RAMP_STEPS = 256
+_UNIT = "in % of the height"
 _RAMPS = {
-    # Two hues, so that nobody takes what is believed for what is known.
+    # Hues of their own, so that nobody takes what is believed for what is known.
     "predicted": ("#f2a93b", "#cf3f6f", "#5b1a78"),
     "exact": ("#7fc4d6", "#2f7fb8", "#1d2c6b"),
+    "movement": ("#afcb60", "#2f8f5c", "#0d3f3c"),
 }
 
 # Björn Ottosson, "A perceptual color space for image processing", 2020: Oklab.
@@ -56,8 +58,9 @@ class Shading(Enum):
 
     PLAIN = "Plain"
     DOMAINS = "Body parts"
-    PREDICTED = "Predicted overlap"
+    PREDICTED = "Estimated overlap"
     EXACT = "Exact overlap"
+    MOVEMENT = "Movement"
 
 
 @dataclass(frozen=True)
@@ -121,75 +124,91 @@ class Shader:
         shading: Shading,
         domain_energy: FloatArray | None = None,
         vertex_energy: FloatArray | None = None,
+        movement: FloatArray | None = None,
     ) -> ColourArray:
         """Colour each vertex: by nothing but what is shown, so that a scale means one thing.
 
         Parameters
         ----------
-        shading : what to show; a kind whose energy is not known is plain
-        domain_energy : (K,) array, the prediction, in squared heights
+        shading : what to show; a kind whose numbers are not known is plain
+        domain_energy : (K,) array, the estimate, in squared heights
         vertex_energy : (V,) array, the exact energy, in squared heights
+        movement : (V,) array, how far Resolve has moved each vertex, in heights
 
         Returns
         -------
         colours : (V, 3) uint8 array, red, green, blue
         """
         if shading is Shading.DOMAINS:
-            colours = self._domains
-        elif shading is Shading.PREDICTED and domain_energy is not None:
+            return self._domains
+        if shading is Shading.PREDICTED and domain_energy is not None:
             spread = domain_energy.astype(np.float32) @ self._mask
-            colours = _on_ramp(np.sqrt(spread) / FULL_PREDICTED, self._ramp("predicted"))
-        elif shading is Shading.EXACT and vertex_energy is not None:
-            colours = _on_ramp(np.sqrt(vertex_energy) / FULL_EXACT, self._ramp("exact"))
-        else:
-            colours = np.broadcast_to(rgb(self.skin), self._domains.shape)
-        return colours
+            return _on_ramp(np.sqrt(spread) / FULL_PREDICTED, self._ramp("predicted"))
+        if shading is Shading.EXACT and vertex_energy is not None:
+            return _on_ramp(np.sqrt(vertex_energy) / FULL_EXACT, self._ramp("exact"))
+        if shading is Shading.MOVEMENT and movement is not None and movement.any():
+            return _on_ramp(movement / movement.max(), self._ramp("movement"))
+        return np.broadcast_to(rgb(self.skin), self._domains.shape)
 
     def legend(
         self,
         shading: Shading,
         domain_energy: FloatArray | None = None,
         vertex_energy: FloatArray | None = None,
+        movement: FloatArray | None = None,
         has_predictor: bool = True,
     ) -> Legend:
         """Explain what `colours` returns for the same arguments.
 
+        Its scale stays while its numbers come and go, so that nothing round it moves.
+
         Parameters
         ----------
-        has_predictor : False where no prediction will ever come
+        has_predictor : False where no estimate will ever come
         """
+        if shading is Shading.PLAIN:
+            return Legend()
         if shading is Shading.DOMAINS:
             # Which colour is whose stands in the panels, and under the pointer.
             greys = ramp(("#ffffff", "#565b63"))
             return Legend(
-                "Body parts",
+                shading.value,
                 "darker where one acts alone",
                 ramp=_ramp_text(greys),
                 ticks=((0.0, "shared"), (1.0, "alone")),
             )
+        if shading is Shading.PREDICTED and not has_predictor:
+            return Legend(shading.value, "this model does not predict")
         if shading is Shading.PREDICTED:
-            if domain_energy is None:
-                note = "computing …" if has_predictor else "this model does not predict"
-                return Legend("Predicted overlap", note)
-            return Legend(
-                "Predicted overlap",
-                "of each body part, in % of the height",
-                ramp=_ramp_text(self._ramp("predicted")),
-                ticks=_ticks(FULL_PREDICTED),
-            )
+            note = "computing …" if domain_energy is None else _UNIT
+            if vertex_energy is not None and not vertex_energy.any():
+                note = "the check found none"
+            return self._scale(shading, note, "predicted", _ticks(FULL_PREDICTED, " or more"))
         if shading is Shading.EXACT:
-            if vertex_energy is None:
-                return Legend("Exact overlap", "computed when the pose rests")
-            if not vertex_energy.any():
-                return Legend("Exact overlap", "none: nothing intersects")
-            return Legend(
-                "Exact overlap",
-                "in % of the height",
-                (("intersecting triangles", COLLIDING_FACE),),
-                ramp=_ramp_text(self._ramp("exact")),
-                ticks=_ticks(FULL_EXACT),
+            note = "checking …" if vertex_energy is None else _UNIT
+            if vertex_energy is not None and not vertex_energy.any():
+                note = "no collisions"
+            return self._scale(
+                shading,
+                note,
+                "exact",
+                _ticks(FULL_EXACT, " or more"),
+                (("crossing triangles", COLLIDING_FACE),),
             )
-        return Legend()
+        most = 0.0 if movement is None else float(movement.max())
+        note = "shown after Resolve" if movement is None else _UNIT if most else "nothing moved"
+        ticks = _ticks(most) if most else ((0.0, "none"), (1.0, "most"))
+        return self._scale(shading, note, "movement", ticks)
+
+    def _scale(
+        self,
+        shading: Shading,
+        note: str,
+        kind: str,
+        ticks: tuple[tuple[float, str], ...],
+        swatches: tuple[tuple[str, str], ...] = (),
+    ) -> Legend:
+        return Legend(shading.value, note, swatches, _ramp_text(self._ramp(kind)), ticks)
 
     def _ramp(self, kind: str) -> ColourArray:
         return ramp((self.skin, *_RAMPS[kind]))
@@ -252,8 +271,8 @@ def _ramp_text(colours: ColourArray) -> tuple[str, ...]:
     return tuple(f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in colours.tolist())
 
 
-def _ticks(full: float) -> tuple[tuple[float, str], ...]:
-    texts = ("0", f"{50 * full:g}", f"{100 * full:g} or more")
+def _ticks(full: float, beyond: str = "") -> tuple[tuple[float, str], ...]:
+    texts = ("0", f"{50 * full:.2g}", f"{100 * full:.2g}{beyond}")
     return tuple(zip((0.0, 0.5, 1.0), texts, strict=True))
 
 

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPointF, QSize, QTimer, Signal, Slot
-from PySide6.QtGui import QCloseEvent, QResizeEvent
+from PySide6.QtGui import QCloseEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
-from PySide6.QtWidgets import QStackedLayout, QWidget
+from PySide6.QtWidgets import QStackedLayout, QVBoxLayout, QWidget
 
 from app.camera import View, kept_in_view, preset_view
 from app.frames import LiveFrame, PoseShower
-from app.legend import DomainTag, LegendCard
+from app.legend import DomainTag, LegendStrip
 from app.motion import CameraTurn, Glide
 from app.pictures import Pictures
 from app.shading import Legend, Shader, Shading
-from app.theme import NORMAL, current_theme
+from app.theme import current_theme
 from app.waiting import WaitingPage
 from app.wording import heading
 from lcollision_core.errors import LCollisionError
@@ -80,11 +80,18 @@ class Viewport(QWidget):
         self._glide_to: npt.NDArray[np.float64] | None = None
         self._loaded: npt.NDArray[np.float64] | None = None
 
-        self._layout = QStackedLayout(self)
+        self._layout = QStackedLayout()
         self._layout.setStackingMode(QStackedLayout.StackingMode.StackOne)
         self.waiting = WaitingPage(document, self)
         self._layout.addWidget(self.waiting)
-        self._legend = LegendCard(self)
+        self._legend = LegendStrip(self)
+        self._legend.hide()
+        # Beneath the mesh, not over it, however close one looks.
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(0)
+        column.addLayout(self._layout, 1)
+        column.addWidget(self._legend)
         self._tag = DomainTag(self)
         # A window that gets its first OpenGL widget when it is already shown is made anew, and
         # flickers.
@@ -105,6 +112,7 @@ class Viewport(QWidget):
         document.frame_changed.connect(self._on_frame_changed)
         document.exact_changed.connect(self._on_exact_changed)
         document.ghost_changed.connect(self._on_ghost_changed)
+        document.outcome_changed.connect(self._on_outcome_changed)
         document.solve_finished.connect(self._on_solve_finished)
         document.pose_loaded.connect(self._on_pose_loaded)
         if document.has_model:
@@ -286,12 +294,6 @@ class Viewport(QWidget):
         """Return a size at which a body is seen well."""
         return QSize(720, 720)
 
-    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Keep the legend in its corner."""
-        super().resizeEvent(event)
-        if self._canvas is not None:
-            self._place_legend()
-
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
         """Follow the theme."""
         super().changeEvent(event)
@@ -351,14 +353,14 @@ class Viewport(QWidget):
             self._layout.addWidget(self._canvas)
             self._layout.setCurrentWidget(self._canvas)
             self.waiting.stop()
-            self._legend.raise_()
+            self._legend.show()
             self._tag.raise_()
         self._pose_stale = True
         self._recolour()
 
     @Slot()
     def _on_exact_changed(self) -> None:
-        if self._shading is Shading.EXACT:
+        if self._shading in (Shading.EXACT, Shading.PREDICTED):
             self._recolour(crossing=True)
 
     @Slot()
@@ -368,6 +370,11 @@ class Viewport(QWidget):
         ghost = self._document.ghost
         self._scene.show_ghost(ghost, None if ghost is None else self._shower.normals(ghost))
         self._canvas.redraw()
+
+    @Slot()
+    def _on_outcome_changed(self) -> None:
+        if self._shading is Shading.MOVEMENT:
+            self._recolour()
 
     @Slot(object)
     def _on_solve_finished(self, result: ResolveResult | None) -> None:
@@ -433,8 +440,7 @@ class Viewport(QWidget):
 
     def _paint(self, scene: Scene, frame: LiveFrame) -> None:
         assert self._shader is not None
-        energies = self._energies(frame)
-        scene.paint(self._shader.colours(self._shading, *energies))
+        scene.paint(self._shader.colours(self._shading, *self._known_of(frame)))
 
     def _shape_of(self, domain: int) -> PartShape:
         from app.outline import PartShape
@@ -442,11 +448,22 @@ class Viewport(QWidget):
         model = self._document.model
         return PartShape.of(model.attention_mask, model.faces, domain)
 
-    def _energies(self, frame: LiveFrame) -> tuple[FloatArray | None, FloatArray | None]:
-        predicted, exact = frame.prediction, self._document.exact
+    def _known_of(
+        self, frame: LiveFrame
+    ) -> tuple[FloatArray | None, FloatArray | None, FloatArray | None]:
+        """Return the estimate, the exact energy and the movement, None what is not known."""
+        document = self._document
+        predicted, exact, before = frame.prediction, document.exact, document.vertices_before
+        outcome, moved = document.outcome, None
+        if outcome is not None and outcome.latent_distance == 0.0:
+            moved = np.zeros(len(frame.vertices))
+        elif before is not None and frame.latent is document.latent:
+            away = frame.vertices.astype(np.float64) - before
+            moved = np.linalg.norm(away, axis=1) / document.model.height
         return (
             predicted.domain_energy if predicted is not None else None,
             exact.vertex_energy if exact is not None else None,
+            moved,
         )
 
     def _explain_colours(self) -> None:
@@ -456,12 +473,8 @@ class Viewport(QWidget):
             return
         has_predictor = self._document.model.has_predictor
         self._legend.set_legend(
-            self._shader.legend(self._shading, *self._energies(frame), has_predictor)
+            self._shader.legend(self._shading, *self._known_of(frame), has_predictor=has_predictor)
         )
-        self._place_legend()
-
-    def _place_legend(self) -> None:
-        self._legend.move(NORMAL, self.height() - self._legend.height() - NORMAL)
 
     def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
         up_axis = self._document.model.up_axis
@@ -469,7 +482,8 @@ class Viewport(QWidget):
 
     @property
     def _aspect(self) -> float:
-        return self.width() / max(1, self.height())
+        seen = self if self._canvas is None else self._canvas
+        return seen.width() / max(1, seen.height())
 
     # Motion.
 

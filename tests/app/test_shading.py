@@ -50,10 +50,9 @@ def shader(request: pytest.FixtureRequest) -> Shader:
 
 
 def ramps(shader: Shader) -> list[list[str]]:
-    energy = np.zeros(2), np.full(4, 1e-6)
-    return [
-        list(shader.legend(shading, *energy).ramp) for shading in (Shading.PREDICTED, Shading.EXACT)
-    ]
+    known = np.zeros(2), np.full(4, 1e-6), np.full(4, 1e-3)
+    scales = (Shading.PREDICTED, Shading.EXACT, Shading.MOVEMENT)
+    return [list(shader.legend(shading, *known).ramp) for shading in scales]
 
 
 def test_a_domain_owns_white_to_its_full_colour() -> None:
@@ -67,12 +66,13 @@ def test_plain_is_one_colour(shader: Shader) -> None:
 
 
 def test_an_unknown_energy_is_plain_and_says_so(shader: Shader) -> None:
-    for shading in (Shading.PREDICTED, Shading.EXACT):
+    for shading in (Shading.PREDICTED, Shading.EXACT, Shading.MOVEMENT):
         assert (shader.colours(shading) == rgb(shader.skin)).all()
         legend = shader.legend(shading)
         assert legend.title
         assert legend.note
-        assert not legend.ramp
+        # The scale is there before its numbers are, or the legend would grow as they come.
+        assert legend.ramp
     assert "does not predict" in shader.legend(Shading.PREDICTED, has_predictor=False).note
 
 
@@ -91,6 +91,27 @@ def test_exact_energy_is_each_vertex_own_and_stops_at_full(shader: Shader) -> No
     colours = shader.colours(Shading.EXACT, None, energy)
     assert (colours[[0, 2, 3]] == ramp_colours[[0, 255, 255]]).all()
     assert (colours[1] == ramp_colours[127]).all()
+
+
+def test_movement_is_drawn_up_to_the_largest_which_the_legend_names(shader: Shader) -> None:
+    moved = np.array([0.0, 0.001, 0.004, 0.002])
+    scale = np.array([rgb(colour) for colour in ramps(shader)[2]])
+    colours = shader.colours(Shading.MOVEMENT, movement=moved)
+    assert (colours == scale[[0, 63, 255, 127]]).all()
+    legend = shader.legend(Shading.MOVEMENT, movement=moved)
+    assert legend.note == "in % of the height"
+    assert legend.ticks == ((0.0, "0"), (0.5, "0.2"), (1.0, "0.4"))
+    still = np.zeros(4)
+    assert (shader.colours(Shading.MOVEMENT, movement=still) == rgb(shader.skin)).all()
+    assert shader.legend(Shading.MOVEMENT, movement=still).note == "nothing moved"
+    assert shader.legend(Shading.MOVEMENT).note == "shown after Resolve"
+
+
+def test_an_estimate_that_the_check_contradicts_says_so_in_its_legend(shader: Shader) -> None:
+    energy = np.array([1e-4, 0.0])
+    assert "%" in shader.legend(Shading.PREDICTED, energy).note
+    assert shader.legend(Shading.PREDICTED, energy, np.zeros(4)).note == "the check found none"
+    assert "%" in shader.legend(Shading.PREDICTED, energy, np.full(4, 1e-6)).note
 
 
 def test_every_step_of_a_scale_looks_alike(shader: Shader) -> None:
@@ -133,10 +154,9 @@ def test_legends_name_what_is_drawn(shader: Shader) -> None:
     assert domains.ramp[0] == "#ffffff"
     assert [text for _, text in domains.ticks] == ["shared", "alone"]
     free = shader.legend(Shading.EXACT, None, np.zeros(4))
-    assert free.note == "none: nothing intersects"
-    assert not free.ramp
+    assert free.note == "no collisions"
     exact = shader.legend(Shading.EXACT, None, np.full(4, 1e-6))
-    assert exact.swatches == (("intersecting triangles", COLLIDING_FACE),)
+    assert exact.swatches == (("crossing triangles", COLLIDING_FACE),)
     assert [place for place, _ in exact.ticks] == [0.0, 0.5, 1.0]
     assert exact.ticks[1][1] == "0.3"
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from PIL import Image
-from PySide6.QtCore import QEvent, QObject, QPoint, Qt, QTimer
+from PySide6.QtCore import QEvent, QObject, QPoint, QPointF, Qt, QTimer
 from PySide6.QtGui import QImage
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
@@ -21,7 +21,7 @@ from app.camera import CAMERAS, View, framing, sees_all
 from app.canvas import Canvas
 from app.document import PoseDocument
 from app.engine import Failure
-from app.legend import LegendCard
+from app.legend import LegendStrip
 from app.rendering import PoseRenderer
 from app.shading import Shading
 from app.theme import DARK, LIGHT, apply_theme
@@ -111,7 +111,8 @@ def seen_vertex(viewport: Viewport, domain: int) -> int:
     assert viewport.scene is not None
     mask = viewport._document.model.attention_mask
     for vertex in np.argsort(-mask[domain]):
-        place = viewport.canvas.place_of(viewport.scene.surface.vertices[vertex])
+        # Of the pixel that the pointer will be on.
+        place = QPointF(place_of(viewport, vertex))
         if viewport.canvas.pick_vertex(place, viewport.scene.body) == vertex:
             return int(vertex)
     raise AssertionError("no vertex of the domain is seen")
@@ -309,7 +310,7 @@ class LegendWatch(QObject):
         self.painting = False
         self.meanwhile: list[str] = []
         self.otherwise: list[str] = []
-        self.legend = viewport.findChild(LegendCard)
+        self.legend = viewport.findChild(LegendStrip)
         self.legend.installEventFilter(self)
         assert viewport.canvas is not None
         viewport.canvas.installEventFilter(self)
@@ -330,12 +331,77 @@ class LegendWatch(QObject):
 def test_the_legend_is_laid_out_while_nothing_is_painted(qtbot: QtBot, viewport: Viewport) -> None:
     """A widget that is shown while the canvas paints may resize it: Qt frees what is drawn into."""
     watch = LegendWatch(viewport)
-    for shading in (Shading.DOMAINS, Shading.PLAIN, Shading.PREDICTED):
+    viewport.resize(SIDE - 60, SIDE)
+    for shading in (Shading.EXACT, Shading.PLAIN, Shading.EXACT):
         viewport.set_shading(shading)
         rest(qtbot, viewport)
-    assert watch.otherwise.count("Show") == 2
-    assert watch.otherwise.count("Hide") == 1
+    assert watch.otherwise.count("Resize") >= 3
     assert watch.meanwhile == []
+
+
+@pytest.mark.parametrize("width", [240, 300, 340, 420, 900])
+def test_the_legend_lies_beneath_the_mesh_and_holds_still_while_a_pose_changes(
+    qtbot: QtBot,
+    document: PoseDocument,
+    viewport: Viewport,
+    colliding: npt.NDArray[np.float64],
+    width: int,
+) -> None:
+    legend, canvas = viewport.findChild(LegendStrip), viewport.canvas
+    assert canvas is not None
+    viewport.resize(width, SIDE)
+    rest(qtbot, viewport)
+    for shading in Shading:
+        viewport.set_shading(shading)
+        rest(qtbot, viewport)
+        geometries = (legend.geometry(), canvas.geometry())
+        assert not legend.geometry().intersects(canvas.geometry())
+        assert legend.geometry().united(canvas.geometry()) == viewport.rect()
+        blocks = [place for _, place in legend._placed()]
+        assert blocks[-1].bottom() <= legend.height()
+        assert max(block.right() for block in blocks) <= width
+        for latent in (colliding, np.zeros_like(colliding)):
+            document.set_latent(latent, "Jump")
+            rest(qtbot, viewport)
+            assert (legend.geometry(), canvas.geometry()) == geometries
+            qtbot.waitUntil(lambda: document.exact is not None)
+            assert (legend.geometry(), canvas.geometry()) == geometries
+
+
+def test_what_resolve_has_moved_is_drawn_and_explained(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
+) -> None:
+    scene = viewport.scene
+    assert scene is not None
+    viewport.set_shading(Shading.MOVEMENT)
+    document.set_latent(colliding, "Jump")
+    rest(qtbot, viewport)
+    assert viewport.legend.note == "shown after Resolve"
+    plain = scene.surface.colours.copy()
+    assert (plain == plain[0]).all()
+    before = scene.surface.vertices.copy()
+    # It is told whether or not the ghost is drawn.
+    document.show_ghost(False)
+    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
+        document.resolve()
+    rest(qtbot, viewport)
+    moved = np.linalg.norm(scene.surface.vertices - before, axis=1) / document.model.height
+    assert viewport.legend.ticks[-1][1] == f"{100 * moved.max():.2g}"
+    brightness = scene.surface.colours.astype(int).sum(axis=1)
+    assert brightness[moved.argmax()] == brightness.min()
+    assert np.corrcoef(moved, brightness)[0, 1] < -0.8
+    document.undo()
+    rest(qtbot, viewport)
+    assert viewport.legend.note == "shown after Resolve"
+    assert (scene.surface.colours == plain).all()
+    document.redo()
+    rest(qtbot, viewport)
+    assert viewport.legend.ticks[-1][1] == f"{100 * moved.max():.2g}"
+    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
+        document.resolve()
+    rest(qtbot, viewport)
+    assert viewport.legend.note == "nothing moved"
+    assert (scene.surface.colours == plain).all()
 
 
 def test_intersecting_faces_are_red_while_the_truth_is_known(
