@@ -101,7 +101,9 @@ SHADINGS: dict[Shading, ActionSpec] = {
 """The ways to colour the body."""
 
 CAMERA_ACTIONS: dict[str, ActionSpec] = {
-    name: ActionSpec(name, f"Alt+{number}", f"Look at the body: {name.lower()}", "camera")
+    name: ActionSpec(
+        name, f"Alt+{number}", f"Look at the body: {name.lower()}", f"camera-{name.lower()}"
+    )
     for number, name in enumerate(CAMERAS, start=1)
 }
 

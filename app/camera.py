@@ -17,6 +17,8 @@ VIEW_ANGLE = 24.0
 """Degrees from the picture's bottom to its top: narrow, so that near limbs do not swell."""
 
 _MARGIN = 1.2
+_NEAREST, _FARTHEST = 0.05, 15.0
+"""Limits of zooming, in heights of the body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +130,35 @@ def _needed_distances(
         np.abs(offset @ np.cross(upward, towards)) / (half_height * aspect),
     )
     return needed, offset @ towards
+
+
+def zoomed(
+    view: View, anchor: FloatArray, factor: float, vertices: npt.NDArray[Any], height: float
+) -> View:
+    """Bring the camera nearer to a point, or away from it; the point stays in its place on screen.
+
+    Parameters
+    ----------
+    anchor : (3,) array, in the data's unit
+    factor : of the distance to it, below 1 to come nearer; no nearer than a hand, no farther than
+        where the body is a dot
+    vertices : (V, 3) array; turning goes round a point of the line of sight that is as deep in the
+        scene as they are
+    height : of the body, in the data's unit
+    """
+    arm = view.position - anchor
+    reach = float(np.linalg.norm(arm))
+    near, far = _NEAREST * height, _FARTHEST * height
+    wanted = reach * factor
+    allowed = max(wanted, min(near, reach)) if factor < 1.0 else min(wanted, max(far, reach))
+    factor = allowed / reach
+    position = anchor + factor * arm
+    sight = view.focus - view.position
+    distance = float(np.linalg.norm(sight))
+    sight = sight / distance
+    depths = (vertices - position) @ sight
+    distance = float(np.clip(factor * distance, depths.min(), depths.max()))
+    return View(position, position + max(distance, 0.5 * near) * sight, view.up)
 
 
 def turned(view: View, angle: float) -> View:

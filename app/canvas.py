@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPointF, Qt, QTimer, Signal, Slot
-from PySide6.QtGui import QDragEnterEvent, QDropEvent, QKeyEvent, QMouseEvent, QResizeEvent
+from PySide6.QtGui import (
+    QContextMenuEvent,
+    QDragEnterEvent,
+    QDropEvent,
+    QKeyEvent,
+    QMouseEvent,
+    QNativeGestureEvent,
+    QResizeEvent,
+    QWheelEvent,
+)
+from PySide6.QtWidgets import QApplication
 from pyvistaqt import QtInteractor
 from vtkmodules.vtkRenderingCore import vtkActor, vtkCellPicker
 
@@ -19,7 +29,38 @@ if TYPE_CHECKING:
 _REST_MILLISECONDS = 220
 _HOVER_MILLISECONDS = 30
 _SMOOTH_SAMPLES = 4
-_FAST_SECONDS = 0.006
+_NOTCH = 120.0  # of a wheel, in eighths of a degree
+_ZOOM_A_NOTCH = 1.15
+
+_SLOW_SECONDS, _FAST_SECONDS = 0.020, 0.012
+"""A smooth picture that takes longer makes a drag stutter; one that takes less leaves time for
+all else before the screen wants the next."""
+_SLOW_PICTURES = 3
+
+
+class Smoothness:
+    """Whether pictures are drawn with smooth edges while something moves, by how long they take.
+
+    They are until some in a row are slow, as where no graphics card helps; then rough ones are,
+    until a smooth one, as at rest, is fast. Between the two limits nothing changes.
+    """
+
+    def __init__(self) -> None:
+        self._n_slow = 0
+
+    @property
+    def while_moving(self) -> bool:
+        """Whether the next picture of a motion is to be smooth."""
+        return self._n_slow < _SLOW_PICTURES
+
+    def note(self, seconds: float) -> None:
+        """Take account of how long a smooth picture took."""
+        if seconds < _FAST_SECONDS:
+            self._n_slow = 0
+        elif seconds > _SLOW_SECONDS:
+            self._n_slow += 1
+        elif self.while_moving:
+            self._n_slow = 0
 
 
 class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
@@ -37,43 +78,54 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
     painted : float, the seconds that drawing one picture took; what it calls must leave widgets
         alone too, or be connected queued
     hovered : QPointF in the widget, or None as the pointer leaves; while no button is pressed
-    camera_moved : the user has turned, shifted or zoomed
+    camera_moved : the user has turned or shifted
+    zoom_wanted : QPointF in the widget and float, the factor of the distance to what is there
+    menu_wanted : QPointF in the widget, where it was clicked with the right button
     """
 
     painted = Signal(float)
     hovered = Signal(object)
     camera_moved = Signal()
+    zoom_wanted = Signal(QPointF, float)
+    menu_wanted = Signal(QPointF)
 
     def __init__(self, before_paint: Callable[[], None], parent: QWidget | None = None) -> None:
         # The default for auto_update draws five times a second for ever.
         super().__init__(parent, auto_update=False, multi_samples=0)
         self.setAcceptDrops(False)
         self._before_paint = before_paint
-        self._painting = self._settled = self._shut = self._fast = False
+        self._painting = self._settled = self._shut = False
+        self._smoothness = Smoothness()
+        self._is_smooth = False
         self.n_painted = 0
         self._rest = QTimer(self, singleShot=True, interval=_REST_MILLISECONDS)
         self._rest.timeout.connect(self._on_rest)
         self._hover = QTimer(self, singleShot=True, interval=_HOVER_MILLISECONDS)
         self._hover.timeout.connect(self._on_hover)
         self._pointer: QPointF | None = None
+        self._right_press: QPointF | None = None
         self._picker = vtkCellPicker()
         self._picker.PickFromListOn()
         self._picker.SetTolerance(0.0)
-        self.enable_terrain_style(mouse_wheel_zooms=True, shift_pans=True)
+        self.enable_terrain_style(mouse_wheel_zooms=False, shift_pans=True)
         # The camera's style would draw at once for each motion of the mouse, and Qt then again.
         self._vtk_interactor = self.ren_win.GetInteractor()
         self._vtk_interactor.EnableRenderOff()
         self._observer = self._vtk_interactor.AddObserver("RenderEvent", self._on_render_wanted)
 
     def redraw(self) -> None:
-        """Ask for a rough picture soon, and a smooth one when nothing moves any more."""
+        """Ask for a picture soon, and for a smooth one once nothing moves any more."""
         if self._shut:
             return
         self._settled = False
-        if not self._fast:
-            self.ren_win.SetMultiSamples(0)
-            self._rest.start()
+        self._draw_smooth(self._smoothness.while_moving)
+        self._rest.start()
         self.update()
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether the next picture has smooth edges."""
+        return self._is_smooth
 
     @property
     def is_settled(self) -> bool:
@@ -95,6 +147,34 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         if not self._picker.Pick(x, y, 0.0, self.renderer) or self._picker.GetCellId() < 0:
             return None
         return int(self._picker.GetPointId())
+
+    def point_at(
+        self, place: QPointF, actor: vtkActor, depth_of: npt.NDArray[Any]
+    ) -> npt.NDArray[np.float64]:
+        """Return what is seen at a place, or beside the mesh a point as deep as another.
+
+        Parameters
+        ----------
+        place : in the widget, in device-independent pixels
+        actor : the mesh
+        depth_of : (3,) array, in the data's unit
+
+        Returns
+        -------
+        point : (3,) array, in the data's unit
+        """
+        if self.pick_vertex(place, actor) is not None:
+            return np.array(self._picker.GetPickPosition())
+        ratio = self.devicePixelRatioF()
+        self.renderer.SetWorldPoint(*np.asarray(depth_of, dtype=np.float64).tolist(), 1.0)
+        self.renderer.WorldToDisplay()
+        depth = self.renderer.GetDisplayPoint()[2]
+        x, y = place.x() * ratio, (self.height() - 1 - place.y()) * ratio
+        self.renderer.SetDisplayPoint(x, y, depth)
+        self.renderer.DisplayToWorld()
+        *point, scale = self.renderer.GetWorldPoint()
+        seen: npt.NDArray[np.float64] = np.array(point) / scale
+        return seen
 
     def place_of(self, point: npt.NDArray[Any]) -> QPointF:
         """Return where a point of the scene is seen.
@@ -139,10 +219,13 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         finally:
             self._vtk_interactor.EnableRenderOff()
             self._painting = False
+        if self._is_smooth:
+            # A graphics card is asked to draw and returns before it has.
+            self.ren_win.WaitForCompletion()
         seconds = time.perf_counter() - start
-        self._settled = self.ren_win.GetMultiSamples() > 0
-        # A graphics card draws smooth pictures as fast as rough ones: they need not alternate.
-        self._fast = self._settled and seconds < _FAST_SECONDS
+        self._settled = self._is_smooth
+        if self._is_smooth:
+            self._smoothness.note(seconds)
         self.n_painted += 1
         self.painted.emit(seconds)
 
@@ -167,13 +250,55 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         """Leave files to the window."""
         event.ignore()
 
+    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
+        """Begin to turn, to shift, to zoom, or to click."""
+        super().mousePressEvent(event)
+        is_right = event.button() is Qt.MouseButton.RightButton
+        self._right_press = event.position() if is_right else None
+
     def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
         """Turn the camera while a button is pressed, tell of the pointer otherwise."""
+        if self._right_press is not None:
+            way = (event.position() - self._right_press).manhattanLength()
+            if way < QApplication.startDragDistance():
+                # Still a click, which leaves the camera alone.
+                return
+            self._right_press = None
         super().mouseMoveEvent(event)
         if event.buttons() == Qt.MouseButton.NoButton:
             self._pointer = event.position()
             if not self._hover.isActive():
                 self._hover.start()
+
+    def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
+        """End a drag, or ask for the menu where the right button was only clicked."""
+        super().mouseReleaseEvent(event)
+        clicked, self._right_press = self._right_press, None
+        if clicked is not None and event.button() is Qt.MouseButton.RightButton:
+            self.menu_wanted.emit(clicked)
+
+    def contextMenuEvent(self, event: QContextMenuEvent) -> None:  # noqa: N802 - Qt's name
+        """Ask for the menu by its key; the right button may yet drag."""
+        event.accept()
+        if event.reason() is QContextMenuEvent.Reason.Keyboard:
+            self.menu_wanted.emit(self._pointer or QPointF(self.rect().center()))
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802 - Qt's name
+        """Zoom at the pointer, as far as the wheel or two fingers have turned."""
+        event.accept()
+        notches = event.angleDelta().y() / _NOTCH
+        if notches:
+            self.zoom_wanted.emit(event.position(), _ZOOM_A_NOTCH**-notches)
+
+    def event(self, event: QEvent) -> bool:
+        """Zoom as two fingers on a touchpad are spread."""
+        if (
+            isinstance(event, QNativeGestureEvent)
+            and event.gestureType() is Qt.NativeGestureType.ZoomNativeGesture
+        ):
+            self.zoom_wanted.emit(event.position(), 1.0 / max(1.0 + event.value(), 0.1))
+            return True
+        return bool(super().event(event))
 
     def leaveEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
         """Tell that the pointer has gone."""
@@ -183,10 +308,16 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
             super().leaveEvent(event)
             self.hovered.emit(None)
 
+    def _draw_smooth(self, smooth: bool) -> None:
+        if smooth != self._is_smooth:
+            self._is_smooth = smooth
+            self.ren_win.SetMultiSamples(_SMOOTH_SAMPLES if smooth else 0)
+
     @Slot()
     def _on_rest(self) -> None:
-        self.ren_win.SetMultiSamples(_SMOOTH_SAMPLES)
-        self.update()
+        if not self._settled:
+            self._draw_smooth(True)
+            self.update()
         if self.underMouse() and self._pointer is not None:
             # Something else may lie beneath the pointer now.
             self._hover.start()

@@ -227,6 +227,14 @@ class PoseDocument(PoseHistory):
         group = next(g for g in self.model.latent_space.groups if index < g.codes.stop)
         return group.full_name(index - group.codes.start)
 
+    def reset_domain(self, domain: int) -> None:
+        """Set all numbers of a domain to 0: its own, and the whole body's that its lock holds."""
+        group = self.model.latent_space.groups[1 + domain]
+        latent = self.latent.copy()
+        latent[domain] = 0.0
+        latent[group.codes] = 0.0
+        self._edit(f"Reset {group.name}", latent)
+
     def set_locked(self, domain: int, locked: bool) -> None:
         """Lock a domain against Resolve, Randomise, Reset all and blending, or let it go."""
         changed = self._locked | {domain} if locked else self._locked - {domain}

@@ -39,6 +39,7 @@ from app.actions import (
     explain_action,
     make_action,
 )
+from app.body_menu import BodyMenu
 from app.dialogs.failure import FailureDialog
 from app.engine import Failure
 from app.file_actions import FileActions
@@ -139,6 +140,7 @@ class MainWindow(QMainWindow):
             "library": self._dock("library", "Poses", self.library),
         }
         self._camera_menu = self._submenu("&Camera", self._cameras.values())
+        self._body_menu = BodyMenu(self, self._shadings.values(), self._camera_menu)
         self._theme_menu = self._submenu("&Theme", self._themes.values())
         self.menus = fill_menus(
             self,
@@ -213,8 +215,8 @@ class MainWindow(QMainWindow):
         for key, spec in ACTIONS.items():
             if spec.icon:
                 self.actions_by_key[key].setIcon(icon(spec.icon))
-        for action in self._cameras.values():
-            action.setIcon(icon("camera"))
+        for name, action in self._cameras.items():
+            action.setIcon(icon(CAMERA_ACTIONS[name].icon))
         refresh_bar(self._bar)
         self.collision.refresh_icons()
         self.randomise.refresh_icons()
@@ -338,6 +340,7 @@ class MainWindow(QMainWindow):
         self.viewport.domain_hovered.connect(self.sliders.light_domain)
         self.viewport.domain_hovered.connect(self.collision.prediction.light_domain)
         self.viewport.shading_changed.connect(self._on_shading)
+        self.viewport.menu_wanted.connect(self._body_menu.open)
         self.collision.resolve.options_wanted.connect(self._handlers.choose_resolve_options)
         self.library.keep_wanted.connect(self._handlers.keep_pose)
         self.library.chosen_changed.connect(self._update_actions)

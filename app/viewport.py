@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
+import time
 from importlib import import_module
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QEvent, QPointF, QSize, QTimer, Signal, Slot
+from PySide6.QtCore import QEvent, QPoint, QPointF, QSize, QTimer, Signal, Slot
 from PySide6.QtGui import QCloseEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QStackedLayout, QVBoxLayout, QWidget
 
-from app.camera import View, kept_in_view, preset_view
+from app.camera import View, kept_in_view, preset_view, zoomed
 from app.frames import LiveFrame, PoseShower
 from app.legend import DomainTag, LegendStrip
 from app.motion import CameraTurn, Glide
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
 _ROOM = 1.15
 """How much larger than its first pose a body may grow before a limb leaves the view."""
 
+_ZOOM_SECONDS = 0.5
+"""A wheel that turns on within this goes on towards the same point, if the pointer stays."""
+
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
 
@@ -55,11 +59,14 @@ class Viewport(QWidget):
     -------
     domain_hovered : int, the domain under the pointer, or None
     shading_changed : Shading
+    menu_wanted : int or None, the domain that was clicked with the right button, and QPoint, where
+        on the screen
     painted : float, the seconds that drawing one picture took; see `Canvas.painted`
     """
 
     domain_hovered = Signal(object)
     shading_changed = Signal(object)
+    menu_wanted = Signal(object, QPoint)
     painted = Signal(float)
 
     def __init__(self, document: PoseDocument, parent: QWidget | None = None) -> None:
@@ -79,6 +86,7 @@ class Viewport(QWidget):
         self._framed: npt.NDArray[np.float64] | None = None
         self._glide_to: npt.NDArray[np.float64] | None = None
         self._loaded: npt.NDArray[np.float64] | None = None
+        self._zoom_anchor: tuple[QPointF, FloatArray, float] | None = None
 
         self._layout = QStackedLayout()
         self._layout.setStackingMode(QStackedLayout.StackingMode.StackOne)
@@ -323,6 +331,8 @@ class Viewport(QWidget):
             self._canvas.hovered.connect(self._on_hovered)
             self._canvas.painted.connect(self.painted)
             self._canvas.camera_moved.connect(self._turn.stop)
+            self._canvas.zoom_wanted.connect(self._on_zoom_wanted)
+            self._canvas.menu_wanted.connect(self._on_menu_wanted)
         if self._scene is not None:
             self._scene.remove()
         self._scene = Scene(
@@ -503,16 +513,41 @@ class Viewport(QWidget):
             self._scene.view = view
             self._canvas.redraw()
 
+    @Slot(QPointF, float)
+    def _on_zoom_wanted(self, place: QPointF, factor: float) -> None:
+        if self._scene is None or self._canvas is None:
+            return
+        self._turn.stop()
+        view, now = self._scene.view, time.monotonic()
+        anchor = self._zoom_anchor
+        if anchor is None or anchor[0] != place or now - anchor[2] > _ZOOM_SECONDS:
+            point = self._canvas.point_at(place, self._scene.body, view.focus)
+        else:
+            point = anchor[1]
+        self._zoom_anchor = (place, point, now)
+        vertices, height = self._scene.surface.vertices, self._document.model.height
+        self._scene.view = zoomed(view, point, factor, vertices, height)
+        self._canvas.redraw()
+
     # The pointer.
+
+    @Slot(QPointF)
+    def _on_menu_wanted(self, place: QPointF) -> None:
+        if self._canvas is not None:
+            where = self._canvas.mapToGlobal(place.toPoint())
+            self.menu_wanted.emit(self._domain_at(place), where)
+
+    def _domain_at(self, place: QPointF) -> int | None:
+        if self._canvas is None or self._scene is None or self._shader is None:
+            return None
+        vertex = self._canvas.pick_vertex(place, self._scene.body)
+        return None if vertex is None else self._shader.leading_domain(vertex)
 
     @Slot(object)
     def _on_hovered(self, place: QPointF | None) -> None:
-        if self._canvas is None or self._scene is None or self._shader is None:
+        if self._canvas is None:
             return
-        vertex = None
-        if place is not None and self._shown is not None:
-            vertex = self._canvas.pick_vertex(place, self._scene.body)
-        domain = None if vertex is None else self._shader.leading_domain(vertex)
+        domain = None if place is None or self._shown is None else self._domain_at(place)
         if domain is None or place is None:
             self._tag.hide()
         else:

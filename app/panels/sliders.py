@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PySide6.QtCore import QEvent, QRectF, QSize, Qt, Signal
+from PySide6.QtCore import QEvent, QRectF, QSize, Qt, QTimer, Signal
 from PySide6.QtGui import QColor, QEnterEvent, QPainter, QPaintEvent, QPixmap
 from PySide6.QtWidgets import QAbstractButton, QLineEdit, QVBoxLayout, QWidget
 
@@ -258,7 +258,8 @@ class SlidersPanel(QWidget):
         top.setContentsMargins(NORMAL, TIGHT, NORMAL, 0)
         top.addWidget(self.filter)
         column.addLayout(top)
-        column.addWidget(scrolling(self._page), 1)
+        self._area = scrolling(self._page)
+        column.addWidget(self._area, 1)
         self._bottom = QVBoxLayout()
         self._bottom.setContentsMargins(NORMAL, 0, NORMAL, CLOSE)
         column.addLayout(self._bottom)
@@ -276,6 +277,16 @@ class SlidersPanel(QWidget):
         """Show which domain the viewport's pointer is on."""
         for group in self.groups:
             group.header.set_lit(domain is not None and group.header.domain == domain)
+
+    def show_domain(self, domain: int) -> None:
+        """Open the sliders of a domain, and scroll to them."""
+        self.filter.clear()
+        group = self.groups[1 + domain]
+        group.set_open(True)
+        group.header.setFocus(Qt.FocusReason.OtherFocusReason)
+        bar = self._area.verticalScrollBar()
+        # Not before they have been laid out.
+        QTimer.singleShot(0, group, lambda: bar.setValue(group.y()))
 
     def row_of(self, code: int) -> CodeRow:
         """Open the group of a code and return its row."""

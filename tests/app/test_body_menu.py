@@ -1,0 +1,103 @@
+"""The menu of the body: what it offers for the part under the pointer, and the camera's icons."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QMenu
+from pytestqt.qtbot import QtBot
+
+from app.icons import pixmap
+from app.main_window import MainWindow
+from app.shading import Shading
+from tests.app.windows import PATIENCE, rest, take_picture
+
+
+def opened(qtbot: QtBot, window: MainWindow, domain: int | None) -> QMenu:
+    window.viewport.menu_wanted.emit(domain, window.mapToGlobal(QPoint(500, 300)))
+    found = [menu for menu in window.findChildren(QMenu) if menu.isVisible()]
+    qtbot.waitUntil(lambda: bool(found), timeout=PATIENCE)
+    return found[0]
+
+
+def chosen(menu: QMenu, start: str) -> QAction:
+    (action,) = (a for a in menu.actions() if a.text().replace("&", "").startswith(start))
+    return action
+
+
+def test_a_part_is_locked_reset_and_found_from_the_body(qtbot: QtBot, window: MainWindow) -> None:
+    document, scene = window.document, window.viewport.scene
+    assert scene is not None
+    name = document.model.domain_names[1]
+    document.set_latent(np.full(document.model.latent_size, 0.1), "Test")
+    rest(qtbot, window)
+    menu = opened(qtbot, window, 1)
+    assert scene.outline.is_shown
+    assert menu.actions()[0].text().lower() == name
+    chosen(menu, f"Reset {name}").trigger()
+    codes = document.model.latent_space.groups[2].codes
+    assert (document.latent[codes] == 0.0).all()
+    assert document.latent[1] == 0.0
+    assert (
+        np.count_nonzero(document.latent) == len(document.latent) - (codes.stop - codes.start) - 1
+    )
+    assert document.undo_stack.undoText() == f"Reset {name}"
+    chosen(menu, f"Lock {name}").trigger()
+    assert document.locked_domains == {1}
+    menu.close()
+    qtbot.waitUntil(lambda: not scene.outline.is_shown, timeout=PATIENCE)
+    menu = opened(qtbot, window, 1)
+    assert not chosen(menu, f"Reset {name}").isEnabled()
+    window.docks["sliders"].hide()
+    window.sliders.filter.setText("nothing")
+    chosen(menu, "Show the sliders").trigger()
+    group = window.sliders.groups[2]
+    qtbot.waitUntil(lambda: group.rows != [] and group.rows[0].isVisible(), timeout=PATIENCE)
+    assert not group.header.visibleRegion().isEmpty()
+    chosen(menu, f"Unlock {name}").trigger()
+    assert document.locked_domains == set()
+    take_picture(window, "body menu")
+    menu.close()
+
+
+def test_the_rest_of_the_menu_is_made_of_the_window_s_own_actions(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    menu = opened(qtbot, window, None)
+    texts = [action.text().replace("&", "") for action in menu.actions()]
+    assert not any(text.startswith(("Lock", "Reset arm", "Show the sliders")) for text in texts)
+    for key in ("reset_camera", "ghost", "resolve", "reset", "undo"):
+        assert window.actions_by_key[key] in menu.actions()
+    submenus = {a.text().replace("&", ""): a.menu() for a in menu.actions() if a.menu()}
+    assert set(submenus) == {"Colour by", "Camera"}
+    chosen(submenus["Colour by"], "Exact").trigger()
+    assert window.viewport.shading is Shading.EXACT
+    assert window.viewport.view is not None
+    before = window.viewport.view.position
+    chosen(submenus["Camera"], "Back").trigger()
+    rest(qtbot, window)
+    assert np.linalg.norm(window.viewport.view.position - before) > 1.0
+    menu.close()
+
+
+@pytest.mark.parametrize("sharpness", [1.0, 2.0])
+def test_each_camera_has_an_icon_of_its_own(window: MainWindow, sharpness: float) -> None:
+    drawn = []
+    for name in window._cameras:
+        picture = pixmap(f"camera-{name.lower()}", "#102030", 20, sharpness).toImage()
+        drawn.append(np.frombuffer(picture.constBits(), dtype=np.uint8).astype(int))
+        icon = (
+            window._cameras[name]
+            .icon()
+            .pixmap(
+                20,
+                20,
+            )
+            .toImage()
+        )
+        assert not icon.isNull()
+    for first in range(6):
+        for second in range(first):
+            assert (np.abs(drawn[first] - drawn[second]) > 60).sum() > 30 * sharpness
