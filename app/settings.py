@@ -10,11 +10,10 @@ from typing import Any
 
 from PySide6.QtCore import QByteArray, QSettings, QStandardPaths
 
+from app.shading import Shading
 from lcollision_core.regular_files import require_regular
 
 _log = logging.getLogger(__name__)
-
-from app.shading import Shading
 
 ORGANISATION = "lcollision"
 APPLICATION = "editor"
