@@ -65,7 +65,9 @@ class ShortcutsDialog(QDialog):
     _ELSEWHERE = (
         ("Drag in the view", "turn the camera"),
         ("Middle-drag or Shift-drag", "move the camera"),
-        ("Wheel in the view", "come nearer, go away"),
+        ("Wheel or pinch in the view", "come nearer, go away, at the pointer"),
+        ("Right-drag in the view", "come nearer, go away"),
+        ("Right-click in the view", "menu of the part under the pointer"),
         ("Arrow keys on a slider", "a hundredth of its range"),
         ("Page keys on a slider", "a tenth of its range"),
         ("Home, End on a slider", "its ends"),
