@@ -219,13 +219,14 @@ def exported(
     """
 
     def work(_: Progress, __: CancelToken) -> Exported:
-        from lcollision_core.model import detector_of, export_frame, export_mesh
+        from lcollision_core.model import export_frame, export_mesh
         from lcollision_core.resolve import exported_vertices
 
         vertices = exported_vertices(model.decode(latent, n_threads=1), placement)
         frame = export_frame(model, axes, path, scale)
         written = export_mesh(path, model, vertices, placement, frame)
-        return Exported(path, len(detector_of(model, frame).detect(written).pairs))
+        unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
+        return Exported(path, len(model.detector.detect(written, unit=unit).pairs))
 
     return work
 

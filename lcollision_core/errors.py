@@ -23,6 +23,19 @@ class PoseSetError(LCollisionError):
     """Meshes cannot form one pose set: their topology differs, or a pose is not usable."""
 
 
+class WrongScaleError(PoseSetError):
+    """A mesh is not in the unit that is needed.
+
+    Attributes
+    ----------
+    factor : what its coordinates are to be multiplied by
+    """
+
+    def __init__(self, message: str, factor: float) -> None:
+        super().__init__(message)
+        self.factor = factor
+
+
 class MissingExtraError(LCollisionError):
     """An optional dependency is not installed; the message names the extra that brings it."""
 

@@ -1,11 +1,24 @@
-"""What commands are given to read: files, and folders in the place of the meshes in them."""
+"""What commands are given to read: files, folders in the place of the meshes in them, units."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Annotated
 
-from lcollision_core.errors import MeshFileError
+import typer
+
+from lcollision_core.errors import LCollisionError, MeshFileError, WrongScaleError
+
+ScaleOption = Annotated[
+    float,
+    typer.Option(
+        "--scale",
+        metavar="S",
+        help="Brings the meshes into the model's unit: 0.001 from millimetres to metres. What "
+        "comes back is in their own.",
+    ),
+]
 
 
 def expanded(inputs: Iterable[Path]) -> list[Path]:
@@ -29,3 +42,9 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
             )
         files += held
     return files
+
+
+def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
+    """Say that a mesh cannot be encoded, and which option helps where it has another unit."""
+    advice = f" with --scale {error.factor:.6g}" if isinstance(error, WrongScaleError) else ""
+    return MeshFileError(f"{path} cannot be encoded: {error}{advice}")

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from app.cli.console import progress_bar, tell
-from app.cli.inputs import expanded
+from app.cli.inputs import ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import (
@@ -17,6 +17,7 @@ from app.cli.results import (
     MeshFormat,
     OutputForm,
     output_named,
+    require_format_holds,
     require_output,
     write_result,
 )
@@ -40,6 +41,7 @@ def encode(
         ),
     ],
     output: PosesOutput,
+    scale: ScaleOption = 1.0,
 ) -> None:
     """Turn meshes into latent poses, and say how well each fits.
 
@@ -59,7 +61,7 @@ def encode(
     vertices = np.stack([mesh.vertices for mesh in files])
     with (
         unfinished_poses(
-            output, model, {"vertices": vertices}, {"command": "encode"}, len(files)
+            output, model, {"vertices": vertices}, {"command": "encode", "scale": scale}, len(files)
         ) as unfinished,
         cancel_on_interrupt() as cancel,
     ):
@@ -67,9 +69,9 @@ def encode(
             for place, (name, mesh) in enumerate(zip(names, files, strict=True)):
                 if place not in unfinished.finished:
                     try:
-                        encoded = model.encode(mesh.vertices, cancel)
+                        encoded = model.encode(mesh.vertices, cancel, scale)
                     except PoseSetError as error:
-                        raise PoseSetError(f"{mesh.source} cannot be encoded: {error}") from error
+                        raise cannot_encode(mesh.source, error) from error
                     unfinished.keep(place, NamedPose.of_mesh(name, encoded), {})
                 progress(place + 1, len(files))
         poses = [
@@ -128,6 +130,7 @@ def decode(
         )
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
+    require_format_holds(destination, model, named, mesh_format)
     write_result(destination, model, named, mesh_format, axes=axes, scale=scale).note()
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
-from app.cli.inputs import expanded
+from app.cli.inputs import ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import (
@@ -20,12 +20,13 @@ from app.cli.results import (
     WrittenPoses,
     note_near_exclusion,
     output_named,
+    require_format_holds,
     require_one_mesh,
     write_result,
 )
 from app.cli.unfinished import UnfinishedPoses, unfinished_poses
 from app.wording import counted, fit_error
-from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from lcollision_core.model import NamedPose, PoseModel
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
-_Detailed = Mapping[int, "npt.NDArray[np.float32]"]
+_Detailed = Mapping[int, "npt.NDArray[np.float64]"]
 """Meshes with what encoding lost of them, (V, 3), by the place of their request."""
 
 _FIELDS = (
@@ -112,6 +113,7 @@ def resolve(
         bool,
         typer.Option("--keep-detail", help="Give meshes back what encoding lost, if still free."),
     ] = False,
+    scale: ScaleOption = 1.0,
     no_verify: Annotated[
         bool, typer.Option("--no-verify", help="Stop at the solver's answer, unchecked.")
     ] = False,
@@ -167,10 +169,11 @@ def resolve(
     files = expanded(inputs)
     if len(files) > 1:
         require_one_mesh(target, len(files))
-    requests, failed = _read(model, files)
+    requests, failed = _read(model, files, scale)
     if not requests:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     require_one_mesh(target, len(requests))
+    require_format_holds(target, model, [request.pose for request in requests], mesh_format)
     with (
         unfinished_poses(
             target.path, model, *_depends_on(model, requests, options, sequence), len(requests)
@@ -250,7 +253,7 @@ def _group_weights(model: PoseModel, wanted: Sequence[str]) -> tuple[float, ...]
     return tuple(weights)
 
 
-def _read(model: PoseModel, inputs: Sequence[Path]) -> tuple[list[_Request], bool]:
+def _read(model: PoseModel, inputs: Sequence[Path], scale: float) -> tuple[list[_Request], bool]:
     """Read and encode what can be; say of each other input in a sentence why it cannot."""
     from lcollision_core.model import unique_names
 
@@ -259,7 +262,7 @@ def _read(model: PoseModel, inputs: Sequence[Path]) -> tuple[list[_Request], boo
     with progress_bar("Reading poses") as progress:
         for done, path in enumerate(inputs):
             try:
-                requests += _requests_of(model, path)
+                requests += _requests_of(model, path, scale)
             except LCollisionError as error:
                 note(str(error))
                 failed = True
@@ -272,7 +275,7 @@ def _read(model: PoseModel, inputs: Sequence[Path]) -> tuple[list[_Request], boo
     return named, failed
 
 
-def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
+def _requests_of(model: PoseModel, path: Path, scale: float) -> Iterator[_Request]:
     from lcollision_core.meshes import read_mesh
     from lcollision_core.model import NamedPose, name_of_file, read_poses
 
@@ -284,11 +287,13 @@ def _requests_of(model: PoseModel, path: Path) -> Iterator[_Request]:
             yield _Request(f"{path}: {pose.name}", pose)
         return
     mesh = read_mesh(path, topology=model.topology)
+    if mesh.coarseness:
+        note(f"{path}: {mesh.coarseness}")
     model.require_topology(mesh.topology, str(path))
     try:
-        encoded = model.encode(mesh.vertices)
+        encoded = model.encode(mesh.vertices, scale=scale)
     except LCollisionError as error:
-        raise MeshFileError(f"{path} cannot be encoded: {error}") from error
+        raise cannot_encode(path, error) from error
     pose = NamedPose.of_mesh(name_of_file(path), encoded)
     fit = fit_error(encoded.fit_error_mean, encoded.fit_error_max)
     note(f"{path} is encoded with a {fit}")
@@ -303,7 +308,9 @@ def _depends_on(
 
     predictor = model.require_predictor().to_section()
     placed = [request.pose.placement for request in requests]
-    frames = [[*p.rotation.ravel(), *p.translation] if p else [np.nan] * 12 for p in placed]
+    frames = [
+        [*p.rotation.ravel(), *p.translation, p.scale] if p else [np.nan] * 13 for p in placed
+    ]
     arrays = {
         **{f"predictor/{name}": array for name, array in predictor.arrays.items()},
         "free": model.free_latent,
@@ -372,23 +379,25 @@ def _detailed(
 
 def _with_detail(
     model: PoseModel, request: _Request, result: ResolveResult
-) -> npt.NDArray[np.float32] | None:
+) -> npt.NDArray[np.float64] | None:
     """Return the fixed mesh with what encoding lost of it, or None where that would collide."""
     import numpy as np
 
-    from lcollision_core.resolve import exported_vertices
+    from lcollision_core.resolve import ExactCheck
 
     placement = request.pose.placement
     if request.mesh is None or placement is None:
         return None
     before, after = model.decode(np.stack([request.pose.latent, result.latent]))
     # Where the pose did not move, only rounded.
-    moved = request.mesh + (placement.apply(after) - placement.apply(before))
-    detailed = exported_vertices(moved)
-    if model.detector.are_colliding(detailed[None], workers=1)[0]:
+    moved: npt.NDArray[np.float64] = request.mesh + (
+        placement.apply(after) - placement.apply(before)
+    )
+    check = ExactCheck(model.embedding, model.detector, model.height, placement)
+    if not check.is_free_mesh(moved):
         note(f"{request.source}: with its detail the fixed mesh would collide, so it has none")
         return None
-    return detailed
+    return moved
 
 
 def _report(

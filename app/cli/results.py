@@ -167,12 +167,35 @@ def require_one_mesh(output: Output, n_poses: int) -> None:
         )
 
 
+def require_format_holds(
+    output: Output,
+    model: PoseModel,
+    poses: Sequence[NamedPose],
+    mesh_format: MeshFormat = MeshFormat.OBJ,
+) -> None:
+    """Refuse a format that cannot hold a pose where it lies, before the work for it is done.
+
+    Raises
+    ------
+    MeshFileError : its rounding steps there exceed a small share of an edge.
+    """
+    from lcollision_core.meshes import as_stored
+
+    if output.form is OutputForm.POSES:
+        return
+    for pose in poses:
+        if pose.placement is not None:
+            name = f"{pose.name}.{mesh_format}"
+            path = output.path / name if output.form is OutputForm.FOLDER else output.path
+            as_stored(path, pose.placement.apply(model.reference), model.topology)
+
+
 def write_result(
     output: Output,
     model: PoseModel,
     poses: Sequence[NamedPose],
     mesh_format: MeshFormat = MeshFormat.OBJ,
-    vertices: Sequence[npt.NDArray[np.float32] | None] | None = None,
+    vertices: Sequence[npt.NDArray[np.floating] | None] | None = None,
     axes: str = "model",
     scale: float | None = None,
 ) -> WrittenPoses:

@@ -56,6 +56,10 @@ def embedding(
             "Default: what the set says.",
         ),
     ] = None,
+    scale: Annotated[
+        float,
+        typer.Option(metavar="S", help="Brings the poses into the unit that the model is to have."),
+    ] = 1.0,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal models.")] = 0,
     source: Annotated[
         str | None, typer.Option(help="What the poses are. Default: the dataset's name.")
@@ -78,6 +82,8 @@ def embedding(
     require_writable(destination)
     before = file_stamp(destination)
     poses = read_pose_set(dataset)
+    if scale != 1.0:
+        poses = poses.scaled(scale)
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
     if near_exclusion is not None:

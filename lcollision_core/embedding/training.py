@@ -29,6 +29,7 @@ from lcollision_core.errors import PoseSetError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.alignment import align_rigid
 from lcollision_core.meshes.pose_set import PoseSet
+from lcollision_core.meshes.precision import can_hold
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import height
 
@@ -79,10 +80,11 @@ def train_embedding(
 ) -> Embedding:
     """Learn the latent space of a pose set.
 
-    Aligns the poses to the first, takes their features, trains the bilevel autoencoder on all of
-    them, fits their codes, and trains a second one without every `held_out_stride`-th pose to
-    measure how unseen poses fare beside plain principal components. A killed run that is started
-    again with the same checkpoint goes on where it was and ends with the same bits.
+    Moves a set that lies far from the origin to it, aligns the poses to the first, takes their
+    features, trains the bilevel autoencoder on all of them, fits their codes, and trains a second
+    one without every `held_out_stride`-th pose to measure how unseen poses fare beside plain
+    principal components. A killed run that is started again with the same checkpoint goes on where
+    it was and ends with the same bits.
 
     Parameters
     ----------
@@ -129,6 +131,9 @@ class _Run:
         seed: int,
     ) -> None:
         vertices = np.asarray(pose_set.vertices, dtype=np.float64)
+        if not can_hold(vertices[0], pose_set.topology, np.float32):
+            # So far from the origin that what is drawn and learnt in float32 would lose its shape.
+            vertices = vertices - vertices[0, pose_set.topology.picked].mean(axis=0)
         vertices = vertices / height(vertices[0], pose_set.topology)
         key = run_key(
             {"vertices": pose_set.vertices, "faces": pose_set.faces},

@@ -31,6 +31,7 @@ from lcollision_core.meshes.pose_set import (
     read_pose_set,
     write_pose_set,
 )
+from lcollision_core.meshes.precision import as_stored, can_hold
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.units import front_direction, height, up_axis
 
@@ -47,9 +48,11 @@ __all__ = [
     "RigidTransform",
     "Topology",
     "align_rigid",
+    "as_stored",
     "atomic_files",
     "atomic_write",
     "audit_mesh",
+    "can_hold",
     "file_stamp",
     "file_stem",
     "file_stems",

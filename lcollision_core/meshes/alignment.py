@@ -26,25 +26,29 @@ _CALM = 0.5
 
 @dataclass(frozen=True, eq=False)
 class RigidTransform:
-    """One rotation and translation, `aligned = rotation @ p + translation`.
+    """One rotation and translation, `aligned = scale * rotation @ p + translation`.
 
     Attributes
     ----------
     rotation : (3, 3) float64 array, determinant +1
-    translation : (3,) float64 array, in the meshes' unit
+    translation : (3,) float64 array, in the unit that it leads to
+    scale : > 0, how many units of where it leads to one of where it begins has: 1 but where a mesh
+        comes in another unit than a model's
     """
 
     rotation: FloatArray
     translation: FloatArray
+    scale: float = 1.0
 
     def apply(self, vertices: npt.NDArray[Any]) -> FloatArray:
         """Move (..., 3) points into the reference's frame."""
-        moved: FloatArray = np.asarray(vertices, np.float64) @ self.rotation.T + self.translation
-        return moved
+        turned: FloatArray = np.asarray(vertices, np.float64) @ self.rotation.T
+        return self.scale * turned + self.translation
 
     def inverse(self) -> RigidTransform:
         """Return the transform that leads back."""
-        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+        back = 1.0 / self.scale
+        return RigidTransform(self.rotation.T, -back * (self.rotation.T @ self.translation), back)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from lcollision_core.meshes.formats.polygons import (
     Polygons,
     triangulate,
 )
+from lcollision_core.meshes.precision import as_stored, can_hold, rounding_step
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.regular_files import open_regular
 
@@ -34,8 +35,6 @@ _ENCODERS: dict[str, Callable[[npt.NDArray[Any], npt.NDArray[np.int32]], bytes]]
     ".stl": stl.encode,
     ".glb": gltf.encode,
 }
-_SINGLE_PRECISION = (".stl", ".glb")
-_FLOAT32_MAX = float(np.finfo(np.float32).max)
 WRITABLE_SUFFIXES = tuple(_ENCODERS)
 """Extensions that `write_mesh` writes, in lower case."""
 
@@ -50,12 +49,15 @@ class Mesh:
     topology : its faces
     source : the file that it was read from
     notes : sentences on what was done on reading, such as the triangulation of quads
+    coarseness : what is lost where a file of single precision holds a mesh so far from the origin
+        that it cannot: a sentence, else None
     """
 
     vertices: npt.NDArray[np.float64]
     topology: Topology
     source: Path
     notes: tuple[str, ...] = ()
+    coarseness: str | None = None
 
     @property
     def faces(self) -> npt.NDArray[np.int32]:
@@ -100,7 +102,20 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
     vertices.flags.writeable = False
     if topology is not None and found == topology:
         found = topology
-    return Mesh(vertices, found, source, polygons.notes + notes)
+    coarseness = coarseness_of(vertices, found) if polygons.is_single else None
+    notes = polygons.notes + notes + ((coarseness,) if coarseness else ())
+    return Mesh(vertices, found, source, notes, coarseness)
+
+
+def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:
+    """Say what a mesh has lost by being stored in float32 where it lies; None if nothing."""
+    if can_hold(vertices, topology, np.float32):
+        return None
+    step, share = rounding_step(vertices, topology, np.float32)
+    return (
+        f"so far from the origin its coordinates are stored in steps of {step:.2g}, {share:.0%} of "
+        f"a short edge; export it nearer to the origin, or with double precision"
+    )
 
 
 def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
@@ -185,7 +200,8 @@ def write_mesh(
     ------
     ShapeError : an array has another shape, or a vertex is not finite.
     PoseSetError : a face names a vertex that does not exist.
-    MeshFileError : the extension is unknown or the file cannot be written.
+    MeshFileError : the extension is unknown, the file cannot be written, or so far from the origin
+        the format cannot hold the mesh: see `as_stored`.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in _ENCODERS:
@@ -202,14 +218,11 @@ def write_mesh(
     vertex = first_not_finite(points)
     if vertex is not None:
         raise ShapeError(f"vertex {vertex} is at {points[vertex].tolist()}, which is not finite")
-    if suffix in _SINGLE_PRECISION and float(np.abs(points).max()) > _FLOAT32_MAX:
-        raise MeshFileError(
-            f"{path} cannot be written: a coordinate exceeds float32, which {suffix} stores; "
-            f"write .ply or .obj"
-        )
+    topology = Topology(faces, len(points))
+    points = as_stored(path, points, topology)
     if suffix == ".glb" and up is not None:
         points = points @ _turn_to_y(up).astype(points.dtype).T
-    data = _ENCODERS[suffix](points, Topology(faces, len(points)).faces)
+    data = _ENCODERS[suffix](points, topology.faces)
     with atomic_write(path) as file:
         file.write(data)
 

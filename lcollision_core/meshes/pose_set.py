@@ -16,7 +16,12 @@ import numpy.typing as npt
 from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.files import READABLE_SUFFIXES, first_not_finite, read_mesh
+from lcollision_core.meshes.files import (
+    READABLE_SUFFIXES,
+    coarseness_of,
+    first_not_finite,
+    read_mesh,
+)
 from lcollision_core.meshes.likeness import unlike_poses
 from lcollision_core.meshes.mesh_kernels import mark_flat_faces
 from lcollision_core.meshes.npz import MAX_ITEMS, read_npz, write_npz
@@ -89,6 +94,19 @@ class PoseSet:
     def __len__(self) -> int:
         """N, the number of poses."""
         return len(self.vertices)
+
+    def scaled(self, factor: float) -> PoseSet:
+        """Return the same poses in another unit, as float64.
+
+        Raises
+        ------
+        ShapeError : the factor is no number above 0, or a coordinate would overflow.
+        """
+        if not 0.0 < factor < np.inf:
+            raise ShapeError(f"the scale must be a number above 0, got {factor:g}")
+        if float(np.abs(self.vertices).max()) > np.finfo(np.float64).max / max(factor, 1.0):
+            raise ShapeError(f"the scale {factor:g} is too large for the coordinates")
+        return replace(self, vertices=self.vertices.astype(np.float64) * factor)
 
     @property
     def faces(self) -> npt.NDArray[np.int32]:
@@ -292,7 +310,9 @@ def _collect_folder(
                     return Collected(None, len(files), same_topology=False)
                 vertices = np.empty((len(files), topology.n_vertices, 3), dtype=np.float64)
             defect = _disagreement(pose, file.name, mesh.topology, topology)
-            if defect is None:
+            if defect is None and mesh.coarseness:
+                report(PoseSetError(f"pose {pose} ({file.name}) is damaged: {mesh.coarseness}"))
+            elif defect is None:
                 vertices[len(names)] = mesh.vertices
                 names.append(file.name)
                 notes.update(mesh.notes)
@@ -365,6 +385,15 @@ def _collect_npz(
                 f"{vertices[pose, vertex].tolist()}, which is not finite; remove that pose"
             )
         )
+    if not usable.any():
+        return Collected(None, len(vertices), same_topology=True)
+    if vertices.dtype == np.float32:
+        for pose in np.flatnonzero(usable):
+            coarseness = coarseness_of(vertices[pose], topology)
+            if coarseness:
+                where = f"pose {pose} ({names[pose]}) of {path}"
+                report(PoseSetError(f"{where} is damaged: {coarseness}"))
+                usable[pose] = False
     if not usable.any():
         return Collected(None, len(vertices), same_topology=True)
     kept = np.flatnonzero(usable)

@@ -8,7 +8,6 @@ from lcollision_core.model.export import (
     LEAST_SCALE,
     ExportAxes,
     ExportFrame,
-    detector_of,
     export_frame,
     export_mesh,
 )
@@ -60,7 +59,6 @@ __all__ = [
     "Symmetry",
     "change_model",
     "checkpoint_path",
-    "detector_of",
     "export_frame",
     "export_mesh",
     "find_latent_space",

@@ -17,7 +17,7 @@ class EncodedPose:
     Attributes
     ----------
     latent : (D,) float64 array
-    placement : takes the decoded pose to where the mesh was, in the data's unit
+    placement : takes the decoded pose to where the mesh was, and into its unit
     fit_error_mean, fit_error_max : distance of the decoded vertices from the mesh's, in heights
     """
 

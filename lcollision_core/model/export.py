@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector
-from lcollision_core.meshes import RigidTransform, write_mesh
+from lcollision_core.meshes import RigidTransform, as_stored, write_mesh
 from lcollision_core.model.pose_model import PoseModel
 
 _AXES = np.eye(3)
@@ -47,8 +46,6 @@ EXPORT_SCALES = {
 LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6
 _ALREADY_FIXED = ".glb"
 """glTF's own axes and unit are y up, z forward and the metre."""
-
-_ROUNDED = (".stl", ".glb")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,17 +130,7 @@ def export_mesh(
     MeshFileError, ShapeError : as for `write_mesh`.
     """
     written = vertices if frame is None else frame.apply(vertices)
-    if Path(path).suffix.lower() in _ROUNDED:
-        written = written.astype(np.float32)
+    written = as_stored(path, written, model.topology)
     up = np.eye(3)[model.up_axis] if placement is None else None
     write_mesh(path, written, model.faces, up=up)
     return written
-
-
-def detector_of(model: PoseModel, frame: ExportFrame | None) -> CollisionDetector:
-    """Return what checks meshes as `export_mesh` has written them, in the file's unit."""
-    if frame is None or frame.scale == 1.0:
-        return model.detector
-    return CollisionDetector(
-        model.topology, frame.apply(model.reference), near_exclusion=model.near_exclusion
-    )

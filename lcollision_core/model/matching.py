@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import PoseSetError, ShapeError
-from lcollision_core.meshes import Topology, height
+from lcollision_core.errors import PoseSetError, ShapeError, WrongScaleError
+from lcollision_core.meshes import Topology, can_hold, height
 from lcollision_core.meshes.likeness import LARGEST_SIZE, is_torn, scale_of
 from lcollision_core.meshes.topology import FloatArray
 
 _MOST_SIZE = 20.0
 """Of meshes whose edges are not scaled alike."""
+
+_UNITS = (0.001, 0.01, 0.0254, 0.1, 0.3048, 1.0)
+"""Metres in a millimetre, centimetre, inch, decimetre, foot and metre."""
 
 
 def require_same_faces(topology: Topology, needed: Topology, source: str, model: str) -> None:
@@ -53,43 +56,78 @@ def _sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
 
 
 def checked_mesh(
-    vertices: npt.ArrayLike, reference: FloatArray, topology: Topology, model: str
+    vertices: npt.ArrayLike,
+    reference: FloatArray,
+    topology: Topology,
+    model: str,
+    scale: float = 1.0,
 ) -> FloatArray:
-    """Return a mesh that a model can encode as a float64 array.
+    """Return a mesh that a model can encode as a float64 array, in the data's unit.
 
     Parameters
     ----------
-    vertices : (V, 3) array, in the data's unit
+    vertices : (V, 3) array
     reference : (V, 3) array, the model's
     topology : of both
     model : its name
+    scale : brings `vertices` into the data's unit
 
     Raises
     ------
-    ShapeError : another shape, or a coordinate that is not finite.
-    PoseSetError : larger or smaller than the reference, as in another unit, or with its vertices
-        in another order.
+    ShapeError : another shape, a coordinate that is not finite, or a scale that is not above 0.
+    WrongScaleError : larger or smaller than the reference, as in another unit.
+    PoseSetError : with its vertices in another order, or too far from the origin for its digits.
     """
+    if not 0.0 < scale < np.inf:
+        raise ShapeError(f"the scale must be a number above 0, got {scale:g}")
     mesh = np.asarray(vertices, dtype=np.float64)
     if mesh.shape != reference.shape:
         raise ShapeError(f"a mesh of {model} has shape {reference.shape}, got {mesh.shape}")
     if not np.isfinite(mesh).all():
         vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
         raise ShapeError(f"vertex {vertex} (from 0) is not finite")
-    lengths, known = (topology.edge_lengths(one) for one in (mesh, reference))
-    scale, limit = scale_of(lengths, known), LARGEST_SIZE
-    if scale is None:
-        # Not scaled as a whole: not a pose perhaps, but no other unit unless it is far off.
-        scale, limit = height(mesh, topology) / height(reference, topology), _MOST_SIZE
-    if not 1.0 / limit < scale < limit:
-        advice = f"scale it by {1.0 / scale:.3g}" if 0.0 < scale < np.inf else "export it again"
+    if not can_hold(mesh, topology, np.float64):
         raise PoseSetError(
-            f"the mesh is {scale:.3g} times as large as the body of {model!r}, which is "
-            f"{height(reference, topology):.3g} tall in its own unit; {advice}"
+            "the mesh lies so far from the origin that its coordinates lose their digits; move it "
+            "nearer to the origin"
         )
-    if is_torn(lengths, scale * known):
+    mesh = mesh * scale
+    lengths, known = (topology.edge_lengths(one) for one in (mesh, reference))
+    size, limit = scale_of(lengths, known), LARGEST_SIZE
+    if size is None:
+        # Not scaled as a whole: not a pose perhaps, but no other unit unless it is far off.
+        size, limit = height(mesh, topology) / height(reference, topology), _MOST_SIZE
+    if not 1.0 / limit < size < limit:
+        sentence = (
+            f"the mesh is {size:.3g} times as large as the body of {model!r}, which is "
+            f"{height(reference, topology):.3g} tall in its own unit"
+        )
+        if not 0.0 < size < np.inf:
+            raise PoseSetError(f"{sentence}; export it again")
+        factor = likely_factor(1.0 / size) * scale
+        raise WrongScaleError(f"{sentence}; scale it by {factor:.6g}", factor)
+    if is_torn(lengths, size * known):
         raise PoseSetError(
             f"the mesh has other vertices joined than the body of {model!r}, as if they came in "
             f"another order; export it with the model's vertex order"
         )
     return mesh
+
+
+def likely_factor(measured: float) -> float:
+    """Return the factor between two usual units that is nearest to a measured one.
+
+    Parameters
+    ----------
+    measured : > 0, what sizes were found to differ by
+
+    Returns
+    -------
+    factor : such as 1000, 39.3701 or 2.54; `measured`, to three digits, where none is within the
+        sizes that bodies have
+    """
+    factors = np.array([one / other for one in _UNITS for other in _UNITS])
+    apart = np.abs(np.log(factors / measured))
+    if apart.min() > np.log(LARGEST_SIZE):
+        return float(f"{measured:.3g}")
+    return float(f"{factors[apart.argmin()]:.6g}")

@@ -48,8 +48,9 @@ class Symmetry:
         """Return the motion that takes a mesh's image to where the placed mesh's image is."""
         flip, shift = np.ones(3), np.zeros(3)
         flip[self.axis], shift[self.axis] = -1.0, 2.0 * self.offset
-        turned = placement.rotation @ shift + placement.translation
-        return RigidTransform(flip[:, None] * placement.rotation * flip, flip * turned + shift)
+        moved = placement.apply(shift)
+        turned = flip[:, None] * placement.rotation * flip
+        return RigidTransform(turned, flip * moved + shift, placement.scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +119,8 @@ def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | No
     if placement is not None:
         for array in (placement.rotation, placement.translation):
             digest.update(np.asarray(array, dtype="<f8").tobytes())
+        if placement.scale != 1.0:
+            digest.update(np.asarray(placement.scale, dtype="<f8").tobytes())
     return digest.hexdigest()[:16]
 
 

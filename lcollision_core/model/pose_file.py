@@ -36,6 +36,7 @@ MAX_TAGS = 50
 _NOT_ROTATED = 1e-6
 _LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e30
 """Far beyond any pose and any unit; what is larger overflows somewhere."""
+_LEAST_SCALE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def write_poses(
 ) -> None:
     """Write latent poses, whole or not at all.
 
-    Without a working pose and tags the file is of version 1, which older programs read.
+    Without a working pose, tags and scales the file is of version 1, which older programs read.
 
     Parameters
     ----------
@@ -169,7 +170,7 @@ def write_poses(
                 f"{path} cannot be written: of the pose {pose.name[:80]!r}, {error}; repair that "
                 f"pose"
             ) from error
-    needs_latest = working is not None or any(pose.tags for pose in poses)
+    needs_latest = working is not None or any(pose.tags or _is_scaled(pose) for pose in poses)
     document = {
         "format": POSES_FORMAT,
         "format_version": POSES_VERSION if needs_latest else 1,
@@ -340,6 +341,8 @@ def _placed_to_json(pose: NamedPose | MirrorSource) -> dict[str, Any]:
             "rotation": pose.placement.rotation.tolist(),
             "translation": pose.placement.translation.tolist(),
         }
+        if pose.placement.scale != 1.0:
+            entry["placement"]["scale"] = pose.placement.scale
     return entry
 
 
@@ -378,7 +381,14 @@ def _placed_from_json(
     turned = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
         raise ValueError("its rotation is no rotation matrix")
-    return latent, RigidTransform(rotation, translation)
+    scale = float(_numbers(held.get("scale", 1.0), (), "scale", 1.0 / _LEAST_SCALE))
+    if not _LEAST_SCALE <= scale <= 1.0 / _LEAST_SCALE:
+        raise ValueError(f"its scale must be {_LEAST_SCALE:g} to {1.0 / _LEAST_SCALE:g}")
+    return latent, RigidTransform(rotation, translation, scale)
+
+
+def _is_scaled(pose: NamedPose) -> bool:
+    return pose.placement is not None and pose.placement.scale != 1.0
 
 
 def _tags(value: Any) -> tuple[str, ...]:
@@ -395,8 +405,10 @@ def _tags(value: Any) -> tuple[str, ...]:
 def _placed_alike(one: RigidTransform | None, other: RigidTransform | None) -> bool:
     if one is None or other is None:
         return one is other
-    return np.array_equal(one.rotation, other.rotation) and np.array_equal(
-        one.translation, other.translation
+    return (
+        np.array_equal(one.rotation, other.rotation)
+        and np.array_equal(one.translation, other.translation)
+        and one.scale == other.scale
     )
 
 
@@ -414,8 +426,8 @@ def _numbers(
     except ValueError:
         array = np.array(None)
     if array.shape != shape or array.dtype.kind not in "iuf":
-        size = " by ".join(map(str, shape))
-        raise ValueError(f"its {name} must be {size} numbers")
+        wanted = f"{' by '.join(map(str, shape))} numbers" if shape else "a number"
+        raise ValueError(f"its {name} must be {wanted}")
     numbers = array.astype(np.float64)
     if not np.isfinite(numbers).all():
         raise ValueError(f"its {name} has a number that is not finite")

@@ -280,7 +280,9 @@ class PoseModel:
             raise ShapeError(f"one pose is mirrored at a time, got an array of shape {pose.shape}")
         return self.pose_mirror.mirror(pose, placement, source, options, progress, cancel)
 
-    def encode(self, vertices: npt.ArrayLike, cancel: CancelToken | None = None) -> EncodedPose:
+    def encode(
+        self, vertices: npt.ArrayLike, cancel: CancelToken | None = None, scale: float = 1.0
+    ) -> EncodedPose:
         """Find the latent pose whose mesh lies nearest to a given one, wherever that lies.
 
         The encoder's guess, then Gauss-Newton steps on the vertex distance that settle code and
@@ -288,18 +290,20 @@ class PoseModel:
 
         Parameters
         ----------
-        vertices : (V, 3) finite array, in the data's unit
+        vertices : (V, 3) finite array, in a unit of its own, which its placement leads back to
         cancel : polled before the fit
+        scale : brings `vertices` into the data's unit
 
         Raises
         ------
-        ShapeError : another shape, or a coordinate that is not finite.
-        PoseSetError : 20 times larger or smaller than the reference.
+        ShapeError : another shape, a coordinate that is not finite, or a scale that is not above 0.
+        WrongScaleError : larger or smaller than a pose of the reference can be.
+        PoseSetError : with other vertices joined, or too far from the origin.
         CancelledError : `cancel` was set.
         """
-        mesh = checked_mesh(vertices, self.reference, self.topology, self.name)
+        mesh = checked_mesh(vertices, self.reference, self.topology, self.name, scale)
         fit = self.embedding.encode(mesh[None] / self.card.height, cancel=cancel)
-        aligning = RigidTransform(fit.rotations[0], fit.translations[0] * self.card.height)
+        aligning = RigidTransform(fit.rotations[0], fit.translations[0] * self.card.height, scale)
         return EncodedPose(
             latent=fit.latent[0].astype(np.float64),
             placement=aligning.inverse(),

@@ -1,6 +1,6 @@
 """The nearest collision-free pose: the paper's problem, then a ladder that ends exactly free."""
 
-from lcollision_core.resolve.exact import exported_vertices
+from lcollision_core.resolve.exact import ExactCheck, exported_vertices
 from lcollision_core.resolve.free_poses import find_free_poses
 from lcollision_core.resolve.ladder import ALL_LOCKED
 from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult, Solver, Step
@@ -9,6 +9,7 @@ from lcollision_core.resolve.sequence import largest_correction_change
 
 __all__ = [
     "ALL_LOCKED",
+    "ExactCheck",
     "Metric",
     "PoseResolver",
     "ResolveOptions",

@@ -10,14 +10,14 @@ import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector, SelfCollisions
 from lcollision_core.embedding import Embedding
-from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes import RigidTransform, Topology, can_hold
 from lcollision_core.meshes.topology import FloatArray
 
 
 def exported_vertices(
     vertices: npt.NDArray[Any], placement: RigidTransform | None = None
-) -> npt.NDArray[np.float32]:
-    """Round vertices to what a file of them holds, and what is proved of them.
+) -> npt.NDArray[np.floating]:
+    """Return the vertices that a pose is exported with.
 
     Parameters
     ----------
@@ -26,16 +26,31 @@ def exported_vertices(
 
     Returns
     -------
-    exported : (..., V, 3) float32 array; a placed pose is rounded as it is drawn, moved, and
-        rounded again
+    exported : (..., V, 3) array: as they are drawn, float32; where a pose has a place, which may
+        be far from the origin, moved there in float64
     """
     drawn: npt.NDArray[np.float32] = vertices.astype(np.float32)
-    return drawn if placement is None else placement.apply(drawn).astype(np.float32)
+    return drawn if placement is None else placement.apply(drawn)
+
+
+def in_each_format(
+    exported: npt.NDArray[np.floating], topology: Topology
+) -> list[npt.NDArray[np.floating]]:
+    """Return one pose's exported (V, 3) vertices as each of the formats holds them.
+
+    A pose that has a place is written in float64 and, by formats that hold no more, in float32,
+    where that leaves it its shape: see `lcollision_core.meshes.precision`.
+    """
+    if exported.dtype == np.float32 or not can_hold(exported, topology, np.float32):
+        return [exported]
+    return [exported, exported.astype(np.float32)]
 
 
 @dataclass(frozen=True, eq=False)
 class ExactCheck:
     """Decodes latent poses and tests them as they are exported; safe to share between threads.
+
+    A pose is free when it is in each format that can hold it.
 
     Attributes
     ----------
@@ -54,18 +69,39 @@ class ExactCheck:
         """Decode (B, D) latent poses to (B, V, 3) vertices in heights, in the reference's frame."""
         return self.embedding.decode(np.atleast_2d(np.asarray(latent)), n_threads=1)
 
-    def exported(self, decoded: FloatArray) -> npt.NDArray[np.float32]:
+    def exported(self, decoded: FloatArray) -> npt.NDArray[np.floating]:
         """Return decoded (..., V, 3) vertices, in heights, as they are exported."""
         return exported_vertices(decoded * self.height, self.placement)
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Tell which of (B, D) latent poses are exactly free: (B,) bool."""
-        return ~self.detector.are_colliding(self.exported(self.decode(latent)), workers=1)
+        exported = self.exported(self.decode(latent))
+        if self.placement is None:
+            return ~self.detector.are_colliding(exported, workers=1)
+        return np.array([self.is_free_mesh(one) for one in exported], dtype=np.bool_)
 
     def is_free(self, latent: npt.ArrayLike) -> bool:
         """Tell whether one (D,) latent pose is exactly free."""
         return bool(self.are_free(latent)[0])
 
+    def is_free_mesh(self, exported: npt.NDArray[np.floating]) -> bool:
+        """Tell whether (V, 3) vertices are free where they are exported to."""
+        forms = in_each_format(exported, self.detector.topology)
+        return not any(
+            self.detector.are_colliding(form[None], workers=1, unit=self._unit)[0] for form in forms
+        )
+
     def find(self, decoded: FloatArray) -> SelfCollisions:
-        """Find all colliding pairs of one pose's decoded (V, 3) vertices."""
-        return self.detector.detect(self.exported(decoded))
+        """Find all colliding pairs of one pose's decoded (V, 3) vertices.
+
+        Those in float64 where it collides in that, else those in float32.
+        """
+        for form in in_each_format(self.exported(decoded), self.detector.topology):
+            found = self.detector.detect(form, unit=self._unit)
+            if found.colliding:
+                break
+        return found
+
+    @property
+    def _unit(self) -> float:
+        return 1.0 if self.placement is None else 1.0 / self.placement.scale

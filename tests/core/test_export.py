@@ -12,7 +12,6 @@ from lcollision_core.model import (
     EXPORT_SCALES,
     ExportAxes,
     PoseModel,
-    detector_of,
     export_frame,
     export_mesh,
 )
@@ -84,7 +83,7 @@ def test_what_is_checked_is_what_is_written(body: PoseModel, tmp_path: Path, suf
         written = export_mesh(path, body, vertices, frame=frame)
         read = read_mesh(path, topology=body.topology).vertices
         np.testing.assert_array_equal(written, read)
-        found = detector_of(body, frame).detect(read)
+        found = body.detector.detect(read, unit=1.0 / frame.scale)
         known = body.detector.detect(vertices)
         assert len(found.pairs) == len(known.pairs)
         assert found.energy == pytest.approx(known.energy, rel=1e-3)

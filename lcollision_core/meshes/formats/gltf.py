@@ -82,17 +82,19 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
         raise MeshFileError(f"it shows {len(meshes)} meshes, one of triangles is needed")
     transform, mesh = meshes[0]
     vertices = np.array(mesh.vertices, dtype=np.float64)
-    if not np.array_equal(transform, np.eye(4)):
+    # A node may place float32 vertices far away, where the product keeps their digits.
+    is_placed = not np.array_equal(transform, np.eye(4))
+    if is_placed:
         # A coordinate that is not finite is refused with all others.
         with np.errstate(all="ignore"):
             vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
     faces = np.array(mesh.faces, dtype=np.int64)
     in_range = faces.size and faces.min() >= 0 and faces.max() < len(vertices)
     if in_range and topology is not None and len(vertices) != topology.n_vertices:
-        joined = with_order_of(vertices[faces.reshape(-1)], topology, _REORDERED)
+        joined = with_order_of(vertices[faces.reshape(-1)], topology, _REORDERED, not is_placed)
         if joined is not None:
             return joined
-    return Polygons.triangles(vertices, faces)
+    return Polygons.triangles(vertices, faces, is_single=not is_placed)
 
 
 def _require_one_mesh(data: bytes) -> None:

@@ -81,7 +81,8 @@ def read(file: BinaryIO) -> Polygons:
     corners = next(columns["face"][name] for name in _CORNER_NAMES if name in columns["face"])
     if corners.sizes is None:
         raise MeshFileError("its faces have no list of vertices; export the mesh again")
-    return Polygons(vertices, corners.sizes, corners.values.astype(np.int64))
+    is_single = byte_order is not None and columns["vertex"]["x"].values.dtype.itemsize == 4
+    return Polygons(vertices, corners.sizes, corners.values.astype(np.int64), is_single=is_single)
 
 
 def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:

@@ -36,12 +36,14 @@ class Polygons:
     sizes : (P,) int64 array, corners of each polygon
     corners : (sum of sizes,) int64 array, vertex indices from 0, one polygon after the other
     notes : sentences on what was done to the file's content
+    is_single : whether the file holds the coordinates as float32
     """
 
     vertices: npt.NDArray[np.float64]
     sizes: npt.NDArray[np.int64]
     corners: npt.NDArray[np.int64]
     notes: tuple[str, ...] = ()
+    is_single: bool = False
 
     @classmethod
     def triangles(
@@ -49,13 +51,15 @@ class Polygons:
         vertices: npt.NDArray[np.float64],
         faces: npt.NDArray[np.int64],
         notes: tuple[str, ...] = (),
+        is_single: bool = False,
     ) -> Polygons:
         """Wrap (V, 3) vertices and (F, 3) faces."""
-        return cls(vertices, np.full(len(faces), 3, dtype=np.int64), faces.reshape(-1), notes)
+        sizes = np.full(len(faces), 3, dtype=np.int64)
+        return cls(vertices, sizes, faces.reshape(-1), notes, is_single)
 
 
 def with_order_of(
-    corners: npt.NDArray[np.float64], topology: Topology | None, note: str
+    corners: npt.NDArray[np.float64], topology: Topology | None, note: str, is_single: bool
 ) -> Polygons | None:
     """Put the corners of triangles back into the vertex order of the mesh that they were cut from.
 
@@ -64,6 +68,7 @@ def with_order_of(
     corners : (3 F, 3) array, three in turn for each triangle
     topology : of that mesh
     note : what to say of it
+    is_single : whether the file holds them as float32
 
     Returns
     -------
@@ -76,7 +81,7 @@ def with_order_of(
     vertices[order] = corners
     if not np.array_equal(vertices[order], corners):
         return None
-    return Polygons.triangles(vertices, topology.faces.astype(np.int64), (note,))
+    return Polygons.triangles(vertices, topology.faces.astype(np.int64), (note,), is_single)
 
 
 def first_at_each_place(points: npt.NDArray[Any]) -> npt.NDArray[np.int32]:

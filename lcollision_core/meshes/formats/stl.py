@@ -67,7 +67,9 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
     else:
         raise MeshFileError(f"it has {size} bytes, too few for an STL file; export the mesh again")
     points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0, as which corner is kept is chance
-    return with_order_of(points, topology, _REORDERED) or _joined(points)
+    is_single = not (is_text and expected != size)
+    ordered = with_order_of(points, topology, _REORDERED, is_single)
+    return ordered or _joined(points, is_single)
 
 
 def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
@@ -89,11 +91,12 @@ def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
     return numbers([word for row in words for word in row], "the corners")
 
 
-def _joined(points: npt.NDArray[np.float64]) -> Polygons:
+def _joined(points: npt.NDArray[np.float64], is_single: bool) -> Polygons:
     first = first_at_each_place(points)
     is_first = first == np.arange(len(first))
     number = np.cumsum(is_first) - 1
-    return Polygons.triangles(points[is_first], number[first].reshape(-1, 3), (_JOINED,))
+    faces = number[first].reshape(-1, 3)
+    return Polygons.triangles(points[is_first], faces, (_JOINED,), is_single)
 
 
 def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:

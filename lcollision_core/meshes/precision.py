@@ -1,0 +1,97 @@
+"""Whether a number format can hold a mesh where it lies: the one rule for reading and writing."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.topology import Topology
+
+SINGLE_PRECISION = (".stl", ".glb")
+"""Formats that hold float32 by their nature; the others hold what they are given."""
+
+LARGEST_SHARE = 0.01
+"""Of a short edge, that the rounding step of a coordinate may be: beyond it, faces lose their
+shape, and what was said of a mesh is not true of its file."""
+
+_SHORT_EDGES = 10.0
+"""Per cent of the edges that are at most as long as a short edge."""
+
+
+def rounding_step(
+    vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLike
+) -> tuple[float, float]:
+    """Return the largest rounding step of a mesh's coordinates, and its share of a short edge.
+
+    Parameters
+    ----------
+    vertices : (V, 3) finite array; those that no face uses do not count
+    topology : of the mesh
+    dtype : float32 or float64, which the coordinates are to be stored in
+
+    Returns
+    -------
+    step : in the mesh's unit
+    share : the step over the length that a tenth of the edges have at most, those without length
+        aside; 0 where no edge has one
+    """
+    points = np.asarray(vertices, dtype=np.float64)
+    farthest = min(float(np.abs(points[topology.picked]).max()), float(np.finfo(dtype).max))
+    step = float(np.spacing(np.asarray(farthest, dtype=dtype)))
+    lengths = topology.edge_lengths(points)
+    lengths = lengths[lengths > 0.0]
+    return step, step / float(np.percentile(lengths, _SHORT_EDGES)) if len(lengths) else 0.0
+
+
+def can_hold(vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLike) -> bool:
+    """Tell whether rounding to a number format leaves a mesh its shape, where it lies.
+
+    Parameters and terms are those of `rounding_step`.
+    """
+    return rounding_step(vertices, topology, dtype)[1] <= LARGEST_SHARE
+
+
+def as_stored(
+    path: str | os.PathLike[str], vertices: npt.NDArray[Any], topology: Topology
+) -> npt.NDArray[Any]:
+    """Round vertices to what a mesh file of them holds.
+
+    Parameters
+    ----------
+    path : its extension says the format
+    vertices : (V, 3) finite array
+    topology : of the mesh
+
+    Returns
+    -------
+    stored : (V, 3) float32 array for formats of single precision, else as `vertices` is
+
+    Raises
+    ------
+    MeshFileError : the rounding steps exceed `LARGEST_SHARE` of a short edge, or a coordinate
+        exceeds the format.
+    """
+    suffix = Path(path).suffix.lower()
+    dtype = np.float32 if suffix in SINGLE_PRECISION else np.float64
+    if float(np.abs(vertices).max()) > np.finfo(dtype).max:
+        raise MeshFileError(
+            f"{path} cannot be written: a coordinate exceeds float32, which {suffix} stores; "
+            f"write .ply or .obj"
+        )
+    stored = np.asarray(vertices, dtype) if dtype is np.float32 else np.asarray(vertices)
+    # What came rounded is not rounded again.
+    if stored.dtype != vertices.dtype or stored.dtype == np.float64:
+        step, share = rounding_step(vertices, topology, dtype)
+        if share > LARGEST_SHARE:
+            advice = "write .obj, .ply or .off, or move" if dtype is np.float32 else "move"
+            raise MeshFileError(
+                f"{path} cannot be written: so far from the origin {suffix} rounds coordinates to "
+                f"steps of {step:.2g}, {share:.0%} of a short edge; {advice} the mesh nearer to "
+                f"the origin"
+            )
+    return stored
