@@ -13,7 +13,6 @@ from app.camera import CAMERAS
 from app.dialogs.failure import open_log_file
 from app.dialogs.forms import resolve_form
 from app.dialogs.help import AboutDialog, ShortcutsDialog
-from app.dialogs.questions import ask_for_name
 
 if TYPE_CHECKING:
     from app.main_window import MainWindow
@@ -37,7 +36,7 @@ class ActionHandlers(QObject):
         super().__init__(window)
         self._window = window
         self._document = document = window.document
-        files, library = window.files, window.library
+        files = window.files
         window.viewport.waiting.open_wanted.connect(window.actions_by_key["open_model"].trigger)
         self.acts: dict[str, Callable[[], object]] = {
             "new": files.new_pose,
@@ -60,10 +59,7 @@ class ActionHandlers(QObject):
             "resolve": self._resolve,
             "cancel": self._cancel,
             "resolve_options": self.choose_resolve_options,
-            "keep": self.keep_pose,
-            "load": library.load_chosen,
-            "rename": self._rename,
-            "remove": self._remove,
+            **window.library_actions.acts,
             "ghost": self._toggle_ghost,
             "reset_camera": lambda: window.viewport.set_camera(CAMERAS[0]),
             "full_screen": self._toggle_full_screen,
@@ -77,15 +73,6 @@ class ActionHandlers(QObject):
     def choose_resolve_options(self) -> None:
         """Ask how Resolve is to work."""
         self._open(resolve_form(self._window.settings, self._window))
-
-    @Slot()
-    def keep_pose(self) -> None:
-        """Ask for a name, and put the pose into the library."""
-        proposed = self._document.pose_name
-        name = ask_for_name(self._window, "Keep this pose", "Name in your library:", proposed)
-        if name is not None:
-            self._document.add_pose_to_library(name)
-            self._window.library.choose_own(self._document.pose_name)
 
     def _find_slider(self) -> None:
         dock = self._window.docks["sliders"]
@@ -114,22 +101,6 @@ class ActionHandlers(QObject):
     def _cancel(self) -> None:
         self._document.cancel_all()
         self._window.viewport.pictures.cancel()
-
-    def _rename(self) -> None:
-        library = self._window.library
-        chosen = library.chosen_own
-        if chosen is None:
-            return
-        label = f"New name of “{chosen.name}”:"
-        name = ask_for_name(self._window, "Rename a pose", label, chosen.name)
-        if name is not None:
-            self._document.rename_pose(chosen.name, name)
-            library.choose_own(name)
-
-    def _remove(self) -> None:
-        chosen = self._window.library.chosen_own
-        if chosen is not None:
-            self._document.remove_pose_from_library(chosen.name)
 
     def _toggle_ghost(self) -> None:
         self._document.show_ghost(self._window.actions_by_key["ghost"].isChecked())

@@ -41,7 +41,7 @@ ACTIONS: dict[str, ActionSpec] = {
     ),
     "open": ActionSpec("&Open…", "Ctrl+O", "Open poses, a mesh or a model", "open"),
     "open_model": ActionSpec("Open &model…", "Ctrl+Shift+O", "Choose another body"),
-    "save": ActionSpec("&Save", "Ctrl+S", "Save the pose and your library", "save"),
+    "save": ActionSpec("&Save", "Ctrl+S", "Save the pose to its file", "save"),
     "save_as": ActionSpec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
     "import": ActionSpec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),
     "export": ActionSpec("&Export mesh…", "Ctrl+E", "Write the mesh on the screen", "export"),
@@ -65,12 +65,33 @@ ACTIONS: dict[str, ActionSpec] = {
     ),
     "cancel": ActionSpec("&Cancel", "Escape", "Stop what is being computed", "cancel"),
     "resolve_options": ActionSpec("Resolve &options…", "Ctrl+Shift+R", "Choose how Resolve works"),
-    "keep": ActionSpec("&Keep this pose…", "Ctrl+K", "Put this pose into your library", "add"),
-    "load": ActionSpec("&Load chosen pose", "Ctrl+Return", "Edit the chosen pose of the library"),
-    "rename": ActionSpec("Re&name chosen pose…", "F2", "Give a pose of yours another name"),
-    "remove": ActionSpec(
-        "R&emove chosen pose", "Ctrl+Delete", "Drop a pose of yours from the library", "remove"
+    "keep": ActionSpec("Add &to library…", "Ctrl+K", "Keep this pose in your library", "add"),
+    "update": ActionSpec(
+        "&Update pose", "Ctrl+U", "Let the pose of your library that this one was be as it is now"
     ),
+    "load": ActionSpec("&Load chosen pose", "Ctrl+Return", "Edit the chosen pose"),
+    "blend": ActionSpec(
+        "&Blend towards chosen pose", "Ctrl+B", "Go to the slider that blends towards it"
+    ),
+    "rename": ActionSpec("Re&name…", "F2", "Give the chosen pose of your library another name"),
+    "tags": ActionSpec("Ta&gs…", "Ctrl+Shift+T", "Choose by which words a pose is found"),
+    "duplicate": ActionSpec("&Duplicate", "Ctrl+Shift+D", "Copy the chosen poses of your library"),
+    "remove": ActionSpec(
+        "R&emove", "Ctrl+Delete", "Drop the chosen poses from your library", "remove"
+    ),
+    "add": ActionSpec(
+        "Add &chosen to library", "Ctrl+Shift+K", "Copy poses from here into your library"
+    ),
+    "import_poses": ActionSpec(
+        "&Import into library…", "Ctrl+Shift+I", "Add the poses of a file to your library"
+    ),
+    "export_poses": ActionSpec(
+        "E&xport chosen poses…", "Ctrl+Shift+E", "Write the chosen poses to a file"
+    ),
+    "export_library": ActionSpec(
+        "Export libr&ary…", "Ctrl+Alt+E", "Write your whole library to a file, to share or to keep"
+    ),
+    "find_pose": ActionSpec("&Find a pose", "Ctrl+Shift+F", "Type what a pose is called"),
     "ghost": ActionSpec(
         "&Ghost", "Ctrl+G", "Show the pose before Resolve, see-through", "ghost", checkable=True
     ),

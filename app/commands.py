@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,8 +13,7 @@ import numpy.typing as npt
 from PySide6.QtGui import QUndoCommand
 
 if TYPE_CHECKING:
-    from lcollision_core.meshes import RigidTransform
-    from lcollision_core.model import MirrorSource, NamedPose
+    from lcollision_core.model import LibraryChange, NamedPose
     from lcollision_core.resolve import ResolveResult
 
 MERGE_SECONDS = 1.0
@@ -22,39 +22,59 @@ MERGE_SECONDS = 1.0
 _MERGE_ID = 1
 
 
+class Source(Enum):
+    """Where a pose comes from."""
+
+    TRAINING = "training"
+    LIBRARY = "library"
+    FILE = "file"
+    MESH = "mesh"
+
+
 @dataclass(frozen=True, eq=False)
-class DocumentState:
-    """All that undo brings back.
+class Origin:
+    """The pose that the working pose was before it was changed.
 
     Attributes
     ----------
-    latent : (D,) float64 array, read-only
-    pose_name : under which Save stores the pose
-    placement : where the decoded pose belongs, for one that came in as a mesh
-    poses : the user's library
+    source : where it is
+    pose : as it was; for one of the library, the pose of its name there counts
+    """
+
+    source: Source
+    pose: NamedPose
+
+
+@dataclass(frozen=True, eq=False)
+class DocumentState:
+    """All that undo brings back, but for the library, which changes by `LibraryChange`.
+
+    Attributes
+    ----------
+    pose : the working pose, its arrays read-only; it has no tags
+    origin : what the working pose came from, None for a new one
     ghost : (V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`
     outcome : of the Resolve that ended in this pose
-    mirror_of : what the pose was mirrored from; once it is changed, of no meaning
     outcome_seconds : from asking for that Resolve to its result, with all that it waited for
     """
 
-    latent: npt.NDArray[np.float64]
-    pose_name: str
-    placement: RigidTransform | None = None
-    poses: tuple[NamedPose, ...] = ()
+    pose: NamedPose
+    origin: Origin | None = None
     ghost: npt.NDArray[np.float32] | None = None
     outcome: ResolveResult | None = None
-    mirror_of: MirrorSource | None = None
     outcome_seconds: float = 0.0
 
     def same_as(self, other: DocumentState) -> bool:
         """Whether there is nothing to undo between two states: equal poses, to the bit."""
         return (
-            self.latent.tobytes() == other.latent.tobytes()
-            and self.pose_name == other.pose_name
-            and self.placement is other.placement
-            and self.poses is other.poses
+            self.pose.name == other.pose.name
+            and self.pose.same_as(other.pose)
+            and _key(self.origin) == _key(other.origin)
         )
+
+
+def _key(origin: Origin | None) -> tuple[Source, str] | None:
+    return None if origin is None else (origin.source, origin.pose.name)
 
 
 class ChangeState(QUndoCommand):
@@ -63,33 +83,37 @@ class ChangeState(QUndoCommand):
     Parameters
     ----------
     label : what the menu calls the act
-    apply : puts a state into the document; a method of the document, as commands know no widget
+    apply : puts a state into the document and makes changes to the library; a method of the
+        document, as commands know no widget
     before, after : the two states, which `PoseHistory` may amend
     run : steps of one run on one slider merge when they follow fast; None never merges
+    changes : of the library, one after the other
     """
 
     def __init__(
         self,
         label: str,
-        apply: Callable[[DocumentState], None],
+        apply: Callable[[DocumentState, Sequence[LibraryChange]], None],
         before: DocumentState,
         after: DocumentState,
         run: int | None = None,
+        changes: Sequence[LibraryChange] = (),
     ) -> None:
         super().__init__(label)
         self._apply = apply
         self.before = before
         self.after = after
         self._run = run
+        self._changes = tuple(changes)
         self._time = time.monotonic()
 
     def redo(self) -> None:
         """Go to the later state."""
-        self._apply(self.after)
+        self._apply(self.after, self._changes)
 
     def undo(self) -> None:
         """Go back to the earlier state."""
-        self._apply(self.before)
+        self._apply(self.before, [change.inverse for change in reversed(self._changes)])
 
     def id(self) -> int:
         """Tell Qt whether to ask `mergeWith`."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app import tasks
-from app.commands import DocumentState
+from app.commands import DocumentState, Source
 from app.engine import Failure, LivePose, LongWork, Work
 from app.frames import ExactVerdict, LiveFrame, PosePrediction
 from app.history import UNNAMED, PoseHistory, read_only
@@ -33,7 +33,7 @@ REST_MILLISECONDS = 60
 
 
 class PoseDocument(PoseHistory):
-    """One model, one pose of it, the user's library, and their history.
+    """One model, one working pose of it, the user's library, and their history.
 
     Lives in the thread of the window and computes nothing there: each change asks two workers,
     and the newest request wins. Until the first model is in, `has_model` is False and only
@@ -44,6 +44,11 @@ class PoseDocument(PoseHistory):
     where they end as they began. A step on a slider outside a gesture, as from the keyboard,
     merges with the one before when it is the same slider within a second.
 
+    Parameters
+    ----------
+    model : may come later
+    library_folder : of the users' pose libraries; the user's own by default
+
     Attributes
     ----------
     may_replace : asked before a model or a file comes in over edits made while it was read
@@ -52,7 +57,8 @@ class PoseDocument(PoseHistory):
     -------
     model_changed : another model is in; latent, library, locks and history are new too
     latent_changed, locks_changed, ghost_changed, library_changed, file_changed : look again;
-        `file_changed` covers `file` and `pose_name`
+        `library_changed` covers `poses` and `file_poses`, `file_changed` covers `file`,
+        `pose_name` and `changed`
     frame_changed, exact_changed : `frame`, `exact` are new, or None as they are not yet known
     pose_loaded : the pose has come in whole, from the library or a file, not by sliders
     modified_changed : bool
@@ -62,7 +68,9 @@ class PoseDocument(PoseHistory):
     busy_changed : str, what the long work is, or "" where there is none
     message : str, one sentence for the status bar
     failed : Failure, one sentence and its details, for a dialog
+    opened : Path, the file of poses or of a model that is in now
     imported : Path, the mesh that has become the pose
+    of_other_model : OtherModel, a file of poses that could not be opened with this model
     recovered : Path, the poses file that `recover` has put in
     """
 
@@ -76,11 +84,19 @@ class PoseDocument(PoseHistory):
     busy_changed = Signal(str)
     message = Signal(str)
     failed = Signal(object)
+    opened = Signal(object)
     imported = Signal(object)
+    of_other_model = Signal(object)
     recovered = Signal(object)
 
-    def __init__(self, model: PoseModel | None = None, parent: QObject | None = None) -> None:
+    def __init__(
+        self,
+        model: PoseModel | None = None,
+        parent: QObject | None = None,
+        library_folder: Path | None = None,
+    ) -> None:
         super().__init__(parent)
+        self._library_folder = library_folder
         self._model: PoseModel | None = None
         self._model_file = ""
         self._predicts = False
@@ -219,7 +235,7 @@ class PoseDocument(PoseHistory):
         _ = self.model.pose_mirror
         self.end_gesture()
         self._long.cancel(self._mirroring)
-        work = tasks.mirrored(self.model, self._state, self._locked)
+        work = tasks.mirrored(self.model, self.pose, self._locked)
         self._mirroring = self._long.start("Mirroring", work, self._on_mirrored)
 
     def code_name(self, index: int) -> str:
@@ -257,7 +273,7 @@ class PoseDocument(PoseHistory):
     # Models and files.
 
     def set_model(self, model: PoseModel) -> None:
-        """Put in another model, with a new pose and an empty library.
+        """Put in another model, with a new pose and the user's library of it.
 
         Parameters
         ----------
@@ -267,6 +283,8 @@ class PoseDocument(PoseHistory):
         self._put_in(tasks.OpenedModel(model, model.name))
 
     def _put_in(self, opened: tasks.OpenedModel) -> None:
+        from lcollision_core.model import PoseLibrary, user_poses_folder
+
         self._model = opened.model
         self._model_file = opened.file
         self._locked = frozenset()
@@ -275,7 +293,11 @@ class PoseDocument(PoseHistory):
         for number in (self._mirroring, self._incoming, self._loading):
             self._long.cancel(number)
         self._frame = self._exact = self._gesture = self._file = None
-        self._state = self._blank()
+        self._file_poses = ()
+        folder = self._library_folder or user_poses_folder()
+        self._library = PoseLibrary(opened.model, folder, self._tell_of_library)
+        self._held = self._blank()
+        self._saved = self._held.pose
         self._predicts = False
         self._live.follow(self.model, self.latent, self._predicts)
         self._load_predictor()
@@ -301,24 +323,36 @@ class PoseDocument(PoseHistory):
         self._bring(f"Opening {name_or_path}", tasks.opened_model(name_or_path), self._on_model)
 
     def new_pose(self) -> None:
-        """Start anew: the reference pose, unnamed, no library, no file, no history."""
+        """Start anew: the reference pose, unnamed, no file, no history; the library stays."""
         self._long.cancel(self._incoming)
         self._begin(self._blank(), None)
 
-    def open_poses(self, path: str | Path) -> None:
-        """Read a poses file in the long worker; its poses are the library, its first is edited."""
-        work = tasks.read(self.model, Path(path))
+    def open_poses(self, path: str | Path, model_file: str | Path | None = None) -> None:
+        """Read a poses file in the long worker; its working or first pose is edited.
+
+        The library stays as it is: the file's poses are `file_poses`.
+
+        Parameters
+        ----------
+        model_file : the model that comes in too; the poses are the present one's where None. Of
+            a file of another model that is known, `of_other_model` tells.
+        """
+        work = tasks.read(None if model_file else self.model, model_file or "", Path(path))
         self._bring(f"Opening {Path(path).name}", work, self._on_poses)
 
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
         """Read what a crash left, as `LostPose` tells of it, and make it the pose, unsaved."""
-        is_open = model_file == self._model_file
-        opened = tasks.OpenedModel(self.model, model_file) if is_open else None
-        work = tasks.recovered(opened, model_file, poses_file, name, file)
-        self._bring(f"Recovering {name}", work, self._on_recovered)
+        model = self.model if model_file == self._model_file else None
+
+        def put_in(read: tasks.ReadPoses) -> None:
+            self._on_recovered(read, name, file)
+
+        self._bring(f"Recovering {name}", tasks.read(model, model_file, poses_file), put_in)
 
     def save(self, path: str | Path | None = None) -> None:
-        """Write the library and the edited pose, under its name, and clear the modified mark.
+        """Write the working pose and the file's other poses, and clear the modified mark.
+
+        A pose without a name is called as its file from then on.
 
         Parameters
         ----------
@@ -328,15 +362,16 @@ class PoseDocument(PoseHistory):
         ------
         ModelFileError : there is no file yet, or it cannot be written.
         """
-        from lcollision_core.model import write_poses
+        from lcollision_core.model import name_of_file, write_poses
 
         self.end_gesture()
-        poses = self.all_poses()
         target = Path(path) if path is not None else self._file
         if target is None:
             raise ModelFileError("the pose has no file yet; save it under a name")
-        write_poses(target, self.model, poses)
-        self._keep_saved(poses, target)
+        name = self.pose_name if self.pose_name != UNNAMED else name_of_file(target)
+        pose = replace(self.pose, name=name)
+        write_poses(target, self.model, self.file_poses, pose)
+        self._keep_saved(pose, target)
         self.message.emit(f"Saved {target.name}")
 
     def import_mesh(self, path: str | Path) -> None:
@@ -445,22 +480,41 @@ class PoseDocument(PoseHistory):
     def _on_model(self, opened: tasks.OpenedModel) -> None:
         self._put_in(opened)
         self.message.emit(f"Opened {opened.model.name}")
+        self.opened.emit(Path(opened.file))
 
-    def _on_poses(self, read: tasks.ReadPoses) -> None:
-        self._begin_with(read.poses[0], read.poses, read.path)
-        self.message.emit(f"Opened {read.path.name}: {counted(len(read.poses), 'pose')}")
+    def _on_poses(self, read: tasks.ReadPoses | tasks.OtherModel) -> None:
+        if isinstance(read, tasks.OtherModel):
+            self.of_other_model.emit(read)
+            return
+        if read.opened is not None:
+            self._put_in(read.opened)
+        held = read.held
+        edited = held.working or held.poses[0]
+        self.begin_with(edited, Source.FILE, read.path, held.poses)
+        self.message.emit(f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}")
+        self.opened.emit(read.path)
 
-    def _on_recovered(self, found: tasks.RecoveredPoses) -> None:
-        if found.opened.model is not self._model:
-            self._put_in(found.opened)
-        edited = next((p for p in found.poses if p.name == found.name), found.poses[0])
-        self._begin_with(edited, found.poses, found.file)
-        self.undo_stack.resetClean()
+    def _on_recovered(
+        self, read: tasks.ReadPoses | tasks.OtherModel, name: str, file: Path | None
+    ) -> None:
+        if isinstance(read, tasks.OtherModel):
+            self.failed.emit(Failure(read.sentence, ""))
+            return
+        if read.opened is not None:
+            self._put_in(read.opened)
+        poses = read.held.poses
+        edited = read.held.working or next((p for p in poses if p.name == name), poses[0])
+        self.begin_with(edited, Source.FILE, file, poses)
+        self._saved = None
+        self._tell_modified()
         self.message.emit(f"Recovered {edited.name}")
-        self.recovered.emit(found.poses_file)
+        self.recovered.emit(read.path)
+
+    def _tell_of_library(self, sentence: str) -> None:
+        self.failed.emit(Failure(sentence, ""))
 
     def _on_encoded(self, imported: tasks.Imported) -> None:
-        self._load(f"Import {imported.pose.name}", imported.pose)
+        self._load(f"Import {imported.pose.name}", imported.pose, Source.MESH)
         self._tell(imported)
         self.imported.emit(imported.path)
 
@@ -469,16 +523,10 @@ class PoseDocument(PoseHistory):
 
     def _on_mirrored(self, image: MirroredPose) -> None:
         self.end_gesture()
+        pose = self.pose.mirrored(image)
+        pose = replace(pose, latent=read_only(np.array(pose.latent, dtype=np.float64)))
         resolution = image.resolution if image.pairs_after == 0 else None
-        after = replace(
-            self._state,
-            latent=read_only(image.latent.copy()),
-            placement=image.placement,
-            ghost=None,
-            outcome=resolution,
-            mirror_of=image.source,
-        )
-        self._push("Mirror", after)
+        self._push("Mirror", replace(self._state, pose=pose, ghost=None, outcome=resolution))
         self.message.emit(heading(mirrored_text(image)))
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
@@ -490,7 +538,8 @@ class PoseDocument(PoseHistory):
             self._amend(replace(self._state, ghost=None, outcome=result, outcome_seconds=seconds))
         else:
             latent = read_only(np.array(result.latent, dtype=np.float64))
-            found = replace(self._state, latent=latent, ghost=resolved.ghost, outcome=result)
+            pose = replace(self.pose, latent=latent, fit_error_mean=None, fit_error_max=None)
+            found = replace(self._state, pose=pose, ghost=resolved.ghost, outcome=result)
             self._push("Resolve", replace(found, outcome_seconds=seconds))
         self.solve_finished.emit(result)
 
@@ -512,18 +561,20 @@ class PoseDocument(PoseHistory):
         """
         self.cancel_resolve()
         self._long.cancel(self._incoming)
-        known = self._state
+        known = self._held
 
         def arrive(value: Any) -> None:
             self.end_gesture()
-            if not ask or self._state.same_as(known) or self.may_replace():
+            if not ask or known is None or self._state.same_as(known) or self.may_replace():
                 done(value)
 
         self._incoming = self._long.start(label, work, arrive)
         self.busy_changed.emit(self.busy)
 
     def _blank(self) -> DocumentState:
-        return DocumentState(read_only(self.model.training_latent[0]), UNNAMED)
+        from lcollision_core.model import NamedPose
+
+        return DocumentState(NamedPose(UNNAMED, read_only(self.model.training_latent[0])))
 
     def _follow_latent(self) -> None:
         self.cancel_resolve()

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QObject, Slot
+from PySide6.QtCore import QObject, Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
 from app.dialogs.forms import export_form, screenshot_form, turntable_form
-from app.dialogs.questions import Answer, ask_about_changes
+from app.dialogs.questions import Answer, ask_about_changes, ask_to_switch
 from app.panels.parts import plain_tip
 from app.wording import menu_text
 from lcollision_core.bundled import bundled_folder
@@ -20,6 +20,7 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from app.document import PoseDocument
     from app.settings import Settings
+    from app.tasks import OtherModel
     from app.viewport import Viewport
 
 POSES_SUFFIX = ".json"
@@ -82,23 +83,29 @@ class FileActions(QObject):
         document.may_replace = lambda: bool(attempt(self.may_lose_changes))
         document.file_changed.connect(self._on_file)
         document.model_changed.connect(self._on_model)
-        document.imported.connect(self._remember)
+        document.imported.connect(self._on_arrived)
+        document.opened.connect(self._on_arrived)
+        document.message.connect(self._on_message)
+        # Once the reading is over, and the window says so.
+        document.of_other_model.connect(self._on_other_model, Qt.ConnectionType.QueuedConnection)
+        self._dropped: tuple[Path, int] | None = None
+        self._told = ""
 
     def open(self) -> None:
         """Ask for any file that can be opened, and open it."""
-        path = self._ask_open("Open", _kinds("poses", "meshes", "models"))
+        path = self.ask_open("Open", "poses", "meshes", "models")
         if path is not None:
             self.open_path(path)
 
     def open_model(self) -> None:
         """Ask for a model, and open it."""
-        path = self._ask_open("Open a model", _kinds("models"))
+        path = self.ask_open("Open a model", "models")
         if path is not None:
             self.open_path(path)
 
     def import_mesh(self) -> None:
         """Ask for a mesh, and make it the pose."""
-        path = self._ask_open("Import a mesh", _kinds("meshes"))
+        path = self.ask_open("Import a mesh", "meshes")
         if path is not None:
             self.open_path(path)
 
@@ -109,6 +116,7 @@ class FileActions(QObject):
         ------
         LCollisionError : the extension is none of these, or there is no such file.
         """
+        self._dropped = None
         suffix = path.suffix.lower()
         if not path.is_file():
             self._settings.forget_file(str(path.resolve()))
@@ -131,6 +139,19 @@ class FileActions(QObject):
             )
         self._settings["last_folder"] = str(path.resolve().parent)
 
+    def open_dropped(self, paths: Sequence[Path]) -> None:
+        """Open the first of some files that can be opened, and tell of the others once it is.
+
+        Raises
+        ------
+        LCollisionError : as for `open_path`.
+        """
+        known = (POSES_SUFFIX, MODEL_SUFFIX, *_mesh_suffixes())
+        path = next((held for held in paths if held.suffix.lower() in known), paths[0])
+        self.open_path(path)
+        if len(paths) > 1:
+            self._dropped = (path, len(paths))
+
     def new_pose(self) -> None:
         """Start anew, once unsaved changes are settled."""
         if self.may_lose_changes():
@@ -150,8 +171,7 @@ class FileActions(QObject):
 
     def save_as(self) -> bool:
         """Ask for a file, and save there; returns whether it was saved."""
-        proposed = self._folder() / f"{self._document.pose_name}{POSES_SUFFIX}"
-        path = self._ask_save("Save poses", proposed, {"Poses": POSES_SUFFIX})
+        path = self.ask_save("Save poses", self._name, {"Poses": POSES_SUFFIX}, self._document.file)
         if path is None:
             return False
         self._document.save(path)
@@ -161,8 +181,7 @@ class FileActions(QObject):
         """Ask for axes, scale and file, and write the mesh on the screen."""
 
         def write() -> None:
-            proposed = self._folder() / f"{self._document.pose_name}.obj"
-            path = self._ask_save("Export the mesh", proposed, _EXPORTS)
+            path = self.ask_save("Export the mesh", self._name, _EXPORTS)
             if path is not None:
                 settings = self._settings
                 self._document.export_mesh(path, settings["export_axes"], settings["export_scale"])
@@ -175,8 +194,7 @@ class FileActions(QObject):
         """Ask for size and file, and save a picture of the viewport."""
 
         def shoot() -> None:
-            proposed = self._folder() / f"{self._document.pose_name}.png"
-            path = self._ask_save("Save the screenshot", proposed, {"PNG": ".png"})
+            path = self.ask_save("Save the screenshot", self._name, {"PNG": ".png"})
             if path is not None:
                 settings = self._settings
                 viewport.screenshot(
@@ -193,8 +211,7 @@ class FileActions(QObject):
         """Ask for duration and file, and save a film of one turn."""
 
         def shoot() -> None:
-            proposed = self._folder() / f"{self._document.pose_name}.gif"
-            path = self._ask_save("Save the turntable", proposed, _FILMS)
+            path = self.ask_save("Save the turntable", self._name, _FILMS)
             if path is not None:
                 viewport.turntable(path, seconds=self._settings["turntable_seconds"])
 
@@ -254,6 +271,26 @@ class FileActions(QObject):
         if self._document.file is not None:
             self._remember(self._document.file)
 
+    @Slot(object)
+    def _on_arrived(self, path: Path) -> None:
+        """Remember a file that is open now, and tell of those that were dropped with it."""
+        if path.suffix.lower() in _mesh_suffixes():
+            self._remember(path)
+        dropped, self._dropped = self._dropped, None
+        if dropped is not None and dropped[0].absolute() == path.absolute():
+            self._document.message.emit(
+                f"{self._told}; of {dropped[1]} files it is the one that was opened"
+            )
+
+    @Slot(str)
+    def _on_message(self, sentence: str) -> None:
+        self._told = sentence
+
+    @Slot(object)
+    def _on_other_model(self, found: OtherModel) -> None:
+        if ask_to_switch(self._window, found.path.name, found.model.name):
+            self._document.open_poses(found.path, found.model.path)
+
     @Slot()
     def _on_model(self) -> None:
         file = Path(self._document.model_file)
@@ -272,15 +309,38 @@ class FileActions(QObject):
         folder = Path(self._settings["last_folder"] or Path.home())
         return folder if folder.is_dir() else Path.home()
 
-    def _ask_open(self, title: str, kinds: str) -> Path | None:
-        name, _ = QFileDialog.getOpenFileName(self._window, title, str(self._folder()), kinds)
+    @property
+    def _name(self) -> str:
+        """What the pose on the screen is called: never as one that it is no longer."""
+        document = self._document
+        return f"{document.pose_name} changed" if document.changed else document.pose_name
+
+    def ask_open(self, title: str, *kinds: str) -> Path | None:
+        """Ask for a file of some kinds: "poses", "meshes", "models"; None where there is none."""
+        name, _ = QFileDialog.getOpenFileName(
+            self._window, title, str(self._folder()), _kinds(*kinds)
+        )
         return Path(name) if name else None
 
-    def _ask_save(self, title: str, proposed: Path, kinds: dict[str, str]) -> Path | None:
-        """Ask for a name; the chosen kind's extension is added to a name without one.
+    def ask_save(
+        self, title: str, name: str, kinds: dict[str, str], file: Path | None = None
+    ) -> Path | None:
+        """Ask for a file to write; the chosen kind's extension is added to a name without one.
 
         Where the extension chooses among kinds, another one is left for the writer to refuse.
+
+        Parameters
+        ----------
+        title : of the dialog
+        name : of what is written, from which a file name that is not taken is made
+        kinds : extensions by what the kinds are called
+        file : that is proposed instead, as it holds what is written
+
+        Returns
+        -------
+        path : None where the user gives up
         """
+        proposed = file or _unused(self._folder(), name, next(iter(kinds.values())))
         filters = {f"{kind} (*{suffix})": suffix for kind, suffix in kinds.items()}
         dialog = QFileDialog(self._window, title, str(proposed))
         dialog.setAcceptMode(QFileDialog.AcceptMode.AcceptSave)
@@ -308,3 +368,15 @@ class FileActions(QObject):
         form.deleteLater()
         if accepted:
             act()
+
+
+def _unused(folder: Path, name: str, suffix: str) -> Path:
+    """Return a file of a folder that is not there yet, called as a pose is."""
+    from lcollision_core.meshes import file_stem
+
+    stem, number = file_stem(name), 1
+    path = folder / f"{stem}{suffix}"
+    while path.exists():
+        number += 1
+        path = folder / f"{stem} {number}{suffix}"
+    return path

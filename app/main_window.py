@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from PySide6.QtCore import QSize, Qt, QTimer, Signal, Slot
+from PySide6.QtCore import QEvent, QSize, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import (
     QAction,
     QActionGroup,
@@ -44,6 +44,7 @@ from app.dialogs.failure import FailureDialog
 from app.engine import Failure
 from app.file_actions import FileActions
 from app.icons import icon, program_icon
+from app.library_actions import LibraryActions
 from app.menus import fill_menus, make_bar, refresh_bar
 from app.panels.collision import CollisionPanel
 from app.panels.dock import Panel
@@ -58,7 +59,7 @@ from app.shortcuts import WindowShortcuts
 from app.status_bar import StatusBar
 from app.theme import apply_theme, wanted_theme
 from app.viewport import Viewport
-from app.wording import menu_text
+from app.wording import menu_text, one_line
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -133,7 +134,8 @@ class MainWindow(QMainWindow):
         self.randomise = RandomiseCard(act["randomise"], settings["randomise_amount"])
         self.sliders.add_card(self.randomise)
         self.collision = CollisionPanel(document, act["resolve"])
-        self.library = LibraryPanel(document)
+        self.library = LibraryPanel(document, act["keep"], act["update"], act["add"])
+        self.library_actions = LibraryActions(self, document, self.library, self.files, act)
         self.docks = {
             "sliders": self._dock("sliders", "Sliders", self.sliders),
             "collision": self._dock("collision", "Collisions", self.collision),
@@ -254,6 +256,12 @@ class MainWindow(QMainWindow):
                 widget.reject()
         self.close()
 
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
+        """See what another editor has kept meanwhile, as the user comes back to this one."""
+        super().changeEvent(event)
+        if event.type() is QEvent.Type.ActivationChange and self.isActiveWindow():
+            self.document.refresh_library()
+
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
         """Settle unsaved changes, then end all work before the view goes."""
 
@@ -289,15 +297,13 @@ class MainWindow(QMainWindow):
             event.acceptProposedAction()
 
     def dropEvent(self, event: QDropEvent) -> None:  # noqa: N802 - Qt's name
-        """Open the first file that is dropped."""
+        """Open a file that is dropped, of several the first that can be opened."""
         paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
         if not paths:
             return
         event.acceptProposedAction()
-        if len(paths) > 1:
-            self._status.tell(f"Of {len(paths)} files {paths[0].name} was opened")
         # The program that is dragged from waits until this returns.
-        QTimer.singleShot(0, self, lambda: self.attempt(lambda: self.files.open_path(paths[0])))
+        QTimer.singleShot(0, self, lambda: self.attempt(lambda: self.files.open_dropped(paths)))
 
     # Building.
 
@@ -342,9 +348,6 @@ class MainWindow(QMainWindow):
         self.viewport.shading_changed.connect(self._on_shading)
         self.viewport.menu_wanted.connect(self._body_menu.open)
         self.collision.resolve.options_wanted.connect(self._handlers.choose_resolve_options)
-        self.library.keep_wanted.connect(self._handlers.keep_pose)
-        self.library.chosen_changed.connect(self._update_actions)
-        self.library.list.itemActivated.connect(self.library.load_chosen)
         self.randomise.wanted.connect(document.randomise)
         self.randomise.refused.connect(self._status.tell)
         document.model_changed.connect(self._on_model)
@@ -423,15 +426,15 @@ class MainWindow(QMainWindow):
         if not document.has_model:
             self.setWindowTitle("LCollision")
             return
+        name = one_line(document.pose_name) + ", changed" * document.changed
         file = f" — {document.file.name}" if document.file is not None else ""
-        self.setWindowTitle(f"{document.pose_name}{file}[*] — {document.model.name}")
+        self.setWindowTitle(f"{name}{file}[*] — {document.model.name}")
         self.setWindowModified(document.modified)
 
     @Slot()
     def _update_actions(self) -> None:
         document, stack = self.document, self.document.undo_stack
         has_model = document.has_model
-        own_chosen = self.library.chosen_own is not None
         allowed = {
             "undo": stack.canUndo(),
             "redo": stack.canRedo(),
@@ -440,16 +443,14 @@ class MainWindow(QMainWindow):
             "resolve": document.can_resolve and not (document.solving or document.incoming),
             "resolve_options": document.can_resolve,
             "cancel": bool(self._busy),
-            "load": self.library.chosen is not None,
-            "rename": own_chosen,
-            "remove": own_chosen,
         }
         waits = f"{document.incoming}: what comes replaces this pose"
         tip = waits if document.incoming else ACTIONS["resolve"].tip
         explain_action(self.actions_by_key["resolve"], tip)
         always = ("open_model", "quit", "reset_layout", "full_screen", "shortcuts", "log", "about")
         for key, action in self.actions_by_key.items():
-            action.setEnabled(key in always or (has_model and allowed.get(key, True)))
+            if key not in self.library_actions.acts:
+                action.setEnabled(key in always or (has_model and allowed.get(key, True)))
         for key, name, text in (
             ("undo", "Undo", stack.undoText()),
             ("redo", "Redo", stack.redoText()),

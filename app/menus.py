@@ -23,9 +23,12 @@ MENUS: dict[str, tuple[str, ...]] = {
         *("undo", "redo", SEPARATOR),
         *("reset", "randomise", "mirror", SEPARATOR, "filter", "unlock"),
     ),
-    "&Pose": (
-        *("resolve", "cancel", "resolve_options", SEPARATOR),
-        *("keep", "load", "rename", "remove"),
+    "&Pose": ("resolve", "cancel", "resolve_options"),
+    "&Library": (
+        *("load", "blend", SEPARATOR),
+        *("rename", "tags", "duplicate", "remove", "add", SEPARATOR),
+        *("keep", "update", SEPARATOR),
+        *("import_poses", "export_poses", "export_library", SEPARATOR, "find_pose"),
     ),
     "&View": (
         *("shading", SEPARATOR, "ghost", SEPARATOR),

@@ -158,15 +158,15 @@ def _lost(parent: Path) -> Iterator[LostPose]:
 
 @dataclass(frozen=True, eq=False)
 class _Snapshot:
-    """What is to be written; None as the poses deletes what was."""
+    """What is to be written; None as the working pose deletes what was."""
 
     session: Session
     model: PoseModel
     model_file: str
-    pose_name: str
     file: Path | None
     locked: tuple[int, ...]
-    poses: tuple[NamedPose, ...] | None
+    file_poses: tuple[NamedPose, ...]
+    working: NamedPose | None
 
 
 class _Writer(QObject):
@@ -181,14 +181,14 @@ class _Writer(QObject):
 
         folder = snapshot.session.folder
         try:
-            if snapshot.poses is None:
+            if snapshot.working is None:
                 (folder / _POSES).unlink(missing_ok=True)
                 (folder / _SESSION).unlink(missing_ok=True)
                 return
-            write_poses(folder / _POSES, snapshot.model, snapshot.poses)
+            write_poses(folder / _POSES, snapshot.model, snapshot.file_poses, snapshot.working)
             held = {
                 "model": snapshot.model_file,
-                "pose_name": snapshot.pose_name,
+                "pose_name": snapshot.working.name,
                 "file": str(snapshot.file) if snapshot.file else None,
                 "locked": snapshot.locked,
             }
@@ -308,10 +308,10 @@ class Autosave(QObject):
             session=session,
             model=document.model,
             model_file=document.model_file,
-            pose_name=document.pose_name,
             file=document.file,
             locked=tuple(sorted(document.locked_domains)),
-            poses=document.all_poses() if document.modified else None,
+            file_poses=document.file_poses,
+            working=document.pose if document.modified else None,
         )
 
     @Slot(object)

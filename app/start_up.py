@@ -84,9 +84,8 @@ class StartUp(QObject):
             path = self._path
             self._window.attempt(lambda: self._window.files.open_path(path))
             return
-        self._document.load_pose(opening_pose(self._document.model))
-        # What the program did is neither a change to save nor one to take back.
-        self._document.undo_stack.clear()
+        # What the program does is neither a change to save nor one to take back.
+        self._document.begin_with(opening_pose(self._document.model))
 
     @Slot()
     def _on_pose_loaded(self) -> None:

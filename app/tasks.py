@@ -16,9 +16,8 @@ from lcollision_core.errors import ModelFileError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
-    from app.commands import DocumentState
     from lcollision_core.meshes import RigidTransform
-    from lcollision_core.model import MirroredPose, NamedPose, PoseModel
+    from lcollision_core.model import ListedModel, MirroredPose, NamedPose, PoseFile, PoseModel
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
@@ -40,30 +39,34 @@ class OpenedModel:
 
 @dataclass(frozen=True, eq=False)
 class ReadPoses:
-    """A poses file: at least one pose."""
-
-    path: Path
-    poses: tuple[NamedPose, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class RecoveredPoses:
-    """What a crash left: at least one pose, `name` being the edited one.
+    """A poses file: at least one pose.
 
     Attributes
     ----------
-    opened : the model that the poses belong to
-    poses_file : where they were kept
-    poses : the library, with the edited pose
-    name : of the edited pose
-    file : that it came from
+    path : that was read
+    held : with a working pose or others
+    opened : the model that was opened for it, None for the one that was open
     """
 
-    opened: OpenedModel
-    poses_file: Path
-    poses: tuple[NamedPose, ...]
-    name: str
-    file: Path | None
+    path: Path
+    held: PoseFile
+    opened: OpenedModel | None
+
+
+@dataclass(frozen=True)
+class OtherModel:
+    """A poses file that belongs to another model than the one that is open.
+
+    Attributes
+    ----------
+    path : the file
+    model : that the poses belong to
+    sentence : that tells of it
+    """
+
+    path: Path
+    model: ListedModel
+    sentence: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,30 +150,30 @@ def loaded_predictor(model: PoseModel) -> Work:
     return work
 
 
-def read(model: PoseModel, path: Path) -> Work:
-    """Read a poses file of a model."""
+def read(model: PoseModel | None, model_file: str | Path, path: Path) -> Work:
+    """Read a poses file of a model, which is opened first where it is None.
 
-    def work(_: Progress, cancel: CancelToken) -> ReadPoses:
-        from lcollision_core.model import read_poses
+    The work's value is `OtherModel` where the file belongs to another model that is known.
+    """
 
-        poses = read_poses(path, model)
+    def work(progress: Progress, cancel: CancelToken) -> ReadPoses | OtherModel:
+        from lcollision_core.model import OtherModelError, read_pose_file
+
+        opened: OpenedModel | None = None
+        owner = model
+        if owner is None:
+            opened = opened_model(model_file)(progress, cancel)
+            owner = opened.model
+        try:
+            held = read_pose_file(path, owner)
+        except OtherModelError as error:
+            if error.model is None:
+                raise
+            return OtherModel(path, error.model, str(error))
         cancel.raise_if_cancelled()
-        if not poses:
+        if not held.all_poses:
             raise ModelFileError(f"{path} holds no poses; open a file that has some")
-        return ReadPoses(path, poses)
-
-    return work
-
-
-def recovered(
-    opened: OpenedModel | None, model_file: str, poses_file: Path, name: str, file: Path | None
-) -> Work:
-    """Read what a crash left, with its model unless that is open already."""
-
-    def work(progress: Progress, cancel: CancelToken) -> RecoveredPoses:
-        model = opened or opened_model(model_file)(progress, cancel)
-        poses = read(model.model, poses_file)(progress, cancel).poses
-        return RecoveredPoses(model, poses_file, poses, name, file)
+        return ReadPoses(path, held, opened)
 
     return work
 
@@ -191,16 +194,14 @@ def encoded(model: PoseModel, path: Path) -> Work:
     return work
 
 
-def mirrored(model: PoseModel, state: DocumentState, locked: frozenset[int]) -> Work:
+def mirrored(model: PoseModel, pose: NamedPose, locked: frozenset[int]) -> Work:
     """Exchange left and right; what Resolve must move then leaves the locked domains."""
 
     def work(progress: Progress, cancel: CancelToken) -> MirroredPose:
         from lcollision_core.resolve import ResolveOptions
 
         options = ResolveOptions(locked_domains=locked)
-        return model.mirror(
-            state.latent, state.placement, state.mirror_of, options, progress, cancel
-        )
+        return model.mirror(pose.latent, pose.placement, pose.mirror_of, options, progress, cancel)
 
     return work
 

@@ -234,6 +234,9 @@ QToolButton#segment:checked {{
     background: {theme.accent}; color: {theme.on_accent}; border-color: {theme.accent};
 }}
 QToolButton#segment:focus {{ border-color: {theme.accent}; }}
+QToolButton#filter {{
+    border: 1px solid {theme.border}; padding: 4px 10px; background: {theme.card};
+}}
 QToolButton#segment[place="first"] {{
     border-top-left-radius: {RADIUS}px; border-bottom-left-radius: {RADIUS}px; margin-left: 0;
 }}

@@ -94,24 +94,25 @@ def time_editor(
     for place, model in enumerate(models):
         for start in range(_STARTS):
             is_last = start == _STARTS - 1
-            answer = _run(model, n_actions if is_last else -1)
+            answer = _run(find_model(model), n_actions if is_last else -1)
             progress(place * _STARTS + start + 1, len(models) * _STARTS)
         rows.append(EditorTiming(**answer))
     return rows
 
 
-def _run(model: str, n_actions: int) -> dict[str, Any]:
-    """Run one editor with settings, log and sessions of its own; -1 only starts it."""
+def _run(model: Path, n_actions: int) -> dict[str, Any]:
+    """Run one editor with settings, log, sessions and library of its own; -1 only starts it."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {
             **os.environ,
             "XDG_CONFIG_HOME": str(Path(folder, "config")),
             "XDG_STATE_HOME": str(Path(folder, "state")),
+            "XDG_DATA_HOME": str(Path(folder, "data")),
         }
         started = time.time()
         try:
             ended = subprocess.run(
-                [sys.executable, "-m", "app.benchmarks.editor_session", model, str(n_actions)]
+                [sys.executable, "-m", "app.benchmarks.editor_session", str(model), str(n_actions)]
                 + [repr(started)],
                 env=environment,
                 capture_output=True,

@@ -200,7 +200,7 @@ class Session(QObject):
             if len(document.poses) < _MOST_KEPT:
                 document.add_pose_to_library("kept")
             else:
-                document.remove_pose_from_library(document.poses[0].name)
+                document.remove_poses_from_library([document.poses[0].name])
 
         def mirror() -> None:
             if document.can_mirror:
@@ -361,7 +361,7 @@ def run(model: str, n_actions: int, started: float) -> None:
         # What is compiled for the first prediction is kept for the next start.
         session.settle()
     # Nothing is to be asked about, nor kept.
-    window.document.undo_stack.setClean()
+    window.document.mark_saved()
     window.close()
     sys.stdout.write(json.dumps(answer) + "\n")
 

@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import (
-    QDialog,
     QGridLayout,
-    QInputDialog,
-    QLabel,
     QMessageBox,
     QPushButton,
     QSpacerItem,
@@ -69,19 +66,28 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Answer:
     return _answer(box, recover, discard)
 
 
-def ask_for_name(parent: QWidget, title: str, label: str, proposed: str) -> str | None:
-    """Ask what something is to be called; None where the user gives up."""
-    dialog = QInputDialog(parent)
-    dialog.setWindowTitle(title)
-    dialog.setLabelText(menu_text(label))
-    # A label of names, such as "<b>", is no HTML.
-    for held in dialog.findChildren(QLabel):
-        held.setTextFormat(Qt.TextFormat.PlainText)
-    dialog.setTextValue(proposed)
-    dialog.resize(_WIDTH, dialog.sizeHint().height())
-    accepted = dialog.exec() == QDialog.DialogCode.Accepted
-    dialog.deleteLater()
-    return dialog.textValue().strip() if accepted else None
+def ask_to_replace(parent: QWidget, name: str) -> bool:
+    """Ask whether a pose of the library is to be replaced."""
+    box = _box(parent, "Replace a pose")
+    box.setText(f"Replace “{name}” in your library?")
+    box.setInformativeText("Undo brings it back.")
+    replace = box.addButton("Replace", QMessageBox.ButtonRole.AcceptRole)
+    other = box.addButton("Choose another name", QMessageBox.ButtonRole.RejectRole)
+    box.setDefaultButton(other)
+    box.setEscapeButton(other)
+    return _answer(box, replace, other) is Answer.SAVE
+
+
+def ask_to_switch(parent: QWidget, file: str, model: str) -> bool:
+    """Ask whether the model that a file of poses belongs to is to be opened with it."""
+    box = _box(parent, "Poses of another model")
+    box.setText(f"{file} holds poses of the model “{model}”.")
+    box.setInformativeText(f"Open “{model}” with these poses?")
+    switch = box.addButton(f"Open “{menu_text(model)}”", QMessageBox.ButtonRole.AcceptRole)
+    stay = box.addButton("Cancel", QMessageBox.ButtonRole.RejectRole)
+    box.setDefaultButton(switch)
+    box.setEscapeButton(stay)
+    return _answer(box, switch, stay) is Answer.SAVE
 
 
 def _box(parent: QWidget, title: str) -> QMessageBox:

@@ -1,36 +1,37 @@
-"""The pose library: training poses and the user's own, as pictures."""
+"""The pose browser: training poses, the user's library and a file's poses, as pictures."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PySide6.QtCore import QSize, Qt, QTimer, Signal, Slot
-from PySide6.QtGui import QIcon, QImage, QPixmap, QShowEvent
+from PySide6.QtCore import QItemSelectionModel, QPoint, Qt, QTimer, Signal, Slot
+from PySide6.QtGui import QAction, QIcon, QImage, QPixmap, QShowEvent
 from PySide6.QtWidgets import (
     QButtonGroup,
     QHBoxLayout,
-    QListWidget,
+    QLineEdit,
     QListWidgetItem,
-    QPushButton,
-    QSizePolicy,
+    QMenu,
     QToolButton,
     QVBoxLayout,
     QWidget,
 )
 
 from app.camera import front_direction, preset_view
-from app.panels.parts import ElidedLabel, Slider, labelled, silent
+from app.commands import Source
+from app.panels.action_button import ActionButton
+from app.panels.parts import ElidedLabel, Slider, labelled, plain_tip, silent
+from app.panels.pose_grid import THUMBNAIL, PoseGrid
 from app.panels.thumbnail import draw_pose
 from app.theme import CLOSE, NORMAL, TIGHT, current_theme
+from app.wording import menu_text, one_line
 
 if TYPE_CHECKING:
     from app.document import PoseDocument
     from app.frames import PoseShower
     from lcollision_core.model import NamedPose
-
-THUMBNAIL = 88
-"""Side of a picture, in device-independent pixels."""
 
 _PAUSE = 25
 """Milliseconds between two pictures, so that the window stays live while they are drawn."""
@@ -40,60 +41,33 @@ _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
 """By whether the theme is dark."""
 
 
-class PoseList(QListWidget):
-    """Pictures of poses with their names beneath; the wheel scrolls them sideways too.
-
-    Attributes
-    ----------
-    hint : what would be there, to be shown in an empty list
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.setViewMode(QListWidget.ViewMode.IconMode)
-        self.setFlow(QListWidget.Flow.LeftToRight)
-        self.setResizeMode(QListWidget.ResizeMode.Adjust)
-        self.setMovement(QListWidget.Movement.Static)
-        self.setIconSize(QSize(THUMBNAIL, THUMBNAIL))
-        self.setGridSize(QSize(THUMBNAIL + 20, THUMBNAIL + 34))
-        self.setUniformItemSizes(True)
-        self.setTextElideMode(Qt.TextElideMode.ElideRight)
-        self.setVerticalScrollMode(QListWidget.ScrollMode.ScrollPerPixel)
-        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        self.hint = labelled("The poses that you keep are shown here", "caption")
-        self.hint.setAlignment(Qt.AlignmentFlag.AlignCenter)
-        self.hint.setWordWrap(True)
-        QVBoxLayout(self.viewport()).addWidget(self.hint)
-
-    def sizeHint(self) -> QSize:  # noqa: N802
-        """Ask for one row of pictures."""
-        return QSize(400, THUMBNAIL + 42)
-
-    def minimumSizeHint(self) -> QSize:  # noqa: N802
-        """Manage with one picture."""
-        return QSize(THUMBNAIL + 40, THUMBNAIL + 40)
-
-
 class LibraryPanel(QWidget):
-    """Poses to load by a double click, to blend towards, and to keep.
+    """Poses to load by a double click, to blend towards, to keep and to find again.
+
+    Three sources: the poses that the model learned from, the user's library, and the poses of the
+    file that is open, where it has some.
 
     Signals
     -------
-    keep_wanted : the user wants to keep the pose
-    chosen_changed : `chosen` or `chosen_own` may be another
+    chosen_changed : `chosen`, `chosen_poses` or `source` may be another
+    menu_wanted : QPoint on the screen, where the context menu is to be
 
     Parameters
     ----------
     document : followed and changed
+    keep, update, add : the actions that have buttons here
     """
 
-    keep_wanted = Signal()
     chosen_changed = Signal()
+    menu_wanted = Signal(object)
 
-    def __init__(self, document: PoseDocument) -> None:
+    def __init__(
+        self, document: PoseDocument, keep: QAction, update: QAction, add: QAction
+    ) -> None:
         super().__init__()
         self._document = document
         self._poses: list[NamedPose] = []
+        self._tag = ""
         self._pictures: dict[bytes, QIcon] = {}
         self._shower: PoseShower | None = None
         self._front = np.zeros(3)
@@ -101,22 +75,27 @@ class LibraryPanel(QWidget):
         self._due = QTimer(self)
         self._due.setSingleShot(True)
         self._due.setInterval(_PAUSE)
-        self.list = PoseList()
-        self.list.setAccessibleName("Pose library")
+        self.list = PoseGrid()
+        self.list.setAccessibleName("Poses")
         self._sources = QButtonGroup(self)
-        sources = QHBoxLayout()
-        sources.setSpacing(0)
-        self.training, self.own = (
-            self._source(text, place, tip)
-            for text, place, tip in (
-                ("Training", "first", "The poses that the model learned from"),
-                ("Yours", "last", "The poses that you keep; Save writes them"),
-            )
-        )
-        sources.addWidget(self.training)
-        sources.addWidget(self.own)
-        self.keep = QPushButton("Keep this pose…")
-        self.keep.setToolTip("Put this pose into your library (Ctrl+K)")
+        self.training = self._source_button("Training", "The poses that the model learned from")
+        self.own = self._source_button("Library", "Your own poses of this model, kept for good")
+        self.of_file = self._source_button("This file", "The poses of the file that is open")
+        self.search = QLineEdit()
+        self.search.setPlaceholderText("Find a pose")
+        self.search.setClearButtonEnabled(True)
+        self.search.setAccessibleName("Find a pose by name or tag")
+        self.search.setMinimumWidth(70)
+        self.search.setMaximumWidth(240)
+        self.tags = QToolButton()
+        self.tags.setObjectName("filter")
+        self.tags.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
+        self.tags.setToolTip("Show the poses with one tag only")
+        self._tag_menu = QMenu(self.tags)
+        self.tags.setMenu(self._tag_menu)
+        self.keep = ActionButton(keep)
+        self.update_button = ActionButton(update)
+        self.add_button = ActionButton(add)
         self._target = ElidedLabel("Choose a pose to blend")
         self._target.setObjectName("caption")
         self._share = labelled("", "caption")
@@ -127,55 +106,91 @@ class LibraryPanel(QWidget):
         self.blend.setToolTip(
             "Drag to blend the pose towards the chosen one; the next begins where this one ends"
         )
+        self._lay_out()
+        self.training.setChecked(True)
+        self._due.timeout.connect(self._draw_next)
+        self._sources.buttonToggled.connect(self._on_source)
+        self.search.textChanged.connect(self._filter)
+        self._tag_menu.triggered.connect(self._on_tag)
+        self.list.itemDoubleClicked.connect(self._on_double_click)
+        self.list.itemActivated.connect(self.load_chosen)
+        self.list.itemSelectionChanged.connect(self._on_chosen)
+        self.list.currentRowChanged.connect(self._on_chosen)
+        self.list.customContextMenuRequested.connect(self._on_menu)
+        self.list.verticalScrollBar().valueChanged.connect(self._draw_soon)
+        self.blend.sliderPressed.connect(self._on_blend_pressed)
+        self.blend.valueChanged.connect(self._on_blend)
+        self.blend.sliderReleased.connect(self._on_blend_released)
+        document.model_changed.connect(self._on_model)
+        document.library_changed.connect(self._on_library)
+        document.pose_loaded.connect(self._on_pose_loaded)
+        if document.has_model:
+            self._on_model()
+
+    def _lay_out(self) -> None:
+        sources = QHBoxLayout()
+        sources.setSpacing(0)
+        for button in self._sources.buttons():
+            sources.addWidget(button)
+        bar = QHBoxLayout()
+        bar.setSpacing(CLOSE)
+        bar.addLayout(sources)
+        bar.addWidget(self.search, 1)
+        bar.addWidget(self.tags)
+        bar.addStretch()
         side = QWidget()
         side.setFixedWidth(182)
         column = QVBoxLayout(side)
         column.setContentsMargins(0, 0, 0, 0)
-        column.setSpacing(CLOSE)
-        column.addLayout(sources)
+        column.setSpacing(TIGHT)
         column.addWidget(self.keep)
+        column.addWidget(self.update_button)
+        column.addWidget(self.add_button)
         column.addStretch()
         line = QHBoxLayout()
         line.addWidget(self._target, 1)
         line.addWidget(self._share)
         column.addLayout(line)
         column.addWidget(self.blend)
-        row = QHBoxLayout(self)
-        row.setContentsMargins(NORMAL, TIGHT, NORMAL, CLOSE)
+        row = QHBoxLayout()
         row.setSpacing(NORMAL)
         row.addWidget(side)
         row.addWidget(self.list, 1)
-        self.training.setChecked(True)
-        self._due.timeout.connect(self._draw_next)
-        self.own.toggled.connect(self._on_source)
-        self.keep.clicked.connect(self.keep_wanted)
-        self.list.itemDoubleClicked.connect(self._on_double_click)
-        self.list.currentRowChanged.connect(self._on_chosen)
-        self.list.verticalScrollBar().valueChanged.connect(self._draw_soon)
-        self.blend.sliderPressed.connect(self._on_blend_pressed)
-        self.blend.valueChanged.connect(self._on_blend)
-        self.blend.sliderReleased.connect(self._on_blend_released)
-        document.model_changed.connect(self._on_model)
-        document.library_changed.connect(self.refresh)
-        document.pose_loaded.connect(self._on_pose_loaded)
-        if document.has_model:
-            self._on_model()
+        page = QVBoxLayout(self)
+        page.setContentsMargins(NORMAL, TIGHT, NORMAL, CLOSE)
+        page.setSpacing(CLOSE)
+        page.addLayout(bar)
+        page.addLayout(row, 1)
+        rows = (self.keep, self.update_button, self.add_button, self.blend)
+        order = (*self._sources.buttons(), self.search, self.tags, self.list, *rows)
+        for before, after in pairwise(order):
+            QWidget.setTabOrder(before, after)
 
     @property
     def chosen(self) -> NamedPose | None:
-        """The pose that is selected, None for none."""
+        """The pose that is chosen, of several the one that was chosen last; None for none."""
         row = self.list.currentRow()
-        return self._poses[row] if 0 <= row < len(self._poses) else None
+        item = self.list.item(row)
+        is_chosen = item is not None and item.isSelected() and row < len(self._poses)
+        return self._poses[row] if is_chosen else None
+
+    @property
+    def chosen_poses(self) -> tuple[NamedPose, ...]:
+        """All poses that are chosen, in their order."""
+        rows = sorted(index.row() for index in self.list.selectedIndexes())
+        return tuple(self._poses[row] for row in rows)
 
     @property
     def chosen_own(self) -> NamedPose | None:
-        """The user's own pose that is selected, None for none or a training pose."""
-        return self.chosen if self.shows_own else None
+        """The chosen pose where the library is shown; None for none or for one of elsewhere."""
+        return self.chosen if self.source is Source.LIBRARY else None
 
     @property
-    def shows_own(self) -> bool:
-        """Whether the user's own poses are shown, not the training poses."""
-        return self.own.isChecked()
+    def source(self) -> Source:
+        """Whose poses are shown."""
+        if self.own.isChecked():
+            return Source.LIBRARY
+        return Source.FILE if self.of_file.isChecked() else Source.TRAINING
 
     def allow_pictures(self) -> None:
         """Start drawing pictures: everything else is on the screen."""
@@ -198,14 +213,25 @@ class LibraryPanel(QWidget):
             self._document.load_pose(self.chosen)
 
     def choose_own(self, name: str) -> None:
-        """Show the user's own poses, and select the one of this name.
+        """Show the library, and choose the pose of this name, whatever is searched for.
 
         Raises
         ------
         ValueError : there is none.
         """
         self.own.setChecked(True)
-        self.list.setCurrentRow(self._names().index(name))
+        row = self._names().index(name)
+        if self.list.isRowHidden(row):
+            self._tag = ""
+            self.search.clear()
+            self._filter()
+        self._choose(row)
+        self.list.scrollToItem(self.list.item(row))
+
+    def find_pose(self) -> None:
+        """Let the user type what a pose is called."""
+        self.search.setFocus(Qt.FocusReason.ShortcutFocusReason)
+        self.search.selectAll()
 
     @Slot()
     def refresh(self) -> None:
@@ -213,9 +239,11 @@ class LibraryPanel(QWidget):
         document = self._document
         if not document.has_model:
             return
-        before = self.chosen
-        if self.shows_own:
+        current, chosen = self.chosen, {pose.name for pose in self.chosen_poses}
+        if self.source is Source.LIBRARY:
             self._poses = list(document.poses)
+        elif self.source is Source.FILE:
+            self._poses = list(document.file_poses)
         else:
             self._poses = [
                 document.training_pose(number) for number in range(len(document.model.pose_names))
@@ -223,16 +251,56 @@ class LibraryPanel(QWidget):
         with silent(self.list):
             self.list.clear()
             for pose in self._poses:
-                item = QListWidgetItem(pose.name)
-                item.setToolTip(f"{pose.name}: double-click to load")
-                item.setTextAlignment(Qt.AlignmentFlag.AlignHCenter)
+                item = QListWidgetItem(one_line(pose.name))
+                tags = f" ({', '.join(pose.tags)})" if pose.tags else ""
+                item.setToolTip(plain_tip(f"{one_line(pose.name + tags)}: double-click to load"))
                 item.setIcon(self._pictures.get(pose.latent.tobytes(), self._blank()))
                 self.list.addItem(item)
-            if before is not None and before.name in self._names():
-                self.list.setCurrentRow(self._names().index(before.name))
-        self.list.hint.setVisible(not self._poses)
-        self.own.setText(f"Yours ({len(document.poses)})" if document.poses else "Yours")
-        self._on_chosen(self.list.currentRow())
+            if current is not None and current.name in self._names():
+                self._choose(self._names().index(current.name))
+            for row, pose in enumerate(self._poses):
+                self.list.item(row).setSelected(pose.name in chosen)
+        for button, text, poses in (
+            (self.own, "Library", document.poses),
+            (self.of_file, "This file", document.file_poses),
+        ):
+            button.setText(f"{text} ({len(poses)})" if poses else text)
+        self.of_file.setVisible(bool(document.file_poses))
+        self.add_button.setVisible(self.source is not Source.LIBRARY)
+        self.own.setProperty("place", "middle" if document.file_poses else "last")
+        self.own.style().polish(self.own)
+        self._list_tags()
+        self._filter()
+
+    def _list_tags(self) -> None:
+        tags = sorted({tag for pose in self._poses for tag in pose.tags}, key=str.casefold)
+        if self._tag not in tags:
+            self._tag = ""
+        self._tag_menu.clear()
+        for tag in ("", *tags):
+            action = self._tag_menu.addAction(menu_text(tag) or "All poses")
+            action.setData(tag)
+            action.setCheckable(True)
+            action.setChecked(tag == self._tag)
+        self.tags.setVisible(bool(tags))
+        self.tags.setText(f"Tag: {menu_text(self._tag)}" if self._tag else "Tags")
+
+    @Slot()
+    def _filter(self) -> None:
+        """Hide what is not searched for, and choose nothing that is hidden."""
+        words = self.search.text().casefold().split()
+        n_shown = 0
+        for row, pose in enumerate(self._poses):
+            text = " ".join((pose.name, *pose.tags)).casefold()
+            shown = all(word in text for word in words) and self._tag in (*pose.tags, "")
+            self.list.setRowHidden(row, not shown)
+            n_shown += shown
+            if not shown:
+                self.list.item(row).setSelected(False)
+        hint = "The poses that you keep are shown here" if not self._poses else "No pose matches"
+        self.list.hint.setText(hint)
+        self.list.hint.setVisible(not n_shown)
+        self._on_chosen()
         self._draw_soon()
 
     def showEvent(self, event: QShowEvent) -> None:  # noqa: N802
@@ -240,17 +308,20 @@ class LibraryPanel(QWidget):
         super().showEvent(event)
         self._draw_soon()
 
+    def _choose(self, row: int) -> None:
+        only = QItemSelectionModel.SelectionFlag.ClearAndSelect
+        self.list.setCurrentItem(self.list.item(row), only)
+
     def _names(self) -> list[str]:
         return [pose.name for pose in self._poses]
 
-    def _source(self, text: str, place: str, tip: str) -> QToolButton:
+    def _source_button(self, text: str, tip: str) -> QToolButton:
         button = QToolButton()
         button.setObjectName("segment")
-        button.setProperty("place", place)
+        button.setProperty("place", "last" if self._sources.buttons() else "first")
         button.setText(text)
         button.setToolTip(tip)
         button.setCheckable(True)
-        button.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
         button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self._sources.addButton(button)
         return button
@@ -264,23 +335,39 @@ class LibraryPanel(QWidget):
     @Slot()
     def _on_model(self) -> None:
         self._pictures.clear()
-        if self.shows_own and not self._document.poses:
+        self._on_source()
+
+    @Slot()
+    def _on_library(self) -> None:
+        if self.source is Source.FILE and not self._document.file_poses:
             # Which shows them.
             self.training.setChecked(True)
         else:
-            self._on_source()
+            self.refresh()
 
     @Slot()
     def _on_pose_loaded(self) -> None:
         # Only a file's poses come in without a past.
-        if self._document.poses and not self._document.undo_stack.count():
-            self.own.setChecked(True)
+        if self._document.file_poses and not self._document.undo_stack.count():
+            self.of_file.setChecked(True)
 
     @Slot()
     def _on_source(self) -> None:
-        # A pose of the other list, or of another model, may have the name of the selected one.
-        self.list.setCurrentRow(-1)
+        # A pose of another source, or of another model, may have the name of the chosen one.
+        self.list.clearSelection()
         self.refresh()
+
+    @Slot(QAction)
+    def _on_tag(self, action: QAction) -> None:
+        self._tag = action.data()
+        self._list_tags()
+        self._filter()
+
+    @Slot(QPoint)
+    def _on_menu(self, place: QPoint) -> None:
+        if self.list.itemAt(place) is None:
+            self.list.clearSelection()
+        self.menu_wanted.emit(self.list.viewport().mapToGlobal(place))
 
     @Slot()
     def _draw_soon(self) -> None:
@@ -303,7 +390,8 @@ class LibraryPanel(QWidget):
         in_sight = (
             place
             for place in missing
-            if self.list.visualItemRect(self.list.item(place)).intersects(seen)
+            if not self.list.isRowHidden(place)
+            and self.list.visualItemRect(self.list.item(place)).intersects(seen)
         )
         place = next(in_sight, missing[0])
         pose = self._poses[place]
@@ -343,12 +431,13 @@ class LibraryPanel(QWidget):
     def _on_double_click(self, item: QListWidgetItem) -> None:
         self._document.load_pose(self._poses[self.list.row(item)])
 
-    @Slot(int)
-    def _on_chosen(self, row: int) -> None:
-        chosen = 0 <= row < len(self._poses)
-        self.blend.setEnabled(chosen)
-        name = f"Blend towards {self._poses[row].name}" if chosen else "Choose a pose to blend"
-        self._target.setText(name)
+    @Slot()
+    def _on_chosen(self) -> None:
+        chosen = self.chosen
+        self.blend.setEnabled(chosen is not None)
+        self._target.setText(
+            "Choose a pose to blend" if chosen is None else f"Blend towards {chosen.name}"
+        )
         self.chosen_changed.emit()
 
     @Slot()

@@ -25,6 +25,8 @@ from lcollision_core.model.library import (
 )
 from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry
 from lcollision_core.model.pose_file import (
+    MAX_NAME_LENGTH,
+    MAX_TAGS,
     NamedPose,
     OtherModelError,
     PoseFile,
@@ -35,6 +37,7 @@ from lcollision_core.model.pose_file import (
     why_no_name,
     write_poses,
 )
+from lcollision_core.model.pose_library import LibraryChange, PoseLibrary, user_poses_folder
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.model.sampling import sample_poses
 
@@ -42,12 +45,15 @@ __all__ = [
     "EXPORT_SCALES",
     "LARGEST_SCALE",
     "LEAST_SCALE",
+    "MAX_NAME_LENGTH",
+    "MAX_TAGS",
     "MODEL_SUFFIX",
     "EncodedPose",
     "ExportAxes",
     "ExportFrame",
     "LatentGroup",
     "LatentSpace",
+    "LibraryChange",
     "ListedModel",
     "MirrorSource",
     "MirroredPose",
@@ -55,6 +61,7 @@ __all__ = [
     "NamedPose",
     "OtherModelError",
     "PoseFile",
+    "PoseLibrary",
     "PoseModel",
     "Symmetry",
     "change_model",
@@ -72,6 +79,7 @@ __all__ = [
     "save_trained",
     "unique_names",
     "user_models_folder",
+    "user_poses_folder",
     "why_no_name",
     "write_poses",
 ]

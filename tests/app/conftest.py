@@ -18,6 +18,12 @@ from tests.app.support import STABBED
 from tests.app.windows import close_window, is_open, open_window, settings_in
 
 
+@pytest.fixture(autouse=True)
+def _own_data(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep models and pose libraries of a test in a folder of its own, never the user's."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("data")))
+
+
 @pytest.fixture
 def stabbed(tmp_path: Path) -> Path:
     """Return the file of a mesh whose faces 0 and 1 collide."""
@@ -56,6 +62,7 @@ def document(qtbot: QtBot, editor_model: PoseModel) -> Iterator[PoseDocument]:
     held.set_model(editor_model)
     held.reset_all()
     held.undo_stack.clear()
+    held.mark_saved()
 
     def settle() -> None:
         # The frame with the prediction comes after one without; either is checked.

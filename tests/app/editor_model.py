@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from lcollision_core.labels import Labeller
-from lcollision_core.model import PoseModel
+from lcollision_core.model import PoseModel, user_models_folder
 from tests.bending_tube import bending_tube
 
 
@@ -26,3 +28,12 @@ def trained_tube() -> PoseModel:
     quick = replace(PRESETS["paper"], epochs=2, average_passes=0.0)
     predictor = train_predictor(rows, bare.embedding, quick)
     return bare.with_predictor(predictor)
+
+
+def another_model(model: PoseModel) -> PoseModel:
+    """Store a model of another latent space among the user's as "snake"; it has no predictor."""
+    shifted = model.embedding.mean_features + np.float32(1e-3)
+    path = user_models_folder() / "snake.safetensors"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PoseModel("snake", replace(model.embedding, mean_features=shifted), model.card).save(path)
+    return PoseModel.load(path)

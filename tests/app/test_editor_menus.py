@@ -10,7 +10,7 @@ from PySide6.QtGui import QAction, QImage
 from PySide6.QtWidgets import QDialog, QMenu
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.questions import ask_about_recovery
+from app.dialogs.questions import ask_about_recovery, ask_to_replace, ask_to_switch
 from app.main_window import MainWindow
 from app.recovery import LostPose, Session
 from lcollision_core.meshes import write_mesh
@@ -116,18 +116,21 @@ def test_no_title_is_cut(window: MainWindow, tmp_path: Path) -> None:
         dialog.reject()
 
     lost = LostPose(Session.new(tmp_path), "tube", "kick", None, (), time.time())
-    window.document.set_code(0, 0.5)
     window.document.add_pose_to_library("kick")
+    window.document.set_code(0, 0.5)
     window.library.choose_own("kick")
     for act in (
         window.actions_by_key["keep"].trigger,
         window.actions_by_key["rename"].trigger,
         window.actions_by_key["new"].trigger,
+        window.actions_by_key["tags"].trigger,
+        lambda: ask_to_replace(window, "kick"),
+        lambda: ask_to_switch(window, "kick.json", "snake"),
         lambda: ask_about_recovery(window, lost),
     ):
         asked = answer(look)
         act()
         assert not asked.isActive()
     least = window.fontMetrics().horizontalAdvance(WIDEST_TITLE) + TITLE_BUTTONS
-    assert len(widths) == 4
+    assert len(widths) == 7
     assert min(widths) >= least

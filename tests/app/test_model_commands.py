@@ -19,8 +19,16 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from app.cli.main import app
+from lcollision_core.bundled import bundled_file
 from lcollision_core.meshes import locked, read_mesh, write_mesh, write_pose_set
-from lcollision_core.model import PoseModel, change_model, checkpoint_path, read_poses
+from lcollision_core.model import (
+    NamedPose,
+    PoseModel,
+    change_model,
+    checkpoint_path,
+    read_poses,
+    write_poses,
+)
 from lcollision_core.model_file import Section
 from tests.app.support import Lcollision
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube
@@ -270,6 +278,28 @@ def test_samples_are_the_seeds_own(lcollision: Lcollision, tube: Path, tmp_path:
     assert [pose.name for pose in poses] == [f"sample {n:02d}" for n in range(1, 13)]
     other = read_poses(files[2], model)
     assert not np.array_equal(poses[0].latent, other[0].latent)
+
+
+def test_poses_of_another_model_are_refused_with_its_name(
+    lcollision: Lcollision, tube: Path, user_models: Path, tmp_path: Path
+) -> None:
+    poses = bundled_file("poses", "body.json")
+    for command in (("decode", tube, poses), ("mirror", tube, poses)):
+        sentence = _refusal(lcollision, *command, "-o", tmp_path / "out.json")
+        assert "holds poses of the model 'body', not of 'tube'; use them with 'body'" in sentence
+        assert PoseModel.load("body").fingerprint not in sentence
+    assert not user_models.exists()
+
+
+def test_what_the_editor_saved_is_decoded_with_its_working_pose(
+    lcollision: Lcollision, tube: Path, tmp_path: Path
+) -> None:
+    model, poses = PoseModel.load(tube), tmp_path / "poses.json"
+    first, second = (NamedPose("kick", row) for row in model.training_latent[:2])
+    write_poses(poses, model, [first], second)
+    assert lcollision("decode", tube, poses, "-o", tmp_path / "out").exit_code == 0
+    files = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert files == ["kick 2.obj", "kick.obj"]
 
 
 @pytest.mark.parametrize(("option", "status"), [("--free", 0), ("--colliding", 1)])

@@ -14,7 +14,8 @@ from pytestqt.qtbot import QtBot
 
 from app.dialogs.failure import FailureDialog
 from app.dialogs.help import ShortcutsDialog
-from app.dialogs.questions import ask_about_changes, ask_for_name
+from app.dialogs.names import ask_for_name
+from app.dialogs.questions import ask_about_changes
 from app.document import PoseDocument
 from app.engine import Failure
 from app.main_window import MainWindow

@@ -12,13 +12,14 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QInputDialog, QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
+from app.commands import Source
 from app.document import PoseDocument
 from app.main_window import MainWindow
 from app.panels.code_slider import CodeRow
-from app.panels.library import THUMBNAIL
+from app.panels.pose_grid import THUMBNAIL
 from app.panels.prediction import DomainRow
 from app.wording import heading
-from lcollision_core.model import PoseModel
+from lcollision_core.model import NamedPose, PoseModel, write_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 
 CONTROL, LEFT = Qt.KeyboardModifier.ControlModifier, Qt.MouseButton.LeftButton
@@ -26,6 +27,12 @@ CONTROL, LEFT = Qt.KeyboardModifier.ControlModifier, Qt.MouseButton.LeftButton
 
 def own_names(window: MainWindow) -> list[str]:
     return [pose.name for pose in window.document.poses]
+
+
+def names_shown(window: MainWindow) -> list[str]:
+    held = window.library.list
+    rows = [row for row in range(held.count()) if not held.isRowHidden(row)]
+    return [held.item(row).text() for row in rows]
 
 
 def may_change_chosen(window: MainWindow) -> bool:
@@ -80,7 +87,7 @@ def test_a_kept_pose_is_chosen_and_stays_so_when_others_go(window: MainWindow) -
         assert library.chosen_own is not None
         assert library.chosen_own.name == name
         assert may_change_chosen(window)
-    document.remove_pose_from_library("first")
+    document.remove_poses_from_library(["first"])
     assert library.chosen_own.name == "second"
     asked = answer(lambda dialog: _enter(dialog, "third"))
     window.actions_by_key["rename"].trigger()
@@ -100,26 +107,32 @@ def is_drawn(icon: QIcon) -> bool:
     return picture.pixelColor(picture.rect().center()).alpha() > 0
 
 
-def test_the_library_shows_the_poses_of_a_file_that_is_opened(
+def test_the_poses_of_a_file_that_is_opened_are_shown_beside_the_library(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
     document, library = window.document, window.library
-    for name in ("kick", "jump"):
-        document.add_pose_to_library(name)
-    document.save(tmp_path / "poses.json")
-    document.load_pose(document.training_pose(0))
-    document.new_pose()
-    assert not library.shows_own
+    held = [NamedPose(name, document.model.training_latent[1]) for name in ("kick", "jump")]
+    write_poses(tmp_path / "poses.json", document.model, held)
+    document.add_pose_to_library("mine")
+    assert not library.of_file.isVisible()
     with qtbot.waitSignal(document.pose_loaded, timeout=PATIENCE):
         window.files.open_path(tmp_path / "poses.json")
-    assert library.shows_own
-    assert [library.list.item(row).text() for row in range(library.list.count())] == own_names(
-        window
-    )
-    # Another model has nothing of one's own yet.
+    assert library.source is Source.FILE
+    assert library.of_file.isVisible()
+    assert names_shown(window) == ["kick", "jump"]
+    assert own_names(window) == ["mine"]
+    assert not may_change_chosen(window)
+    QTest.mouseClick(library.add_button, LEFT)
+    assert own_names(window) == ["mine", "kick", "jump"]
+    choose(window, "jump")
+    QTest.mouseClick(library.add_button, LEFT)
+    assert own_names(window) == ["mine", "kick", "jump"]
+    assert "already" in window.statusBar().currentMessage()
+    # Another model has no file, and the library that it had.
     document.set_model(document.model)
-    assert own_names(window) == []
-    assert not library.shows_own
+    assert own_names(window) == ["mine", "kick", "jump"]
+    assert library.source is Source.TRAINING
+    assert not library.of_file.isVisible()
 
 
 def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_is_seen(

@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 
 from app.document import PoseDocument
 from app.recovery import Autosave, Session, find_lost_poses
-from lcollision_core.model import PoseModel, read_poses
+from lcollision_core.model import NamedPose, PoseModel, read_pose_file, read_poses, write_poses
 
 EDITOR = """
 import sys
@@ -108,6 +108,36 @@ def test_an_editor_told_to_end_keeps_its_last_edit(document: PoseDocument, tmp_p
         found = find_lost_poses(folder)
         assert len(found) == edited
     assert read_poses(found[0].poses_file, document.model)[0].latent[0] == 0.5
+
+
+def test_the_poses_of_the_file_are_recovered_beside_the_working_pose(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    path, folder = tmp_path / "poses.json", tmp_path / "sessions"
+    held = [NamedPose(name, document.model.training_latent[k]) for k, name in enumerate("ab")]
+    write_poses(path, document.model, held)
+    with qtbot.waitSignal(document.opened):
+        document.open_poses(path)
+    document.set_code(0, 0.5)
+    working = document.latent.tobytes()
+    assert Autosave(document, folder, seconds=1000.0).close(keep=True)
+    document.mark_saved()
+    document.new_pose()
+    (lost,) = find_lost_poses(folder)
+    autosave = Autosave(document, folder, seconds=1000.0)
+    with qtbot.waitSignal(document.recovered):
+        autosave.recover(lost)
+    assert document.latent.tobytes() == working
+    assert document.pose_name == "a"
+    assert document.file == path
+    assert document.modified
+    assert [pose.latent.tobytes() for pose in document.file_poses] == [
+        pose.latent.tobytes() for pose in held
+    ]
+    document.save()
+    assert not document.modified
+    assert read_pose_file(path, document.model).poses[0].latent[0] == held[0].latent[0]
+    assert autosave.close()
 
 
 def test_nothing_is_kept_of_what_is_saved(

@@ -60,7 +60,7 @@ def application() -> QApplication:
 def close_window(window: MainWindow) -> None:
     """Close a window whose changes may be lost, and see that nothing of it runs on."""
     window.document.end_gesture()
-    window.document.undo_stack.setClean()
+    window.document.mark_saved()
     assert window.close()
     dispose(window)
 

@@ -1,0 +1,501 @@
+"""The library in the window, by mouse and keyboard: kept poses stay as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint, Qt, QTimer
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import (
+    QApplication,
+    QDialog,
+    QFileDialog,
+    QLineEdit,
+    QMenu,
+    QMessageBox,
+    QWidget,
+)
+from pytestqt.qtbot import QtBot
+
+from app.dialogs.failure import FailureDialog
+from app.dialogs.names import NameDialog
+from app.document import PoseDocument
+from app.main_window import MainWindow
+from app.panels.pose_grid import THUMBNAIL, lines_of
+from lcollision_core.meshes import write_mesh
+from lcollision_core.model import NamedPose, read_pose_file, read_poses, write_poses
+from tests.app.editor_model import another_model
+from tests.app.windows import (
+    PATIENCE,
+    answer,
+    close_window,
+    drag,
+    drop,
+    open_window,
+    rest,
+    settings_in,
+    shown,
+    take_picture,
+)
+
+LEFT, RIGHT = Qt.MouseButton.LeftButton, Qt.MouseButton.RightButton
+CONTROL, SHIFT = Qt.KeyboardModifier.ControlModifier, Qt.KeyboardModifier.ShiftModifier
+
+
+def own(window: MainWindow) -> dict[str, bytes]:
+    return {pose.name: pose.latent.tobytes() for pose in window.document.poses}
+
+
+def names_shown(window: MainWindow) -> list[str]:
+    held = window.library.list
+    rows = [row for row in range(held.count()) if not held.isRowHidden(row)]
+    return [held.item(row).text() for row in rows]
+
+
+def place_of(window: MainWindow, name: str) -> QPoint:
+    held = window.library.list
+    (item,) = held.findItems(name, Qt.MatchFlag.MatchExactly)
+    held.scrollToItem(item)
+    return held.visualItemRect(item).center()
+
+
+def click(
+    window: MainWindow,
+    name: str,
+    button: Qt.MouseButton = LEFT,
+    key: Qt.KeyboardModifier = Qt.KeyboardModifier.NoModifier,
+) -> None:
+    QTest.mouseClick(window.library.list.viewport(), button, key, place_of(window, name))
+
+
+def double_click(qtbot: QtBot, window: MainWindow, name: str) -> None:
+    viewport, place = window.library.list.viewport(), place_of(window, name)
+    QTest.mouseClick(viewport, LEFT, pos=place)
+    QTest.mouseDClick(viewport, LEFT, pos=place)
+    rest(qtbot, window)
+
+
+def typing(text: str) -> Callable[[QDialog], None]:
+    """Return what types a name and Enter into a dialog that asks for one."""
+
+    def act(dialog: QDialog) -> None:
+        assert isinstance(dialog, NameDialog)
+        type_name(dialog, text)
+
+    return act
+
+
+def type_name(dialog: QDialog, text: str) -> None:
+    field = dialog.findChild(QLineEdit)
+    assert isinstance(field, QLineEdit)
+    field.selectAll()
+    QTest.keyClick(field, Qt.Key.Key_Delete)
+    QTest.keyClicks(field, text)
+    QTest.keyClick(field, Qt.Key.Key_Return)
+
+
+def choosing(path: Path) -> Callable[[QDialog], None]:
+    """Return what types a file's name and Enter into a dialog that asks for one."""
+
+    def act(dialog: QDialog) -> None:
+        assert isinstance(dialog, QFileDialog)
+        field = dialog.findChild(QLineEdit, "fileNameEdit")
+        assert isinstance(field, QLineEdit)
+        field.setText(str(path))
+        QTest.keyClick(field, Qt.Key.Key_Return)
+
+    return act
+
+
+def pressing(text: str) -> Callable[[QDialog], None]:
+    """Return what presses a button of a question."""
+
+    def act(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        (button,) = [held for held in dialog.buttons() if held.text() == text]
+        QTest.mouseClick(button, LEFT)
+
+    return act
+
+
+def press(window: QWidget, key: Qt.Key, modifiers: Qt.KeyboardModifier, *acts: object) -> None:
+    """Press a shortcut, and answer the dialogs that come, one after the other."""
+    waiting = [act for act in acts if callable(act)]
+    timers: list[QTimer] = []
+
+    def expect() -> None:
+        if waiting:
+            act = waiting.pop(0)
+
+            def answered(dialog: QDialog) -> None:
+                expect()
+                act(dialog)
+
+            timers.append(answer(answered))
+
+    expect()
+    # Without a window manager nothing is active once a dialog has closed.
+    window.activateWindow()
+    assert QTest.qWaitForWindowActive(window)
+    QTest.keyClick(window, key, modifiers)
+    assert not any(timer.isActive() for timer in timers)
+    assert not waiting
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_story_save_changes_no_kept_pose(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path, theme: str
+) -> None:
+    settings = settings_in(tmp_path)
+    settings["theme"] = theme
+    window = open_window(qtbot, document, settings)
+    window.library.allow_pictures()
+    double_click(qtbot, window, "bend 0")
+    kept, mesh = document.latent.tobytes(), shown(window)
+    assert not window.isWindowModified()
+    press(window, Qt.Key.Key_K, CONTROL, typing("A"))
+    assert own(window) == {"A": kept}
+    assert window.windowTitle().startswith("A[*]")
+    take_picture(window, f"library-{theme}-1-kept")
+    drag(qtbot, window.sliders.row_of(0), by=25)
+    rest(qtbot, window)
+    assert window.windowTitle().startswith("A, changed[*]")
+    press(window, Qt.Key.Key_S, CONTROL, choosing(tmp_path / "work.json"))
+    assert window.windowTitle().startswith("A, changed — work.json[*]")
+    assert not window.isWindowModified()
+    changed = document.latent.tobytes()
+    assert changed != kept
+    take_picture(window, f"library-{theme}-2-saved")
+    double_click(qtbot, window, "A")
+    assert document.latent.tobytes() == kept
+    assert np.array_equal(shown(window), mesh)
+    assert own(window) == {"A": kept}
+    take_picture(window, f"library-{theme}-3-loaded-again")
+    (saved,) = read_poses(tmp_path / "work.json", document.model)
+    assert saved.latent.tobytes() == changed
+    close_window(window)
+
+
+def test_story_a_full_blend_is_saved_beside_the_kept_pose(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document, library, path = window.document, window.library, tmp_path / "work.json"
+    double_click(qtbot, window, "bend 3")
+    kept = document.latent.tobytes()
+    press(window, Qt.Key.Key_K, CONTROL, typing("hand on hip"))
+    double_click(qtbot, window, "hand on hip")
+    QTest.mouseClick(library.training, LEFT)
+    click(window, "bend 5")
+    press(window, Qt.Key.Key_B, CONTROL)
+    assert library.blend.hasFocus()
+    QTest.keyClick(library.blend, Qt.Key.Key_End)
+    target = document.model.training_latent[5]
+    assert np.array_equal(document.latent, target)
+    press(window, Qt.Key.Key_S, CONTROL, choosing(path))
+    press(window, Qt.Key.Key_N, CONTROL)
+    assert own(window) == {"hand on hip": kept}
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        drop(window, path)
+    rest(qtbot, window)
+    assert np.array_equal(document.latent, target)
+    assert own(window) == {"hand on hip": kept}
+    QTest.mouseClick(library.own, LEFT)
+    double_click(qtbot, window, "hand on hip")
+    assert document.latent.tobytes() == kept
+
+
+def test_update_is_asked_for_by_name_and_can_be_undone(qtbot: QtBot, window: MainWindow) -> None:
+    document, update = window.document, window.actions_by_key["update"]
+    assert not update.isEnabled()
+    press(window, Qt.Key.Key_K, CONTROL, typing("A & B"))
+    kept = document.latent.tobytes()
+    assert not update.isEnabled()
+    drag(qtbot, window.sliders.row_of(0), by=25)
+    assert update.isEnabled()
+    assert update.text() == "&Update “A && B”"
+    QTest.mouseClick(window.library.update_button, LEFT)
+    changed = document.latent.tobytes()
+    assert own(window) == {"A & B": changed}
+    assert not update.isEnabled()
+    press(window, Qt.Key.Key_Z, CONTROL)
+    assert own(window) == {"A & B": kept}
+    assert document.latent.tobytes() == changed
+    assert update.isEnabled()
+
+
+def test_a_taken_name_is_refused_with_its_text_or_replaced_when_confirmed(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    document = window.document
+    for name in ("A", "B"):
+        press(window, Qt.Key.Key_K, CONTROL, typing(name))
+    before = own(window)
+    heard: list[tuple[str, str]] = []
+
+    def try_taken(dialog: QDialog) -> None:
+        assert isinstance(dialog, NameDialog)
+        for text in ("a", "", "x" * 201):
+            type_name(dialog, text)
+            assert dialog.isVisible()
+            heard.append((dialog.textValue(), dialog.reason.text()))
+            assert dialog.reason.isVisible()
+        take_picture(window, "library-name-refused")
+        type_name(dialog, "C")
+
+    QTest.mouseClick(window.library.list.viewport(), LEFT, pos=place_of(window, "B"))
+    press(window, Qt.Key.Key_F2, Qt.KeyboardModifier.NoModifier, try_taken)
+    assert [text for text, _ in heard] == ["a", "", "x" * 201]
+    assert "has a pose “A” already" in heard[0][1]
+    assert "needs a name" in heard[1][1]
+    assert "at most 200 characters" in heard[2][1]
+    assert list(own(window)) == ["A", "C"]
+    document.undo()
+    assert own(window) == before
+    drag(qtbot, window.sliders.row_of(0), by=25)
+
+    def give_up(dialog: QDialog) -> None:
+        assert isinstance(dialog, NameDialog)
+        timer = answer(pressing("Choose another name"))
+        type_name(dialog, "A")
+        assert not timer.isActive()
+        assert dialog.isVisible()
+        assert dialog.textValue() == "A"
+        dialog.reject()
+
+    press(window, Qt.Key.Key_K, CONTROL, give_up)
+    assert own(window) == before
+    press(window, Qt.Key.Key_K, CONTROL, typing("A"), pressing("Replace"))
+    assert list(own(window)) == ["A", "B"]
+    assert own(window)["A"] == document.latent.tobytes() != before["A"]
+    press(window, Qt.Key.Key_Z, CONTROL)
+    assert own(window) == before
+
+
+def test_the_browser_has_as_many_rows_as_there_is_room(qtbot: QtBot, window: MainWindow) -> None:
+    held = window.library.list
+
+    def rows_in_sight() -> int:
+        seen = held.viewport().rect()
+        rects = [held.visualItemRect(held.item(row)) for row in range(held.count())]
+        return len({rect.top() for rect in rects if seen.contains(rect)})
+
+    assert rows_in_sight() == 1
+    dock = window.docks["library"]
+    window.resizeDocks([dock], [470], Qt.Orientation.Vertical)
+    qtbot.waitUntil(lambda: rows_in_sight() >= 2, timeout=PATIENCE)
+    dock.setFloating(True)
+    dock.resize(700, 700)
+    qtbot.waitUntil(lambda: rows_in_sight() >= 3, timeout=PATIENCE)
+
+
+def test_names_are_not_cut_but_broken(window: MainWindow) -> None:
+    held = window.library.list
+    metrics, width = held.fontMetrics(), THUMBNAIL
+    assert lines_of("kick", metrics, width) == ["kick"]
+    assert lines_of("kicking with the left", metrics, width) == ["kicking with", "the left"]
+    name = "kicking_with_the_left"
+    assert "".join(lines_of(name, metrics, width)) == name
+    first, second = lines_of("a name that is longer than any name of a pose", metrics, width)
+    assert second.endswith("…")
+    assert metrics.horizontalAdvance(first) <= width >= metrics.horizontalAdvance(second)
+    assert lines_of("W" * 9, metrics, 1) != []
+    long = "a name that is longer than any name of a pose"
+    window.document.add_pose_to_library(long)
+    window.library.choose_own(long)
+    assert long in held.item(0).toolTip()
+
+
+def test_search_and_tags_find_poses(window: MainWindow) -> None:
+    document, library = window.document, window.library
+    for name in ("left kick", "right kick", "T pose"):
+        document.add_pose_to_library(name)
+    QTest.mouseClick(library.own, LEFT)
+    assert not library.tags.isVisible()
+    click(window, "left kick")
+    click(window, "T pose", key=CONTROL)
+    press(window, Qt.Key.Key_T, CONTROL | SHIFT, typing("leg, high & wide,leg"))
+    assert [pose.tags for pose in document.poses] == [
+        ("leg", "high & wide"),
+        (),
+        ("leg", "high & wide"),
+    ]
+    assert library.tags.isVisible()
+    entries = {action.text(): action for action in library.tags.menu().actions()}
+    assert list(entries) == ["All poses", "high && wide", "leg"]
+    entries["leg"].trigger()
+    assert names_shown(window) == ["left kick", "T pose"]
+    press(window, Qt.Key.Key_F, CONTROL | SHIFT)
+    assert library.search.hasFocus()
+    QTest.keyClicks(library.search, "KICK")
+    assert names_shown(window) == ["left kick"]
+    assert [pose.name for pose in library.chosen_poses] == ["left kick"]
+    QTest.keyClicks(library.search, "ing")
+    assert names_shown(window) == []
+    assert library.list.hint.text() == "No pose matches"
+    assert library.chosen is None
+    library.search.clear()
+    {action.text(): action for action in library.tags.menu().actions()}["All poses"].trigger()
+    assert len(names_shown(window)) == 3
+    # One that is kept is shown whatever was searched for.
+    library.search.setText("nothing")
+    press(window, Qt.Key.Key_K, CONTROL, typing("new"))
+    assert library.chosen_own is not None
+    assert library.chosen_own.name == "new"
+
+
+def test_the_context_menu_has_the_menu_s_own_actions(qtbot: QtBot, window: MainWindow) -> None:
+    document, library = window.document, window.library
+
+    def opened_at(place: QPoint) -> list[str]:
+        library.list.customContextMenuRequested.emit(place)
+        menu = QApplication.activePopupWidget()
+        assert isinstance(menu, QMenu)
+        found = [action for action in menu.actions() if not action.isSeparator()]
+        held = window.actions_by_key
+        keys = [next(key for key, own in held.items() if own is action) for action in found]
+        menu.close()
+        return keys
+
+    click(window, "bend 2", RIGHT)
+    assert library.chosen is not None
+    assert library.chosen.name == "bend 2"
+    at_training = opened_at(place_of(window, "bend 2"))
+    assert at_training == [
+        *("load", "blend", "add", "keep", "import_poses", "export_poses", "find_pose")
+    ]
+    document.add_pose_to_library("mine")
+    library.choose_own("mine")
+    document.set_code(0, 0.5)
+    assert opened_at(place_of(window, "mine")) == [
+        *("load", "blend", "rename", "tags", "duplicate", "remove", "keep", "update"),
+        *("import_poses", "export_poses", "export_library", "find_pose"),
+    ]
+    empty = library.list.viewport().rect().bottomRight() - QPoint(3, 3)
+    assert opened_at(empty) == [*("keep", "update", "import_poses", "export_library", "find_pose")]
+    library.choose_own("mine")
+    press(window, Qt.Key.Key_D, CONTROL | SHIFT)
+    assert list(own(window)) == ["mine", "mine 2"]
+    QTest.keyClick(library.list, Qt.Key.Key_A, CONTROL)
+    press(window, Qt.Key.Key_Delete, CONTROL)
+    assert own(window) == {}
+    assert document.undo_stack.undoText() == "Remove 2 poses"
+    rest(qtbot, window)
+
+
+def test_a_library_is_shared_as_a_file(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
+    document, library = window.document, window.library
+    for value, name in enumerate(("left kick", "right kick", "T pose")):
+        document.set_code(0, 0.25 * value)
+        document.add_pose_to_library(name)
+    document.tag_poses(["T pose"], ["arms"])
+    whole, some = tmp_path / "library.json", tmp_path / "some.json"
+    press(window, Qt.Key.Key_E, CONTROL | Qt.KeyboardModifier.AltModifier, choosing(whole))
+    QTest.mouseClick(library.own, LEFT)
+    click(window, "left kick")
+    click(window, "right kick", key=CONTROL)
+    press(window, Qt.Key.Key_E, CONTROL | SHIFT, choosing(some))
+    assert [pose.name for pose in read_poses(some, document.model)] == ["left kick", "right kick"]
+    assert read_pose_file(whole, document.model).poses[2].tags == ("arms",)
+    before = own(window)
+    document.remove_poses_from_library(["right kick", "T pose"])
+    document.set_code(0, 5.0)
+    document.replace_pose_of_library("left kick")
+    press(window, Qt.Key.Key_I, CONTROL | SHIFT, choosing(whole))
+    assert list(own(window)) == ["left kick", "left kick 2", "right kick", "T pose"]
+    assert own(window)["left kick 2"] == before["left kick"]
+    assert "Added 3 poses" in window.statusBar().currentMessage()
+    press(window, Qt.Key.Key_I, CONTROL | SHIFT, choosing(some))
+    assert len(own(window)) == 5
+    press(window, Qt.Key.Key_Z, CONTROL)
+    press(window, Qt.Key.Key_Z, CONTROL)
+    assert list(own(window)) == ["left kick"]
+    rest(qtbot, window)
+
+
+def test_a_file_of_another_model_is_offered_with_its_model(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document, path = window.document, tmp_path / "snake.json"
+    snake = another_model(document.model)
+    write_poses(path, snake, [NamedPose("coil", snake.training_latent[1])])
+    heard: list[str] = []
+
+    def cancel(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        heard.append(f"{dialog.text()} {dialog.informativeText()}")
+        take_picture(window, "library-other-model")
+        dialog.reject()
+
+    asked = answer(cancel)
+    drop(window, path)
+    qtbot.waitUntil(lambda: not asked.isActive(), timeout=PATIENCE)
+    assert heard == ["snake.json holds poses of the model “snake”. Open “snake” with these poses?"]
+    assert document.model.name == "tube"
+    asked = answer(pressing("Open “snake”"))
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        drop(window, path)
+    assert document.model.fingerprint == snake.fingerprint
+    assert document.pose_name == "coil"
+    rest(qtbot, window)
+
+
+@pytest.mark.parametrize("is_good", [True, False])
+def test_of_several_files_what_was_opened_is_told_once_it_is(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, is_good: bool
+) -> None:
+    document, model = window.document, window.document.model
+    files = [tmp_path / name for name in ("notes.txt", "bent.obj", "other.obj")]
+    files[0].write_text("no pose")
+    files[1].write_text("garbage")
+    if is_good:
+        write_mesh(files[1], model.decode(model.training_latent[1]), model.faces)
+    with qtbot.waitSignal(document.imported if is_good else document.failed, timeout=PATIENCE):
+        drop(window, *files)
+    said = window.statusBar().currentMessage()
+    assert ("of 3 files" in said) == is_good
+    if is_good:
+        assert said.startswith("Imported bent: fit error of ")
+        rest(qtbot, window)
+    for dialog in window.findChildren(FailureDialog):
+        dialog.reject()
+
+
+def test_names_that_are_proposed_are_those_of_the_pose_and_never_taken(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document = window.document
+    window.settings["last_folder"] = str(tmp_path)
+    proposed: list[str] = []
+
+    def look(dialog: QDialog) -> None:
+        assert isinstance(dialog, QFileDialog)
+        field = dialog.findChild(QLineEdit, "fileNameEdit")
+        assert isinstance(field, QLineEdit)
+        proposed.append(Path(field.text()).stem)
+        dialog.reject()
+
+    def export() -> str:
+        press(window, Qt.Key.Key_E, CONTROL, lambda form: form.accept(), look)
+        return proposed[-1]
+
+    document.load_pose(NamedPose("two\nlines", document.model.training_latent[1]))
+    assert window.windowTitle().startswith("two\\nlines[*]")
+    document.load_pose(NamedPose("left/right: kick", document.model.training_latent[1]))
+    assert export() == "left_right_ kick"
+    (tmp_path / "left_right_ kick.obj").write_text("mine")
+    assert export() == "left_right_ kick 2"
+    document.reset_all()
+    assert window.windowTitle().startswith("left/right: kick, changed[*]")
+    assert export() == "left_right_ kick changed"
+    document.save(tmp_path / "poses.json")
+    assert window.windowTitle().startswith("left/right: kick — poses.json[*]")
+    press(window, Qt.Key.Key_S, CONTROL | SHIFT, look)
+    assert proposed[-1] == "poses"
+    document.new_pose()
+    document.set_code(0, 0.5)
+    document.save(tmp_path / "squat.json")
+    assert window.windowTitle().startswith("squat — squat.json[*]")
+    rest(qtbot, window)
