@@ -28,7 +28,7 @@ MODEL_SUFFIX = ".safetensors"
 """As in `lcollision_core.model`, which takes too long to import before the window is there."""
 
 _EXPORTS = {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
-_FILMS = {"GIF": ".gif", "WebP": ".webp"}
+_FILMS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png"}
 
 
 def _kinds(*wanted: str) -> str:
@@ -208,12 +208,25 @@ class FileActions(QObject):
         self._after(screenshot_form(self._settings, self._window), shoot)
 
     def turntable(self, viewport: Viewport) -> None:
-        """Ask for duration and file, and save a film of one turn."""
+        """Ask for format, size, rate, background and file, and save a film of one turn."""
+        from app.turntable import TurntableStyle
 
         def shoot() -> None:
-            path = self.ask_save("Save the turntable", self._name, _FILMS)
+            settings = self._settings
+            # The chosen format first.
+            chosen = f".{settings['turntable_format']}"
+            kinds = dict(sorted(_FILMS.items(), key=lambda film: film[1] != chosen))
+            path = self.ask_save("Save the turntable", self._name, kinds)
             if path is not None:
-                viewport.turntable(path, seconds=self._settings["turntable_seconds"])
+                style = TurntableStyle(
+                    settings["turntable_seconds"],
+                    settings["turntable_width"],
+                    settings["turntable_height"],
+                    settings["turntable_rate"],
+                    settings["turntable_background"],
+                    settings["turntable_colour"],
+                )
+                viewport.turntable(path, style)
 
         self._after(turntable_form(self._settings, self._window), shoot)
 

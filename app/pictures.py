@@ -11,7 +11,7 @@ from PySide6.QtCore import QObject, Signal, Slot
 from app.engine import Failure
 from app.rendering import PoseRenderer
 from app.theme import current_theme
-from app.turntable import Turntable
+from app.turntable import Turntable, TurntableStyle
 
 if TYPE_CHECKING:
     from app.document import PoseDocument
@@ -60,12 +60,16 @@ class Pictures(QObject):
             renderer.close()
 
     def turntable(
-        self, scene: Scene, path: str | os.PathLike[str], seconds: float, width: int, height: int
+        self, scene: Scene, path: str | os.PathLike[str], style: TurntableStyle
     ) -> Turntable:
         """Begin a film of a scene, in place of one that is being drawn."""
         self.stop()
-        renderer = self._copy(scene, width, height, transparent=False)
-        self._film = Turntable(renderer, scene.view, Path(path), seconds, self)
+        transparent = style.background == "transparent"
+        renderer = self._copy(scene, style.width, style.height, transparent)
+        if style.background == "plain":
+            renderer.scene.show_floor(False)
+            renderer.scene.set_plain_background(style.colour)
+        self._film = Turntable(renderer, scene.view, Path(path), style, self)
         self._film.progressed.connect(self._on_progressed)
         self._film.finished.connect(self._on_finished)
         self._film.failed.connect(self._on_failed)

@@ -55,7 +55,13 @@ SETTINGS: dict[str, Setting] = {
     "screenshot_width": Setting(1920, 16, 16384),
     "screenshot_height": Setting(1080, 16, 16384),
     "screenshot_transparent": Setting(True),
+    "turntable_format": Setting("gif", choices=("gif", "webp", "png")),
     "turntable_seconds": Setting(4.0, 0.5, 20.0),
+    "turntable_rate": Setting(25, 1, 60),
+    "turntable_width": Setting(640, 16, 4096),
+    "turntable_height": Setting(640, 16, 4096),
+    "turntable_background": Setting("shown", choices=("shown", "plain", "transparent")),
+    "turntable_colour": Setting("#ffffff"),
 }
 """All settings by key; `Settings` refuses any other key."""
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from app.document import PoseDocument
     from app.outline import PartShape
     from app.scene import Scene
-    from app.turntable import Turntable
+    from app.turntable import Turntable, TurntableStyle
     from lcollision_core.resolve import ResolveResult
 
 _ROOM = 1.15
@@ -255,26 +255,20 @@ class Viewport(QWidget):
         """
         self.pictures.screenshot(self._scene_now(), path, width, height, transparent)
 
-    def turntable(
-        self,
-        path: str | os.PathLike[str],
-        seconds: float = 4.0,
-        width: int = 640,
-        height: int = 640,
-    ) -> Turntable:
+    def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> Turntable:
         """Begin a film of one turn round what is seen; the document tells when it is saved.
 
         Parameters
         ----------
-        path : a .gif or .webp file
-        seconds : that one turn lasts
-        width, height : in pixels
+        path : a .gif or .webp file, or a .png one, whose name without that a new folder of
+            numbered pictures gets
+        style : its size, rate and background
 
         Raises
         ------
-        MeshFileError : `path` has another extension.
+        MeshFileError : see `Turntable`.
         """
-        return self.pictures.turntable(self._scene_now(), path, seconds, width, height)
+        return self.pictures.turntable(self._scene_now(), path, style)
 
     def _scene_now(self) -> Scene:
         """Return the scene with what waits for the next picture on the screen."""

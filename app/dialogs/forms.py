@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Slot
+from PySide6.QtCore import Qt, Slot
+from PySide6.QtGui import QColor, QIcon, QPainter, QPixmap
 from PySide6.QtWidgets import (
     QCheckBox,
+    QColorDialog,
     QComboBox,
     QDialog,
     QDialogButtonBox,
     QFormLayout,
     QLabel,
+    QPushButton,
     QVBoxLayout,
     QWidget,
 )
@@ -38,6 +41,48 @@ EXPORT_NAMES = {
 """What the export's axes are called, by `ExportAxes`."""
 
 
+class ColourButton(QPushButton):
+    """Shows a colour, and asks for another when it is pressed.
+
+    Parameters
+    ----------
+    colour : "#rrggbb"; anything else is white
+    title : of the dialog that asks
+    """
+
+    def __init__(self, colour: str, title: str) -> None:
+        super().__init__()
+        self._title = title
+        # A dialog's button that takes Enter would be pressed by it.
+        self.setAutoDefault(False)
+        self.setStyleSheet("text-align: left;")
+        self._show(QColor(colour) if QColor(colour).isValid() else QColor("#ffffff"))
+        self.clicked.connect(self._ask)
+
+    @property
+    def colour(self) -> str:
+        """The colour, "#rrggbb"."""
+        return self._colour.name()
+
+    @Slot()
+    def _ask(self) -> None:
+        chosen = QColorDialog.getColor(self._colour, self, self._title)
+        if chosen.isValid():
+            self._show(chosen)
+
+    def _show(self, colour: QColor) -> None:
+        self._colour = colour
+        picture = QPixmap(self.iconSize())
+        picture.fill(colour)
+        painter = QPainter(picture)
+        # White on white is seen too.
+        painter.setPen(QColor("#888888"))
+        painter.drawRect(picture.rect().adjusted(0, 0, -1, -1))
+        painter.end()
+        self.setIcon(QIcon(picture))
+        self.setText(colour.name())
+
+
 class Form(QDialog):
     """Fields that show settings and write them back when they are accepted.
 
@@ -55,7 +100,9 @@ class Form(QDialog):
         self.setFixedWidth(_WIDTH)
         self._settings = settings
         self._refused = False
-        self._fields: dict[str, QuietIntegerBox | QuietSpinBox | QCheckBox | QComboBox] = {}
+        self._fields: dict[
+            str, QuietIntegerBox | QuietSpinBox | QCheckBox | QComboBox | ColourButton
+        ] = {}
         self._form = QFormLayout()
         self._form.setHorizontalSpacing(WIDE)
         self._form.setVerticalSpacing(NORMAL)
@@ -88,11 +135,13 @@ class Form(QDialog):
                 self._settings[key] = field.isChecked()
             elif isinstance(field, QComboBox):
                 self._settings[key] = field.currentData()
+            elif isinstance(field, ColourButton):
+                self._settings[key] = field.colour
             else:
                 self._settings[key] = field.value()
         super().accept()
 
-    def add_whole_number(self, key: str, label: str, suffix: str) -> None:
+    def add_whole_number(self, key: str, label: str, suffix: str) -> QuietIntegerBox:
         """Add a field for a whole number."""
         field = QuietIntegerBox()
         setting = SETTINGS[key]
@@ -100,6 +149,7 @@ class Form(QDialog):
         field.setSuffix(suffix)
         field.setValue(self._settings[key])
         self._add(key, label, field)
+        return field
 
     def add_number(
         self, key: str, label: str, suffix: str, step: float, tip: str = "", decimals: int = 0
@@ -132,6 +182,13 @@ class Form(QDialog):
         field.setChecked(self._settings[key])
         self._fields[key] = field
         self._form.addRow("", field)
+
+    def add_colour(self, key: str, label: str) -> ColourButton:
+        """Add a button that shows a colour and asks for another."""
+        field = ColourButton(self._settings[key], label)
+        self._fields[key] = field
+        self._form.addRow(label, field)
+        return field
 
     def add_note(self, text: str) -> QLabel:
         """Add some lines of explanation."""
@@ -218,10 +275,45 @@ def export_form(
 
 
 def turntable_form(settings: Settings, parent: QWidget) -> Form:
-    """Ask how long a turntable is to be."""
+    """Ask how long, how large and in front of what a turntable is to be, in which format."""
+    from app.turntable import FASTEST_GIF
+
     form = Form("Turntable", "Choose file…", settings, parent)
+    formats = {"gif": "GIF", "webp": "WebP", "png": "PNG sequence"}
+    kind = form.add_choice("turntable_format", "Format", formats, "What is written")
     form.add_number("turntable_seconds", "One turn takes", " s", 0.5)
-    form.add_note("The body turns once round its upright, as it is shaded now.")
+    rate = form.add_whole_number("turntable_rate", "Frames per second", "")
+    form.add_whole_number("turntable_width", "Width", " px")
+    form.add_whole_number("turntable_height", "Height", " px")
+    backgrounds = {"shown": "As shown", "plain": "One colour", "transparent": "Transparent"}
+    behind = form.add_choice(
+        "turntable_background", "Background", backgrounds, "What stands behind the body"
+    )
+    colour = form.add_colour("turntable_colour", "Colour")
+    note = form.add_note("")
+    most = rate.maximum()
+    meanings = {
+        "gif": f"256 colours, at most {FASTEST_GIF} frames per second, never transparent.",
+        "webp": "All colours, smaller than a GIF.",
+        "png": "A new folder of numbered pictures, as for making an MP4.",
+    }
+
+    def follow() -> None:
+        is_gif = kind.currentData() == "gif"
+        rate.setMaximum(min(most, FASTEST_GIF) if is_gif else most)
+        place = list(backgrounds).index("transparent")
+        behind.setItemData(place, 0 if is_gif else None, Qt.ItemDataRole.UserRole - 1)
+        if is_gif and behind.currentIndex() == place:
+            behind.setCurrentIndex(0)
+        form.explain(note, f"One full turn, current shading. {meanings[kind.currentData()]}")
+
+    def show_colour() -> None:
+        colour.setEnabled(behind.currentData() == "plain")
+
+    follow()
+    show_colour()
+    kind.currentIndexChanged.connect(follow)
+    behind.currentIndexChanged.connect(show_colour)
     return form
 
 

@@ -18,6 +18,7 @@ from app.main_window import MainWindow
 from app.panels.code_slider import CodeRow
 from app.panels.pose_grid import THUMBNAIL
 from app.panels.prediction import DomainRow
+from app.turntable import TurntableStyle
 from app.wording import heading
 from lcollision_core.model import NamedPose, PoseModel, write_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
@@ -153,7 +154,7 @@ def test_escape_stops_a_turntable_that_the_status_bar_tells_of(
 ) -> None:
     cancel = window.actions_by_key["cancel"]
     assert not cancel.isEnabled()
-    film = window.viewport.turntable(tmp_path / "turn.gif", width=60, height=60)
+    film = window.viewport.turntable(tmp_path / "turn.gif", TurntableStyle(width=60, height=60))
     assert cancel.isEnabled()
     assert "Filming turn.gif…" in told_as_busy(window)
     with qtbot.waitSignal(film.finished, timeout=PATIENCE) as finished:

@@ -31,6 +31,7 @@ from app.legend import LegendStrip
 from app.rendering import PoseRenderer
 from app.shading import Shading
 from app.theme import DARK, LIGHT, apply_theme
+from app.turntable import TurntableStyle
 from app.viewport import Viewport
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.model import NamedPose, PoseModel, sample_poses
@@ -763,7 +764,7 @@ def test_a_turntable_goes_round_once(
     qtbot: QtBot, viewport: Viewport, tmp_path: Path, suffix: str
 ) -> None:
     path = tmp_path / f"turn{suffix}"
-    film = viewport.turntable(path, seconds=0.32, width=90, height=120)
+    film = viewport.turntable(path, TurntableStyle(seconds=0.32, width=90, height=120))
     with qtbot.waitSignal(film.finished, timeout=20_000) as finished:
         assert film.is_running
     assert finished.args == [path]
@@ -782,7 +783,9 @@ def test_a_turntable_goes_round_once(
 def test_a_cancelled_turntable_leaves_no_file(
     qtbot: QtBot, viewport: Viewport, tmp_path: Path
 ) -> None:
-    film = viewport.turntable(tmp_path / "turn.gif", seconds=4.0, width=60, height=60)
+    film = viewport.turntable(
+        tmp_path / "turn.gif", TurntableStyle(seconds=4.0, width=60, height=60)
+    )
     qtbot.waitSignal(film.progressed).wait()
     with qtbot.waitSignal(film.finished) as finished:
         film.cancel()
@@ -801,7 +804,9 @@ def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
         assert cancelled.wait(20.0)
 
     monkeypatch.setattr(Image.Image, "save", save_slowly)
-    film = viewport.turntable(tmp_path / "turn.gif", seconds=0.08, width=60, height=60)
+    film = viewport.turntable(
+        tmp_path / "turn.gif", TurntableStyle(seconds=0.08, width=60, height=60)
+    )
     qtbot.waitUntil(lambda: film._packer is not None, timeout=20_000)
     with qtbot.waitSignal(film.finished, timeout=20_000) as finished:
         film.cancel()
@@ -835,7 +840,9 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
     monkeypatch.setattr(owner, act, fail)
     told: list[Failure] = []
     document.failed.connect(told.append)
-    film = viewport.turntable(tmp_path / "turn.webp", seconds=0.08, width=60, height=60)
+    film = viewport.turntable(
+        tmp_path / "turn.webp", TurntableStyle(seconds=0.08, width=60, height=60)
+    )
     assert "turn.webp" in viewport.pictures.busy
     qtbot.waitUntil(lambda: not film.is_running, timeout=20_000)
     (failure,) = told
@@ -846,8 +853,8 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
 
 
 def test_a_turntable_of_another_kind_is_refused(viewport: Viewport, tmp_path: Path) -> None:
-    with pytest.raises(MeshFileError, match=r"turn\.avi .* \.gif or \.webp"):
-        viewport.turntable(tmp_path / "turn.avi")
+    with pytest.raises(MeshFileError, match=r"turn\.avi .* \.gif, \.webp, \.png"):
+        viewport.turntable(tmp_path / "turn.avi", TurntableStyle())
 
 
 def test_the_theme_changes_what_is_behind_and_not_the_pose(
@@ -903,7 +910,7 @@ def test_a_closed_viewport_leaves_no_vtk_object_no_timer_and_no_thread(
         shown.show()
         rest(qtbot, shown)
         shown.screenshot(tmp_path / "shot.png", 50, 50, transparent=True)
-        shown.turntable(tmp_path / "cut.gif", width=50, height=50)
+        shown.turntable(tmp_path / "cut.gif", TurntableStyle(width=50, height=50))
         shown.set_camera("Back")
         n_alive = len(vtk_objects())
         dispose(shown)
