@@ -57,7 +57,12 @@ ACTIONS: dict[str, ActionSpec] = {
         "reset",
     ),
     "randomise": ActionSpec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),
-    "mirror": ActionSpec("&Mirror", "Ctrl+M", "Exchange left and right", "mirror"),
+    "mirror": ActionSpec(
+        "&Mirror pose",
+        "Ctrl+M",
+        "Exchange left and right of the whole pose, of locked parts too",
+        "mirror",
+    ),
     "filter": ActionSpec("&Find a slider", "Ctrl+F", "Type what a slider is called", "search"),
     "unlock": ActionSpec("Un&lock everything", "Ctrl+L", "Let all locked parts move again"),
     "resolve": ActionSpec(
@@ -76,6 +81,11 @@ ACTIONS: dict[str, ActionSpec] = {
     "rename": ActionSpec("Re&name…", "F2", "Give the chosen pose of your library another name"),
     "tags": ActionSpec("Ta&gs…", "Ctrl+Shift+T", "Choose by which words a pose is found"),
     "duplicate": ActionSpec("&Duplicate", "Ctrl+Shift+D", "Copy the chosen poses of your library"),
+    "mirror_poses": ActionSpec(
+        "&Mirror into library",
+        "Ctrl+Shift+M",
+        "Add the chosen poses with left and right exchanged to your library",
+    ),
     "remove": ActionSpec(
         "R&emove", "Ctrl+Delete", "Drop the chosen poses from your library", "remove"
     ),

@@ -199,11 +199,3 @@ def between(start: View, end: View, share: float) -> View:
         direction = (np.sin((1.0 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
     length = (1.0 - share) * lengths[0] + share * lengths[1]
     return View(focus + length * direction, focus, end.up)
-
-
-def front_direction(vertices: npt.NDArray[Any], up_axis: int) -> FloatArray:
-    """Guess the direction in which a body looks: see `lcollision_core.meshes`."""
-    # Loads SciPy: not before the window is on the screen.
-    from lcollision_core.meshes import front_direction as guessed
-
-    return guessed(vertices, up_axis)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from app.commands import DocumentState, Source
 from app.engine import Failure, LivePose, LongWork, Work
 from app.frames import ExactVerdict, LiveFrame, PosePrediction
 from app.history import UNNAMED, PoseHistory, read_only
-from app.wording import counted, heading, mirrored_text
+from app.wording import counted, heading, height_text, mirrored_text
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class PoseDocument(PoseHistory):
 
         self._solve: int | None = None
         self._solve_began = 0.0
-        self._mirroring = self._incoming = self._loading = 0
+        self._mirroring = self._mirroring_poses = self._incoming = self._loading = 0
         self._exports: list[int] = []
         self._closed = False
         self.may_replace: Callable[[], bool] = lambda: True
@@ -238,6 +238,22 @@ class PoseDocument(PoseHistory):
         work = tasks.mirrored(self.model, self.pose, self._locked)
         self._mirroring = self._long.start("Mirroring", work, self._on_mirrored)
 
+    def mirror_poses(self, poses: Sequence[NamedPose]) -> None:
+        """Add the mirror images of poses to the library, in the long worker, as one step.
+
+        "Left" and "right" in a name change places; other names get "mirrored". An image that is
+        there already, as that of an image is, is left out.
+
+        Raises
+        ------
+        LCollisionError : the model has no two sides.
+        """
+        _ = self.model.pose_mirror
+        self._long.cancel(self._mirroring_poses)
+        work = tasks.mirrored_poses(self.model, tuple(poses))
+        label = f"Mirroring {counted(len(poses), 'pose')}"
+        self._mirroring_poses = self._long.start(label, work, self._on_poses_mirrored)
+
     def code_name(self, index: int) -> str:
         """Return what a person would call one number of the latent."""
         group = next(g for g in self.model.latent_space.groups if index < g.codes.stop)
@@ -290,7 +306,8 @@ class PoseDocument(PoseHistory):
         self._locked = frozenset()
         self.cancel_resolve()
         # What is being exported is a snapshot, and goes on.
-        for number in (self._mirroring, self._incoming, self._loading):
+        others = (self._mirroring, self._mirroring_poses, self._incoming, self._loading)
+        for number in others:
             self._long.cancel(number)
         self._frame = self._exact = self._gesture = self._file = None
         self._file_poses = ()
@@ -525,9 +542,35 @@ class PoseDocument(PoseHistory):
         self.end_gesture()
         pose = self.pose.mirrored(image)
         pose = replace(pose, latent=read_only(np.array(pose.latent, dtype=np.float64)))
-        resolution = image.resolution if image.pairs_after == 0 else None
-        self._push("Mirror", replace(self._state, pose=pose, ghost=None, outcome=resolution))
-        self.message.emit(heading(mirrored_text(image)))
+        after = replace(self._state, pose=pose, ghost=None, outcome=image.resolution)
+        if image.resolution is not None:
+            after = replace(after, outcome_seconds=image.resolution.seconds)
+        self._push("Mirror", after)
+        said = [heading(mirrored_text(image))]
+        if image.lost_freedom and image.resolution is not None and image.resolution.note:
+            said.append(image.resolution.note)
+        if self._locked and not image.restored:
+            said.append("locked parts were mirrored too")
+        self.message.emit("; ".join(said))
+
+    def _on_poses_mirrored(self, images: list[tuple[NamedPose, MirroredPose]]) -> None:
+        added = self.add_to_library([pose for pose, _ in images])
+        if not added:
+            self.message.emit("Your library has these mirror images already")
+            return
+        said = [f"Added {counted(added, 'mirrored pose')} to your library"]
+        if len(images) == 1:
+            said.append(mirrored_text(images[0][1]))
+        else:
+            worst = max(image.fit_error_max for _, image in images)
+            said.append(f"off by at most {height_text(worst)} of the height")
+            for count, words in (
+                (sum(i.pairs_after == 0 < i.pairs_mirrored for _, i in images), "resolved"),
+                (sum(i.lost_freedom for _, i in images), "colliding, though free before"),
+            ):
+                if count:
+                    said.append(f"{count} {words}")
+        self.message.emit("; ".join(said))
 
     def _on_resolved(self, resolved: tasks.Resolved) -> None:
         result, self._solve = resolved.result, None

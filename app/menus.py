@@ -26,7 +26,7 @@ MENUS: dict[str, tuple[str, ...]] = {
     "&Pose": ("resolve", "cancel", "resolve_options"),
     "&Library": (
         *("load", "blend", SEPARATOR),
-        *("rename", "tags", "duplicate", "remove", "add", SEPARATOR),
+        *("rename", "tags", "duplicate", "mirror_poses", "remove", "add", SEPARATOR),
         *("keep", "update", SEPARATOR),
         *("import_poses", "export_poses", "export_library", SEPARATOR, "find_pose"),
     ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from app.engine import Work
 from app.frames import PoseShower, keep_torch_to_one_thread
-from app.wording import counted, fit_error
+from app.wording import counted, fit_error, mirrored_name
 from lcollision_core.errors import ModelFileError
 from lcollision_core.jobs import CancelToken, Progress
 
@@ -202,6 +202,23 @@ def mirrored(model: PoseModel, pose: NamedPose, locked: frozenset[int]) -> Work:
 
         options = ResolveOptions(locked_domains=locked)
         return model.mirror(pose.latent, pose.placement, pose.mirror_of, options, progress, cancel)
+
+    return work
+
+
+def mirrored_poses(model: PoseModel, poses: tuple[NamedPose, ...]) -> Work:
+    """Return the mirror images of poses, and what there is to say of each."""
+
+    def work(progress: Progress, cancel: CancelToken) -> list[tuple[NamedPose, MirroredPose]]:
+        from lcollision_core.model import MAX_NAME_LENGTH
+
+        images = []
+        for done, pose in enumerate(poses, 1):
+            image = model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel)
+            name = mirrored_name(pose.name)[:MAX_NAME_LENGTH]
+            images.append((replace(pose.mirrored(image), name=name), image))
+            progress(done, len(poses))
+        return images
 
     return work
 

@@ -17,6 +17,9 @@ _FAR = 0.03
 """Heights by which a mesh is hardly ever off the pose nearest to it, unless it is another body."""
 
 
+_MIRRORED = " mirrored"
+
+
 def overlap_text(energy: float) -> str:
     """Write an energy in squared heights as the depth that it stands for, as in "1.1 %"."""
     return "none" if energy == 0.0 else height_text(math.sqrt(energy))
@@ -60,6 +63,23 @@ def fit_error(mean: float | None, most: float | None) -> str:
     mean, most = mean or 0.0, most or 0.0
     far = ", which is far: is it this body, in the model's vertex order?" if mean > _FAR else ""
     return f"fit error of {100.0 * mean:.3f} % of the height, at most {100.0 * most:.2f} %{far}"
+
+
+def mirrored_name(name: str) -> str:
+    """Return what the mirror image of a pose is called: "twist left" of "twist right".
+
+    Of a name without a side, "NAME mirrored"; and of that, NAME.
+    """
+    turned = re.sub(r"\b(left|right)\b", _other_side, name, flags=re.IGNORECASE)
+    if turned != name:
+        return turned
+    return name.removesuffix(_MIRRORED) or name if name.endswith(_MIRRORED) else name + _MIRRORED
+
+
+def _other_side(word: re.Match[str]) -> str:
+    side = word[0]
+    other = "left" if side.casefold() == "right" else "right"
+    return other.upper() if side.isupper() else other.title() if side.istitle() else other
 
 
 def mirrored_text(mirrored: MirroredPose) -> str:

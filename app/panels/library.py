@@ -19,7 +19,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from app.camera import front_direction, preset_view
+from app.camera import preset_view
 from app.commands import Source
 from app.panels.action_button import ActionButton
 from app.panels.parts import ElidedLabel, Slider, labelled, plain_tip, silent
@@ -70,7 +70,6 @@ class LibraryPanel(QWidget):
         self._tag = ""
         self._pictures: dict[bytes, QIcon] = {}
         self._shower: PoseShower | None = None
-        self._front = np.zeros(3)
         self._may_draw = False
         self._due = QTimer(self)
         self._due.setSingleShot(True)
@@ -406,7 +405,6 @@ class LibraryPanel(QWidget):
         model = self._document.model
         if self._shower is None or self._shower.model is not model:
             self._shower = PoseShower(model)
-            self._front = front_direction(model.reference, model.up_axis)
         sharpness = self.devicePixelRatioF()
         side = round(THUMBNAIL * sharpness)
         vertices = model.decode(pose.latent, 1).astype(np.float32)
@@ -414,7 +412,7 @@ class LibraryPanel(QWidget):
             vertices,
             self._shower.normals(vertices),
             model.faces,
-            preset_view("Three-quarter", vertices, model.up_axis, self._front, 1.0),
+            preset_view("Three-quarter", vertices, model.up_axis, model.front, 1.0),
             side,
             _SKIN[current_theme().is_dark],
         )

@@ -1,0 +1,214 @@
+"""Mirroring in a real window: a pose, twice, over a save, and a library by its menu."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint, Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QMenu
+from pytestqt.qtbot import QtBot
+
+from app.document import PoseDocument
+from app.main_window import MainWindow
+from app.theme import DARK, LIGHT, apply_theme
+from app.wording import mirrored_name
+from lcollision_core.model import PoseModel
+from tests.app.windows import (
+    PATIENCE,
+    close_window,
+    is_open,
+    open_window,
+    rest,
+    settings_in,
+    shown,
+    take_picture,
+)
+
+FREE_THAT_COLLIDES_MIRRORED = 1
+"""As in the core's tests: the second sample of generator 0."""
+
+
+@pytest.fixture(scope="module")
+def body(compiled_body: None) -> PoseModel:  # noqa: ARG001
+    return PoseModel.load("body")
+
+
+@pytest.fixture
+def window(qtbot: QtBot, body: PoseModel, tmp_path: Path) -> Iterator[MainWindow]:
+    document = PoseDocument(body, library_folder=tmp_path / "library")
+    held = open_window(qtbot, document, settings_in(tmp_path), (1280, 860))
+    yield held
+    if is_open(held):
+        close_window(held)
+    assert document.close()
+    document.deleteLater()
+
+
+def press_mirror(qtbot: QtBot, window: MainWindow) -> str:
+    """Press Ctrl+M, wait for the pose, and return what the status bar says."""
+    told: list[str] = []
+    window.document.message.connect(told.append)
+    QTest.keyClick(window, Qt.Key.Key_M, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(lambda: any("irror" in sentence for sentence in told), timeout=4 * PATIENCE)
+    rest(qtbot, window)
+    window.document.message.disconnect(told.append)
+    return next(sentence for sentence in told if "irror" in sentence)
+
+
+def test_mirroring_twice_is_the_pose_again_also_after_save_and_reopen(
+    qtbot: QtBot, window: MainWindow, body: PoseModel, tmp_path: Path
+) -> None:
+    document = window.document
+    pose = body.latent_space.sample(1, np.random.default_rng(0))[0]
+    document.set_latent(pose, "Test")
+    rest(qtbot, window)
+    take_picture(window, "mirror_before")
+    before = shown(window).astype(float)
+    said = press_mirror(qtbot, window)
+    assert said.startswith("Mirrored with a fit error of 0.")
+    assert document.undo_stack.undoText() == "Mirror"
+    symmetry = body.symmetry
+    assert symmetry is not None
+    distance = np.linalg.norm(shown(window) - symmetry.image(before), axis=1)
+    assert distance.mean() / body.height < 0.008
+    take_picture(window, "mirror_after")
+
+    image = document.latent.tobytes()
+    assert press_mirror(qtbot, window).startswith("The pose that it was mirrored from")
+    assert document.latent.tobytes() == pose.tobytes()
+    document.undo()
+    assert document.latent.tobytes() == image
+    path = tmp_path / "image.json"
+    document.save(path)
+    document.new_pose()
+    document.open_poses(path)
+    qtbot.waitUntil(lambda: document.latent.tobytes() == image, timeout=PATIENCE)
+    press_mirror(qtbot, window)
+    assert document.latent.tobytes() == pose.tobytes()
+
+    # A changed image is another pose, whose mirror image is found anew.
+    document.undo()
+    document.set_code(3, document.latent[3] + 0.5)
+    assert press_mirror(qtbot, window).startswith("Mirrored with a fit error")
+    assert document.latent.tobytes() != pose.tobytes()
+
+
+def test_a_free_pose_that_would_collide_is_resolved_or_it_is_said(
+    qtbot: QtBot, window: MainWindow, body: PoseModel
+) -> None:
+    document = window.document
+    pose = body.latent_space.sample(2, np.random.default_rng(0))[FREE_THAT_COLLIDES_MIRRORED]
+    document.set_latent(pose, "Test")
+    rest(qtbot, window)
+    assert document.exact is not None
+    assert not document.exact.colliding
+    assert "collided in the mirror image only were resolved" in press_mirror(qtbot, window)
+    assert document.exact is not None
+    assert not document.exact.colliding
+    assert document.outcome is not None
+    assert document.outcome.exactly_free
+    take_picture(window, "mirror_resolved")
+
+    document.undo()
+    assert document.outcome is None
+    for domain in range(len(body.domain_names)):
+        document.set_locked(domain, True)
+    said = press_mirror(qtbot, window)
+    assert "which the pose before does not have" in said
+    assert "unlock" in said
+    assert "locked parts were mirrored too" in said
+    assert document.exact is not None
+    assert document.exact.colliding
+
+
+def choose(window: MainWindow, *names: str) -> QPoint:
+    held = window.library.list
+    place = QPoint()
+    for number, name in enumerate(names):
+        (item,) = held.findItems(name, Qt.MatchFlag.MatchExactly)
+        held.scrollToItem(item)
+        place = held.visualItemRect(item).center()
+        key = Qt.KeyboardModifier.ControlModifier if number else Qt.KeyboardModifier.NoModifier
+        QTest.mouseClick(held.viewport(), Qt.MouseButton.LeftButton, key, place)
+    return place
+
+
+def mirror_by_menu(qtbot: QtBot, window: MainWindow, place: QPoint, picture: str = "") -> str:
+    """Open the context menu of chosen poses, choose Mirror, and return what is said of it."""
+    told: list[str] = []
+    window.document.message.connect(told.append)
+    window.library.list.customContextMenuRequested.emit(place)
+    menus = [menu for menu in window.findChildren(QMenu) if menu.isVisible()]
+    (menu,) = menus
+    if picture:
+        QApplication.processEvents()
+        take_picture(window, picture)
+    action = window.actions_by_key["mirror_poses"]
+    assert action in menu.actions()
+    action.trigger()
+    menu.close()
+    qtbot.waitUntil(lambda: any("irror" in sentence for sentence in told), timeout=4 * PATIENCE)
+    window.document.message.disconnect(told.append)
+    return next(sentence for sentence in told if "irror" in sentence)
+
+
+@pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
+def test_a_library_is_mirrored_and_back_to_the_bit(
+    qtbot: QtBot, window: MainWindow, body: PoseModel, theme: object
+) -> None:
+    apply_theme(QApplication.instance(), theme)
+    ending = "dark" if theme is DARK else "light"
+    document, library = window.document, window.library
+    library.allow_pictures()
+    names = ("twist right", "right side lunge")
+    place = choose(window, *names)
+    said = mirror_by_menu(qtbot, window, place, f"mirror_menu_{ending}")
+    assert said.startswith("Added 2 mirrored poses to your library; off by at most 0.2 %")
+    assert document.undo_stack.undoText() == "Add 2 poses"
+    assert {pose.name for pose in document.poses} == {"twist left", "left side lunge"}
+    library.own.setChecked(True)
+    place = choose(window, "twist left", "left side lunge")
+    mirror_by_menu(qtbot, window, place)
+    held = {pose.name: pose for pose in document.poses}
+    assert set(held) == {"twist left", "left side lunge", *names}
+    for name in names:
+        trained = body.training_latent[body.pose_names.index(name)].astype(np.float64)
+        assert held[name].latent.tobytes() == trained.tobytes()
+    place = choose(window, "twist left")
+    said = mirror_by_menu(qtbot, window, place)
+    assert said == "Your library has these mirror images already"
+    assert len(document.poses) == 4
+    qtbot.waitUntil(lambda: not library._due.isActive(), timeout=PATIENCE)
+    rest(qtbot, window)
+    take_picture(window, f"mirror_library_{ending}")
+    document.undo()
+    document.undo()
+    assert document.poses == ()
+    apply_theme(QApplication.instance(), LIGHT)
+
+
+def test_a_mirrored_pose_is_called_after_its_other_side() -> None:
+    for name, image in (
+        ("twist right", "twist left"),
+        ("Left arm RIGHT", "Right arm LEFT"),
+        ("bright", "bright mirrored"),
+        ("bow", "bow mirrored"),
+    ):
+        assert mirrored_name(name) == image
+        assert mirrored_name(image) == name
+    assert mirrored_name(" mirrored") == " mirrored"
+
+
+def test_a_model_without_two_sides_offers_no_mirror(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    held = open_window(qtbot, document, settings_in(tmp_path))
+    held.library.list.selectAll()
+    assert held.library.chosen_poses
+    for key in ("mirror", "mirror_poses"):
+        assert not held.actions_by_key[key].isEnabled()
+    close_window(held)
