@@ -61,7 +61,7 @@ class LibraryActions(QObject):
             "rename": self._rename,
             "tags": self._tag,
             "duplicate": lambda: document.duplicate_poses(panel.chosen_poses),
-            "mirror_poses": lambda: document.mirror_poses(panel.chosen_poses),
+            "mirror_poses": self._mirror,
             "remove": self._remove,
             "add": self._add,
             "import_poses": self._import,
@@ -181,6 +181,11 @@ class LibraryActions(QObject):
         )
         if text is not None:
             self._document.tag_poses([pose.name for pose in chosen], _split(text))
+
+    def _mirror(self) -> None:
+        self._document.mirror_poses(self._panel.chosen_poses)
+        # Where they will be.
+        self._panel.own.setChecked(True)
 
     def _remove(self) -> None:
         self._document.remove_poses_from_library([p.name for p in self._panel.chosen_poses])

@@ -170,7 +170,7 @@ def test_a_library_is_mirrored_and_back_to_the_bit(
     assert said.startswith("Added 2 mirrored poses to your library; off by at most 0.2 %")
     assert document.undo_stack.undoText() == "Add 2 poses"
     assert {pose.name for pose in document.poses} == {"twist left", "left side lunge"}
-    library.own.setChecked(True)
+    assert library.own.isChecked()
     place = choose(window, "twist left", "left side lunge")
     mirror_by_menu(qtbot, window, place)
     held = {pose.name: pose for pose in document.poses}
