@@ -7,14 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.document import PoseDocument
 from app.frames import PoseShower
 from app.main_window import MainWindow
+from app.theme import LIGHT, apply_theme
+from app.viewport import Viewport
 from lcollision_core.model import PoseModel, find_model
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
+from tests.app.views import SIDE, dispose, rest
 from tests.app.windows import close_window, is_open, open_window, settings_in
 
 
@@ -85,3 +89,15 @@ def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[Mai
     yield held
     if is_open(held):
         close_window(held)
+
+
+@pytest.fixture
+def viewport(qtbot: QtBot, document: PoseDocument) -> Iterator[Viewport]:
+    """Return a viewport of the document that has drawn its pose, in the light theme."""
+    apply_theme(QApplication.instance(), LIGHT)
+    shown = Viewport(document)
+    shown.resize(SIDE, SIDE)
+    shown.show()
+    rest(qtbot, shown)
+    yield shown
+    dispose(shown)

@@ -1,0 +1,86 @@
+"""What the tests of the viewport share: pictures of the screen, and places on it."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QEvent, QPoint, QPointF
+from PySide6.QtGui import (
+    QImage,
+)
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from app.viewport import Viewport
+
+SIDE = 420
+
+
+def dispose(shown: Viewport) -> None:
+    shown.shut_down()
+    shown.close()
+    shown.deleteLater()
+    QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
+
+
+def rest(qtbot: QtBot, viewport: Viewport) -> None:
+    """Wait until the smooth picture of the newest pose is on the screen."""
+
+    def settle() -> None:
+        frame, document = viewport.shown_frame, viewport._document
+        assert frame is not None, "no pose has been shown"
+        newest = document.frame is not None and document.frame.latent is document.latent
+        assert newest, "the frame of the newest pose has not come"
+        assert frame is document.frame, "the newest frame is not shown"
+        assert viewport.canvas is not None
+        assert viewport.canvas.is_settled, "the smooth picture has not been drawn"
+        assert viewport.is_at_rest, "something glides"
+
+    qtbot.waitUntil(settle, timeout=20_000)
+    # Qt hands the picture to the screen after it is drawn.
+    qtbot.wait(30)
+
+
+def pixels(viewport: Viewport) -> npt.NDArray[np.int64]:
+    """Return what the screen shows of the viewport, (SIDE, SIDE, 3)."""
+    QApplication.processEvents()
+    image = viewport.screen().grabWindow(viewport.winId()).toImage()
+    image = image.convertToFormat(QImage.Format.Format_RGB888)
+    rows = np.frombuffer(image.constBits(), dtype=np.uint8).reshape(image.height(), -1)
+    return rows[:, : 3 * image.width()].reshape(image.height(), image.width(), 3).astype(int)
+
+
+def steady_pixels(qtbot: QtBot, viewport: Viewport) -> npt.NDArray[np.int64]:
+    """Return what the screen shows once it shows the same for a while: a busy machine lags."""
+    shown = [pixels(viewport)]
+
+    def stays() -> bool:
+        qtbot.wait(300)
+        shown.append(pixels(viewport))
+        return not changed(*shown[-2:]).any()
+
+    qtbot.waitUntil(stays, timeout=20_000)
+    return shown[-1]
+
+
+def changed(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    return np.abs(after - before).sum(axis=2) > 24
+
+
+def place_of(viewport: Viewport, vertex: int) -> QPoint:
+    assert viewport.canvas is not None
+    assert viewport.scene is not None
+    return viewport.canvas.place_of(viewport.scene.surface.vertices[vertex]).toPoint()
+
+
+def seen_vertex(viewport: Viewport, domain: int) -> int:
+    """Return a vertex of a domain that nothing hides."""
+    assert viewport.canvas is not None
+    assert viewport.scene is not None
+    mask = viewport._document.model.attention_mask
+    for vertex in np.argsort(-mask[domain]):
+        # Of the pixel that the pointer will be on.
+        place = QPointF(place_of(viewport, vertex))
+        if viewport.canvas.pick_vertex(place, viewport.scene.body) == vertex:
+            return int(vertex)
+    raise AssertionError("no vertex of the domain is seen")
