@@ -394,7 +394,7 @@ class MainWindow(QMainWindow):
         self.resizeDocks(sides, widths, Qt.Orientation.Horizontal)
         self.resizeDocks(
             [self.docks["library"]],
-            [self.library.sizeHint().height()],
+            [self.docks["library"].sizeHint().height()],
             Qt.Orientation.Vertical,
         )
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PySide6.QtCore import QItemSelectionModel, QPoint, Qt, QTimer, Signal, Slot
+from PySide6.QtCore import QItemSelectionModel, QPoint, QSize, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import QAction, QIcon, QImage, QPixmap, QShowEvent
 from PySide6.QtWidgets import (
     QButtonGroup,
@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 
 _PAUSE = 25
 """Milliseconds between two pictures, so that the window stays live while they are drawn."""
+
+_HEIGHT_OF_A_ROW = 480
+"""Of the window, so that most of it stays the body's."""
 
 _BLEND_STEPS = 100
 _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
@@ -301,6 +304,11 @@ class LibraryPanel(QWidget):
         self.list.hint.setVisible(not n_shown)
         self._on_chosen()
         self._draw_soon()
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for one row of pictures, and in a tall window for more."""
+        one, rows = super().sizeHint(), max(self.window().height() // _HEIGHT_OF_A_ROW, 1)
+        return one + QSize(0, (rows - 1) * self.list.gridSize().height())
 
     def showEvent(self, event: QShowEvent) -> None:  # noqa: N802
         """Go on with the pictures: none is drawn while nobody sees them."""

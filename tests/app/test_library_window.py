@@ -274,21 +274,29 @@ def test_a_taken_name_is_refused_with_its_text_or_replaced_when_confirmed(
     assert own(window) == before
 
 
-def test_the_browser_has_as_many_rows_as_there_is_room(qtbot: QtBot, window: MainWindow) -> None:
+def rows_in_sight(window: MainWindow) -> int:
     held = window.library.list
+    seen = held.viewport().rect()
+    rects = [held.visualItemRect(held.item(row)) for row in range(held.count())]
+    return len({rect.top() for rect in rects if seen.contains(rect)})
 
-    def rows_in_sight() -> int:
-        seen = held.viewport().rect()
-        rects = [held.visualItemRect(held.item(row)) for row in range(held.count())]
-        return len({rect.top() for rect in rects if seen.contains(rect)})
 
-    assert rows_in_sight() == 1
+def test_the_browser_has_as_many_rows_as_there_is_room(qtbot: QtBot, window: MainWindow) -> None:
+    assert rows_in_sight(window) == 1
     dock = window.docks["library"]
     window.resizeDocks([dock], [470], Qt.Orientation.Vertical)
-    qtbot.waitUntil(lambda: rows_in_sight() >= 2, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: rows_in_sight(window) >= 2, timeout=PATIENCE)
     dock.setFloating(True)
     dock.resize(700, 700)
-    qtbot.waitUntil(lambda: rows_in_sight() >= 3, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: rows_in_sight(window) >= 3, timeout=PATIENCE)
+
+
+def test_a_tall_window_begins_with_two_rows(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    window = open_window(qtbot, document, settings_in(tmp_path), (1280, 980))
+    qtbot.waitUntil(lambda: rows_in_sight(window) == 2, timeout=PATIENCE)
+    close_window(window)
 
 
 def test_names_are_not_cut_but_broken(window: MainWindow) -> None:
