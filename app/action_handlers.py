@@ -46,6 +46,7 @@ class ActionHandlers(QObject):
             "save_as": files.save_as,
             "import": files.import_mesh,
             "export": files.export,
+            "upright": files.turn_upright,
             "screenshot": lambda: files.screenshot(window.viewport),
             "turntable": lambda: files.turntable(window.viewport),
             "quit": window.close,

@@ -45,6 +45,9 @@ ACTIONS: dict[str, ActionSpec] = {
     "save_as": ActionSpec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
     "import": ActionSpec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),
     "export": ActionSpec("&Export mesh…", "Ctrl+E", "Write the mesh on the screen", "export"),
+    "upright": ActionSpec(
+        "Turn &upright", "Ctrl+Shift+U", "Turn the body to its next axis, which its file keeps"
+    ),
     "screenshot": ActionSpec("S&creenshot…", "Ctrl+P", "Save a picture of the view", "screenshot"),
     "turntable": ActionSpec("&Turntable…", "Ctrl+T", "Save a film of one turn", "turntable"),
     "quit": ActionSpec("&Quit", "Ctrl+Q", "Close the editor"),

@@ -69,6 +69,7 @@ class PoseDocument(PoseHistory):
     message : str, one sentence for the status bar
     failed : Failure, one sentence and its details, for a dialog
     opened : Path, the file of poses or of a model that is in now
+    wrong_scale : WrongScale, where a mesh to import is in another unit
     imported : Path, the mesh that has become the pose
     of_other_model : OtherModel, a file of poses that could not be opened with this model
     recovered : Path, the poses file that `recover` has put in
@@ -87,6 +88,7 @@ class PoseDocument(PoseHistory):
     opened = Signal(object)
     imported = Signal(object)
     of_other_model = Signal(object)
+    wrong_scale = Signal(object)
     recovered = Signal(object)
 
     def __init__(
@@ -391,9 +393,12 @@ class PoseDocument(PoseHistory):
         self._keep_saved(pose, target)
         self.message.emit(f"Saved {target.name}")
 
-    def import_mesh(self, path: str | Path) -> None:
-        """Encode a mesh of the model's topology in the long worker and make it the pose."""
-        work = tasks.encoded(self.model, Path(path))
+    def import_mesh(self, path: str | Path, scale: float = 1.0) -> None:
+        """Encode a mesh of the model's topology in the long worker and make it the pose.
+
+        `scale` brings it into the model's unit; `wrong_scale` tells where it is another.
+        """
+        work = tasks.encoded(self.model, Path(path), scale)
         self._bring(f"Importing {Path(path).name}", work, self._on_encoded, ask=False)
 
     def export_mesh(
@@ -530,7 +535,10 @@ class PoseDocument(PoseHistory):
     def _tell_of_library(self, sentence: str) -> None:
         self.failed.emit(Failure(sentence, ""))
 
-    def _on_encoded(self, imported: tasks.Imported) -> None:
+    def _on_encoded(self, imported: tasks.Imported | tasks.WrongScale) -> None:
+        if isinstance(imported, tasks.WrongScale):
+            self.wrong_scale.emit(imported)
+            return
         self._load(f"Import {imported.pose.name}", imported.pose, Source.MESH)
         self._tell(imported)
         self.imported.emit(imported.path)

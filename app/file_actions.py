@@ -11,7 +11,7 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
 from app.dialogs.forms import export_form, screenshot_form, turntable_form
-from app.dialogs.questions import Answer, ask_about_changes, ask_to_switch
+from app.dialogs.questions import Answer, ask_about_changes, ask_about_scale, ask_to_switch
 from app.panels.parts import plain_tip
 from app.wording import menu_text
 from lcollision_core.bundled import bundled_folder
@@ -20,7 +20,7 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from app.document import PoseDocument
     from app.settings import Settings
-    from app.tasks import OtherModel
+    from app.tasks import OtherModel, WrongScale
     from app.viewport import Viewport
 
 POSES_SUFFIX = ".json"
@@ -88,6 +88,7 @@ class FileActions(QObject):
         document.message.connect(self._on_message)
         # Once the reading is over, and the window says so.
         document.of_other_model.connect(self._on_other_model, Qt.ConnectionType.QueuedConnection)
+        document.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
         self._dropped: tuple[Path, int] | None = None
         self._told = ""
 
@@ -108,6 +109,28 @@ class FileActions(QObject):
         path = self.ask_open("Import a mesh", "meshes")
         if path is not None:
             self.open_path(path)
+
+    def turn_upright(self) -> None:
+        """Turn the model by the next axis, in its file, and open it anew.
+
+        Raises
+        ------
+        LCollisionError : it is a bundled model, or has no file.
+        """
+        from lcollision_core.model import change_model
+
+        document = self._document
+        file = Path(document.model_file)
+        if not file.is_file() or file.parent == bundled_folder("models"):
+            raise LCollisionError(
+                f"{document.model.name} comes with the program and stays as it is; copy {file}, "
+                f"open the copy and turn that"
+            )
+        if not self.may_lose_changes():
+            return
+        axis = (document.model.up_axis + 1) % 3
+        change_model(file, lambda model: model.turned_upright(axis))
+        document.open_model(file)
 
     def open_path(self, path: Path) -> None:
         """Open a file as what its extension says: poses, a model, or a mesh.
@@ -317,6 +340,12 @@ class FileActions(QObject):
     def _remember(self, path: Path) -> None:
         """Put a file that has opened first among the recent ones."""
         self._settings.remember_file(str(path.resolve()))
+
+    @Slot(object)
+    def _offer_scale(self, found: WrongScale) -> None:
+        """Ask whether a mesh in another unit is to be scaled, and import it then."""
+        if ask_about_scale(self._window, found):
+            self._document.import_mesh(found.path, found.factor)
 
     def _folder(self) -> Path:
         folder = Path(self._settings["last_folder"] or Path.home())

@@ -32,7 +32,7 @@ MENUS: dict[str, tuple[str, ...]] = {
     ),
     "&View": (
         *("shading", SEPARATOR, "ghost", SEPARATOR),
-        *("cameras", "reset_camera", SEPARATOR),
+        *("cameras", "reset_camera", "upright", SEPARATOR),
         *("docks", "reset_layout", SEPARATOR, "themes", "full_screen"),
     ),
     "&Help": ("shortcuts", "log", SEPARATOR, "about"),

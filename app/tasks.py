@@ -12,7 +12,7 @@ import numpy.typing as npt
 from app.engine import Work
 from app.frames import PoseShower, keep_torch_to_one_thread
 from app.wording import counted, fit_error, mirrored_name
-from lcollision_core.errors import ModelFileError
+from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
@@ -178,17 +178,39 @@ def read(model: PoseModel | None, model_file: str | Path, path: Path) -> Work:
     return work
 
 
-def encoded(model: PoseModel, path: Path) -> Work:
-    """Read a mesh of a model's topology as a latent pose, named after its file."""
+@dataclass(frozen=True)
+class WrongScale:
+    """A mesh that is in another unit than the model.
 
-    def work(_: Progress, cancel: CancelToken) -> Imported:
+    Attributes
+    ----------
+    path : its file
+    sentence : what is wrong, without what to do
+    factor : what brings it into the model's unit
+    """
+
+    path: Path
+    sentence: str
+    factor: float
+
+
+def encoded(model: PoseModel, path: Path, scale: float = 1.0) -> Work:
+    """Read a mesh of a model's topology as a latent pose, named after its file.
+
+    `scale` brings it into the model's unit. Without the right one it comes back as `WrongScale`.
+    """
+
+    def work(_: Progress, cancel: CancelToken) -> Imported | WrongScale:
         from lcollision_core.meshes import read_mesh
         from lcollision_core.model import NamedPose, name_of_file
 
         mesh = read_mesh(path, topology=model.topology)
         model.require_topology(mesh.topology, str(path))
         cancel.raise_if_cancelled()
-        encoding = model.encode(mesh.vertices, cancel=cancel)
+        try:
+            encoding = model.encode(mesh.vertices, cancel=cancel, scale=scale)
+        except WrongScaleError as error:
+            return WrongScale(path, str(error).partition(";")[0], error.factor)
         return Imported(path, NamedPose.of_mesh(name_of_file(path), encoding))
 
     return work

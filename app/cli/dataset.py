@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
+from app.cli.inputs import up_sentence
 from app.wording import counted
 
 app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no_args_is_help=True)
@@ -63,6 +64,7 @@ def check(
             found = detector.detect_batch(poses.vertices, progress=progress)
     except ShapeError as error:
         raise MeshFileError(f"{path} cannot be checked: {error}") from error
+    guess = poses.up
     report: dict[str, Any] = {
         "poses": inspection.n_found,
         "vertices": poses.topology.n_vertices,
@@ -72,6 +74,8 @@ def check(
         "colliding_poses": int(found.colliding.sum()),
         "problems": list(inspection.problems),
         "near_exclusion": exclusion,
+        "up_axis": "xyz"[guess.axis],
+        "up_is_sure": guess.is_sure,
         "colliding": [
             {
                 "pose": poses.names[pose],
@@ -85,18 +89,21 @@ def check(
     if as_json:
         print_json(report)
     else:
-        _print(path, report)
+        _print(path, report, up_sentence(guess))
+        if not guess.is_sure:
+            note("`train embedding` takes that, unless --up x|y|z says otherwise")
     usable = len(poses) == inspection.n_found and not len(inspection.audit.degenerate_faces)
     if not usable:
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
-def _print(path: Path, report: dict[str, Any]) -> None:
+def _print(path: Path, report: dict[str, Any], up: str) -> None:
     surface = "watertight" if report["watertight"] else "not watertight"
     tell(
         f"{path}: {counted(report['poses'], 'pose')} of {report['vertices']} vertices and "
         f"{report['faces']} faces, {surface}"
     )
+    typer.echo(f"  {up}")
     for problem in report["problems"]:
         tell(f"  problem: {problem}")
     n_colliding = report["colliding_poses"]

@@ -3,12 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lcollision_core.errors import LCollisionError, MeshFileError, WrongScaleError
+
+if TYPE_CHECKING:
+    from lcollision_core.meshes import UpGuess
+
+
+class Axis(StrEnum):
+    """An axis of a mesh."""
+
+    X = "x"
+    Y = "y"
+    Z = "z"
+
+    @property
+    def number(self) -> int:
+        """0, 1 or 2."""
+        return "xyz".index(self.value)
+
 
 ScaleOption = Annotated[
     float,
@@ -48,3 +66,8 @@ def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
     """Say that a mesh cannot be encoded, and which option helps where it has another unit."""
     advice = f" with --scale {error.factor:.6g}" if isinstance(error, WrongScaleError) else ""
     return MeshFileError(f"{path} cannot be encoded: {error}{advice}")
+
+
+def up_sentence(guess: UpGuess) -> str:
+    """Say which way was taken to be up, and why."""
+    return f"{'xyz'[guess.axis]} is {'' if guess.is_sure else 'perhaps '}up: {guess.reason}"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, note, print_json, tell
+from app.cli.inputs import Axis
 from app.cli.results import require_output
 from app.wording import counted
 from lcollision_core.errors import LCollisionError, ModelFileError
@@ -92,7 +93,7 @@ def domains(
     ] = None,
 ) -> None:
     """List the domains of a model, or rename them."""
-    from lcollision_core.model import PoseModel, change_model, find_model, list_models
+    from lcollision_core.model import PoseModel, change_model, find_model
 
     path = find_model(model_name)
     renamings: dict[int, str] = {}
@@ -104,14 +105,38 @@ def domains(
             )
         renamings[int(number) - 1] = name
     if renamings:
-        if any(listed.bundled and listed.path == path for listed in list_models()):
-            raise LCollisionError(
-                f"{path.stem} is a bundled model and stays as it is; copy {path} and name the copy"
-            )
+        _refuse_bundled(path)
         model = change_model(path, lambda model: model.rename_domains(renamings))
     else:
         model = PoseModel.load(path)
     _print_domains(describe(model))
+
+
+def upright(
+    model_name: ModelArgument,
+    up: Annotated[
+        Axis | None, typer.Option(help="The axis that is up, which the model's file keeps.")
+    ] = None,
+) -> None:
+    """Say which axis of a model is up, or turn it upright once and for all."""
+    from lcollision_core.model import PoseModel, change_model, find_model
+
+    path = find_model(model_name)
+    if up is None:
+        model = PoseModel.load(path)
+    else:
+        _refuse_bundled(path)
+        model = change_model(path, lambda model: model.turned_upright(up.number))
+    typer.echo(f"{model.name}: {'xyz'[model.up_axis]} is up")
+
+
+def _refuse_bundled(path: Path) -> None:
+    from lcollision_core.model import list_models
+
+    if any(listed.bundled and listed.path == path for listed in list_models()):
+        raise LCollisionError(
+            f"{path.stem} is a bundled model and stays as it is; copy {path} and name the copy"
+        )
 
 
 def describe(model: PoseModel) -> dict[str, Any]:

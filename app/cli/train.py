@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import note, status_bar
+from app.cli.inputs import Axis, up_sentence
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import describe, error_sentence, note_if_beside
 from app.cli.train_predictor import predictor
@@ -56,6 +57,10 @@ def embedding(
             "Default: what the set says.",
         ),
     ] = None,
+    up: Annotated[
+        Axis | None,
+        typer.Option(help="The axis that is up. Default: what the set says, else a guess."),
+    ] = None,
     scale: Annotated[
         float,
         typer.Option(metavar="S", help="Brings the poses into the unit that the model is to have."),
@@ -84,6 +89,13 @@ def embedding(
     poses = read_pose_set(dataset)
     if scale != 1.0:
         poses = poses.scaled(scale)
+    if up is not None:
+        poses = replace(poses, up_axis=up.number)
+    else:
+        guess = poses.up
+        if not guess.is_sure:
+            note(f"{up_sentence(guess)}; --up x|y|z says otherwise, now or by `lcollision upright`")
+        poses = replace(poses, up_axis=guess.axis)
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
     if near_exclusion is not None:

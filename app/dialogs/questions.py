@@ -21,6 +21,7 @@ from app.wording import menu_text
 
 if TYPE_CHECKING:
     from app.recovery import LostPose
+    from app.tasks import WrongScale
 
 _WIDTH = 400
 """At least, so that no title is cut."""
@@ -88,6 +89,21 @@ def ask_to_switch(parent: QWidget, file: str, model: str) -> bool:
     box.setDefaultButton(switch)
     box.setEscapeButton(stay)
     return _answer(box, switch, stay) is Answer.SAVE
+
+
+def ask_about_scale(parent: QWidget, found: WrongScale) -> bool:
+    """Offer to import a mesh that is in another unit; whether it is to be scaled."""
+    box = _box(parent, "Another unit")
+    box.setText(f"“{found.path.name}” seems to be in another unit.")
+    sentence = found.sentence[:1].upper() + found.sentence[1:]
+    box.setInformativeText(
+        f"{sentence}. Scaled by {found.factor:.6g} it fits; exported, it has its own size again."
+    )
+    scale = box.addButton("Scale and import", QMessageBox.ButtonRole.AcceptRole)
+    cancel = box.addButton("Cancel", QMessageBox.ButtonRole.RejectRole)
+    box.setDefaultButton(scale)
+    box.setEscapeButton(cancel)
+    return _answer(box, scale, cancel) is Answer.SAVE
 
 
 def _box(parent: QWidget, title: str) -> QMessageBox:

@@ -34,6 +34,7 @@ from lcollision_core.meshes.pose_set import (
 from lcollision_core.meshes.precision import as_stored, can_hold
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.units import front_direction, height, up_axis
+from lcollision_core.meshes.upright import UpGuess, guess_up
 
 __all__ = [
     "MAX_FACES",
@@ -47,6 +48,7 @@ __all__ = [
     "PoseSetInspection",
     "RigidTransform",
     "Topology",
+    "UpGuess",
     "align_rigid",
     "as_stored",
     "atomic_files",
@@ -58,6 +60,7 @@ __all__ = [
     "file_stems",
     "fit_rigid",
     "front_direction",
+    "guess_up",
     "has_known_suffix",
     "height",
     "inspect_pose_set",

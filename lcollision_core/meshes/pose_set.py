@@ -27,6 +27,7 @@ from lcollision_core.meshes.mesh_kernels import mark_flat_faces
 from lcollision_core.meshes.npz import MAX_ITEMS, read_npz, write_npz
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.units import height
+from lcollision_core.meshes.upright import UpGuess, guess_up
 
 FORMAT_VERSION = 1
 """The version that `write_pose_set` stores; later ones are refused."""
@@ -49,7 +50,7 @@ class PoseSet:
     source : the folder or file that it was read from, if it was
     notes : sentences on what was done on reading
     near_exclusion : fraction of the height below which pairs are near, not colliding
-    up_axis : 0, 1 or 2 for x, y or z; None where the longest side of the reference decides
+    up_axis : 0, 1 or 2 for x, y or z; None where it is to be guessed
     vertex_labels : (V,) array of printable strings, the body part of each vertex, if known
 
     Raises
@@ -107,6 +108,13 @@ class PoseSet:
         if float(np.abs(self.vertices).max()) > np.finfo(np.float64).max / max(factor, 1.0):
             raise ShapeError(f"the scale {factor:g} is too large for the coordinates")
         return replace(self, vertices=self.vertices.astype(np.float64) * factor)
+
+    @property
+    def up(self) -> UpGuess:
+        """Which way is up: what the set says, else a guess from its poses."""
+        if self.up_axis is not None:
+            return UpGuess(self.up_axis, True, "the set says so")
+        return guess_up(self.topology, self.vertices)
 
     @property
     def faces(self) -> npt.NDArray[np.int32]:
@@ -328,7 +336,11 @@ def _collect_folder(
     ]
     if others:
         sentences.append(f"{len(others)} other entries were ignored: {', '.join(others[:5])}")
-    pose_set = PoseSet(vertices[: len(names)], topology, tuple(names), path, tuple(sentences))
+    # By its standard y is up in a glTF file.
+    up_axis = 1 if formats.keys() <= {".glb", ".gltf"} else None
+    pose_set = PoseSet(
+        vertices[: len(names)], topology, tuple(names), path, tuple(sentences), up_axis=up_axis
+    )
     return Collected(pose_set, len(files), same_topology)
 
 

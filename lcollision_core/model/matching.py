@@ -99,8 +99,8 @@ def checked_mesh(
         size, limit = height(mesh, topology) / height(reference, topology), _MOST_SIZE
     if not 1.0 / limit < size < limit:
         sentence = (
-            f"the mesh is {size:.3g} times as large as the body of {model!r}, which is "
-            f"{height(reference, topology):.3g} tall in its own unit"
+            f"the mesh is {float(f'{size:.3g}'):g} times as large as the body of {model!r}, "
+            f"which is {height(reference, topology):.3g} tall in its own unit"
         )
         if not 0.0 < size < np.inf:
             raise PoseSetError(f"{sentence}; export it again")

@@ -22,7 +22,6 @@ from lcollision_core.meshes import (
     Topology,
     front_direction,
     height,
-    up_axis,
 )
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.colours import domain_colours
@@ -154,7 +153,7 @@ class PoseModel:
         provenance : how it was made, JSON values by name
         """
         reference = pose_set.vertices[0]
-        up = up_axis(reference, pose_set.topology) if pose_set.up_axis is None else pose_set.up_axis
+        up = pose_set.up.axis
         if pose_set.vertex_labels is None:
             names = numbered_names(embedding.n_domains)
         else:
@@ -347,6 +346,16 @@ class PoseModel:
             if renamed.count(name) > 1:
                 raise ModelFileError(f"two domains would be called {name!r}; choose another name")
         card = replace(self.card, domain_names=tuple(renamed))
+        return PoseModel(self.name, self.embedding, card, self._other_sections)
+
+    def turned_upright(self, up_axis: int) -> PoseModel:
+        """Return the same model with another axis upwards: 0, 1 or 2 for x, y or z.
+
+        Raises
+        ------
+        ModelFileError : there is no such axis.
+        """
+        card = replace(self.card, up_axis=up_axis)
         return PoseModel(self.name, self.embedding, card, self._other_sections)
 
     def with_predictor(self, predictor: CollisionPredictor) -> PoseModel:

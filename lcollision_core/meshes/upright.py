@@ -1,0 +1,113 @@
+"""Which way is up: a guess from the shape of the poses, and how far it can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.units import up_axis
+
+_MOST_POSES = 12
+_SUPPORT, _LEGS = 0.04, 0.12
+"""Shares of the height: what stands on the floor, and what legs are looked for in."""
+_CELLS = 24
+_SYMMETRIC = 0.01
+"""In heights: the mean distance of a symmetric body from its mirror image."""
+_LEAST_EXTENT = 0.35
+"""Of the longest side: what is flatter lies, and does not stand."""
+_LONGEST = 0.1
+_SURE = 0.15
+
+
+@dataclass(frozen=True)
+class UpGuess:
+    """An axis that may be up.
+
+    Attributes
+    ----------
+    axis : 0, 1 or 2 for x, y or z
+    is_sure : whether the shape leaves no doubt
+    reason : why, as in "y is up (...)"
+    """
+
+    axis: int
+    is_sure: bool
+    reason: str
+
+
+def guess_up(topology: Topology, vertices: npt.NDArray[Any]) -> UpGuess:
+    """Guess which axis is up from what a body stands on.
+
+    A body is taken to stand on narrow legs, with its middle above what it stands on, in most of
+    its poses, and never on a side, which its plane of symmetry tells.
+
+    Parameters
+    ----------
+    topology : of all poses
+    vertices : (N, V, 3) array, the first the reference
+
+    Returns
+    -------
+    guess : the longest side decides where the rest does not
+    """
+    some = np.linspace(0, len(vertices) - 1, min(len(vertices), _MOST_POSES)).astype(int)
+    poses = [np.asarray(vertices[pose], np.float64)[topology.picked] for pose in some]
+    longest = up_axis(np.asarray(vertices[0]), topology)
+    scores = np.array([_standing(poses, axis) for axis in range(3)])
+    extents = np.median([np.ptp(pose, axis=0) for pose in poses], axis=0)
+    scores[extents < _LEAST_EXTENT * extents.max()] = 0.0
+    scores[longest] += _LONGEST
+    side = _side(poses[0])
+    if side is not None:
+        scores[side] = 0.0
+    first, second = np.argsort(-scores, kind="stable")[:2]
+    is_sure = bool(scores[first] > 0.0 and scores[first] - scores[second] >= _SURE)
+    if not is_sure:
+        axis = longest if longest != side else int(first)
+        return UpGuess(axis, False, "what it stands on does not tell, so the longest side decides")
+    return UpGuess(int(first), True, "it stands on that end in most poses")
+
+
+def _standing(poses: list[FloatArray], axis: int) -> float:
+    """Return in how many poses, and on how narrow legs, a body may stand along an axis."""
+    return max(
+        float(np.mean([_stands(sign * pose, axis) for pose in poses])) for sign in (1.0, -1.0)
+    )
+
+
+def _stands(pose: FloatArray, axis: int) -> float:
+    """Return 0 where a body would fall, else the share of its shadow that its legs leave free."""
+    level = pose[:, axis] - pose[:, axis].min()
+    extent = max(float(level.max()), np.finfo(np.float64).tiny)
+    flat = np.delete(pose, axis, axis=1)
+    try:
+        hull = ConvexHull(flat[level <= _SUPPORT * extent])
+    except (QhullError, ValueError):  # too few points, or all on a line: a point to balance on
+        return 0.0
+    middle = flat.mean(axis=0)
+    if (hull.equations[:, :2] @ middle + hull.equations[:, 2]).max() > 0.0:
+        return 0.0
+    low, size = flat.min(axis=0), max(float(np.ptp(flat, axis=0).max()), np.finfo(float).tiny)
+    cells = np.minimum((_CELLS * (flat - low) / size).astype(int), _CELLS - 1) @ [1, _CELLS]
+    legs = len(np.unique(cells[level <= _LEGS * extent]))
+    return 1.0 - legs / len(np.unique(cells))
+
+
+def _side(reference: FloatArray) -> int | None:
+    """Return the axis across which a body is symmetric, None where there is no one such."""
+    extent = float(np.ptp(reference, axis=0).max())
+    if extent == 0.0:
+        return None
+    tree = cKDTree(reference)
+    apart = []
+    for axis in range(3):
+        image = reference.copy()
+        image[:, axis] = image[:, axis].min() + image[:, axis].max() - image[:, axis]
+        apart.append(float(tree.query(image)[0].mean()) / extent)
+    nearest, other = np.sort(apart)[:2]
+    return int(np.argmin(apart)) if nearest < _SYMMETRIC and other > 3.0 * nearest else None

@@ -1,0 +1,78 @@
+"""A mesh in another unit: the window offers to scale it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QTimer
+from PySide6.QtWidgets import QApplication, QMessageBox
+from pytestqt.qtbot import QtBot
+
+from app.main_window import MainWindow
+from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes import read_mesh, write_mesh
+from lcollision_core.model import PoseModel
+from tests.app.windows import take_picture
+
+
+def answer_with(words: str, told: list[str]) -> None:
+    """Click a button of the question that is about to be asked."""
+
+    def click() -> None:
+        box = QApplication.activeModalWidget()
+        if not isinstance(box, QMessageBox):
+            QTimer.singleShot(20, click)
+            return
+        told.extend([box.text(), box.informativeText()])
+        take_picture(box, "scale_and_import")
+        next(button for button in box.buttons() if button.text() == words).click()
+
+    QTimer.singleShot(0, click)
+
+
+@pytest.mark.parametrize("words", ["Scale and import", "Cancel"])
+def test_a_mesh_in_millimetres_is_scaled_and_goes_back_to_its_size(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, words: str
+) -> None:
+    document = window.document
+    model = document.model
+    vertices = 1000.0 * (model.decode(model.training_latent[2]) + 5.0)
+    write_mesh(tmp_path / "scan.obj", vertices, model.faces)
+    told: list[str] = []
+    answer_with(words, told)
+    with qtbot.waitSignal(document.wrong_scale, timeout=20_000):
+        window.files.open_path(tmp_path / "scan.obj")
+    qtbot.waitUntil(lambda: len(told) == 2, timeout=20_000)
+    assert told[0] == "“scan.obj” seems to be in another unit."
+    assert "Scaled by 0.001 it fits" in told[1]
+    if words == "Cancel":
+        assert document.placement is None
+        return
+    qtbot.waitUntil(lambda: document.placement is not None, timeout=20_000)
+    assert document.pose_name == "scan"
+    document.export_mesh(tmp_path / "back.obj")
+    qtbot.waitUntil((tmp_path / "back.obj").exists, timeout=20_000)
+    back = read_mesh(tmp_path / "back.obj").vertices
+    assert np.abs(back - vertices).max() < 1000.0 * 0.02 * model.height
+
+
+def test_the_window_turns_a_model_upright_in_its_file(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document = window.document
+    path = tmp_path / "own.safetensors"
+    document.model.save(path)
+    with qtbot.waitSignal(document.model_changed, timeout=20_000):
+        document.open_model(path)
+    assert document.model.up_axis == 1
+    with qtbot.waitSignal(document.model_changed, timeout=20_000):
+        window.actions_by_key["upright"].trigger()
+    assert document.model.up_axis == 2
+    assert PoseModel.load(path).up_axis == 2
+
+
+def test_the_window_leaves_a_bundled_model_as_it_is(window: MainWindow) -> None:
+    with pytest.raises(LCollisionError, match="copy"):
+        window.files.turn_upright()
