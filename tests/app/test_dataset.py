@@ -35,6 +35,8 @@ def test_report_of_a_good_set(
     (colliding,) = report.pop("colliding")
     assert colliding["pose"] == "poked"
     assert colliding["pairs"] == 3
+    assert report.pop("up_axis") in "xyz"
+    assert isinstance(report.pop("up_is_sure"), bool)
     assert report == {
         "poses": 2,
         "vertices": 8,

@@ -394,7 +394,7 @@ def test_resolve_checks_the_mesh_that_would_be_exported(
     resolve(qtbot, document)
     assert document.outcome is not None
     drawn = drawn_vertices(model, colliding)
-    placed = model.detector.detect(far.apply(drawn).astype(np.float32))
+    placed = model.detector.detect(far.apply(drawn))
     assert document.outcome.energy_before == placed.energy
     assert document.outcome.energy_before != model.detector.detect(drawn).energy
 
