@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -382,6 +383,8 @@ class FileActions(QObject):
         -------
         path : None where the user gives up
         """
+        from lcollision_core.meshes import has_known_suffix
+
         proposed = file or _unused(self._folder(), name, next(iter(kinds.values())))
         filters = {f"{kind} (*{suffix})": suffix for kind, suffix in kinds.items()}
         dialog = QFileDialog(self._window, title, str(proposed))
@@ -392,11 +395,11 @@ class FileActions(QObject):
         path = None
         while path is None and dialog.exec() == QDialog.DialogCode.Accepted:
             path = Path(dialog.selectedFiles()[0])
-            chooses = len(kinds) > 1 and path.suffix
+            chooses = len(kinds) > 1 and has_known_suffix(path)
             if path.suffix.lower() not in kinds.values() and not chooses:
                 # Qt adds no extension behind a dot, so that it has asked about another file.
                 path = path.with_name(f"{path.name}.{dialog.defaultSuffix()}")
-                if path.exists():
+                if os.path.exists(path):  # noqa: PTH110 - a name that is too long is none, no error
                     dialog.selectFile(str(path))
                     path = None
         dialog.deleteLater()

@@ -426,9 +426,9 @@ class MainWindow(QMainWindow):
         if not document.has_model:
             self.setWindowTitle("LCollision")
             return
-        name = one_line(document.pose_name) + ", changed" * document.changed
+        name = document.pose_name + ", changed" * document.changed
         file = f" — {document.file.name}" if document.file is not None else ""
-        self.setWindowTitle(f"{name}{file}[*] — {document.model.name}")
+        self.setWindowTitle(one_line(f"{name}{file}[*] — {document.model.name}"))
         self.setWindowModified(document.modified)
 
     @Slot()

@@ -7,6 +7,7 @@ from PySide6.QtWidgets import QProgressBar, QStatusBar
 
 from app.panels.parts import labelled
 from app.theme import NORMAL
+from app.wording import one_line
 
 _MESSAGE_MILLISECONDS = 8000
 
@@ -31,15 +32,15 @@ class StatusBar(QStatusBar):
     @Slot(str)
     def tell(self, sentence: str) -> None:
         """Show a message for some seconds."""
-        self.showMessage(sentence, _MESSAGE_MILLISECONDS)
+        self.showMessage(one_line(sentence), _MESSAGE_MILLISECONDS)
 
     def show_facts(self, facts: str) -> None:
         """Say what is true until another model comes."""
-        self._facts.setText(facts)
+        self._facts.setText(one_line(facts))
 
     def show_busy(self, work: str) -> None:
         """Say what is being done, or nothing for ""."""
-        self._work = work
+        self._work = one_line(work)
         self._reason = self._reason if work else ""
         self._show()
 

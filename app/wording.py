@@ -50,7 +50,7 @@ def seconds_text(seconds: float) -> str:
 
 def menu_text(name: str) -> str:
     """Write a name so that a menu, a button or a form's label shows it to the letter."""
-    return name.replace("&", "&&")
+    return one_line(name).replace("&", "&&")
 
 
 def one_line(text: str) -> str:

@@ -20,6 +20,7 @@ from app.icons import pixmap
 from app.log import log_file
 from app.panels.parts import labelled
 from app.theme import NORMAL, WIDE, current_theme
+from app.wording import one_line
 
 
 class FailureDialog(QDialog):
@@ -36,7 +37,7 @@ class FailureDialog(QDialog):
         self.setWindowTitle("That did not work")
         self.setMinimumWidth(480)
         self.failure = failure
-        what, advice = split_sentence(failure.sentence)
+        what, advice = split_sentence(one_line(failure.sentence))
         sign = QLabel()
         sign.setPixmap(pixmap("warning", current_theme().colliding, 36, self.devicePixelRatioF()))
         self.what = labelled(what, "verdict")

@@ -17,7 +17,7 @@ from PySide6.QtWidgets import (
 
 from app.icons import pixmap
 from app.theme import WIDE, current_theme
-from app.wording import menu_text
+from app.wording import menu_text, one_line
 
 if TYPE_CHECKING:
     from app.recovery import LostPose
@@ -38,7 +38,7 @@ class Answer(Enum):
 def ask_about_changes(parent: QWidget, pose_name: str) -> Answer:
     """Ask what becomes of unsaved changes."""
     box = _box(parent, "Unsaved changes")
-    box.setText(f"Save the changes to “{pose_name}”?")
+    box.setText(f"Save the changes to “{one_line(pose_name)}”?")
     box.setInformativeText("They are lost if you do not save them.")
     save = box.addButton("Save", QMessageBox.ButtonRole.AcceptRole)
     discard = box.addButton("Discard", QMessageBox.ButtonRole.DestructiveRole)
@@ -57,7 +57,7 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Answer:
     """
     moment = datetime.fromtimestamp(lost.saved).astimezone()
     box = _box(parent, "Recover a pose")
-    box.setText(f"The editor closed unexpectedly while “{lost.pose_name}” was not saved.")
+    box.setText(f"The editor closed unexpectedly while “{one_line(lost.pose_name)}” was not saved.")
     box.setInformativeText(f"It was kept on {moment.day} {moment:%B at %H:%M}. Recover it?")
     recover = box.addButton("Recover", QMessageBox.ButtonRole.AcceptRole)
     discard = box.addButton("Delete it", QMessageBox.ButtonRole.DestructiveRole)

@@ -15,8 +15,8 @@ MAX_STEM_BYTES = 130
 """Of a file's name without its extension; file systems allow 143 to 255 for all of it."""
 
 _OF_OTHER_PROGRAMS = re.compile(
-    r"\.(3dm|3ds|3mf|7z|abc|blend|bvh|bz2|c4d|dae|docx?|dxf|fbx|gltf|gz|iges|igs|ini|jsonl|log|lwo|ma|max"
-    r"|mb|md|mdd|msh|npy|npz|od[pst]|pc2|pickle|pkl|pptx|pt|pth|rar|safetensors|skp|step|stp|toml|usd[acz]?"
+    r"\.(3dm|3ds|3mf|7z|abc|blend|bvh|bz2|c4d|dae|docx?|dxf|fbx|glb|gltf|gz|iges|igs|ini|jsonl?|log|lwo|ma|max"
+    r"|mb|md|mdd|msh|npy|npz|obj|od[pst]|off|pc2|pickle|pkl|ply|pptx|pt|pth|rar|safetensors|skp|step|stl|stp|toml|usd[acz]?"
     r"|vrml|vtk|vtp|vtu|wrl|x3d|xlsx|xyz|xz|ya?ml|zip|zst|ztl)"
 )
 _MEDIA = MimeTypes()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import ModelFileError
+from lcollision_core.meshes import has_known_suffix
 
 MODEL_SUFFIX = ".safetensors"
 
@@ -67,7 +68,7 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
         for model in listed:
             if model.name == path.name:
                 return model.path
-        if not path.suffix:
+        if not has_known_suffix(path):
             destination = user_models_folder() / f"{path}{MODEL_SUFFIX}"
     if destination.name and checkpoint_path(destination).is_file():
         raise ModelFileError(
@@ -94,7 +95,8 @@ def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
 
     Parameters
     ----------
-    name_or_path : a file ending in .safetensors; or a name without extension or folder, which
+    name_or_path : a file ending in .safetensors; or a name without folder or extension ("v0.9"
+        ends in none), which
         goes to the user's own models, whose folder is made
 
     Raises
@@ -102,7 +104,7 @@ def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
     ModelFileError : another extension, no such folder, or the user's folder cannot be made.
     """
     path = Path(name_or_path)
-    if len(path.parts) == 1 and not path.suffix:
+    if len(path.parts) == 1 and not has_known_suffix(path):
         folder = user_models_folder()
         try:
             folder.mkdir(parents=True, exist_ok=True)

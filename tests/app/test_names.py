@@ -6,11 +6,17 @@ import shutil
 from pathlib import Path
 
 import pytest
+from PySide6.QtWidgets import QDialog, QFileDialog, QLabel, QLineEdit
+from pytestqt.qtbot import QtBot
 
+from app.dialogs.failure import FailureDialog
+from app.engine import Failure
+from app.main_window import MainWindow
 from app.wording import one_line
 from lcollision_core.meshes import write_pose_set
 from lcollision_core.model import NamedPose, PoseModel, write_poses
 from tests.app.support import STABBED, Lcollision
+from tests.app.windows import PATIENCE, answer
 from tests.bending_tube import bending_tube
 
 LONG = "x" * 300
@@ -94,3 +100,75 @@ def test_line_breaks_in_names_are_shown_escaped(lcollision: Lcollision) -> None:
 def test_plain_names_are_shown_as_they_are() -> None:
     for name in ("hand on hip", "Größe \N{DANCER}", "a\\nb", "\u5de6\u624b", "e\u0301"):
         assert one_line(name) == name
+
+
+def named(window: MainWindow, name: str) -> None:
+    """Let a window open a file of one pose."""
+    path = Path(window.settings["last_folder"]) / "poses.json"
+    model = window.document.model
+    write_poses(path, model, [NamedPose(name, model.training_latent[0])])
+    window.document.open_poses(path)
+
+
+def test_the_window_shows_names_in_one_line(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    window.settings["last_folder"] = str(tmp_path)
+    named(window, TWO_LINES)
+    qtbot.waitUntil(lambda: window.document.pose_name == TWO_LINES, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: window.windowTitle().startswith(SHOWN), timeout=PATIENCE)
+    window.document.message.emit(f"Saved {TWO_LINES}")
+    assert window.statusBar().currentMessage() == f"Saved {SHOWN}"
+    dialog = FailureDialog(Failure(f"{TWO_LINES} is damaged; copy it again", ""), window)
+    assert f"{SHOWN} is damaged" in [label.text() for label in dialog.findChildren(QLabel)]
+
+
+def test_a_proposed_file_name_is_one(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
+    window.settings["last_folder"] = str(tmp_path)
+    named(window, "../two\nlines")
+    qtbot.waitUntil(lambda: window.document.pose_name == "../two\nlines", timeout=PATIENCE)
+    proposed = []
+
+    def look(dialog: QDialog) -> None:
+        assert isinstance(dialog, QFileDialog)
+        proposed.extend(map(Path, dialog.selectedFiles()))
+        dialog.reject()
+
+    timer = answer(look)
+    window.actions_by_key["save_as"].trigger()
+    assert not timer.isActive()
+    assert proposed == [tmp_path / "_two_lines.json"]
+
+
+def test_a_dot_in_a_name_ends_no_format(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
+    def choose(dialog: QDialog) -> None:
+        assert isinstance(dialog, QFileDialog)
+        field = dialog.findChild(QLineEdit, "fileNameEdit")
+        assert isinstance(field, QLineEdit)
+        field.setText(str(tmp_path / "walk v0.9"))
+        dialog.accept()
+
+    def accept(dialog: QDialog) -> None:
+        timers.append(answer(choose))
+        dialog.accept()
+
+    timers = [answer(accept)]
+    window.actions_by_key["export"].trigger()
+    qtbot.waitUntil((tmp_path / "walk v0.9.obj").is_file, timeout=PATIENCE)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".obj", ".png"])
+def test_the_window_tells_of_a_name_that_is_too_long(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
+) -> None:
+    path, document = tmp_path / f"{LONG}{suffix}", window.document
+    write = {
+        ".json": document.save,
+        ".obj": document.export_mesh,
+        ".png": lambda path: window.viewport.screenshot(path, 64, 64, False),
+    }[suffix]
+    window.attempt(lambda: write(path))
+    qtbot.waitUntil(lambda: bool(window.findChildren(FailureDialog)), timeout=PATIENCE)
+    (failure,) = window.findChildren(FailureDialog)
+    assert "too long" in failure.what.text()
+    failure.reject()

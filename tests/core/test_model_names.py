@@ -192,6 +192,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_users_models_are_found_by_name(folder: Path) -> None:
     assert user_models_folder() == folder
     assert model_destination("tail") == folder / "tail.safetensors"
+    assert model_destination("tail_v0.9") == folder / "tail_v0.9.safetensors"
     (folder / "tail.safetensors").write_bytes(b"anything")
     (folder / ".tail.safetensors.1.part").write_bytes(b"")
     (folder / "notes.txt").write_bytes(b"")
@@ -213,7 +214,7 @@ def test_an_unknown_name_lists_those_that_there_are(folder: Path) -> None:
 
 
 def test_an_unfinished_training_says_how_to_go_on(folder: Path, tmp_path: Path) -> None:
-    for named in ("dancer", tmp_path / "dancer.safetensors"):
+    for named in ("dancer", "dancer_v0.9", tmp_path / "dancer.safetensors"):
         checkpoint = checkpoint_path(model_destination(named))
         checkpoint.touch()
         with pytest.raises(
@@ -249,6 +250,7 @@ def test_destinations_that_cannot_be_are_refused(folder: Path, tmp_path: Path) -
     (tmp_path / "taken.safetensors").mkdir()
     for destination, reason in (
         (tmp_path / "model.obj", "a model is a .safetensors file"),
+        ("model.ply", "a model is a .safetensors file"),
         (tmp_path / "none" / "m.safetensors", "no folder"),
         (tmp_path / "taken.safetensors", "it is a folder"),
     ):
