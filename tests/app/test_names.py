@@ -123,10 +123,8 @@ def test_the_window_shows_names_in_one_line(
     assert f"{SHOWN} is damaged" in [label.text() for label in dialog.findChildren(QLabel)]
 
 
-def test_a_proposed_file_name_is_one(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
+def test_a_proposed_file_name_is_one(window: MainWindow, tmp_path: Path) -> None:
     window.settings["last_folder"] = str(tmp_path)
-    named(window, "../two\nlines")
-    qtbot.waitUntil(lambda: window.document.pose_name == "../two\nlines", timeout=PATIENCE)
     proposed = []
 
     def look(dialog: QDialog) -> None:
@@ -135,7 +133,7 @@ def test_a_proposed_file_name_is_one(qtbot: QtBot, window: MainWindow, tmp_path:
         dialog.reject()
 
     timer = answer(look)
-    window.actions_by_key["save_as"].trigger()
+    window.files.ask_save("Save", "../two\nlines", {"Poses": ".json"})
     assert not timer.isActive()
     assert proposed == [tmp_path / "_two_lines.json"]
 
