@@ -387,7 +387,7 @@ def test_resolve_checks_the_mesh_that_would_be_exported(
 ) -> None:
     model = document.model
     # So far away that rounding moves every vertex by much.
-    far = RigidTransform(QUARTER_TURN.rotation, np.full(3, 1e5 * model.height))
+    far = RigidTransform(QUARTER_TURN.rotation, np.full(3, 1e8 * model.height))
     document.load_pose(NamedPose("far", colliding, far))
     for domain in range(len(model.domain_names)):
         document.set_locked(domain, True)
