@@ -27,30 +27,36 @@ def models(
     """List the bundled models and your own, with their metrics."""
     from lcollision_core.model import PoseModel, list_models, user_models_folder
 
-    reports, failed = [], False
+    reports, damaged = [], []
     for listed in list_models():
         try:
             report = describe(PoseModel.load(listed.path))
         except LCollisionError as error:
             note(str(error))
-            failed = True
+            damaged.append(listed)
             continue
         reports.append(report | {"bundled": listed.bundled, "file": str(listed.path)})
     if as_json:
         print_json(reports)
     else:
         for report in reports:
-            origin = "bundled" if report["bundled"] else "your own"
+            origin = _origin(report["bundled"])
             tell(f"{report['name']}: {_size_sentence(report)} ({origin})")
             tell(f"  {error_sentence(report)}")
             tell(f"  {_predictor_sentence(report)}")
-        if not reports and not failed:
+        for listed in damaged:
+            tell(f"{listed.name}: damaged ({_origin(listed.bundled)})")
+        if not reports and not damaged:
             tell(
                 f"there are no models yet; `lcollision train embedding` makes one, and those in "
                 f"{user_models_folder()} are listed here"
             )
-    if failed:
+    if damaged:
         raise typer.Exit(ExitStatus.BAD_INPUT)
+
+
+def _origin(bundled: bool) -> str:
+    return "bundled" if bundled else "your own"
 
 
 def info(

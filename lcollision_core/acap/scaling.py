@@ -21,6 +21,11 @@ SCALED_BOUND = 0.95
 """Training features fill [-0.95, 0.95] (Gao et al. 2019), inside the reach of tanh."""
 
 
+_LARGEST_FEATURE, _LARGEST_SCALE = 100.0, 1e18
+"""Radians, or a stretch, beyond all that training meets; numbers that hardly differ have large
+scales."""
+
+
 @dataclass(frozen=True)
 class FeatureScaling:
     """One affine map for all log R numbers and one for all S numbers.
@@ -29,12 +34,27 @@ class FeatureScaling:
     ----------
     rotation_centre, rotation_scale : scaled = (log R - centre) * scale, log R in radians
     stretch_centre, stretch_scale : scaled = (S - centre) * scale
+
+    Raises
+    ------
+    ValueError : no features have such extremes.
     """
 
     rotation_centre: float
     rotation_scale: float
     stretch_centre: float
     stretch_scale: float
+
+    def __post_init__(self) -> None:
+        for name in ("rotation_centre", "stretch_centre"):
+            if not abs(getattr(self, name)) <= _LARGEST_FEATURE:
+                raise ValueError(f"{name} must be within {_LARGEST_FEATURE:g} of 0")
+        for name in ("rotation_scale", "stretch_scale"):
+            if not 1.0 / _LARGEST_FEATURE <= getattr(self, name) <= _LARGEST_SCALE:
+                raise ValueError(
+                    f"{name} must be from {1.0 / _LARGEST_FEATURE:g} to {_LARGEST_SCALE:g}, got "
+                    f"{getattr(self, name):g}"
+                )
 
     @classmethod
     def fit(cls, features: npt.NDArray[Any]) -> FeatureScaling:

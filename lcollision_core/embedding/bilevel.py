@@ -26,10 +26,18 @@ from lcollision_core.embedding.autoencoders import (
 from lcollision_core.embedding.decoder import FeatureDecoder, Float32Array
 from lcollision_core.embedding.fitting import MAX_STEPS, LatentFit, fit_latent
 from lcollision_core.embedding.metrics import EmbeddingMetrics
-from lcollision_core.errors import ModelFileError, ShapeError
+from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.json_values import from_json
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.model_file import required_array
+
+_LARGEST_SHARE, _LARGEST_WEIGHT = 1.01, 1e4
+_LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e6
+_LEAST_LEADING, _LEAST_SIZE = 1e-6, 1e-3
+"""What the arrays of a file may hold: weights of norm 1 and features within 1 of 0, the others far
+beyond what training finds, and far below what overflows."""
 
 _LEAST_RANGE = 1e-6
 """So that the range of a code that no training pose uses still straddles 0."""
@@ -248,95 +256,106 @@ class Embedding:
         ModelFileError : something is missing, or the arrays do not fit together.
         """
         try:
-            n_vertices, n_domains = int(metadata["n_vertices"]), int(metadata["n_domains"])
-            mask = np.zeros((n_domains, n_vertices), dtype=np.float32)
-            parts = []
-            for name in ("level1", *(f"level2_{k}" for k in range(n_domains))):
-                support = (
-                    np.arange(n_vertices, dtype=np.int32)
-                    if name == "level1"
-                    else _int32(arrays[f"{name}_support"])
-                )
-                parts.append(
-                    AutoencoderWeights(
-                        components=_float32(arrays[f"{name}_components"]),
-                        self_weight=_float32(arrays[f"{name}_self_weight"]),
-                        ring_weight=_float32(arrays[f"{name}_ring_weight"]),
-                        support=support,
-                    )
-                )
-                if name != "level1":
-                    mask[len(parts) - 2, support] = arrays[f"{name}_mask"]
-            metrics = metadata["metrics"]
-            embedding = cls(
-                topology=Topology(arrays["faces"], n_vertices),
-                rest_vertices=np.asarray(arrays["rest_vertices"], dtype=np.float64),
-                alignment_weights=np.asarray(arrays["alignment_weights"], dtype=np.float64),
-                scaling=FeatureScaling(**metadata["scaling"]),
-                mean_features=_float32(arrays["mean_features"]),
-                level1=parts[0],
-                level2=tuple(parts[1:]),
-                attention_mask=mask,
-                training_latent=_float32(arrays["training_latent"]),
-                metrics=None if metrics is None else EmbeddingMetrics(**metrics),
-                config=dict(metadata["config"]),
-                seed=int(metadata["seed"]),
+            return cls._read(arrays, from_json(_Values, metadata, "embedding"))
+        except (LCollisionError, ValueError) as error:
+            raise ModelFileError(
+                f"the model's embedding does not fit together: {error}; train or copy the model "
+                "again"
+            ) from error
+
+    @classmethod
+    def _read(cls, arrays: Mapping[str, npt.NDArray[Any]], values: _Values) -> Embedding:
+        # Sizes are the arrays' own: nothing is made of a size that is only announced.
+        rest = required_array(arrays, "rest_vertices", np.float64, (None, 3), _LARGEST_PLACE)
+        n_vertices, n_domains = len(rest), values.n_domains
+        if values.n_vertices != n_vertices:
+            raise ValueError(f"it announces {values.n_vertices} vertices, but has {n_vertices}")
+        topology = Topology(required_array(arrays, "faces", np.int32, (None, 3)), n_vertices)
+        _require_size(rest, topology)
+        leading = required_array(
+            arrays, "alignment_weights", np.float64, (n_vertices,), _LARGEST_WEIGHT
+        )
+        if leading.min() < 0.0 or leading.max() < _LEAST_LEADING:
+            raise ValueError("its alignment_weights must be at least 0, and one of them more")
+        mean_features = required_array(
+            arrays, "mean_features", np.float32, (n_vertices, N_FEATURES), _LARGEST_SHARE
+        )
+        part = _read_part(arrays, "level1", np.arange(n_vertices, dtype=np.int32))
+        if len(part.components) != n_domains:
+            raise ValueError(
+                f"it announces {n_domains} domains, but its level 1 has {len(part.components)}"
             )
-        except KeyError as error:
-            raise ModelFileError(
-                f"the model's embedding lacks {error.args[0]!r}; train or copy the model again"
-            ) from error
-        except (TypeError, ValueError, IndexError) as error:
-            raise ModelFileError(
-                f"the model's embedding does not fit together ({error}); train or copy the "
-                "model again"
-            ) from error
-        embedding._refuse_misfits()
-        return embedding
+        parts, mask = [part], np.zeros((n_domains, n_vertices), dtype=np.float32)
+        for domain in range(n_domains):
+            name = f"level2_{domain}"
+            support = required_array(arrays, f"{name}_support", np.int32, (None,))
+            if not 0 <= support[0] <= support[-1] < n_vertices or (np.diff(support) <= 0).any():
+                raise ValueError(
+                    f"its array {name}_support is no ascending list of its {n_vertices} vertices"
+                )
+            parts.append(_read_part(arrays, name, support))
+            share = required_array(arrays, f"{name}_mask", np.float32, support.shape)
+            if share.min() < 0.0:
+                raise ValueError(f"its array {name}_mask has a share below 0")
+            mask[domain, support] = share
+        if np.abs(mask.sum(axis=0) - 1.0).max() > 1e-5:
+            raise ValueError("its attention masks do not sum to 1")
+        latent_size = sum(len(part.components) for part in parts)
+        return cls(
+            topology=topology,
+            rest_vertices=rest,
+            alignment_weights=leading,
+            scaling=values.scaling,
+            mean_features=mean_features,
+            level1=parts[0],
+            level2=tuple(parts[1:]),
+            attention_mask=mask,
+            training_latent=required_array(
+                arrays, "training_latent", np.float32, (None, latent_size), _LARGEST_CODE
+            ),
+            metrics=values.metrics,
+            config=dict(values.config),
+            seed=values.seed,
+        )
 
     def _named_parts(self) -> Iterator[tuple[str, AutoencoderWeights]]:
         yield "level1", self.level1
         for domain, part in enumerate(self.level2):
             yield f"level2_{domain}", part
 
-    def _refuse_misfits(self) -> None:
-        n_vertices, n_poses = self.topology.n_vertices, len(self.training_latent)
-        expected: dict[str, tuple[npt.NDArray[Any], tuple[int, ...]]] = {
-            "rest_vertices": (self.rest_vertices, (n_vertices, 3)),
-            "alignment_weights": (self.alignment_weights, (n_vertices,)),
-            "mean_features": (self.mean_features, (n_vertices, N_FEATURES)),
-            "training_latent": (self.training_latent, (n_poses, self.latent_size)),
-        }
-        for name, part in self._named_parts():
-            shape = (len(part.components), len(part.support), N_FEATURES)
-            expected[f"{name}_components"] = (part.components, shape)
-            for kind in ("self_weight", "ring_weight"):
-                expected[f"{name}_{kind}"] = (getattr(part, kind), (N_FEATURES, N_FEATURES))
-            inside = (part.support >= 0) & (part.support < n_vertices)
-            if len(part.support) == 0 or not inside.all() or (np.diff(part.support) <= 0).any():
-                raise ModelFileError(
-                    f"the model's {name}_support is no ascending list of its {n_vertices} "
-                    "vertices; train or copy the model again"
-                )
-        expected["level1_components"] = (
-            self.level1.components,
-            (self.n_domains, n_vertices, N_FEATURES),
-        )
-        for name, (array, wanted) in expected.items():
-            if array.shape != wanted or 0 in wanted:
-                raise ModelFileError(
-                    f"the model's {name} has shape {array.shape} instead of {wanted}; train or "
-                    "copy the model again"
-                )
-        if np.abs(self.attention_mask.sum(axis=0) - 1.0).max() > 1e-5:
-            raise ModelFileError(
-                "the model's attention masks do not sum to 1; train or copy the model again"
-            )
+
+@dataclass(frozen=True)
+class _Values:
+    """The JSON values beside an embedding's arrays."""
+
+    n_vertices: int
+    n_domains: int
+    scaling: FeatureScaling
+    metrics: EmbeddingMetrics | None
+    config: Mapping[str, Any]
+    seed: int
 
 
-def _float32(array: npt.NDArray[Any]) -> Float32Array:
-    return np.ascontiguousarray(array, dtype=np.float32)
+def _require_size(rest: FloatArray, topology: Topology) -> None:
+    """Refuse a reference that is not in heights, as far as its faces tell."""
+    used = rest[topology.faces.reshape(-1)]
+    size = float(np.ptp(used, axis=0).max())
+    # A vertex in no face counted once, and may have made the others smaller.
+    if not _LEAST_SIZE <= size <= 1.0 + _LEAST_SIZE:
+        raise ValueError(f"its array rest_vertices must be 1 height tall, got {size:.6g}")
 
 
-def _int32(array: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
-    return np.ascontiguousarray(array, dtype=np.int32)
+def _read_part(
+    arrays: Mapping[str, npt.NDArray[Any]], name: str, support: npt.NDArray[np.int32]
+) -> AutoencoderWeights:
+    shape, square = (None, len(support), N_FEATURES), (N_FEATURES, N_FEATURES)
+    return AutoencoderWeights(
+        components=required_array(arrays, f"{name}_components", np.float32, shape, _LARGEST_SHARE),
+        self_weight=required_array(
+            arrays, f"{name}_self_weight", np.float32, square, _LARGEST_WEIGHT
+        ),
+        ring_weight=required_array(
+            arrays, f"{name}_ring_weight", np.float32, square, _LARGEST_WEIGHT
+        ),
+        support=support,
+    )

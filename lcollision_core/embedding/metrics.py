@@ -14,6 +14,8 @@ from lcollision_core.embedding.seeding import principal_components
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray
 
+_LARGEST = 1e9
+
 
 @dataclass(frozen=True)
 class EmbeddingMetrics:
@@ -32,6 +34,10 @@ class EmbeddingMetrics:
     acap_mean, acap_max : of encoding poses as features and decoding them, without any code
     connected_share : least share of a domain's vertices in its largest connected patch
     domains_per_vertex : effective number of domains of a vertex, 1 / Σ_k (M^{ki})², mean
+
+    Raises
+    ------
+    ValueError : a value that cannot be.
     """
 
     level1_mean: float
@@ -47,6 +53,14 @@ class EmbeddingMetrics:
     acap_max: float
     connected_share: float
     domains_per_vertex: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is not None and not 0.0 <= value <= _LARGEST:
+                raise ValueError(f"{name} must be from 0 to {_LARGEST:g}, got {value:g}")
+        held_out = (self.held_out_mean, self.held_out_max, self.pca_held_out_mean, self.pca_size)
+        if None in held_out and any(value is not None for value in held_out):
+            raise ValueError("the held-out errors must be all there or all missing")
 
 
 def vertex_distances(decoded: npt.NDArray[Any], vertices: npt.NDArray[Any]) -> FloatArray:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.json_values import from_json
 from lcollision_core.labels.labeller import Labeller
 
 
@@ -38,6 +39,10 @@ class StoreIdentity:
     height : one height in the data's unit, in which vertices are rounded
     near_exclusion : in heights
     box_low, box_high : D numbers each
+
+    Raises
+    ------
+    ValueError : there is no box or no domain.
     """
 
     model: str
@@ -47,6 +52,10 @@ class StoreIdentity:
     near_exclusion: float
     box_low: tuple[float, ...]
     box_high: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not 0 < len(self.box_low) == len(self.box_high) or self.n_domains < 1:
+            raise ValueError("there is no latent box, or no domain")
 
     @classmethod
     def of(cls, labeller: Labeller, seed: int) -> StoreIdentity:
@@ -63,19 +72,8 @@ class StoreIdentity:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> StoreIdentity:
-        """Rebuild an identity from JSON values; KeyError, TypeError or ValueError if it cannot."""
-        identity = cls(
-            model=str(metadata["model"]),
-            seed=int(metadata["seed"]),
-            n_domains=int(metadata["n_domains"]),
-            height=float(metadata["height"]),
-            near_exclusion=float(metadata["near_exclusion"]),
-            box_low=tuple(float(number) for number in metadata["box_low"]),
-            box_high=tuple(float(number) for number in metadata["box_high"]),
-        )
-        if not 0 < len(identity.box_low) == len(identity.box_high) or identity.n_domains < 1:
-            raise ValueError("no latent box")
-        return identity
+        """Rebuild an identity from JSON values; ValueError if it cannot."""
+        return from_json(cls, metadata, "labels")
 
     @property
     def latent_size(self) -> int:

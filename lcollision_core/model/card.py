@@ -8,7 +8,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lcollision_core.errors import ModelFileError
+from lcollision_core.json_values import from_json
 from lcollision_core.model.naming import MAX_NAME_LENGTH
+
+_LEAST_HEIGHT = 1e-12
+"""Of a body, in whatever unit; its inverse is the largest."""
+
+_MAX_TEXT_LENGTH = 1000
+_ADVICE = "train or copy the model again"
 
 
 @dataclass(frozen=True)
@@ -43,27 +50,34 @@ class ModelCard:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        names = self.domain_names
-        sound = (
-            _is_number(self.height)
-            and 0.0 < self.height < float("inf")
-            and self.up_axis in (0, 1, 2)
-            and _is_number(self.near_exclusion)
-            and 0.0 <= self.near_exclusion < 1.0
-            and all(
-                isinstance(text, str) for text in (*names, *self.pose_names, *self.domain_colours)
-            )
-            and all(0 < len(name) <= MAX_NAME_LENGTH for name in names)
-            and len(set(names)) == len(names) == len(self.domain_colours)
-            and all(re.fullmatch("#[0-9a-f]{6}", colour) for colour in self.domain_colours)
-            and isinstance(self.source, str)
-            and isinstance(self.licence, str)
-            and isinstance(self.provenance, Mapping)
-        )
-        if not sound:
-            raise ModelFileError(
-                "the model's names, colours or units are unusable; train or copy the model again"
-            )
+        names, colours = self.domain_names, self.domain_colours
+        for sound, needed in (
+            (
+                _LEAST_HEIGHT <= self.height <= 1.0 / _LEAST_HEIGHT,
+                f"its height must be from {_LEAST_HEIGHT:g} to {1.0 / _LEAST_HEIGHT:g}",
+            ),
+            (self.up_axis in (0, 1, 2), "its up_axis must be 0, 1 or 2"),
+            (0.0 <= self.near_exclusion < 1.0, "its near_exclusion must be from 0 to below 1"),
+            (
+                all(0 < len(name) <= MAX_NAME_LENGTH and name.isprintable() for name in names),
+                f"its domain_names must be 1 to {MAX_NAME_LENGTH} printable characters",
+            ),
+            (len(set(names)) == len(names), "its domain_names must all differ"),
+            (
+                len(colours) == len(names)
+                and all(re.fullmatch("#[0-9a-f]{6}", colour) for colour in colours),
+                "its domain_colours must be one #rrggbb for each name",
+            ),
+            (
+                all(
+                    len(text) <= _MAX_TEXT_LENGTH
+                    for text in (*self.pose_names, self.source, self.licence)
+                ),
+                f"its names, source and licence must be at most {_MAX_TEXT_LENGTH} characters",
+            ),
+        ):
+            if not sound:
+                raise ModelFileError(f"the model's card is damaged: {needed}; {_ADVICE}")
 
     def to_metadata(self) -> dict[str, Any]:
         """Return JSON values from which `from_metadata` builds the same card."""
@@ -87,15 +101,7 @@ class ModelCard:
         ------
         ModelFileError : something is missing or cannot be.
         """
-        values: dict[str, Any] = {name: metadata.get(name) for name in cls.__dataclass_fields__}
-        for name in ("domain_names", "domain_colours", "pose_names"):
-            if not isinstance(values[name], list):
-                raise ModelFileError(
-                    f"the model lacks its {name.replace('_', ' ')}; train or copy the model again"
-                )
-            values[name] = tuple(values[name])
-        return cls(**values)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+        try:
+            return from_json(cls, metadata, "card")
+        except ValueError as error:
+            raise ModelFileError(f"the model's card is damaged: {error}; {_ADVICE}") from error

@@ -38,7 +38,12 @@ from lcollision_core.model.mirror import (
     find_symmetry,
 )
 from lcollision_core.model.naming import checked_name, names_from_labels, numbered_names
-from lcollision_core.model_file import Section, read_model_file, write_model_file
+from lcollision_core.model_file import (
+    Section,
+    read_model_file,
+    required_array,
+    write_model_file,
+)
 
 if TYPE_CHECKING:
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
@@ -49,6 +54,8 @@ FloatArray = npt.NDArray[np.float64]
 _CARD = "model"
 _PREDICTOR = "predictor"
 _FREE_POSES = "free_poses"
+_LARGEST_CODE = 1e6
+"""Of a latent pose; what is larger would overflow."""
 
 
 class PoseModel:
@@ -126,7 +133,10 @@ class PoseModel:
             embedding_section, card_section = sections.pop(EMBEDDING), sections.pop(_CARD)
             embedding = Embedding.from_arrays(embedding_section.arrays, embedding_section.metadata)
             card = ModelCard.from_metadata(card_section.metadata)
-            return cls(path.stem, embedding, card, sections)
+            model = cls(path.stem, embedding, card, sections)
+            # What is loaded is sound: the others are used only later, where nobody expects it.
+            _ = model.predictor_record, model.free_latent
+            return model
         except ModelFileError as error:
             raise ModelFileError(f"{path} is unusable: {error}") from error
 
@@ -402,7 +412,7 @@ class PoseModel:
 
         return CollisionPredictor.from_section(section, self.embedding)
 
-    @property
+    @cached_property
     def predictor_record(self) -> PredictorRecord | None:
         """How the predictor was trained and measured, without torch; None where there is none.
 
@@ -415,7 +425,7 @@ class PoseModel:
             return None
         from lcollision_core.predictor import PredictorRecord
 
-        return PredictorRecord.from_metadata(section.metadata)
+        return PredictorRecord.of_section(section, self.embedding)
 
     def require_predictor(self) -> CollisionPredictor:
         """Return the predictor, or raise ModelFileError where there is none or a damaged one."""
@@ -429,11 +439,24 @@ class PoseModel:
 
     @cached_property
     def free_latent(self) -> FloatArray:
-        """(F, D) poses that were found exactly free when the predictor was made, read-only."""
+        """(F, D) poses that were found exactly free when the predictor was made, read-only.
+
+        Raises
+        ------
+        ModelFileError : they are damaged.
+        """
         section = self._other_sections.get(_FREE_POSES)
         codes = None if section is None else section.arrays.get("latent")
-        if codes is None or codes.ndim != 2 or codes.shape[1] != self.latent_size:
+        if section is None or (codes is not None and codes.shape == (0, self.latent_size)):
             return _read_only(np.empty((0, self.latent_size)))
+        try:
+            codes = required_array(
+                section.arrays, "latent", np.float32, (None, self.latent_size), _LARGEST_CODE
+            )
+        except ValueError as error:
+            raise ModelFileError(
+                f"the model's free poses are damaged: {error}; train the predictor again"
+            ) from error
         return _read_only(codes.astype(np.float64))
 
     @cached_property

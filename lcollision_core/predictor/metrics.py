@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.json_values import from_json
 from lcollision_core.meshes.topology import FloatArray
 
 CALIBRATION_BINS = 10
@@ -52,6 +53,10 @@ class PredictorMetrics:
     spearman : rank correlation of predicted and true PDe-sum over colliding samples
     calibration_error : expected calibration error over `calibration`
     calibration : the curve, `CALIBRATION_BINS` equal bins of the predicted probability
+
+    Raises
+    ------
+    ValueError : a share or a count that cannot be.
     """
 
     samples: int
@@ -65,6 +70,14 @@ class PredictorMetrics:
     calibration_error: float
     calibration: tuple[CalibrationBin, ...]
 
+    def __post_init__(self) -> None:
+        for name in ("accuracy", "false_positive_rate", "false_negative_rate", "majority_rate"):
+            share = getattr(self, name)
+            if share is not None and not 0.0 <= share <= 1.0:
+                raise ValueError(f"{name} must be from 0 to 1, got {share:g}")
+        if self.samples < 1 or len(self.calibration) != CALIBRATION_BINS:
+            raise ValueError(f"samples must be over 0, and calibration {CALIBRATION_BINS} entries")
+
     def to_metadata(self) -> dict[str, Any]:
         """Return the metrics as JSON values."""
         values = asdict(self)
@@ -73,10 +86,8 @@ class PredictorMetrics:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> PredictorMetrics:
-        """Rebuild metrics from JSON values; KeyError or TypeError if it cannot."""
-        values = dict(metadata)
-        values["calibration"] = tuple(CalibrationBin(**entry) for entry in values["calibration"])
-        return cls(**values)
+        """Rebuild metrics from JSON values; ValueError if it cannot."""
+        return from_json(cls, metadata, "metrics")
 
 
 @dataclass(frozen=True)

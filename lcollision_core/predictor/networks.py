@@ -15,11 +15,12 @@ from lcollision_core.labels import LabelRows
 from lcollision_core.predictor.config import PredictorConfig
 from lcollision_core.predictor.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
 from lcollision_core.predictor.patch_labels import SkinCells
-
-ENCODER_SIZES = (512, 256, 256)
-PREDICTOR_SIZES = (512, 256, 256, 128)
-CLASSIFIER_SIZE = 64
-UNDIVIDED_SIZE = 128
+from lcollision_core.predictor.stored_network import (
+    CLASSIFIER_SIZE,
+    ENCODER_SIZES,
+    PREDICTOR_SIZES,
+    UNDIVIDED_SIZE,
+)
 
 
 class NetworkOutput(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -15,12 +14,14 @@ import numpy.typing as npt
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.json_values import from_json, quoted
 from lcollision_core.labels import LabelRows, StoreIdentity
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.compiled_network import CompiledNetwork
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.metrics import EnergyScores, PredictorMetrics, measure
+from lcollision_core.predictor.stored_network import require_network
 
 if TYPE_CHECKING:
     from lcollision_core.predictor.networks import PredictorNetwork
@@ -33,7 +34,8 @@ _ROWS_A_THREAD = 64
 
 _ROWS_A_REPORT = 50 * BATCH_ROWS
 
-_MISFIT = "the model's predictor does not fit its latent space; train the predictor again"
+_LEAST_ENERGY, _LARGEST_FACT = 1e-18, 1e6
+"""Of facts: far beyond what training finds, and far from what overflows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +85,19 @@ class TrainingFacts:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> TrainingFacts:
-        """Rebuild the facts from JSON values; KeyError, TypeError or ValueError if it cannot."""
-        values = dict(metadata)
-        if values["store"] is not None:
-            values["store"] = StoreIdentity.from_metadata(values["store"])
-        facts = cls(**values)
-        if not facts.energy_scale > 0.0:
-            raise ValueError("no energy scale")
-        if not math.isfinite(facts.logit_shift):
-            raise ValueError("the logit's shift is not finite")
+        """Rebuild the facts from JSON values; ValueError if it cannot."""
+        facts = from_json(cls, metadata, "facts")
+        for name, low, high in (
+            ("rows", 1, np.inf),
+            ("training_rows", 0, facts.rows),
+            ("colliding_share", 0.0, 1.0),
+            ("seed", 0, np.inf),
+            ("energy_scale", _LEAST_ENERGY, _LARGEST_FACT),
+            ("margin", 0.0, _LARGEST_FACT),
+            ("logit_shift", -_LARGEST_FACT, _LARGEST_FACT),
+        ):
+            if not low <= getattr(facts, name) <= high:
+                raise ValueError(f"{name} must be from {low:g} to {high:g}")
         return facts
 
 
@@ -119,22 +125,51 @@ class PredictorRecord:
         ModelFileError : the preset is unknown, or a value is missing or wrong.
         """
         preset = metadata.get("preset")
-        if preset not in PRESETS:
+        if not isinstance(preset, str) or preset not in PRESETS:
             raise ModelFileError(
-                f"the model's predictor has the preset {preset!r}, this program knows "
+                f"the model's predictor has the preset {quoted(preset)}, this program knows "
                 f"{', '.join(PRESETS)}; update the program or train the predictor again"
             )
         try:
-            measured = metadata["metrics"]
-            # Earlier versions wrote which pass was kept.
-            config = {name: value for name, value in metadata["config"].items() if name != "kept"}
+            config = from_json(PredictorConfig, metadata.get("config"), "config")
+            if config.preset != preset:
+                raise ValueError(f"config.preset must be {preset!r}, got {quoted(config.preset)}")
+            measured = metadata.get("metrics")
             return cls(
-                PredictorConfig(**config),
-                TrainingFacts.from_metadata(metadata["facts"]),
+                config,
+                TrainingFacts.from_metadata(metadata.get("facts", {})),
                 None if measured is None else PredictorMetrics.from_metadata(measured),
             )
-        except (AttributeError, KeyError, TypeError, ValueError, LCollisionError) as error:
-            raise ModelFileError(_MISFIT) from error
+        except (ValueError, LCollisionError) as error:
+            raise _misfit(error) from error
+
+    @classmethod
+    def of_section(cls, section: Section, embedding: Embedding) -> PredictorRecord:
+        """Read the record, and check the weights beside it, without torch.
+
+        Parameters
+        ----------
+        section : of the model file
+        embedding : of the same file
+
+        Raises
+        ------
+        ModelFileError : as for `from_metadata`, or the weights do not fit the embedding.
+        """
+        record = cls.from_metadata(section.metadata)
+        try:
+            require_network(
+                section.arrays, embedding, record.config.preset, record.config.by_domain
+            )
+        except ValueError as error:
+            raise _misfit(error) from error
+        return record
+
+
+def _misfit(error: Exception) -> ModelFileError:
+    return ModelFileError(
+        f"the model's predictor does not fit its latent space: {error}; train the predictor again"
+    )
 
 
 class CollisionPredictor:
@@ -339,15 +374,8 @@ class CollisionPredictor:
         ------
         ModelFileError : the preset is unknown, or the weights do not fit the embedding.
         """
-        record = PredictorRecord.from_metadata(section.metadata)
-        predictor = cls(embedding, section.arrays, record.config, record.facts, record.metrics)
-        try:
-            # Built at once, as the arrays may be anything.
-            if predictor.needs_torch:
-                _ = predictor._network
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise ModelFileError(_MISFIT) from error
-        return predictor
+        record = PredictorRecord.of_section(section, embedding)
+        return cls(embedding, section.arrays, record.config, record.facts, record.metrics)
 
     def __getstate__(self) -> dict[str, Any]:
         networks = ("_compiled", "_network", "_exact_network")

@@ -1,0 +1,92 @@
+"""What every field of a file is replaced by: other types, sizes, signs, NaN and infinities."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+
+MISSING, TOO_LARGE = "@missing@", "@1e999@"
+VALUES: tuple[Any, ...] = (
+    MISSING,
+    TOO_LARGE,
+    None,
+    True,
+    -1,
+    0,
+    1,
+    2.0,
+    0.5,
+    1e308,
+    -1e308,
+    5e-324,
+    float("nan"),
+    -(10**400),
+    "",
+    "\ud800\n",
+    "x" * 100_000,
+    [],
+    [[1], "a"],
+    {"a" * 100_000: None},
+)
+"""What every JSON value of a model file is replaced by."""
+
+NUMBERS = (0.0, -1.0, 1.0, 1e-38, 1e4, 1e30, 3e38, -1e300, np.nan, np.inf, -np.inf)
+WHOLE_NUMBERS = (0, -1, 1, 2**31 - 1, -(2**31))
+
+
+def as_json(value: Any) -> str:
+    """Write JSON with numbers that no reader should take."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return text.replace(f'"{TOO_LARGE}"', "1e999")
+
+
+def places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Give the place of every JSON value, of a list's the first and the last item's."""
+    if place:
+        yield place
+    if isinstance(value, dict):
+        for key in value:
+            yield from places(value[key], (*place, key))
+    elif isinstance(value, list | tuple):
+        for index in sorted({0, len(value) - 1}) if value else ():
+            yield from places(value[index], (*place, index))
+
+
+def with_value(metadata: Any, place: tuple[Any, ...], value: Any) -> Any:
+    changed = deepcopy(metadata)
+    holder = changed
+    for key in place[:-1]:
+        holder = holder[key]
+    if value == MISSING:
+        del holder[place[-1]]
+    else:
+        holder[place[-1]] = value
+    return changed
+
+
+def changed_arrays(array: np.ndarray) -> Iterator[tuple[str, np.ndarray | None]]:
+    """Give an array with another type, another shape, or other numbers."""
+    yield "missing", None
+    for dtype in (np.float64, np.float32, np.int64, np.int32, np.uint8, np.bool_):
+        if dtype != array.dtype:
+            yield f"as {np.dtype(dtype)}", array.astype(dtype)
+    yield "as one number", np.zeros((), array.dtype)
+    yield "with an axis more", array[None]
+    yield "flat", array.reshape(-1) if array.ndim > 1 else array[:, None]
+    yield "transposed", array.T if array.ndim > 1 else array[::-1].copy()
+    for axis in range(array.ndim):
+        yield f"without {axis}", np.take(array, [], axis=axis)
+        yield f"shorter in {axis}", np.take(array, range(array.shape[axis] - 1), axis=axis)
+        yield f"longer in {axis}", np.concatenate([array, np.take(array, [0], axis)], axis)
+    for number in NUMBERS if array.dtype.kind == "f" else WHOLE_NUMBERS:
+        with np.errstate(over="ignore"):
+            cast = np.array(number).astype(array.dtype)
+        yield f"all {number}", np.full_like(array, cast)
+        for place in (0, array.size - 1):
+            changed = array.copy()
+            changed.reshape(-1)[place] = cast
+            yield f"{number} at {place}", changed
