@@ -52,7 +52,9 @@ def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:
     OSError, ValueError : as for `open_regular`, or it has more than `most_bytes` bytes.
     """
     with open_regular(path) as file:
-        content = file.read(most_bytes + 1)
-    if len(content) > most_bytes:
-        raise OSError(errno.EFBIG, f"it has more than {most_bytes} bytes", os.fspath(path))
-    return content
+        size = os.fstat(file.fileno()).st_size
+        if size > most_bytes:
+            raise OSError(
+                errno.EFBIG, f"it has {size} bytes, at most {most_bytes} are read", os.fspath(path)
+            )
+        return file.read(size)

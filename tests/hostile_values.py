@@ -71,6 +71,14 @@ def with_value(metadata: Any, place: tuple[Any, ...], value: Any) -> Any:
 def changed_arrays(array: np.ndarray) -> Iterator[tuple[str, np.ndarray | None]]:
     """Give an array with another type, another shape, or other numbers."""
     yield "missing", None
+    if array.dtype.kind == "U":
+        # As numbers that stand for no character.
+        bad = np.full(array.shape + (array.dtype.itemsize // 4,), 0xFFFFFFFF, np.uint32)
+        yield "no characters", bad.view(array.dtype).reshape(array.shape)
+        for text in ("", "\ud800\n", "x" * 10_000):
+            yield f"all {text[:3]!r}", np.full(array.shape, text)
+        yield "flat", array.reshape(-1, 1)
+        return
     for dtype in (np.float64, np.float32, np.int64, np.int32, np.uint8, np.bool_):
         if dtype != array.dtype:
             yield f"as {np.dtype(dtype)}", array.astype(dtype)

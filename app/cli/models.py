@@ -11,7 +11,7 @@ from app.cli.console import ExitStatus, note, print_json, tell
 from app.cli.inputs import Axis
 from app.cli.results import require_output
 from app.wording import counted
-from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
@@ -232,10 +232,7 @@ def note_if_beside(written: Path, destination: Path) -> None:
 def _describe_predictor(model: PoseModel) -> dict[str, Any] | None:
     from dataclasses import asdict
 
-    try:
-        record = model.predictor_record
-    except LCollisionError as error:
-        raise ModelFileError(f"the model {model.name!r} is unusable: {error}") from error
+    record = model.predictor_record
     if record is None:
         return None
     facts = record.facts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -388,7 +389,7 @@ def _collect_npz(
         report(MeshFileError(f"{path} cannot be read as a pose set: {error}"))
         return nothing
     names = extras.pop("names") or tuple(f"pose {pose}" for pose in range(len(vertices)))
-    usable = np.isfinite(vertices).all(axis=(1, 2))
+    usable = np.array([first_not_finite(pose) is None for pose in vertices])
     for pose in np.flatnonzero(~usable):
         vertex = first_not_finite(vertices[pose])
         report(
@@ -449,10 +450,10 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
             raise MeshFileError(
                 f"{name} must be ({length},) strings, got {value.dtype} {value.shape}"
             )
-        try:
-            texts = value.tolist()
-        except ValueError as error:
-            raise MeshFileError(f"{name} holds a character that there is not") from error
+        native = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("="))
+        if (native.view(np.uint32) > sys.maxunicode).any():
+            raise MeshFileError(f"{name} holds a character that does not exist")
+        texts = native.tolist()
         # Half a character, of a file name that was no text, cannot be printed.
         return [text[:_MAX_TEXT_LENGTH].encode(errors="replace").decode() for text in texts]
 

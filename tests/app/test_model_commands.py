@@ -255,7 +255,7 @@ def test_a_damaged_model_is_named_and_the_others_are_listed(
     assert result.exit_code == 2
     assert "good: 210 vertices" in result.stdout
     assert "bad.safetensors" in result.stderr
-    assert "the model 'odd' is unusable: the model's predictor does not fit" in result.stderr
+    assert "odd.safetensors is unusable: the model's predictor does not fit" in result.stderr
 
 
 def test_no_models_are_no_error(

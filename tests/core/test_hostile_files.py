@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import LCollisionError, MeshFileError
-from lcollision_core.meshes import Topology, read_mesh, read_pose_set
+from lcollision_core.meshes import RigidTransform, Topology, read_mesh, read_pose_set
 from lcollision_core.meshes.files import READABLE_SUFFIXES
-from lcollision_core.model import PoseModel, read_poses
+from lcollision_core.model import NamedPose, PoseModel, read_poses, write_poses
 from lcollision_core.model_file import read_model_file
 from lcollision_core.regular_files import open_regular
+from tests.hostile_values import VALUES, as_json, changed_arrays, places, with_value
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1.5, 0], [0, 0, -2.25]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -209,6 +210,7 @@ def test_of_an_npz_only_what_is_wanted_is_read(tmp_path: Path) -> None:
     unused = {f"unused{i}": np.zeros(5_000_000) for i in range(2)}
     np.savez_compressed(path, vertices=VERTICES[None], faces=FACES, V=unused["unused0"], **unused)
     assert path.stat().st_size < 10**6
+    read_pose_set(path)  # What is compiled is compiled.
     assert _peak(lambda: read_pose_set(path)) < 10**7
 
 
@@ -223,3 +225,139 @@ def test_an_npz_size_that_the_file_cannot_hold_takes_no_memory(tmp_path: Path) -
             read_pose_set(path)
 
     assert _peak(read) < 2 * 10**6
+
+
+N_ROWS = 60_000
+POINTS = np.random.default_rng(0).normal(size=(N_ROWS, 3)).astype(np.float32)
+CORNERS = np.stack([np.arange(N_ROWS - 2) + i for i in range(3)], axis=1)
+
+
+def _text_files() -> dict[str, str]:
+    """Return meshes in which nothing is plain, so that no short way through is taken."""
+    points = [f"{x:.7g} {y:.7g} {z:.7g}" for x, y, z in POINTS.tolist()]
+    rows = [" ".join(map(str, row)) for row in CORNERS.tolist()]
+    ply = (
+        f"ply\nformat ascii 1.0\nelement vertex {N_ROWS}\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face {len(rows) + 1}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    odd = ["1_0 0 0", *points[1:]]
+    facets = [
+        "facet normal 0 0 1\nouter loop\n"
+        + "".join(f"vertex {odd[i]}\n" for i in row)
+        + "endloop\nendfacet\n"
+        for row in CORNERS[: N_ROWS // 6].tolist()
+    ]
+    return {
+        ".ply": ply + "\n".join([*odd, "4 0 1 2 3", *(f"3 {row}" for row in rows)]) + "\n",
+        ".obj": "\n".join(
+            [f"v {odd[0]} # first", *(f"v {p}" for p in odd[1:]), "f -3 -2 -1", "f 1/1 2/2 3/3"]
+            + ["f " + " ".join(map(str, row)) for row in (CORNERS + 1).tolist()]
+        ),
+        ".off": f"OFF\n{N_ROWS} {len(rows) + 1} 0\n"
+        + "\n".join([*odd, "4 0 1 2 3", *(f"3 {row}" for row in rows)]),
+        ".stl": "solid a\n" + "".join(facets) + "endsolid a\n",
+    }
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl"])
+def test_text_takes_memory_by_its_size(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Words and lines as Python's objects took thirty times the file, all at the same time."""
+    from lcollision_core.meshes.formats import text
+
+    monkeypatch.setattr(text, "_CHUNK_BYTES", 1 << 16)
+    monkeypatch.setattr(text, "_BLOCK_LINES", 1 << 12)
+    path = tmp_path / f"m{suffix}"
+    path.write_text(_text_files()[suffix])
+    meshes = []
+    read_mesh(path)  # What is compiled is compiled.
+    peak = _peak(lambda: meshes.append(read_mesh(path)))
+    assert len(meshes[0].faces) >= N_ROWS // 6
+    assert meshes[0].vertices[0].tolist() == [10.0, 0.0, 0.0]
+    assert np.allclose(meshes[0].vertices[1:50], POINTS[1:50])
+    assert peak < 14 * path.stat().st_size
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"[" + b"{}," * 4_000_000 + b"{}]",
+        b"[" + b"[]," * 7_000_000 + b"[]]",
+        b"[" + b'"ab",' * 6_000_000 + b"0]",
+        b"[" * 100_000,
+    ],
+)
+def test_json_that_would_fill_the_memory_is_refused(
+    content: bytes, tmp_path: Path, tube_model: PoseModel
+) -> None:
+    path = tmp_path / "poses.json"
+    path.write_bytes(content)
+
+    def read() -> None:
+        with pytest.raises(LCollisionError, match=r"poses\.json is no JSON \(") as caught:
+            read_poses(path, tube_model)
+        assert len(str(caught.value)) < 400
+
+    assert _peak(read) < 4 * len(content) + 10**6
+
+
+def test_poses_with_any_value_changed(tube_model: PoseModel, tmp_path: Path) -> None:
+    path = tmp_path / "poses.json"
+    placement = RigidTransform(np.eye(3), np.zeros(3))
+    poses = [
+        NamedPose("a", 0.1 * tube_model.training_latent[0]),
+        NamedPose("b", tube_model.training_latent[1], placement, 0.01, 0.02),
+    ]
+    write_poses(path, tube_model, poses)
+    document = json.loads(path.read_text())
+    n_working = n_changes = 0
+    for place in places(document):
+        for value in VALUES:
+            path.write_text(as_json(with_value(document, place, value)))
+            n_changes += 1
+            try:
+                read = read_poses(path, tube_model)
+            except LCollisionError as error:
+                sentence = str(error)
+            else:
+                n_working += 1
+                for pose in read:
+                    assert np.isfinite(tube_model.decode(pose.latent)).all()
+                continue
+            assert str(path) in sentence
+            assert "\n" not in sentence
+            assert len(sentence) < len(str(path)) + 600
+    assert n_changes > 300
+    assert 30 < n_working < n_changes / 2
+
+
+def test_a_pose_set_with_any_array_changed(tmp_path: Path) -> None:
+    path, n_refused = tmp_path / "s.npz", 0
+    arrays: dict[str, np.ndarray] = {
+        "vertices": np.stack([VERTICES, VERTICES + 1.0]),
+        "faces": FACES,
+        "names": np.array(["a", "b"]),
+        "notes": np.array(["a note"]),
+        "near_exclusion": np.array(0.01),
+        "up_axis": np.array(1),
+        "vertex_labels": np.array(["arm", "arm", "leg", "leg"]),
+        "format_version": np.array(1),
+    }
+    for name, array in arrays.items():
+        for _, changed in changed_arrays(array):
+            others = {key: held for key, held in arrays.items() if key != name}
+            np.savez(path, **others, **({} if changed is None else {name: changed}))
+            try:
+                pose_set = read_pose_set(path)
+            except LCollisionError as error:
+                sentence = str(error)
+            else:
+                assert np.isfinite(pose_set.vertices).all()
+                continue
+            n_refused += 1
+            assert str(path) in sentence
+            assert "\n" not in sentence
+            assert len(sentence) < len(str(path)) + 600
+    assert n_refused > 80

@@ -7,7 +7,9 @@ texture coordinates or normals differ.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterator, Sequence
+from io import BytesIO
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -16,6 +18,7 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_few
 from lcollision_core.meshes.formats.text import (
+    blocks_of_lines,
     decimals,
     normalised_text,
     plain_decimals,
@@ -23,7 +26,6 @@ from lcollision_core.meshes.formats.text import (
 )
 
 _SHORTEST_LINE = len(b"f 1 2 3\n")
-_BLOCK_LINES = 1 << 18
 _LARGEST = np.iinfo(np.int64).max
 
 
@@ -114,27 +116,40 @@ def _plain_faces(
 
 def _read_any(data: bytes) -> Polygons:
     """Read line by line, and say what is wrong with which."""
-    vertex_lines: list[bytes] = []
-    face_lines: list[bytes] = []
-    vertices_before: list[int] = []
-    for line in data.split(b"\n"):
-        start = line[:2]
-        if start not in (b"v ", b"f "):
-            words = line.split(None, 1)
-            if not words or words[0] not in (b"v", b"f"):
-                continue
-            line = words[0] + b" " + (words[1] if len(words) > 1 else b"")
+    n_vertices = 0
+    before = array("q")  # of each face, the vertices before it
+
+    def lines_of(keyword: bytes) -> Iterator[bytes]:
+        nonlocal n_vertices
+        n_vertices = 0
+        for line in BytesIO(data):
             start = line[:2]
-        if start == b"v ":
-            vertex_lines.append(line)
-        else:
-            face_lines.append(line)
-            vertices_before.append(len(vertex_lines))
-    if b"#" in data:
-        vertex_lines = [line.partition(b"#")[0] for line in vertex_lines]
-        face_lines = [line.partition(b"#")[0] for line in face_lines]
-    sizes, corners = _parse_faces(face_lines, vertices_before)
-    return Polygons(_parse_vertices(vertex_lines), sizes, corners)
+            if start not in (b"v ", b"f "):
+                words = line.split(None, 1)
+                if not words or words[0] not in (b"v", b"f"):
+                    continue
+                line = words[0] + b" " + (words[1] if len(words) > 1 else b"")
+                start = line[:2]
+            n_vertices += start == b"v "
+            if start == keyword:
+                if keyword == b"f ":
+                    before.append(n_vertices)
+                yield line.partition(b"#")[0] if b"#" in line else line
+
+    vertices, sizes, corners = [np.empty((0, 3))], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    done = 0
+    for block in blocks_of_lines(lines_of(b"f ")):
+        counted = np.frombuffer(before, dtype=np.int64)[done : done + len(block)]
+        block_sizes, block_corners = _parse_faces(block, done, counted)
+        del counted  # or `before` could not grow
+        sizes.append(block_sizes)
+        corners.append(block_corners)
+        done += len(block)
+    done = 0
+    for block in blocks_of_lines(lines_of(b"v ")):
+        vertices.append(_parse_vertices(block, done))
+        done += len(block)
+    return Polygons(np.concatenate(vertices), np.concatenate(sizes), np.concatenate(corners))
 
 
 def _table(lines: Sequence[bytes]) -> list[bytes] | None:
@@ -147,63 +162,55 @@ def _table(lines: Sequence[bytes]) -> list[bytes] | None:
     return words if aligned else None
 
 
-def _parse_vertices(lines: list[bytes]) -> npt.NDArray[np.float64]:
-    vertices = np.empty((len(lines), 3), dtype=np.float64)
-    for start in range(0, len(lines), _BLOCK_LINES):
-        block = lines[start : start + _BLOCK_LINES]
-        words = _table(block)
-        columns = len(block[0].split())
-        if words is not None and columns >= 4:
-            try:
-                for axis in range(3):
-                    vertices[start : start + len(block), axis] = list(
-                        map(float, words[axis + 1 :: columns])
-                    )
-                continue
-            except ValueError:
-                pass  # The walk below finds out which vertex it was.
-        for vertex, line in enumerate(block, start):
-            coordinates = line.split()[1:4]
-            if len(coordinates) < 3:
-                raise MeshFileError(
-                    f"vertex {vertex} (from 0) has {len(coordinates)} coordinates, three are needed"
-                )
-            try:
-                vertices[vertex] = list(map(float, coordinates))
-            except ValueError as error:
-                raise MeshFileError(
-                    f"vertex {vertex} (from 0) has a coordinate that is no number: "
-                    f"{b' '.join(coordinates)[:60]!r}"
-                ) from error
+def _parse_vertices(block: list[bytes], first: int) -> npt.NDArray[np.float64]:
+    vertices = np.empty((len(block), 3), dtype=np.float64)
+    words = _table(block)
+    columns = len(block[0].split())
+    if words is not None and columns >= 4:
+        try:
+            for axis in range(3):
+                vertices[:, axis] = list(map(float, words[axis + 1 :: columns]))
+        except ValueError:
+            pass  # The walk below finds out which vertex it was.
+        else:
+            return vertices
+    for row, line in enumerate(block):
+        coordinates = line.split()[1:4]
+        if len(coordinates) < 3:
+            raise MeshFileError(
+                f"vertex {first + row} (from 0) has {len(coordinates)} coordinates, three are "
+                f"needed"
+            )
+        try:
+            vertices[row] = list(map(float, coordinates))
+        except ValueError as error:
+            raise MeshFileError(
+                f"vertex {first + row} (from 0) has a coordinate that is no number: "
+                f"{b' '.join(coordinates)[:60]!r}"
+            ) from error
     return vertices
 
 
 def _parse_faces(
-    lines: list[bytes], vertices_before: list[int]
+    block: list[bytes], first: int, vertices_before: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    all_sizes = [np.empty(0, dtype=np.int64)]
-    all_corners = [np.empty(0, dtype=np.int64)]
-    for start in range(0, len(lines), _BLOCK_LINES):
-        block = lines[start : start + _BLOCK_LINES]
-        sizes, named = _parse_any_faces(block, start)
-        owner = np.repeat(np.arange(start, start + len(block)), sizes)
-        zero = np.flatnonzero(named == 0)
-        if len(zero):
+    sizes, named = _parse_any_faces(block, first)
+    owner = np.repeat(np.arange(len(block)), sizes)
+    zero = np.flatnonzero(named == 0)
+    if len(zero):
+        raise MeshFileError(
+            f"face {first + owner[zero[0]]} (from 0) names vertex 0, but OBJ counts vertices from 1"
+        )
+    if (named < 0).any():
+        counted = vertices_before[owner]
+        outside = np.flatnonzero(named < -counted)
+        if len(outside):
             raise MeshFileError(
-                f"face {owner[zero[0]]} (from 0) names vertex 0, but OBJ counts vertices from 1"
+                f"face {first + owner[outside[0]]} (from 0) names vertex {named[outside[0]]}, "
+                f"but only {counted[outside[0]]} vertices come before it"
             )
-        if (named < 0).any():
-            counted = np.array(vertices_before, dtype=np.int64)[owner]
-            outside = np.flatnonzero(named < -counted)
-            if len(outside):
-                raise MeshFileError(
-                    f"face {owner[outside[0]]} (from 0) names vertex {named[outside[0]]}, "
-                    f"but only {counted[outside[0]]} vertices come before it"
-                )
-            named = np.where(named < 0, counted + named + 1, named)
-        all_sizes.append(sizes)
-        all_corners.append(named - 1)
-    return np.concatenate(all_sizes), np.concatenate(all_corners)
+        named = np.where(named < 0, counted + named + 1, named)
+    return sizes, named - 1
 
 
 def _parse_any_faces(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from io import BytesIO
+from itertools import islice
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -10,7 +12,13 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_plausible_count
-from lcollision_core.meshes.formats.text import decimals, normalised_text, numbers, plain_integers
+from lcollision_core.meshes.formats.text import (
+    blocks_of_lines,
+    decimals,
+    normalised_text,
+    numbers,
+    plain_integers,
+)
 
 _HEADER = re.compile(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?C?N?OFF\b([^\n]*)", re.IGNORECASE)
 _COUNTS = re.compile(rb"(?:\s*(?:#[^\n]*\n)?)*(-?\d+)\s+(-?\d+)")
@@ -48,31 +56,39 @@ def read(file: BinaryIO) -> Polygons:
     data = data.partition(b"\n")[2]
     if b"#" in data:
         data = re.sub(rb"#[^\n]*", b"", data)
-    lines = [line for line in data.split(b"\n") if line.strip()]
-    if len(lines) < n_vertices + n_faces:
+    n_lines = sum(1 for line in BytesIO(data) if line.strip())
+    if n_lines < n_vertices + n_faces:
         raise MeshFileError(
-            f"it announces {n_vertices} vertices and {n_faces} faces but has only {len(lines)} "
+            f"it announces {n_vertices} vertices and {n_faces} faces but has only {n_lines} "
             f"lines for them; it is truncated"
         )
-    vertices = _vertices(lines[:n_vertices])
-    sizes, corners = _faces(lines[n_vertices : n_vertices + n_faces])
-    return Polygons(vertices, sizes, corners)
+    lines = (line for line in BytesIO(data) if line.strip())
+    vertices = [np.empty((0, 3))]
+    for block in blocks_of_lines(islice(lines, n_vertices)):
+        vertices.append(_vertices(block, sum(map(len, vertices))))
+    sizes, corners = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for block in blocks_of_lines(islice(lines, n_faces)):
+        block_sizes, block_corners = _faces(block, sum(map(len, sizes)))
+        sizes.append(block_sizes)
+        corners.append(block_corners)
+    return Polygons(np.concatenate(vertices), np.concatenate(sizes), np.concatenate(corners))
 
 
-def _vertices(lines: list[bytes]) -> npt.NDArray[np.float64]:
+def _vertices(lines: list[bytes], first: int) -> npt.NDArray[np.float64]:
     words = b" ".join(lines).split()
     if len(words) != 3 * len(lines):
         rows = [line.split() for line in lines]
         short = next((i for i, row in enumerate(rows) if len(row) < 3), None)
         if short is not None:
             raise MeshFileError(
-                f"vertex {short} (from 0) has {len(rows[short])} coordinates, three are needed"
+                f"vertex {first + short} (from 0) has {len(rows[short])} coordinates, three are "
+                f"needed"
             )
         words = [word for row in rows for word in row[:3]]
     return numbers(words, "the vertices").reshape(-1, 3)
 
 
-def _faces(lines: list[bytes]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _faces(lines: list[bytes], first: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     table = plain_integers(b"\n".join(lines))
     if table is not None and len(table) == 4 * len(lines) and (table[::4] == 3).all():
         return table[::4], table.reshape(-1, 4)[:, 1:].reshape(-1)
@@ -85,11 +101,11 @@ def _faces(lines: list[bytes]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.in
             named = list(map(int, row[1 : 1 + max(size, 0)]))
         except ValueError as error:
             raise MeshFileError(
-                f"face {face} (from 0) has a corner that is no vertex number"
+                f"face {first + face} (from 0) has a corner that is no vertex number"
             ) from error
         if size < 0 or len(named) < size:
             raise MeshFileError(
-                f"face {face} (from 0) announces {size} corners but has {len(named)}"
+                f"face {first + face} (from 0) announces {size} corners but has {len(named)}"
             )
         sizes[face] = size
         corners += named

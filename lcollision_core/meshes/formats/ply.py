@@ -6,6 +6,7 @@ memory is taken: trimesh splits vertices at texture seams and reads the body fir
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_plausible_count
-from lcollision_core.meshes.formats.text import numbers, plain_decimals
+from lcollision_core.meshes.formats.text import numbers_of_text
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -249,8 +250,7 @@ class _TextBody:
     """The rows of a text body, read from the front."""
 
     def __init__(self, data: bytes) -> None:
-        plain = plain_decimals(data)
-        self._values = numbers(data.split(), "the rows") if plain is None else plain
+        self._values = numbers_of_text(data, "the rows")
         self._offset = 0
 
     def read(self, element: _Element) -> dict[str, _Column]:
@@ -258,8 +258,8 @@ class _TextBody:
         if element.count == 0 or not element.properties:
             return _no_rows(element)
         values = self._values
-        sizes: list[list[int]] = [[] for _ in element.properties]
-        starts: list[list[int]] = [[] for _ in element.properties]
+        sizes = [array("q") for _ in element.properties]
+        starts = [array("q") for _ in element.properties]
         offset = self._offset
         if all(item.count_dtype is None for item in element.properties):
             width = len(element.properties)

@@ -17,10 +17,11 @@ from lcollision_core.meshes.formats.polygons import (
     require_plausible_count,
     with_order_of,
 )
-from lcollision_core.meshes.formats.text import numbers
+from lcollision_core.meshes.formats.text import blocks_of_lines, numbers
 from lcollision_core.meshes.topology import Topology
 
 _HEADER_BYTES = 84
+_CORNER = re.compile(rb"\bvertex\s([^\n\r]*)")
 _TRIANGLE = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _SHORTEST_FACET = len(b"facet vertex0 0 0 vertex0 0 0 vertex0 0 0 endfacet")
 _JOINED = "STL stores no shared vertices; corners at equal coordinates were joined"
@@ -74,21 +75,26 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
 
 def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
     lowered = data.lower()
-    rows = re.findall(rb"\bvertex\s([^\n\r]*)", lowered)
+    n_rows = sum(1 for _ in _CORNER.finditer(lowered))
     n_facets = lowered.count(b"endfacet")
-    if len(rows) != 3 * n_facets or b"endsolid" not in lowered:
+    if n_rows != 3 * n_facets or b"endsolid" not in lowered:
         raise MeshFileError(
-            f"it has {n_facets} complete triangles and {len(rows)} corners, and "
+            f"it has {n_facets} complete triangles and {n_rows} corners, and "
             f"{'an' if b'endsolid' in lowered else 'no'} end line; it is truncated or damaged"
         )
-    words = [row.split() for row in rows]
-    ragged = next((i for i, row in enumerate(words) if len(row) != 3), None)
-    if ragged is not None:
-        raise MeshFileError(
-            f"corner {ragged % 3} of triangle {ragged // 3} (from 0) has "
-            f"{len(words[ragged])} coordinates, three are needed"
-        )
-    return numbers([word for row in words for word in row], "the corners")
+    parts, done = [np.empty(0)], 0
+    for rows in blocks_of_lines(match[1] for match in _CORNER.finditer(lowered)):
+        words = [row.split() for row in rows]
+        ragged = next((i for i, row in enumerate(words) if len(row) != 3), None)
+        if ragged is not None:
+            corner = done + ragged
+            raise MeshFileError(
+                f"corner {corner % 3} of triangle {corner // 3} (from 0) has "
+                f"{len(words[ragged])} coordinates, three are needed"
+            )
+        parts.append(numbers([word for row in words for word in row], "the corners"))
+        done += len(rows)
+    return np.concatenate(parts)
 
 
 def _joined(points: npt.NDArray[np.float64], is_single: bool) -> Polygons:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
+
+_CHUNK_BYTES = 1 << 23
+_BLOCK_LINES = 1 << 18
+_BLANK = re.compile(rb"\s")
 
 
 def decimals(values: npt.NDArray[Any]) -> tuple[str, ...]:
@@ -50,6 +55,51 @@ def numbers(words: Sequence[bytes], what: str) -> npt.NDArray[np.float64]:
                     f"{what} hold {word[:30]!r}, which is no number; export the mesh again"
                 ) from error
         raise
+
+
+def numbers_of_text(text: bytes, what: str) -> npt.NDArray[np.float64]:
+    """Parse blank-separated decimals in chunks: words take ten times their text in memory.
+
+    Parameters
+    ----------
+    text : the decimals
+    what : plural noun for the message
+
+    Raises
+    ------
+    MeshFileError : a word is no number.
+    """
+    parts, start = [np.empty(0)], 0
+    while start < len(text):
+        # To the end of the word at hand; no number is as long as what is looked at for it.
+        blank = _BLANK.search(text, start + _CHUNK_BYTES, start + 2 * _CHUNK_BYTES)
+        end = blank.start() if blank else start + 2 * _CHUNK_BYTES
+        chunk = text[start:end]
+        plain = plain_decimals(chunk)
+        parts.append(numbers(chunk.split(), what) if plain is None else plain)
+        start = end
+    return np.concatenate(parts)
+
+
+def blocks_of_lines(lines: Iterable[bytes]) -> Iterator[list[bytes]]:
+    """Group lines into blocks of bounded length, as lists of words take much memory.
+
+    Raises
+    ------
+    MeshFileError : a line is longer than all that a mesh can say in one.
+    """
+    block: list[bytes] = []
+    n_bytes = 0
+    for line in lines:
+        if len(line) > _CHUNK_BYTES:
+            raise MeshFileError(f"it has a line of {len(line)} bytes; export the mesh again")
+        block.append(line)
+        n_bytes += len(line)
+        if n_bytes > _CHUNK_BYTES or len(block) >= _BLOCK_LINES:
+            yield block
+            block, n_bytes = [], 0
+    if block:
+        yield block
 
 
 def plain_integers(text: bytes) -> npt.NDArray[np.int64] | None:
