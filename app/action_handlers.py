@@ -57,6 +57,7 @@ class ActionHandlers(QObject):
             "mirror": document.mirror,
             "filter": self._find_slider,
             "unlock": self._unlock,
+            "parts": window.edit_parts,
             "resolve": self._resolve,
             "cancel": self._cancel,
             "resolve_options": self.choose_resolve_options,

@@ -68,6 +68,9 @@ ACTIONS: dict[str, ActionSpec] = {
     ),
     "filter": ActionSpec("&Find a slider", "Ctrl+F", "Type what a slider is called", "search"),
     "unlock": ActionSpec("Un&lock everything", "Ctrl+L", "Let all locked parts move again"),
+    "parts": ActionSpec(
+        "Body &parts…", "Ctrl+B", "Rename, recolour and reorder the body parts of the model"
+    ),
     "resolve": ActionSpec(
         "&Resolve", "Ctrl+R", "Find the nearest pose that does not collide", "resolve"
     ),

@@ -259,7 +259,8 @@ class PoseDocument(PoseHistory):
     def code_name(self, index: int) -> str:
         """Return what a person would call one number of the latent."""
         group = next(g for g in self.model.latent_space.groups if index < g.codes.stop)
-        return group.full_name(index - group.codes.start)
+        name = self.model.code_names[index]
+        return name if group.colour is None else f"{group.name}, {name}"
 
     def reset_domain(self, domain: int) -> None:
         """Set all numbers of a domain to 0: its own, and the whole body's that its lock holds."""
@@ -340,6 +341,18 @@ class PoseDocument(PoseHistory):
     def open_model(self, name_or_path: str | Path) -> None:
         """Read a model in the long worker and put it in."""
         self._bring(f"Opening {name_or_path}", tasks.opened_model(name_or_path), self._on_model)
+
+    def edit_parts(self, edits: tasks.PartEdits) -> None:
+        """Rename, recolour or reorder body parts in the model's file, in the long worker.
+
+        The pose, its history and the locks stay; nothing of it can be undone.
+
+        Parameters
+        ----------
+        edits : what changes, and the name of the copy where the model's own file is not to
+        """
+        work = tasks.edited_parts(self.model, self._model_file, edits)
+        self._long.start("Saving the body parts", work, self._on_parts)
 
     def new_pose(self) -> None:
         """Start anew: the reference pose, unnamed, no file, no history; the library stays."""
@@ -515,6 +528,18 @@ class PoseDocument(PoseHistory):
         self.begin_with(edited, Source.FILE, read.path, held.poses)
         self.message.emit(f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}")
         self.opened.emit(read.path)
+
+    def _on_parts(self, changed: tasks.ChangedParts) -> None:
+        if changed.model.fingerprint != self.model.fingerprint:
+            return
+        self._model, self._model_file = changed.model, changed.file
+        self._live.follow(self.model, self.latent, self._predicts)
+        for told in (self.model_changed, self.frame_changed, self.exact_changed):
+            told.emit()
+        for told in (self.locks_changed, self.outcome_changed, self.ghost_changed):
+            told.emit()
+        self.file_changed.emit()
+        self.message.emit(f"Saved the body parts in {self.model.name}")
 
     def _on_recovered(
         self, read: tasks.ReadPoses | tasks.OtherModel, name: str, file: Path | None

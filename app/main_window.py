@@ -40,6 +40,7 @@ from app.actions import (
     make_action,
 )
 from app.body_menu import BodyMenu
+from app.dialogs.body_parts import BodyPartsDialog
 from app.dialogs.failure import FailureDialog
 from app.engine import Failure
 from app.file_actions import FileActions
@@ -49,6 +50,7 @@ from app.menus import fill_menus, make_bar, refresh_bar
 from app.panels.collision import CollisionPanel
 from app.panels.dock import Panel
 from app.panels.library import LibraryPanel
+from app.panels.part_menu import PartMenus
 from app.panels.parts import silent
 from app.panels.randomise import RandomiseCard
 from app.panels.sliders import SlidersPanel
@@ -70,7 +72,7 @@ _log = logging.getLogger(__name__)
 
 _LAYOUT_VERSION = 1
 _SIZE = QSize(1440, 900)
-_SIDE_SHARES = {"sliders": (0.25, 330, 440), "collision": (0.22, 312, 380)}
+_SIDE_SHARES = {"sliders": (0.25, 344, 460), "collision": (0.22, 312, 380)}
 """Of the window's width, at least and at most, in device-independent pixels."""
 _NARROW = 1100
 """A window narrower than this has no room for the poses between the panels at its sides."""
@@ -161,6 +163,7 @@ class MainWindow(QMainWindow):
         self._bar = make_bar(act, self._shadings.values(), self._camera_menu)
         self.addToolBar(self._bar)
         self._handlers = ActionHandlers(self)
+        self.part_menus = PartMenus(self)
         WindowShortcuts(self)
         self._status = StatusBar()
         self.setStatusBar(self._status)
@@ -223,6 +226,36 @@ class MainWindow(QMainWindow):
         self.collision.refresh_icons()
         self.randomise.refresh_icons()
         self.library.redraw()
+
+    def show_in_sliders(self, domain: int) -> None:
+        """Open a body part's sliders and bring them into sight."""
+        self.docks["sliders"].show()
+        self.docks["sliders"].raise_()
+        self.sliders.show_domain(domain)
+
+    def edit_parts(self, domain: int | None = None, what: str = "") -> None:
+        """Show the dialog of the body parts.
+
+        Parameters
+        ----------
+        domain : the one to begin with, None for the first
+        what : "name" or "colour" of it to change at once, "" for neither
+        """
+        from app.tasks import is_bundled
+        from lcollision_core.model import list_models
+
+        document = self.document
+        taken = [model.name for model in list_models()]
+        dialog = BodyPartsDialog(document.model, is_bundled(document.model_file), taken, self)
+        dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        dialog.edited.connect(document.edit_parts)
+        dialog.open()
+        if domain is not None:
+            dialog.choose(domain)
+        if what == "name":
+            dialog.edit_name()
+        elif what == "colour":
+            dialog.choose_colour()
 
     def reset_layout(self) -> None:
         """Put all panels back to their places."""
@@ -343,6 +376,8 @@ class MainWindow(QMainWindow):
         document = self.document
         for panel in (self.sliders, self.collision):
             panel.domain_hovered.connect(self.viewport.highlight_domain)
+        for rows in (self.sliders, self.collision.prediction):
+            rows.menu_wanted.connect(self.part_menus.show_menu)
         self.viewport.domain_hovered.connect(self.sliders.light_domain)
         self.viewport.domain_hovered.connect(self.collision.prediction.light_domain)
         self.viewport.shading_changed.connect(self._on_shading)

@@ -99,6 +99,31 @@ class Exported:
         return f"Exported {self.path.name}: {state}"
 
 
+@dataclass(frozen=True)
+class PartEdits:
+    """How a user wants body parts called, coloured and listed.
+
+    Attributes
+    ----------
+    names, colours : of those domains that change, by index from 0
+    order : all domains in the order in which to list them, None where it stays
+    copy_name : of the user's own model to make, None to change the model's file
+    """
+
+    names: dict[int, str]
+    colours: dict[int, str]
+    order: tuple[int, ...] | None = None
+    copy_name: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedParts:
+    """The same model with other names, colours or order of its parts, and its file."""
+
+    model: PoseModel
+    file: str
+
+
 @dataclass(frozen=True, eq=False)
 class Resolved:
     """What Resolve found, and the mesh before, (V, 3) float32, read-only."""
@@ -136,7 +161,7 @@ def warm_up(model: PoseModel) -> None:
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
     shower.verdict(shower.frame(latent, 0))
-    _ = model.fingerprint, model.latent_space, model.symmetry
+    _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
 
 
 def loaded_predictor(model: PoseModel) -> Work:
@@ -285,5 +310,45 @@ def resolved(
             latent, options, progress=progress, cancel=cancel, placement=placement
         )
         return Resolved(result, ghost)
+
+    return work
+
+
+def is_bundled(model_file: str) -> bool:
+    """Whether a model came with the program, or from no file, so that it is changed in a copy."""
+    from lcollision_core.bundled import bundled_folder
+
+    path = Path(model_file)
+    return not path.is_file() or path.parent == bundled_folder("models")
+
+
+def edited_parts(model: PoseModel, model_file: str, edits: PartEdits) -> Work:
+    """Write a model's parts into its file, as that is now, or into a copy of the user's own."""
+
+    def work(_: Progress, __: CancelToken) -> ChangedParts:
+        from lcollision_core.meshes import locked
+        from lcollision_core.model import change_model, model_destination
+
+        def change(held: PoseModel) -> PoseModel:
+            if held.fingerprint != model.fingerprint:
+                raise ModelFileError(
+                    f"{model_file} holds another model by now; open it again to change its body "
+                    f"parts"
+                )
+            return held.edit_domains(edits.names, edits.colours, edits.order)
+
+        if edits.copy_name is None:
+            written, path = change_model(model_file, change), Path(model_file)
+        else:
+            path = model_destination(edits.copy_name)
+            with locked(path):
+                if path.exists():
+                    raise ModelFileError(
+                        f"there is a model {edits.copy_name!r} already; choose another name"
+                    )
+                written = change(model)
+                written.save(path)
+        # What the open model has loaded and compiled stays.
+        return ChangedParts(model.with_card(written.card, path.stem), str(path))
 
     return work

@@ -327,7 +327,11 @@ class Viewport(QWidget):
             self._canvas.camera_moved.connect(self._turn.stop)
             self._canvas.zoom_wanted.connect(self._on_zoom_wanted)
             self._canvas.menu_wanted.connect(self._on_menu_wanted)
+        view = None
         if self._scene is not None:
+            # The same body with other names or colours is looked at as before.
+            is_same = self._shower is not None and self._shower.model.embedding is model.embedding
+            view = self._scene.view if is_same else None
             self._scene.remove()
         self._scene = Scene(
             self._canvas,
@@ -344,7 +348,9 @@ class Viewport(QWidget):
         self._shader = Shader.of(self._document.model, current_theme().is_dark)
         self._shown = None
         self._highlight = self._hovered = None
-        self._place_camera = True
+        self._place_camera = view is None
+        if view is not None:
+            self._scene.view = view
         if self._document.frame is not None:
             self._on_frame_changed()
         self._on_ghost_changed()

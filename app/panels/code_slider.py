@@ -114,7 +114,8 @@ class CodeRow(HoverRow):
     Parameters
     ----------
     code : index from 0 in the latent
-    name : what a person would call it
+    name : what it does
+    number : what it is called by its place, in the tool tip
     domain : that it moves
     low, high : range of the slider
     colour : of the bar
@@ -129,6 +130,7 @@ class CodeRow(HoverRow):
         self,
         code: int,
         name: str,
+        number: str,
         domain: int,
         low: float,
         high: float,
@@ -153,7 +155,8 @@ class CodeRow(HoverRow):
         self.field.setAccessibleName(f"{name}, number")
         self.slider.setToolTip(
             plain_tip(
-                f"{name}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
+                f"{name} ({number}): drag to move, hold Ctrl to move ten times finer, double-click "
+                f"to reset"
             )
         )
         self._name = name
@@ -199,6 +202,11 @@ class CodeRow(HoverRow):
         if outside:
             words += f"; this one is outside the trained range, {least} to {most}"
         self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
+
+    def edit_number(self) -> None:
+        """Give the field the keyboard, to type a number."""
+        self.field.setFocus(Qt.FocusReason.OtherFocusReason)
+        self.field.selectAll()
 
     def _on_slider(self) -> None:
         self.number_changed.emit(self.code, self.slider.number)

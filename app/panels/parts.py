@@ -6,9 +6,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from html import escape
 
-from PySide6.QtCore import QEvent, QObject, QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtCore import QEvent, QObject, QPoint, QPointF, QRectF, QSize, Qt, Signal
 from PySide6.QtGui import (
     QColor,
+    QContextMenuEvent,
     QEnterEvent,
     QMouseEvent,
     QPainter,
@@ -118,13 +119,19 @@ class HoverRow(QWidget):
     Signals
     -------
     hovered : int, the row's domain; None when the pointer leaves
+    menu_wanted : QPoint, where on the screen a menu of what can be done with the row is wanted
     """
 
     hovered = Signal(object)
+    menu_wanted = Signal(QPoint)
 
     def __init__(self, domain: int | None) -> None:
         super().__init__()
         self.domain = domain
+
+    def contextMenuEvent(self, event: QContextMenuEvent) -> None:  # noqa: N802
+        """Ask for the menu."""
+        self.menu_wanted.emit(event.globalPos())
 
     def enterEvent(self, event: QEnterEvent) -> None:  # noqa: N802
         """Tell the domain."""

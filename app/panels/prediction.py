@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtCore import QPoint, QPointF, QRectF, QSize, Qt, Signal, Slot
 from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPolygonF
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy, QToolButton, QVBoxLayout, QWidget
 
@@ -238,6 +238,8 @@ class PredictionCard(Card):
     Signals
     -------
     domain_hovered : int or None, the domain of the row that the pointer is on
+    menu_wanted : int, None and QPoint: the domain, and where on the screen a menu of what can be
+        done with it is wanted
 
     Parameters
     ----------
@@ -245,6 +247,7 @@ class PredictionCard(Card):
     """
 
     domain_hovered = Signal(object)
+    menu_wanted = Signal(object, object, QPoint)
 
     def __init__(self, document: PoseDocument) -> None:
         super().__init__()
@@ -301,9 +304,16 @@ class PredictionCard(Card):
         ):
             row = DomainRow(domain, name, colour, name_width)
             row.hovered.connect(self.domain_hovered)
+            row.menu_wanted.connect(self._on_menu)
             row.lock_toggled.connect(self._document.set_locked)
-            self._rows.addWidget(row)
             self.rows.append(row)
+        before: QWidget | None = None
+        for domain in model.domain_order:
+            row = self.rows[domain]
+            self._rows.addWidget(row)
+            if before is not None:
+                QWidget.setTabOrder(before, row.lock)
+            before = row.lock
         predicts = self._document.can_resolve
         for widget in (self.meter, self.verdict, self.percent):
             widget.setVisible(predicts)
@@ -335,6 +345,12 @@ class PredictionCard(Card):
             show_verdict(label, word if exact is None else "aside")
         for row, energy in zip(self.rows, prediction.domain_energy, strict=True):
             row.show_energy(float(energy))
+
+    @Slot(QPoint)
+    def _on_menu(self, place: QPoint) -> None:
+        row = self.sender()
+        if isinstance(row, DomainRow):
+            self.menu_wanted.emit(row.domain, None, place)
 
     def _on_locks(self) -> None:
         for row in self.rows:

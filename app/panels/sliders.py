@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PySide6.QtCore import QEvent, QRectF, QSize, Qt, QTimer, Signal
-from PySide6.QtGui import QColor, QEnterEvent, QPainter, QPaintEvent, QPixmap
+from PySide6.QtCore import QEvent, QPoint, QRectF, QSize, Qt, QTimer, Signal, Slot
+from PySide6.QtGui import QColor, QContextMenuEvent, QEnterEvent, QPainter, QPaintEvent, QPixmap
 from PySide6.QtWidgets import QAbstractButton, QLineEdit, QVBoxLayout, QWidget
 
 from app.icons import pixmap
@@ -28,6 +28,7 @@ class GroupHeader(QAbstractButton):
     Signals
     -------
     hovered : int, the group's domain, or None
+    menu_wanted : QPoint, where on the screen a menu of what can be done with the part is wanted
 
     Parameters
     ----------
@@ -37,6 +38,7 @@ class GroupHeader(QAbstractButton):
     """
 
     hovered = Signal(object)
+    menu_wanted = Signal(QPoint)
 
     def __init__(self, name: str, colour: str | None, domain: int | None) -> None:
         super().__init__()
@@ -63,6 +65,10 @@ class GroupHeader(QAbstractButton):
         if lit != self._lit:
             self._lit = lit
             self.update()
+
+    def contextMenuEvent(self, event: QContextMenuEvent) -> None:  # noqa: N802
+        """Ask for the menu."""
+        self.menu_wanted.emit(event.globalPos())
 
     def sizeHint(self) -> QSize:  # noqa: N802
         """Ask for one header's height."""
@@ -141,6 +147,7 @@ class SliderGroup(QWidget):
         column.addWidget(self._body)
         self.header.toggled.connect(self.set_open)
         self.header.hovered.connect(panel.domain_hovered)
+        self.header.menu_wanted.connect(self._on_menu)
 
     def set_open(self, is_open: bool) -> None:
         """Show or hide the rows."""
@@ -172,7 +179,9 @@ class SliderGroup(QWidget):
             self._open_before = self.header.isChecked()
         hits = []
         for place in range(len(self._group.code_names)):
-            name = f"{self._group.name} {self._group.full_name(place)}".casefold()
+            # By the number of before as well.
+            own = self._panel.document.model.code_names[self._group.codes.start + place]
+            name = f"{self._group.name} {own} {self._group.full_name(place)}".casefold()
             hits.append(all(word in name for word in words.split()))
         self.setVisible(any(hits))
         if any(hits):
@@ -183,22 +192,25 @@ class SliderGroup(QWidget):
 
     def _make_rows(self) -> None:
         document = self._panel.document
-        space = document.model.latent_space
+        model = document.model
+        space = model.latent_space
         low, high = space.low.tolist(), space.high.tolist()
-        colours = document.model.domain_colours
-        for place, name in enumerate(self._group.code_names):
+        names = [heading(name) for name in model.code_names[self._group.codes]]
+        name_width = longest_name(self, names)
+        for place, name in enumerate(names):
             code = self._group.codes.start + place
-            # The k-th number of the whole body moves most what the k-th domain covers.
-            domain = place if self._domain is None else self._domain
+            domain = model.code_effects[code].domain if self._domain is None else self._domain
             row = CodeRow(
                 code,
-                heading(name),
+                name,
+                f"motion {place + 1}",
                 domain,
                 low[code],
                 high[code],
-                colours[domain],
-                self._panel.name_width,
+                model.domain_colours[domain],
+                name_width,
             )
+            row.menu_wanted.connect(self._on_menu)
             row.show_number(float(document.latent[code]))
             row.hovered.connect(self._panel.domain_hovered)
             row.number_changed.connect(document.set_code)
@@ -211,6 +223,12 @@ class SliderGroup(QWidget):
             self.rows.append(row)
         tab_order(self.rows, self.header)
 
+    @Slot(QPoint)
+    def _on_menu(self, place: QPoint) -> None:
+        row = self.sender()
+        code = row.code if isinstance(row, CodeRow) else None
+        self._panel.menu_wanted.emit(self._domain, code, place)
+
 
 class SlidersPanel(QWidget):
     """All sliders of the model, below a filter.
@@ -218,6 +236,8 @@ class SlidersPanel(QWidget):
     Signals
     -------
     domain_hovered : int or None, the domain of the row that the pointer is on
+    menu_wanted : int or None, int or None and QPoint: the domain, the code and where on the screen
+        a menu of what can be done with them is wanted
 
     Parameters
     ----------
@@ -225,17 +245,17 @@ class SlidersPanel(QWidget):
 
     Attributes
     ----------
-    groups : one for the whole body, then one for each domain
-    name_width : of the longest name of a slider, in device-independent pixels
+    groups : one for the whole body, then one for each domain, shown in the order of the model's
     """
 
     domain_hovered = Signal(object)
+    menu_wanted = Signal(object, object, QPoint)
 
     def __init__(self, document: PoseDocument) -> None:
         super().__init__()
         self.document = document
         self.groups: list[SliderGroup] = []
-        self.name_width = 0
+        self._fingerprint = ""
         self._shown = np.zeros(0)
         self.filter = QLineEdit()
         self.filter.setPlaceholderText("Filter sliders, such as “thigh”")
@@ -308,18 +328,23 @@ class SlidersPanel(QWidget):
         for group in self.groups:
             self._column.removeWidget(group)
             group.deleteLater()
-        space = self.document.model.latent_space
-        names = (heading(name) for group in space.groups for name in group.code_names)
-        self.name_width = longest_name(self, names)
-        self.groups = [SliderGroup(self, place, group) for place, group in enumerate(space.groups)]
-        for place, group in enumerate(self.groups):
-            self._column.insertWidget(place, group)
-        self._shown = np.array(self.document.latent)
+        model = self.document.model
+        # Other names of the same body leave open what is open.
+        opened = [True]
+        if model.fingerprint == self._fingerprint:
+            opened = [group.header.isChecked() for group in self.groups]
+        self._fingerprint = model.fingerprint
+        groups = model.latent_space.groups
+        self.groups = [SliderGroup(self, place, group) for place, group in enumerate(groups)]
+        shown = [self.groups[0], *(self.groups[1 + domain] for domain in model.domain_order)]
         before: QWidget = self.filter
-        for group in self.groups:
+        for place, group in enumerate(shown):
+            self._column.insertWidget(place, group)
             QWidget.setTabOrder(before, group.header)
             before = group.header
-        self.groups[0].set_open(True)
+        self._shown = np.array(self.document.latent)
+        for group, is_open in zip(self.groups, opened, strict=False):
+            group.set_open(is_open)
         self._on_filter(self.filter.text())
 
     def _on_latent(self) -> None:

@@ -33,6 +33,8 @@ class ModelCard:
     source : what the model was trained on
     licence : under which the model may be used
     provenance : how it was made, JSON values by name
+    domain_order : all K domains, indices from 0, in the order in which to list them; empty for the
+        latent's
 
     Raises
     ------
@@ -48,6 +50,7 @@ class ModelCard:
     source: str
     licence: str
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    domain_order: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         names, colours = self.domain_names, self.domain_colours
@@ -75,12 +78,17 @@ class ModelCard:
                 ),
                 f"its names, source and licence must be at most {_MAX_TEXT_LENGTH} characters",
             ),
+            (
+                not self.domain_order or sorted(self.domain_order) == list(range(len(names))),
+                "its domain_order must hold each domain once",
+            ),
         ):
             if not sound:
                 raise ModelFileError(f"the model's card is damaged: {needed}; {_ADVICE}")
 
     def to_metadata(self) -> dict[str, Any]:
         """Return JSON values from which `from_metadata` builds the same card."""
+        ordered = {"domain_order": list(self.domain_order)} if self.domain_order else {}
         return {
             "height": self.height,
             "up_axis": self.up_axis,
@@ -91,6 +99,7 @@ class ModelCard:
             "source": self.source,
             "licence": self.licence,
             "provenance": dict(self.provenance),
+            **ordered,
         }
 
     @classmethod

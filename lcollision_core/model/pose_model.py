@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -24,6 +26,7 @@ from lcollision_core.meshes import (
     height,
 )
 from lcollision_core.model.card import ModelCard
+from lcollision_core.model.code_names import CodeEffect, code_effects, code_names
 from lcollision_core.model.colours import domain_colours
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_identity import EMBEDDING, fingerprint_of
@@ -335,28 +338,70 @@ class PoseModel:
         require_same_faces(topology, self.topology, source, self.name)
 
     def rename_domains(self, names: Mapping[int, str]) -> PoseModel:
-        """Return the same model with some domains called otherwise.
+        """Return the same model with some domains called otherwise; see `edit_domains`."""
+        return self.edit_domains(names)
+
+    def edit_domains(
+        self,
+        names: Mapping[int, str] | None = None,
+        colours: Mapping[int, str] | None = None,
+        order: Sequence[int] | None = None,
+    ) -> PoseModel:
+        """Return the same model with some domains called, coloured or listed otherwise.
 
         Parameters
         ----------
         names : new names by domain, an index from 0; two domains may swap theirs
+        colours : new colours "#rrggbb" by domain
+        order : all domains in the order in which to list them; the latent's stays as it is
 
         Raises
         ------
-        ModelFileError : there is no such domain, or a name cannot be or is another domain's.
+        ModelFileError : there is no such domain, a name cannot be or is another domain's, or a
+            colour or an order is none.
         """
-        renamed = list(self.domain_names)
-        for domain, name in names.items():
-            if not 0 <= domain < len(renamed):
-                raise ModelFileError(
-                    f"{self.name} has no domain {domain + 1}; its domains are 1 to {len(renamed)}"
-                )
-            renamed[domain] = checked_name(name)
+        renamed, coloured = list(self.domain_names), list(self.domain_colours)
+        for values, changes in ((renamed, names or {}), (coloured, colours or {})):
+            for domain, value in changes.items():
+                if not 0 <= domain < len(values):
+                    raise ModelFileError(
+                        f"{self.name} has no domain {domain + 1}; its domains are 1 to "
+                        f"{len(values)}"
+                    )
+                values[domain] = checked_name(value) if values is renamed else value.lower()
         for name in renamed:
             if renamed.count(name) > 1:
                 raise ModelFileError(f"two domains would be called {name!r}; choose another name")
-        card = replace(self.card, domain_names=tuple(renamed))
-        return PoseModel(self.name, self.embedding, card, self._other_sections)
+        if order is not None and sorted(order) != list(range(len(renamed))):
+            raise ModelFileError(
+                f"{list(order)} is no order of the {len(renamed)} domains of {self.name}; name "
+                f"each once"
+            )
+        for colour in coloured:
+            if not re.fullmatch("#[0-9a-f]{6}", colour):
+                raise ModelFileError(f"{colour!r} is no colour; write it as in #0077bb")
+        return self.with_card(
+            replace(
+                self.card,
+                domain_names=tuple(renamed),
+                domain_colours=tuple(coloured),
+                domain_order=self.card.domain_order if order is None else tuple(order),
+            )
+        )
+
+    def with_card(self, card: ModelCard, name: str | None = None) -> PoseModel:
+        """Return the same model with another card, and what was computed of it.
+
+        Parameters
+        ----------
+        card : names, colours or order differ; units and poses are the same
+        name : what to call the model, by default as it is
+        """
+        other = copy(self)
+        other.card, other.name = card, name or self.name
+        for cached in ("latent_space", "code_names"):
+            other.__dict__.pop(cached, None)
+        return other
 
     def turned_upright(self, up_axis: int) -> PoseModel:
         """Return the same model with another axis upwards: 0, 1 or 2 for x, y or z.
@@ -532,6 +577,28 @@ class PoseModel:
         )
 
     @cached_property
+    def front(self) -> FloatArray:
+        """(3,) array, the direction in which the reference looks, level, of length 1."""
+        return front_direction(self.reference, self.up_axis)
+
+    @cached_property
+    def code_effects(self) -> tuple[CodeEffect, ...]:
+        """What raising each of the D codes does to the body, measured by decoding some poses."""
+        return code_effects(
+            self.decode,
+            self.latent_space.high,
+            self.attention_mask,
+            self.embedding.group_sizes,
+            self.up_axis,
+            self.front,
+        )
+
+    @cached_property
+    def code_names(self) -> tuple[str, ...]:
+        """D names of what the codes do, different within each group: "left thigh forward"."""
+        return code_names(self.code_effects, self.domain_names, self.embedding.group_sizes)
+
+    @cached_property
     def detector(self) -> CollisionDetector:
         """Finds exact self-collisions of this model's meshes, in the data's unit."""
         return CollisionDetector(self.topology, self.reference, near_exclusion=self.near_exclusion)
@@ -585,6 +652,11 @@ class PoseModel:
     def domain_colours(self) -> tuple[str, ...]:
         """K colours "#rrggbb"."""
         return self.card.domain_colours
+
+    @property
+    def domain_order(self) -> tuple[int, ...]:
+        """All K domains, indices from 0, in the order in which people want them listed."""
+        return self.card.domain_order or tuple(range(len(self.domain_names)))
 
     @property
     def pose_names(self) -> tuple[str, ...]:

@@ -181,9 +181,10 @@ def test_a_slider_is_found_by_what_its_row_and_undo_call_it(window: MainWindow) 
     group = space.groups[2]
     code = group.codes.start + 2
     name = document.code_name(code)
-    assert name == f"{group.name}, motion 3"
+    own = document.model.code_names[code]
+    assert name == f"{group.name}, {own}"
     row = panel.row_of(code)
-    assert "Motion 3" in [label.text() for label in row.findChildren(QLabel)]
+    assert heading(own) in [label.text() for label in row.findChildren(QLabel)]
     QTest.keyClick(row.slider, Qt.Key.Key_Right)
     assert document.undo_stack.undoText() == f"Move {name}"
     whole, parts = space.groups[0].codes, range(space.groups[1].codes.start, space.size)
@@ -197,7 +198,7 @@ def test_a_slider_is_found_by_what_its_row_and_undo_call_it(window: MainWindow) 
     ):
         panel.filter.setText(words)
         assert shown_codes(window) == codes
-    assert panel.row_of(0).slider.accessibleName() == heading(space.groups[0].code_names[0])
+    assert panel.row_of(0).slider.accessibleName() == heading(document.model.code_names[0])
 
 
 def test_what_can_be_typed_is_near_the_sliders_range(qtbot: QtBot, window: MainWindow) -> None:

@@ -1,0 +1,162 @@
+"""What each number of a latent pose does to the body, in words: "left thigh forward", "twist"."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+_CHUNK = 32
+"""Poses that are decoded together: memory stays small for large meshes."""
+_STEP = 0.5
+"""Of a code's range above zero, at which its effect is measured."""
+_AIMLESS = 0.5
+"""Of what a code moves, as sums of squares: with less as one shift, a turn or a bend names it."""
+_OWN = 0.25
+"""Of the largest domain's motion: a domain that moves as much is what its own code moves."""
+_TINY = 1e-12
+
+_WAYS = (("up", "down"), ("forward", "back"), ("left", "right"))
+
+
+@dataclass(frozen=True)
+class CodeEffect:
+    """What raising one code does.
+
+    Attributes
+    ----------
+    domain : index from 0 of the domain that moves most, for its size; a domain's own code moves
+        that domain, unless it hardly moves beside another that it carries along
+    motion : "up", "down", "forward", "back", "left" or "right" for a shift of that domain; "bend
+        up" and so on where it turns, after its far end; "twist" about its long axis; "still" where
+        nothing moves
+    """
+
+    domain: int
+    motion: str
+
+
+def code_effects(
+    decode: Callable[[FloatArray], FloatArray],
+    high: npt.NDArray[np.float64],
+    attention_mask: npt.NDArray[np.float32],
+    group_sizes: Sequence[int],
+    up_axis: int,
+    front: FloatArray,
+) -> tuple[CodeEffect, ...]:
+    """Measure what each code does about the pose of zeros.
+
+    Parameters
+    ----------
+    decode : turns (B, D) latent poses into (B, V, 3) vertices
+    high : (D,) array, the upper end of each code's range, above 0
+    attention_mask : (K, V) array, each column sums to 1
+    group_sizes : 1 + K sizes of the latent's groups, which sum to D
+    up_axis : 0, 1 or 2
+    front : (3,) array, the direction in which the body looks, level
+
+    Returns
+    -------
+    effects : D of them
+
+    Notes
+    -----
+    What moves as the code goes from 0 to half of its range is weighted by the squares of the mask:
+    what a domain owns, not what it touches. The leading domain's motion is split into a shift, a
+    turn about its middle, by least squares, and what is left.
+    """
+    up = np.eye(3)[up_axis]
+    axes = np.stack([up, front, np.cross(up, front)])
+    weights = np.asarray(attention_mask, dtype=np.float64) ** 2
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), _TINY)
+    own = np.repeat(np.arange(len(group_sizes)) - 1, group_sizes)
+    positions = decode(np.zeros((1, len(high))))[0]
+    effects: list[CodeEffect] = []
+    for start in range(0, len(high), _CHUNK):
+        codes = np.arange(start, min(start + _CHUNK, len(high)))
+        poses = np.zeros((len(codes), len(high)))
+        poses[codes - start, codes] = _STEP * high[codes]
+        moved = decode(poses) - positions
+        effects.extend(
+            _effect(motion, positions, weights, axes, int(own[code]))
+            for code, motion in zip(codes, moved, strict=True)
+        )
+    return tuple(effects)
+
+
+def code_names(
+    effects: Sequence[CodeEffect], domain_names: Sequence[str], group_sizes: Sequence[int]
+) -> tuple[str, ...]:
+    """Name the codes after what they do; names within a group differ.
+
+    Parameters
+    ----------
+    effects : D, in the latent's order
+    domain_names : K names
+    group_sizes : 1 + K sizes that sum to D
+
+    Returns
+    -------
+    names : D names: in the first group of the domain and its motion, "left thigh forward"; in a
+        domain's own of the motion, with the domain's name only where another one moves more. The
+        second of two that are alike is "forward 2".
+    """
+    names: list[str] = []
+    start = 0
+    for group, size in enumerate(group_sizes):
+        taken: dict[str, int] = {}
+        for effect in effects[start : start + size]:
+            own = effect.domain == group - 1 or effect.motion == "still"
+            name = effect.motion if own else f"{domain_names[effect.domain]} {effect.motion}"
+            taken[name] = taken.get(name, 0) + 1
+            while taken[name] > 1 and f"{name} {taken[name]}" in taken:
+                taken[name] += 1
+            numbered = name if taken[name] == 1 else f"{name} {taken[name]}"
+            taken.setdefault(numbered, 1)
+            names.append(numbered)
+        start += size
+    return tuple(names)
+
+
+def _effect(
+    moved: FloatArray, positions: FloatArray, weights: FloatArray, axes: FloatArray, own: int
+) -> CodeEffect:
+    motion = weights @ (moved**2).sum(axis=1)
+    domain = int(motion.argmax())
+    if own >= 0 and motion[own] >= _OWN * motion[domain]:
+        domain = own
+    share = weights[domain]
+    total = float(share @ (moved**2).sum(axis=1))
+    if total <= _TINY * float(share @ (positions**2).sum(axis=1)):
+        return CodeEffect(domain, "still")
+    shift = share @ moved
+    if float(shift @ shift) >= _AIMLESS * total:
+        return CodeEffect(domain, _way(axes @ shift))
+    arms = positions - share @ positions
+    spread = (share[:, None] * arms).T @ arms
+    inertia = np.trace(spread) * np.eye(3) - spread
+    torque = share @ np.cross(arms, moved - shift)
+    turn = np.linalg.lstsq(inertia, torque, rcond=1e-9)[0]
+    long_axis = np.linalg.eigh(spread)[1][:, -1]
+    twist = (turn @ long_axis) * long_axis
+
+    def size(rotation: FloatArray) -> float:
+        return float(share @ (np.cross(rotation, arms) ** 2).sum(axis=1))
+
+    if size(twist) > size(turn - twist):
+        return CodeEffect(domain, "twist")
+    # The far end of a limb points away from the body's middle, that of the trunk is its top.
+    away = long_axis @ (share @ positions - positions.mean(axis=0))
+    half_length = np.sqrt(3.0 * long_axis @ spread @ long_axis)
+    outward = long_axis * np.sign((away if abs(away) > half_length else axes[0] @ long_axis) or 1)
+    return CodeEffect(domain, f"bend {_way(axes @ np.cross(turn, outward))}")
+
+
+def _way(along: FloatArray) -> str:
+    """Return the word for a direction's largest part up, forward or to the left."""
+    way = int(np.abs(along).argmax())
+    return _WAYS[way][int(along[way] < 0.0)]
