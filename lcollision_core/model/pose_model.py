@@ -577,11 +577,6 @@ class PoseModel:
         )
 
     @cached_property
-    def front(self) -> FloatArray:
-        """(3,) array, the direction in which the reference looks, level, of length 1."""
-        return front_direction(self.reference, self.up_axis)
-
-    @cached_property
     def code_effects(self) -> tuple[CodeEffect, ...]:
         """What raising each of the D codes does to the body, measured by decoding some poses."""
         return code_effects(
