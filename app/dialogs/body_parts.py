@@ -23,7 +23,7 @@ from PySide6.QtWidgets import (
 
 from app.panels.parts import labelled
 from app.tasks import PartEdits
-from app.theme import CLOSE, NORMAL, WIDE
+from app.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE
 from lcollision_core.errors import ModelFileError
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ class BodyPartsDialog(QDialog):
             item.setFlags(item.flags() | Qt.ItemFlag.ItemIsEditable)
             item.setFlags(item.flags() & ~Qt.ItemFlag.ItemIsDropEnabled)
             item.setData(_DOMAIN, domain)
+            item.setSizeHint(QSize(0, ROW_HEIGHT + 2))
             self.list.addItem(item)
             self._put_colour(item, model.domain_colours[domain])
         self.list.setCurrentRow(0)

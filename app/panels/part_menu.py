@@ -8,7 +8,6 @@ from PySide6.QtCore import QObject, QPoint, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QMenu
 
-from app.icons import icon
 from app.wording import heading, menu_text
 
 if TYPE_CHECKING:
@@ -47,7 +46,8 @@ class PartMenus(QObject):
         menu = QMenu(window)
         menu.setToolTipsVisible(True)
         if code is not None:
-            row = window.sliders.row_of(code)
+            rows = (row for group in window.sliders.groups for row in group.rows)
+            row = next(row for row in rows if row.code == code)
             reset = self._add(menu, "&Reset", lambda: document.reset_code(code))
             reset.setEnabled(bool(document.latent[code] != 0.0))
             self._add(menu, "&Type a value…", row.edit_number)
@@ -57,7 +57,6 @@ class PartMenus(QObject):
             lock = self._add(menu, f"&Lock {name}", lambda: None)
             lock.setCheckable(True)
             lock.setChecked(domain in document.locked_domains)
-            lock.setIcon(icon("lock"))
             lock.toggled.connect(lambda locked: document.set_locked(domain, locked))
             self._add(menu, f"R&eset {name}", lambda: document.reset_domain(domain))
             if code is None:

@@ -189,8 +189,8 @@ def test_a_slider_is_found_by_what_its_row_and_undo_call_it(window: MainWindow) 
     assert document.undo_stack.undoText() == f"Move {name}"
     whole, parts = space.groups[0].codes, range(space.groups[1].codes.start, space.size)
     for words, codes in (
-        (name, [code]),
-        (f"{group.name} 3", [code]),
+        (f"{group.name} motion 3", [code]),
+        (f"{own} motion 3", [code]),
         ("motion", list(parts)),
         ("Whole body", list(range(whole.start, whole.stop))),
         ("knuckle", []),
@@ -242,7 +242,7 @@ def name_label(row: QWidget) -> QLabel:
 def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
     qtbot: QtBot, editor_model: PoseModel, tmp_path: Path
 ) -> None:
-    long, endless = "right upper arm & chest", "arm and " * 7 + "arm"
+    long, endless = "right upper arm", "arm and " * 7 + "arm"
     document = PoseDocument(editor_model.rename_domains({1: long}))
     window = open_window(qtbot, document, settings_in(tmp_path))
 
