@@ -534,6 +534,7 @@ class PoseDocument(PoseHistory):
             return
         self._model, self._model_file = changed.model, changed.file
         self._live.follow(self.model, self.latent, self._predicts)
+        self._load_predictor()
         for told in (self.model_changed, self.frame_changed, self.exact_changed):
             told.emit()
         for told in (self.locks_changed, self.outcome_changed, self.ghost_changed):
