@@ -125,7 +125,7 @@ class ActionHandlers(QObject):
         if self._document.has_model:
             model = self._document.model
             lines = [
-                f"{model.name}: {model.n_vertices} vertices, {len(model.domain_names)} parts, "
+                f"{model.name}: {model.n_vertices} vertices, {len(model.domain_names)} body parts, "
                 f"{model.latent_size} sliders",
                 f"trained on {model.card.source}, licence {model.card.licence}",
             ]

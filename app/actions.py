@@ -36,7 +36,7 @@ ACTIONS: dict[str, ActionSpec] = {
     "new": ActionSpec(
         "&New pose",
         "Ctrl+N",
-        "Start again from the first pose of those learnt",
+        "Start again from the first training pose",
         "new",
     ),
     "open": ActionSpec("&Open…", "Ctrl+O", "Open poses, a mesh or a model", "open"),
@@ -49,36 +49,33 @@ ACTIONS: dict[str, ActionSpec] = {
         "Turn &upright", "Ctrl+Shift+U", "Turn the body to its next axis, which its file keeps"
     ),
     "screenshot": ActionSpec("S&creenshot…", "Ctrl+P", "Save a picture of the view", "screenshot"),
-    "turntable": ActionSpec("&Turntable…", "Ctrl+T", "Save a film of one turn", "turntable"),
+    "turntable": ActionSpec("&Turntable…", "Ctrl+T", "Save a video of one full turn", "turntable"),
     "quit": ActionSpec("&Quit", "Ctrl+Q", "Close the editor"),
-    "undo": ActionSpec("&Undo", "Ctrl+Z", "Take back the last change", "undo"),
-    "redo": ActionSpec("&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Do again what was taken back", "redo"),
+    "undo": ActionSpec("&Undo", "Ctrl+Z", "Undo the last change", "undo"),
+    "redo": ActionSpec(
+        "&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Repeat the change that was undone", "redo"
+    ),
     "reset": ActionSpec(
         "Reset &all",
         "Ctrl+Backspace",
-        "All sliders back to zero: the average of the poses it learnt from",
+        "Set all sliders to zero: the average of the training poses",
         "reset",
     ),
     "randomise": ActionSpec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),
-    "mirror": ActionSpec(
-        "&Mirror pose",
-        "Ctrl+M",
-        "Exchange left and right of the whole pose, of locked parts too",
-        "mirror",
-    ),
-    "filter": ActionSpec("&Find a slider", "Ctrl+F", "Type what a slider is called", "search"),
-    "unlock": ActionSpec("Un&lock everything", "Ctrl+L", "Let all locked parts move again"),
+    "mirror": ActionSpec("&Mirror pose", "Ctrl+M", "Swap left and right, also of locked body parts", "mirror"),
+    "filter": ActionSpec("&Find a slider", "Ctrl+F", "Type part of a slider's name", "search"),
+    "unlock": ActionSpec("Un&lock all", "Ctrl+L", "Unlock all body parts"),
     "parts": ActionSpec(
-        "Body &parts…", "Ctrl+B", "Rename, recolour and reorder the body parts of the model"
+        "Body &parts…", "Ctrl+Alt+B", "Rename, recolour and reorder the body parts of the model"
     ),
     "resolve": ActionSpec(
-        "&Resolve", "Ctrl+R", "Find the nearest pose that does not collide", "resolve"
+        "&Resolve", "Ctrl+R", "Find the nearest pose without collisions", "resolve"
     ),
     "cancel": ActionSpec("&Cancel", "Escape", "Stop what is being computed", "cancel"),
     "resolve_options": ActionSpec("Resolve &options…", "Ctrl+Shift+R", "Choose how Resolve works"),
     "keep": ActionSpec("Add &to library…", "Ctrl+K", "Keep this pose in your library", "add"),
     "update": ActionSpec(
-        "&Update pose", "Ctrl+U", "Let the pose of your library that this one was be as it is now"
+        "&Update pose", "Ctrl+U", "Replace the library's pose by this one, which began as it"
     ),
     "load": ActionSpec("&Load chosen pose", "Ctrl+Return", "Edit the chosen pose"),
     "blend": ActionSpec(
@@ -93,7 +90,7 @@ ACTIONS: dict[str, ActionSpec] = {
         "Add the chosen poses with left and right exchanged to your library",
     ),
     "remove": ActionSpec(
-        "R&emove", "Ctrl+Delete", "Drop the chosen poses from your library", "remove"
+        "R&emove", "Ctrl+Delete", "Remove the selected poses from your library", "remove"
     ),
     "add": ActionSpec(
         "Add &chosen to library", "Ctrl+Shift+K", "Copy poses from here into your library"
@@ -109,21 +106,33 @@ ACTIONS: dict[str, ActionSpec] = {
     ),
     "find_pose": ActionSpec("&Find a pose", "Ctrl+Shift+F", "Type what a pose is called"),
     "ghost": ActionSpec(
-        "&Ghost", "Ctrl+G", "Show the pose before Resolve, see-through", "ghost", checkable=True
+        "&Ghost",
+        "Ctrl+G",
+        "Show the pose before Resolve as a transparent body",
+        "ghost",
+        checkable=True,
     ),
-    "reset_camera": ActionSpec("Show the &whole body", "Ctrl+Home", "Bring the whole body in view"),
-    "full_screen": ActionSpec("&Full screen", "F11", "Give the editor the whole screen", "", True),
-    "reset_layout": ActionSpec("Reset la&yout", "Ctrl+Alt+0", "All panels back to their places"),
+    "reset_camera": ActionSpec(
+        "Show the &whole body", "Ctrl+Home", "Fit the whole body into the view"
+    ),
+    "full_screen": ActionSpec("&Full screen", "F11", "Use the whole screen", "", True),
+    "reset_layout": ActionSpec(
+        "Reset la&yout", "Ctrl+Alt+0", "Put all panels back in their places"
+    ),
     "shortcuts": ActionSpec("&Keyboard and mouse", "F1", "All shortcuts", "info"),
-    "log": ActionSpec("Open &log file", "Ctrl+Shift+L", "What went wrong, in detail"),
+    "log": ActionSpec("Open &log file", "Ctrl+Shift+L", "Open the log with the details of errors"),
     "about": ActionSpec("&About LCollision", "Shift+F1", "Version, licence and model"),
 }
 """All actions that stand alone, by key."""
 
 SHADINGS: dict[Shading, ActionSpec] = {
-    Shading.PLAIN: ActionSpec("&Plain", "Ctrl+1", "The bare body", "", True),
+    Shading.PLAIN: ActionSpec("&Plain", "Ctrl+1", "The body in one colour", "", True),
     Shading.DOMAINS: ActionSpec(
-        "&Body parts", "Ctrl+2", "Each part in its colour, darker where it acts alone", "", True
+        "&Body parts",
+        "Ctrl+2",
+        "Body parts in colour; stronger colour = only this part controls it",
+        "",
+        True,
     ),
     Shading.PREDICTED: ActionSpec(
         "&Estimate", "Ctrl+3", "Where the model estimates that it collides, and how deep", "", True
@@ -139,13 +148,13 @@ SHADINGS: dict[Shading, ActionSpec] = {
 
 CAMERA_ACTIONS: dict[str, ActionSpec] = {
     name: ActionSpec(
-        name, f"Alt+{number}", f"Look at the body: {name.lower()}", f"camera-{name.lower()}"
+        name, f"Alt+{number}", f"Camera view: {name.lower()}", f"camera-{name.lower()}"
     )
     for number, name in enumerate(CAMERAS, start=1)
 }
 
 THEMES: dict[str, ActionSpec] = {
-    "system": ActionSpec("As the &system", "F6", "Follow the desktop", "", True),
+    "system": ActionSpec("Match &system", "F6", "Match the desktop's theme", "", True),
     "light": ActionSpec("&Light", "F7", "Dark text on light", "", True),
     "dark": ActionSpec("&Dark", "F8", "Light text on dark", "", True),
 }
@@ -153,7 +162,7 @@ THEMES: dict[str, ActionSpec] = {
 DOCKS: dict[str, ActionSpec] = {
     "sliders": ActionSpec("&Sliders", "Ctrl+Alt+1", "Show or hide the sliders", "", True),
     "collision": ActionSpec(
-        "&Collisions", "Ctrl+Alt+2", "Show or hide prediction, check and Resolve", "", True
+        "&Collisions", "Ctrl+Alt+2", "Show or hide the check, the estimate and Resolve", "", True
     ),
     "library": ActionSpec("&Poses", "Ctrl+Alt+3", "Show or hide the pose library", "", True),
 }

@@ -38,7 +38,7 @@ def _kinds(*wanted: str) -> str:
     masks = {kind: " ".join(f"*{suffix}" for suffix in found) for kind, found in suffixes.items()}
     filters = [f"{kind.capitalize()} ({masks[kind]})" for kind in wanted]
     if len(wanted) > 1:
-        filters.insert(0, f"All that can be opened ({' '.join(masks[kind] for kind in wanted)})")
+        filters.insert(0, f"All supported files ({' '.join(masks[kind] for kind in wanted)})")
     return ";;".join(filters)
 
 
@@ -47,6 +47,11 @@ def _mesh_suffixes() -> tuple[str, ...]:
     from lcollision_core.meshes import READABLE_SUFFIXES
 
     return READABLE_SUFFIXES
+
+
+def _kind(path: Path) -> str:
+    """Name a file's kind after its extension, "FBX"."""
+    return path.suffix.removeprefix(".").upper() or "A file without an extension"
 
 
 class FileActions(QObject):
@@ -107,7 +112,7 @@ class FileActions(QObject):
 
     def import_mesh(self) -> None:
         """Ask for a mesh, and make it the pose."""
-        path = self.ask_open("Import a mesh", "meshes")
+        path = self.ask_open("Import mesh", "meshes")
         if path is not None:
             self.open_path(path)
 
@@ -144,8 +149,10 @@ class FileActions(QObject):
         suffix = path.suffix.lower()
         if not path.is_file():
             self._settings.forget_file(str(path.resolve()))
-            kind = "is a folder" if path.is_dir() else "is not there"
-            raise LCollisionError(f"{path} {kind}; choose a file of poses, a mesh or a model")
+            kind = "it is a folder" if path.is_dir() else "there is no such file"
+            raise LCollisionError(
+                f"Couldn't open {path}: {kind}; choose a file of poses, a mesh or a model"
+            )
         if suffix == POSES_SUFFIX:
             if not self.may_lose_changes():
                 return
@@ -158,7 +165,7 @@ class FileActions(QObject):
             self._document.import_mesh(path)
         else:
             raise LCollisionError(
-                f"{path.name} is nothing that the editor knows; open poses ({POSES_SUFFIX}), a "
+                f"{_kind(path)} isn't supported ({path.name}); open poses ({POSES_SUFFIX}), a "
                 f"mesh ({', '.join(_mesh_suffixes())}) or a model ({MODEL_SUFFIX})"
             )
         self._settings["last_folder"] = str(path.resolve().parent)
@@ -205,7 +212,7 @@ class FileActions(QObject):
         """Ask for axes, scale and file, and write the mesh on the screen."""
 
         def write() -> None:
-            path = self.ask_save("Export the mesh", self._name, _EXPORTS)
+            path = self.ask_save("Export mesh", self._name, _EXPORTS)
             if path is not None:
                 settings = self._settings
                 self._document.export_mesh(path, settings["export_axes"], settings["export_scale"])
@@ -218,7 +225,7 @@ class FileActions(QObject):
         """Ask for size and file, and save a picture of the viewport."""
 
         def shoot() -> None:
-            path = self.ask_save("Save the screenshot", self._name, {"PNG": ".png"})
+            path = self.ask_save("Save screenshot", self._name, {"PNG": ".png"})
             if path is not None:
                 settings = self._settings
                 viewport.screenshot(
@@ -240,7 +247,7 @@ class FileActions(QObject):
             # The chosen format first.
             chosen = f".{settings['turntable_format']}"
             kinds = dict(sorted(_FILMS.items(), key=lambda film: film[1] != chosen))
-            path = self.ask_save("Save the turntable", self._name, kinds)
+            path = self.ask_save("Save turntable", self._name, kinds)
             if path is not None:
                 style = TurntableStyle(
                     settings["turntable_seconds"],

@@ -143,7 +143,7 @@ class MainWindow(QMainWindow):
             "collision": self._dock("collision", "Collisions", self.collision),
             "library": self._dock("library", "Poses", self.library),
         }
-        self._camera_menu = self._submenu("&Camera", self._cameras.values())
+        self._camera_menu = self._submenu("&Camera view", self._cameras.values())
         self._body_menu = BodyMenu(self, self._shadings.values(), self._camera_menu)
         self._theme_menu = self._submenu("&Theme", self._themes.values())
         self.menus = fill_menus(
@@ -479,7 +479,7 @@ class MainWindow(QMainWindow):
             "resolve_options": document.can_resolve,
             "cancel": bool(self._busy),
         }
-        waits = f"{document.incoming}: what comes replaces this pose"
+        waits = f"{document.incoming}: it replaces this pose"
         tip = waits if document.incoming else ACTIONS["resolve"].tip
         explain_action(self.actions_by_key["resolve"], tip)
         always = ("open_model", "quit", "reset_layout", "full_screen", "shortcuts", "log", "about")

@@ -113,8 +113,8 @@ def make_bar(
             button.setMenu(cameras)
             button.setIcon(icon("camera"))
             button.setObjectName("cameras")
-            button.setToolTip("From where to look")
-            button.setAccessibleName("Camera")
+            button.setToolTip("Camera view")
+            button.setAccessibleName("Camera view")
             button.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
             bar.addWidget(button)
         else:

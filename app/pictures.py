@@ -42,7 +42,7 @@ class Pictures(QObject):
     def busy(self) -> str:
         """Which film is being made, or "" where none is."""
         film = self._film
-        return f"Filming {film.path.name}" if film is not None and film.is_running else ""
+        return f"Making {film.path.name}" if film is not None and film.is_running else ""
 
     def screenshot(
         self,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from PySide6.QtCore import QObject, Signal
 
-REASON = "Preparing for this computer, once: this takes some seconds"
+REASON = "First use: preparing for this computer, some seconds"
 
 
 class Preparing(QObject):

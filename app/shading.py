@@ -173,14 +173,14 @@ class Shader:
             greys = ramp(("#ffffff", "#565b63"))
             return Legend(
                 shading.value,
-                "darker where one acts alone",
+                "stronger colour = only this part controls it",
                 ramp=_ramp_text(greys),
                 ticks=((0.0, "shared"), (1.0, "alone")),
             )
         if shading is Shading.PREDICTED and not has_predictor:
-            return Legend(shading.value, "this model does not predict")
+            return Legend(shading.value, "this model has no estimate")
         if shading is Shading.PREDICTED:
-            note = "computing …" if domain_energy is None else _UNIT
+            note = "computing…" if domain_energy is None else _UNIT
             if vertex_energy is not None and not vertex_energy.any():
                 note = "the check found none"
             return self._scale(shading, note, "predicted", _ticks(FULL_PREDICTED, " or more"))

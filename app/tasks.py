@@ -93,7 +93,7 @@ class Exported:
     @property
     def sentence(self) -> str:
         """What the status bar says of it."""
-        state = "exactly collision-free"
+        state = "no collisions (checked)"
         if self.n_pairs:
             state = f"{counted(self.n_pairs, 'pair')} of its triangles collide"
         return f"Exported {self.path.name}: {state}"

@@ -257,7 +257,7 @@ def _why_not(path: Path, style: TurntableStyle) -> str:
     """Say why a film cannot be written so, or return "" where it can."""
     suffix = path.suffix.lower()
     if suffix not in FILMS:
-        return f"{path.name} is no film that can be written; call it {', '.join(FILMS)}"
+        return f"{path.name} can't be written as a turntable; name it {', '.join(FILMS)}"
     if suffix == ".png" and path.with_suffix("").exists():
         return f"{path.with_suffix('')} is there already; choose a new name for the PNG sequence"
     if suffix == ".gif" and style.background == "transparent":

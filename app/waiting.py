@@ -71,7 +71,7 @@ class WaitingPage(QWidget):
     @property
     def text(self) -> str:
         """What is waited for and why it takes long, or what went wrong."""
-        return self._text if self._failed else f"{self._text} …\n{self._reason}".rstrip()
+        return self._text if self._failed else f"{self._text}…\n{self._reason}".rstrip()
 
     @property
     def turns(self) -> bool:

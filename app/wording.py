@@ -87,7 +87,7 @@ def mirrored_text(mirrored: MirroredPose) -> str:
     pairs = counted(mirrored.pairs_after, "pair of faces", "pairs of faces")
     if mirrored.pairs_after == 0 < mirrored.pairs_mirrored:
         resolved = counted(mirrored.pairs_mirrored, "pair of faces", "pairs of faces")
-        state = f"free, as {resolved} that collided in the mirror image only were resolved"
+        state = f"no collisions (checked), as {resolved} of the mirror image were resolved"
     elif mirrored.lost_freedom:
         state = f"colliding: {pairs}, which the pose before does not have"
     elif mirrored.pairs_after:

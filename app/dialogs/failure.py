@@ -34,7 +34,7 @@ class FailureDialog(QDialog):
 
     def __init__(self, failure: Failure, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self.setWindowTitle("That did not work")
+        self.setWindowTitle("Couldn't do that")
         self.setMinimumWidth(480)
         self.failure = failure
         what, advice = split_sentence(one_line(failure.sentence))

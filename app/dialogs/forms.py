@@ -281,7 +281,7 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
     form = Form("Turntable", "Choose file…", settings, parent)
     formats = {"gif": "GIF", "webp": "WebP", "png": "PNG sequence"}
     kind = form.add_choice("turntable_format", "Format", formats, "What is written")
-    form.add_number("turntable_seconds", "One turn takes", " s", 0.5)
+    form.add_number("turntable_seconds", "Duration", " s", 0.5)
     rate = form.add_whole_number("turntable_rate", "Frames per second", "")
     form.add_whole_number("turntable_width", "Width", " px")
     form.add_whole_number("turntable_height", "Height", " px")
@@ -319,26 +319,26 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
 
 def resolve_form(settings: Settings, parent: QWidget) -> Form:
     """Ask how Resolve is to work."""
-    form = Form("How Resolve works", "Keep", settings, parent)
+    form = Form("Resolve options", "OK", settings, parent)
     form.add_choice(
         "resolve_metric",
-        "Stay close",
-        {"eye": "to how the pose looks", "latent": "to the sliders' numbers"},
+        "Keep close to",
+        {"eye": "the look of the pose", "latent": "the slider values"},
         "What Resolve tries to change as little as possible",
     )
     form.add_number(
         "resolve_threshold",
-        "Stop when a collision is less likely than",
+        "Decision threshold of the estimate",
         "",
         0.05,
-        "From 0, certainly free, to 1, certainly colliding; less is safer but moves the pose more",
+        "Below it the estimate calls a pose clear; lower is safer but moves the pose more",
     )
     form.add_number(
         "resolve_time_budget",
-        "Take at most",
+        "Time limit",
         " s",
         1.0,
-        "After this time Resolve takes the nearest way out that it knows",
+        "After this time Resolve falls back to a known pose without collisions",
     )
-    form.add_note("Whatever you choose, the exact check has the last word.")
+    form.add_note("The exact check decides in any case.")
     return form

@@ -40,7 +40,7 @@ class AboutDialog(QDialog):
         words.addWidget(labelled("LCollision", "headline"))
         words.addWidget(labelled(f"Version {_version()}, Apache-2.0 licence", "caption"))
         text = QLabel(
-            "A pose editor that knows when a body runs into itself, and moves it free. After "
+            "A pose editor that detects self-collisions and resolves them. After "
             "“LCollision: Fast Generation of Collision-Free Human Poses using Learned "
             "Non-Penetration Constraints” by Tan, Pan and Manocha, AAAI 2021."
         )
@@ -63,16 +63,16 @@ class ShortcutsDialog(QDialog):
     """All actions with their shortcuts, and what mouse and keys do elsewhere."""
 
     _ELSEWHERE = (
-        ("Drag in the view", "turn the camera"),
+        ("Drag in the view", "rotate the camera"),
         ("Middle-drag or Shift-drag", "move the camera"),
         ("Wheel or pinch in the view", "come nearer, go away, at the pointer"),
-        ("Right-drag in the view", "come nearer, go away"),
+        ("Right-drag in the view", "zoom"),
         ("Right-click in the view", "menu of the part under the pointer"),
         ("Arrow keys on a slider", "a hundredth of its range"),
         ("Page keys on a slider", "a tenth of its range"),
-        ("Home, End on a slider", "its ends"),
+        ("Home, End on a slider", "lowest and highest value"),
         ("Delete or double-click on a slider", "reset it"),
-        ("Ctrl or Shift while dragging a slider", "ten times finer"),
+        ("Ctrl or Shift while dragging a slider", "ten times finer steps"),
         ("Escape while dragging a slider", "back to where it was"),
     )
 

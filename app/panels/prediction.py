@@ -191,7 +191,7 @@ class DomainRow(HoverRow):
         self.lock.setIcon(icon("lock" if locked else "unlock", None if locked else theme.muted))
         self.lock.setToolTip(
             plain_tip(
-                f"{self._name} keeps its numbers: click to let it move again"
+                f"{self._name} is locked: click to unlock it"
                 if locked
                 else f"Lock {self._name}: Resolve, Randomise, Reset all and blending leave its "
                 "numbers alone"
@@ -259,8 +259,8 @@ class PredictionCard(Card):
         for widget in (self.percent, self.meter):
             widget.setToolTip(_TIP)
         self._missing = QLabel(
-            "This model has not learnt to predict collisions, so Resolve is off. Open another "
-            "model, or teach this one with “lcollision train predictor” in a terminal."
+            "This model has no collision predictor: no estimate, and no Resolve. Open another "
+            "model, or train one with “lcollision train predictor” in a terminal."
         )
         self._missing.setObjectName("caption")
         self._missing.setWordWrap(True)

@@ -40,7 +40,7 @@ class RandomiseCard(Card):
         self.amount.setPageStep(10)
         self.amount.setValue(round(100 * amount))
         self.amount.setAccessibleName("Amount")
-        self.amount.setToolTip("How far to go: 100 % forgets the present pose")
+        self.amount.setToolTip("How far to go to the random pose: 100 % replaces the current pose")
         self._percent = labelled("", "caption")
         self._percent.setMinimumWidth(self.fontMetrics().horizontalAdvance("100 %"))
         self._percent.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
@@ -48,7 +48,7 @@ class RandomiseCard(Card):
         self.seed.setMinimumWidth(_SEED_WIDTH)
         self.seed.setRange(0, _LARGEST_SEED)
         self.seed.setAccessibleName("Seed")
-        self.seed.setToolTip("Equal numbers draw equal poses; it counts up by itself")
+        self.seed.setToolTip("The same seed gives the same random pose; it counts up by itself")
         self.button = QPushButton("Randomise")
         self.button.setToolTip(action.toolTip())
         for widgets in (

@@ -114,7 +114,7 @@ class ResolveCard(Card):
         self.options = QPushButton("Options…")
         self.options.setToolTip("Choose how Resolve works")
         self.cancel = QPushButton("Cancel")
-        self.cancel.setToolTip("Stop Resolve and keep the pose as it is (Escape)")
+        self.cancel.setToolTip("Stop Resolve and leave the pose as it is (Escape)")
         self.bar = QProgressBar()
         self.bar.setTextVisible(False)
         self.working = QWidget()
@@ -122,7 +122,7 @@ class ResolveCard(Card):
         working.setContentsMargins(0, 0, 0, 0)
         working.setHorizontalSpacing(NORMAL)
         working.setVerticalSpacing(TIGHT)
-        working.addWidget(ElidedLabel("Looking for a free pose…"), 0, 0)
+        working.addWidget(ElidedLabel("Searching for a pose without collisions…"), 0, 0)
         working.addWidget(self.bar, 1, 0)
         working.addWidget(self.cancel, 0, 1, 2, 1)
         working.setColumnStretch(0, 1)
@@ -169,8 +169,8 @@ class ResolveCard(Card):
                 False: "The search stopped early",
                 None: "No search was needed",
             },
-            "Whether the search came to an end by itself: the exact check, not this, tells whether "
-            "the pose is free",
+            "Whether the search ended by itself; the exact check alone decides whether the pose "
+            "collides",
         )
         self.predicted_free = Fact(
             {
@@ -272,11 +272,11 @@ class ResolveCard(Card):
         # A search that was cut short has done its work where its pose is free.
         instead, sign = "", "info"
         if ran and exactly_free:
-            instead, sign = "The search ended at a free pose", "check"
+            instead, sign = "The search found a pose without collisions", "check"
         elif not ran and ALL_LOCKED in (result.note or ""):
             instead = "No search: all body parts are locked"
         elif not ran and result.step != Step.UNCHANGED:
-            instead = "No search: the time was over before"
+            instead = "No search: the time limit came first"
         self.converged.show_truth(result.converged if ran else None, instead, sign)
         overruled = exactly_free is not None and exactly_free != predicted_free
         word = "clear" if predicted_free else "colliding"
@@ -292,7 +292,7 @@ class ResolveCard(Card):
         mean, largest = result.vertex_distance_mean, result.vertex_distance_max
         moved = f"{height_text(mean)} of the height,\nat most {height_text(largest)}"
         self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
-        self._moved.setToolTip("On average, and where it moved furthest")
+        self._moved.setToolTip("Mean and maximum over the mesh")
         self._took.setText(_times(result.seconds, self._document.outcome_seconds))
         self._note.setText(heading(result.note or ""))
         self._note.setVisible(bool(result.note))

@@ -215,7 +215,7 @@ def test_a_free_pose_reads_as_success_whatever_was_predicted(
             ["check", "check", "info"],
             [
                 "No collisions (checked)",
-                "The search ended at a free pose",
+                "The search found a pose without collisions",
                 "Estimate: probably colliding, overruled",
             ],
         ),

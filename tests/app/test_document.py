@@ -372,7 +372,7 @@ def test_an_export_says_whether_the_mesh_collides(
 ) -> None:
     with qtbot.waitSignal(document.message) as free:
         document.export_mesh(tmp_path / "free.obj")
-    assert free.args == ["Exported free.obj: exactly collision-free"]
+    assert free.args == ["Exported free.obj: no collisions (checked)"]
     document.set_latent(colliding, "Jump")
     with qtbot.waitSignal(document.message) as told:
         document.export_mesh(tmp_path / "bad.obj")

@@ -332,7 +332,7 @@ def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_p
         ("broken.obj", "v 1 2\nf 1 2 3\n", "broken.obj"),
         ("other.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "3 vertices"),
         ("empty.ply", "", "empty"),
-        ("notes.txt", "hello", "nothing that the editor knows"),
+        ("notes.txt", "hello", "TXT isn't supported"),
         ("poses.json", "[1, 2", "no JSON"),
         ("model.safetensors", "garbage", "model.safetensors"),
     ],
@@ -403,7 +403,7 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     ("action", "name", "sentence"),
     [
         ("export", "b.fbx", ".fbx is no mesh format known here"),
-        ("turntable", "b.mp4", "b.mp4 is no film that can be written"),
+        ("turntable", "b.mp4", "b.mp4 can't be written as a turntable"),
     ],
 )
 def test_no_file_is_written_in_another_format_than_was_asked_for(

@@ -156,7 +156,7 @@ def test_escape_stops_a_turntable_that_the_status_bar_tells_of(
     assert not cancel.isEnabled()
     film = window.viewport.turntable(tmp_path / "turn.gif", TurntableStyle(width=60, height=60))
     assert cancel.isEnabled()
-    assert "Filming turn.gif…" in told_as_busy(window)
+    assert "Making turn.gif…" in told_as_busy(window)
     with qtbot.waitSignal(film.finished, timeout=PATIENCE) as finished:
         QTest.keyClick(window, Qt.Key.Key_Escape)
     assert finished.args == [None]
@@ -281,10 +281,10 @@ def test_a_cleared_filter_leaves_the_groups_folded_as_they_were(window: MainWind
     for text in ("motion", "left thigh", "knuckle"):
         panel.filter.selectAll()
         QTest.keyClicks(panel.filter, text)
-        assert says(panel, "No slider is called that") == (text == "knuckle")
+        assert says(panel, "No matching sliders") == (text == "knuckle")
     panel.filter.clear()
     assert folds(window) == before
-    assert not says(panel, "No slider is called that")
+    assert not says(panel, "No matching sliders")
     assert shown_codes(window) == [row.code for row in panel.groups[2].rows]
     # Another time, from other folds.
     QTest.mouseClick(panel.groups[2].header, LEFT)

@@ -78,7 +78,7 @@ def test_a_search_that_had_no_time_is_not_called_needless(
             outcome, solver_status="not run", step=Step.WALK_BACK, exactly_free=free, note=None
         )
         document._amend(replace(document._state, outcome=rushed))
-        assert "No search: the time was over before" in texts(card)
+        assert "No search: the time limit came first" in texts(card)
 
 
 def test_the_time_told_is_what_was_waited_as_well(

@@ -1,0 +1,67 @@
+"""What the window says, in plain, standard words."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from PySide6.QtWidgets import QDialog
+from pytestqt.qtbot import QtBot
+
+from app.dialogs.forms import resolve_form
+from app.main_window import MainWindow
+from app.shading import Shading
+from lcollision_core.errors import LCollisionError
+from lcollision_core.model import sample_poses
+from tests.app.test_editor_window import words_on_the_screen
+from tests.app.windows import PATIENCE, rest
+
+OUR_OWN = re.compile(
+    r"\b(mend\w*|upon|films?|filming|learnt|believes?|in truth|proved|truly|exactly free"
+    r"|collision-free|domains?|commoner|by chance|nobody|as the system|keep this pose"
+    r"|looking for|so manieth|to the eye|moves it free|freed)\b",
+    re.IGNORECASE,
+)
+
+
+def test_the_window_uses_standard_words(qtbot: QtBot, window: MainWindow) -> None:
+    document = window.document
+    form = resolve_form(window.settings, window)
+    qtbot.addWidget(form)
+    document.set_latent(sample_poses(document.model, 1, 0, colliding=True)[0], "Test")
+    rest(qtbot, window)
+    said: set[str] = set()
+    for shading in Shading:
+        window.viewport.set_shading(shading)
+        rest(qtbot, window)
+        said |= set(words_on_the_screen(window))
+    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+        window.actions_by_key["resolve"].trigger()
+    rest(qtbot, window)
+    for key in ("shortcuts", "about", "parts"):
+        window.actions_by_key[key].trigger()
+    said |= set(words_on_the_screen(window))
+    assert [text for text in sorted(said) if OUR_OWN.search(text)] == []
+    plain = {text.replace("&", "") for text in said}
+    assert {
+        "Match system",
+        "Camera view",
+        "Mirror pose",
+        "Add to library…",
+        "No collisions (checked)",
+        "Resolve options…",
+    } <= plain
+    assert form.windowTitle() == "Resolve options"
+    for dialog in window.findChildren(QDialog):
+        dialog.close()
+
+
+def test_what_is_not_supported_is_said_so(window: MainWindow, tmp_path: object) -> None:
+    from pathlib import Path
+
+    path = Path(str(tmp_path)) / "dancer.fbx"
+    path.write_bytes(b"Kaydara FBX Binary")
+    with pytest.raises(LCollisionError, match="FBX isn't supported"):
+        window.files.open_path(path)
+    with pytest.raises(LCollisionError, match=r"Couldn't open .*: there is no such file"):
+        window.files.open_path(path.with_suffix(".json"))
