@@ -62,7 +62,9 @@ ACTIONS: dict[str, ActionSpec] = {
         "reset",
     ),
     "randomise": ActionSpec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),
-    "mirror": ActionSpec("&Mirror pose", "Ctrl+M", "Swap left and right, also of locked body parts", "mirror"),
+    "mirror": ActionSpec(
+        "&Mirror pose", "Ctrl+M", "Swap left and right, also of locked body parts", "mirror"
+    ),
     "filter": ActionSpec("&Find a slider", "Ctrl+F", "Type part of a slider's name", "search"),
     "unlock": ActionSpec("Un&lock all", "Ctrl+L", "Unlock all body parts"),
     "parts": ActionSpec(
