@@ -64,7 +64,7 @@ def test_the_menu_shows_the_step_to_undo_to_the_letter(hostile: MainWindow) -> N
         document.undo()
         assert shown_text(redo.text()).endswith(kept)
     document.set_code(0, 0.1)
-    assert shown_text(undo.text()) == f"Undo move {HOSTILE[0]}"
+    assert shown_text(undo.text()) == f"Undo move {document.code_name(0)}"
 
 
 def test_no_text_of_a_window_takes_a_name_for_a_shortcut_or_for_html(hostile: MainWindow) -> None:

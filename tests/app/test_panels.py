@@ -242,7 +242,7 @@ def name_label(row: QWidget) -> QLabel:
 def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
     qtbot: QtBot, editor_model: PoseModel, tmp_path: Path
 ) -> None:
-    long, endless = "right upper arm", "arm and " * 7 + "arm"
+    long, endless = "right arm", "arm and " * 7 + "arm"
     document = PoseDocument(editor_model.rename_domains({1: long}))
     window = open_window(qtbot, document, settings_in(tmp_path))
 
