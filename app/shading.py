@@ -173,7 +173,7 @@ class Shader:
             greys = ramp(("#ffffff", "#565b63"))
             return Legend(
                 shading.value,
-                "stronger colour = only this part controls it",
+                "stronger colour = only this part",
                 ramp=_ramp_text(greys),
                 ticks=((0.0, "shared"), (1.0, "alone")),
             )

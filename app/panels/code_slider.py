@@ -139,7 +139,8 @@ class CodeRow(HoverRow):
     ) -> None:
         super().__init__(domain)
         self.code = code
-        label = ElidedLabel(name)
+        # Its end tells what the part does.
+        label = ElidedLabel(name, Qt.TextElideMode.ElideMiddle)
         label.setMaximumWidth(name_width)
         self.slider = CodeSlider(low, high, colour)
         self.field = QuietSpinBox()

@@ -63,10 +63,17 @@ class Card(QFrame):
 
 
 class ElidedLabel(QLabel):
-    """A label that shortens its text to the room it has, with the whole text as tool tip then."""
+    """A label that shortens its text to the room it has, with the whole text as tool tip then.
 
-    def __init__(self, text: str) -> None:
+    Parameters
+    ----------
+    text : to show
+    cut : where it is shortened
+    """
+
+    def __init__(self, text: str, cut: Qt.TextElideMode = Qt.TextElideMode.ElideRight) -> None:
         super().__init__(text)
+        self._cut = cut
         self.setTextFormat(Qt.TextFormat.PlainText)
         self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
 
@@ -91,7 +98,7 @@ class ElidedLabel(QLabel):
         painter.drawText(self.rect(), int(self.alignment()), self._fitting())
 
     def _fitting(self) -> str:
-        return self.fontMetrics().elidedText(self.text(), Qt.TextElideMode.ElideRight, self.width())
+        return self.fontMetrics().elidedText(self.text(), self._cut, self.width())
 
     def _offer_whole(self) -> None:
         self.setToolTip("" if self._fitting() == self.text() else plain_tip(self.text()))
