@@ -178,7 +178,7 @@ class Shader:
                 ticks=((0.0, "shared"), (1.0, "alone")),
             )
         if shading is Shading.PREDICTED and not has_predictor:
-            return Legend(shading.value, "this model has no estimate")
+            return Legend(shading.value, "this model does not predict")
         if shading is Shading.PREDICTED:
             note = "computing…" if domain_energy is None else _UNIT
             if vertex_energy is not None and not vertex_energy.any():

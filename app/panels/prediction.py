@@ -259,7 +259,7 @@ class PredictionCard(Card):
         for widget in (self.percent, self.meter):
             widget.setToolTip(_TIP)
         self._missing = QLabel(
-            "This model has no collision predictor: no estimate, and no Resolve. Open another "
+            "This model can't estimate collisions, so Resolve is off. Open another "
             "model, or train one with “lcollision train predictor” in a terminal."
         )
         self._missing.setObjectName("caption")
