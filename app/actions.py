@@ -75,7 +75,7 @@ ACTIONS: dict[str, ActionSpec] = {
     ),
     "cancel": ActionSpec("&Cancel", "Escape", "Stop what is being computed", "cancel"),
     "resolve_options": ActionSpec("Resolve &options…", "Ctrl+Shift+R", "Choose how Resolve works"),
-    "keep": ActionSpec("Add &to library…", "Ctrl+K", "Keep this pose in your library", "add"),
+    "keep": ActionSpec("Add &to library…", "Ctrl+K", "Add this pose to your library", "add"),
     "update": ActionSpec(
         "&Update pose", "Ctrl+U", "Replace the library's pose by this one, which began as it"
     ),

@@ -18,7 +18,7 @@ from tests.app.windows import PATIENCE, rest
 
 OUR_OWN = re.compile(
     r"\b(mend\w*|upon|films?|filming|learnt|believes?|in truth|proved|truly|exactly free"
-    r"|collision-free|domains?|commoner|by chance|nobody|as the system|keep this pose"
+    r"|domains?|commoner|by chance|nobody|as the system|keep this pose"
     r"|looking for|so manieth|to the eye|moves it free|freed)\b",
     re.IGNORECASE,
 )
