@@ -261,14 +261,15 @@ class CollisionPredictor:
         codes = np.ascontiguousarray(latent, dtype=np.float32)
         n_outputs = self.n_domains if self.config.by_domain else 1
         domain_energy, logit = np.empty((len(codes), n_outputs)), np.empty(len(codes))
-        compute = self._torch_outputs if self._compiled is None else self._compiled.outputs
+        compiled = self._compiled
+        # Torch shares out its work by itself.
+        compute = self._torch_outputs if compiled is None else compiled.outputs
+        most_threads = 1 if compiled is None else available_cores()
 
         def fill(start: int, stop: int) -> None:
             domain_energy[start:stop], logit[start:stop] = compute(codes[start:stop])
 
-        n_threads = 1
-        if self.device == "cpu":
-            n_threads = max(1, min(available_cores(), len(codes) // _ROWS_A_THREAD))
+        n_threads = max(1, min(most_threads, len(codes) // _ROWS_A_THREAD))
         cuts = np.linspace(0, len(codes), n_threads + 1).astype(int).tolist()
         if n_threads == 1:
             fill(0, len(codes))

@@ -156,9 +156,13 @@ def test_threads_may_share_a_predictor(predictor: CollisionPredictor, rows: Labe
     def both(part: np.ndarray) -> tuple[np.ndarray, ...]:
         return *predictor.scaled_outputs(part), *predictor.logit_and_gradient(part)
 
+    # Torch's products round by how many threads of its own share them out.
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     expected = [both(part) for part in parts]
     expected_many = [predictor.scaled_outputs(part) for part in many]
-    with ThreadPoolExecutor(4) as pool:
+    torch.set_num_threads(n_threads)
+    with ThreadPoolExecutor(4, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         found = list(pool.map(both, parts))
         found_many = list(pool.map(predictor.scaled_outputs, many))
     for results, truth in ((found, expected), (found_many, expected_many)):
