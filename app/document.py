@@ -21,6 +21,7 @@ from app.wording import counted, heading, height_text, mirrored_text
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
+    from lcollision_core.meshes import FileStamp
     from lcollision_core.model import MirroredPose, NamedPose, PoseModel
     from lcollision_core.resolve import ResolveOptions
 
@@ -101,6 +102,7 @@ class PoseDocument(PoseHistory):
         self._library_folder = library_folder
         self._model: PoseModel | None = None
         self._model_file = ""
+        self._file_stamp: FileStamp | None = None
         self._predicts = False
         self._locked: frozenset[int] = frozenset()
         self._frame: LiveFrame | None = None
@@ -381,6 +383,13 @@ class PoseDocument(PoseHistory):
 
         self._bring(f"Recovering {name}", tasks.read(model, model_file, poses_file), put_in)
 
+    @property
+    def file_is_another_s(self) -> bool:
+        """Whether another program has written the file since it was opened or saved here."""
+        from lcollision_core.meshes import file_stamp
+
+        return self._file is not None and file_stamp(self._file) not in (None, self._file_stamp)
+
     def save(self, path: str | Path | None = None) -> None:
         """Write the working pose and the file's other poses, and clear the modified mark.
 
@@ -394,6 +403,7 @@ class PoseDocument(PoseHistory):
         ------
         ModelFileError : there is no file yet, or it cannot be written.
         """
+        from lcollision_core.meshes import file_stamp
         from lcollision_core.model import name_of_file, write_poses
 
         self.end_gesture()
@@ -403,6 +413,7 @@ class PoseDocument(PoseHistory):
         name = self.pose_name if self.pose_name != UNNAMED else name_of_file(target)
         pose = replace(self.pose, name=name)
         write_poses(target, self.model, self.file_poses, pose)
+        self._file_stamp = file_stamp(target)
         self._keep_saved(pose, target)
         self.message.emit(f"Saved {target.name}")
 
@@ -526,6 +537,7 @@ class PoseDocument(PoseHistory):
         held = read.held
         edited = held.working or held.poses[0]
         self.begin_with(edited, Source.FILE, read.path, held.poses)
+        self._file_stamp = read.stamp
         self.message.emit(f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}")
         self.opened.emit(read.path)
 
@@ -545,6 +557,8 @@ class PoseDocument(PoseHistory):
     def _on_recovered(
         self, read: tasks.ReadPoses | tasks.OtherModel, name: str, file: Path | None
     ) -> None:
+        from lcollision_core.meshes import file_stamp
+
         if isinstance(read, tasks.OtherModel):
             self.failed.emit(Failure(read.sentence, ""))
             return
@@ -553,6 +567,7 @@ class PoseDocument(PoseHistory):
         poses = read.held.poses
         edited = read.held.working or next((p for p in poses if p.name == name), poses[0])
         self.begin_with(edited, Source.FILE, file, poses)
+        self._file_stamp = file_stamp(file) if file is not None else None
         self._saved = None
         self._tell_modified()
         self.message.emit(f"Recovered {edited.name}")

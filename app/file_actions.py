@@ -12,7 +12,13 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
 from app.dialogs.forms import export_form, screenshot_form, turntable_form
-from app.dialogs.questions import Answer, ask_about_changes, ask_about_scale, ask_to_switch
+from app.dialogs.questions import (
+    Answer,
+    ask_about_another_s,
+    ask_about_changes,
+    ask_about_scale,
+    ask_to_switch,
+)
 from app.panels.parts import plain_tip
 from app.wording import menu_text
 from lcollision_core.bundled import bundled_folder
@@ -195,9 +201,14 @@ class FileActions(QObject):
         -------
         saved : whether it was, not given up
         """
-        if self._document.file is None:
+        document = self._document
+        if document.file is None:
             return self.save_as()
-        self._document.save()
+        if document.file_is_another_s:
+            answer = ask_about_another_s(self._window, document.file.name)
+            if answer is not Answer.SAVE:
+                return answer is Answer.DISCARD and self.save_as()
+        document.save()
         return True
 
     def save_as(self) -> bool:

@@ -16,7 +16,7 @@ from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
-    from lcollision_core.meshes import RigidTransform
+    from lcollision_core.meshes import FileStamp, RigidTransform
     from lcollision_core.model import ListedModel, MirroredPose, NamedPose, PoseFile, PoseModel
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
@@ -45,11 +45,13 @@ class ReadPoses:
     ----------
     path : that was read
     held : with a working pose or others
+    stamp : of the file as it was read
     opened : the model that was opened for it, None for the one that was open
     """
 
     path: Path
     held: PoseFile
+    stamp: FileStamp | None
     opened: OpenedModel | None
 
 
@@ -182,6 +184,7 @@ def read(model: PoseModel | None, model_file: str | Path, path: Path) -> Work:
     """
 
     def work(progress: Progress, cancel: CancelToken) -> ReadPoses | OtherModel:
+        from lcollision_core.meshes import file_stamp
         from lcollision_core.model import OtherModelError, read_pose_file
 
         opened: OpenedModel | None = None
@@ -189,6 +192,7 @@ def read(model: PoseModel | None, model_file: str | Path, path: Path) -> Work:
         if owner is None:
             opened = opened_model(model_file)(progress, cancel)
             owner = opened.model
+        stamp = file_stamp(path)
         try:
             held = read_pose_file(path, owner)
         except OtherModelError as error:
@@ -198,7 +202,7 @@ def read(model: PoseModel | None, model_file: str | Path, path: Path) -> Work:
         cancel.raise_if_cancelled()
         if not held.all_poses:
             raise ModelFileError(f"{path} holds no poses; open a file that has some")
-        return ReadPoses(path, held, opened)
+        return ReadPoses(path, held, stamp, opened)
 
     return work
 

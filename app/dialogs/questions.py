@@ -67,6 +67,24 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Answer:
     return _answer(box, recover, discard)
 
 
+def ask_about_another_s(parent: QWidget, file: str) -> Answer:
+    """Ask what to do with a file that another program has changed meanwhile.
+
+    Returns
+    -------
+    answer : SAVE to replace it, DISCARD to save under another name
+    """
+    box = _box(parent, "Changed by another program")
+    box.setText(f"“{one_line(file)}” was changed by another program since it was opened.")
+    box.setInformativeText("Saving replaces what that program wrote.")
+    replace = box.addButton("Replace", QMessageBox.ButtonRole.DestructiveRole)
+    other = box.addButton("Save as…", QMessageBox.ButtonRole.AcceptRole)
+    cancel = box.addButton("Cancel", QMessageBox.ButtonRole.RejectRole)
+    box.setDefaultButton(other)
+    box.setEscapeButton(cancel)
+    return _answer(box, replace, other)
+
+
 def ask_to_replace(parent: QWidget, name: str) -> bool:
     """Ask whether a pose of the library is to be replaced."""
     box = _box(parent, "Replace a pose")

@@ -450,6 +450,35 @@ def test_a_file_of_another_model_is_offered_with_its_model(
     rest(qtbot, window)
 
 
+def test_save_asks_before_it_replaces_what_another_program_wrote_meanwhile(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document, path = window.document, tmp_path / "work.json"
+    latent = document.model.training_latent
+    write_poses(path, document.model, [NamedPose("first", latent[1])])
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        drop(window, path)
+    document.set_code(0, 0.25)
+    # Nobody else has written it: no question.
+    press(window, Qt.Key.Key_S, CONTROL)
+    assert not document.modified
+    write_poses(path, document.model, [NamedPose("of another", latent[2])])
+    others = path.read_bytes()
+    document.set_code(0, 0.5)
+
+    def cancel(dialog: QDialog) -> None:
+        take_picture(window, "library-changed-by-another")
+        pressing("Cancel")(dialog)
+
+    press(window, Qt.Key.Key_S, CONTROL, cancel)
+    assert path.read_bytes() == others
+    assert document.modified
+    press(window, Qt.Key.Key_S, CONTROL, pressing("Replace"))
+    assert [pose.name for pose in read_pose_file(path, document.model).poses] == ["first"]
+    assert not document.modified
+    rest(qtbot, window)
+
+
 @pytest.mark.parametrize("is_good", [True, False])
 def test_of_several_files_what_was_opened_is_told_once_it_is(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, is_good: bool
