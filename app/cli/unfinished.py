@@ -41,6 +41,7 @@ class UnfinishedPoses:
         self.finished: dict[int, tuple[NamedPose, Mapping[str, Any]]] = {}
         self._model, self._key, self._total = model, key, total
         self._seconds = 0.0
+        self._failure = ""
         self._written = time.monotonic()
         if path.exists():
             self._go_on()
@@ -50,7 +51,7 @@ class UnfinishedPoses:
         self.finished[place] = (pose, facts)
         pause = max(_SECONDS_BETWEEN_WRITES, self._seconds / _LARGEST_SHARE)
         if time.monotonic() - self._written > pause:
-            self.write()
+            self._write_or_say()
 
     def write(self) -> None:
         """Write all that is done."""
@@ -70,13 +71,20 @@ class UnfinishedPoses:
 
     def stop(self) -> None:
         """Write what is done, and say how to go on."""
-        if not self.finished:
-            return
+        if self.finished and self._write_or_say():
+            note(f"stopped; {self.path} has {self._told}, run the same command again to go on")
+
+    def _write_or_say(self) -> bool:
+        """Write, or say once why not: a full disk neither ends the command nor hides what does."""
         try:
             self.write()
-        except LCollisionError as error:  # a full disk must not hide what stopped the command
-            note(str(error))
-        note(f"stopped; {self.path} has {self._told}, run the same command again to go on")
+        except LCollisionError as error:
+            self._written = time.monotonic()
+            if str(error) != self._failure:
+                self._failure = str(error)
+                note(self._failure)
+            return False
+        return True
 
     def damaged(self) -> LCollisionError:
         """Return the error for a file whose facts are not those that were kept."""

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from app.cli import unfinished
 from lcollision_core.contact import DEPTH_TOLERANCE
+from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import (
     RigidTransform,
     as_stored,
@@ -548,6 +550,33 @@ def test_what_another_run_left_is_neither_used_nor_lost(
     kept.write_bytes(left)
     lcollision("domains", model_file, "--name", "1=somewhere")
     assert lcollision("resolve", model_file, poses, "-o", out).exit_code == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+def test_a_full_disk_loses_nothing_of_what_an_earlier_run_left(
+    lcollision: Lcollision,
+    model_file: Path,
+    poses: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out, kept = tmp_path / "free.json", tmp_path / "free.partial.json"
+    stopped("SIGINT", "resolve", model_file, poses, "-o", out)
+    left = kept.read_bytes()
+
+    def write(*_: object, **__: object) -> None:
+        raise ModelFileError("it cannot be written: No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr("lcollision_core.model.write_poses", write)
+        full.setattr(unfinished, "_SECONDS_BETWEEN_WRITES", -1.0)
+        result = lcollision("resolve", model_file, poses, "-o", out, "--workers", "1")
+    assert result.exit_code == 2
+    # Once for what is kept, and once for the output.
+    assert result.stderr.count("No space left") == 2
+    assert "stopped" not in result.stderr
+    assert kept.read_bytes() == left
+    assert "2 of 5" in lcollision("resolve", model_file, poses, "-o", out).stderr
 
 
 def test_two_runs_to_one_output_are_refused(
