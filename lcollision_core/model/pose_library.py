@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lcollision_core.errors import MeshFileError, ModelFileError
-from lcollision_core.meshes.locks import locked
+from lcollision_core.meshes import FileStamp, file_stamp, locked, spare_name
 from lcollision_core.model.pose_file import (
     DamagedPosesError,
     NamedPose,
@@ -71,12 +71,13 @@ class PoseLibrary:
     def __init__(self, model: PoseModel, folder: Path, tell: Callable[[str], None]) -> None:
         self._model = model
         self._tell = tell
+        self._folder = folder
         self.path = _path(model, folder)
         self._in_file: tuple[NamedPose, ...] = ()
         self._unwritten: list[LibraryChange] = []
         self._poses: tuple[NamedPose, ...] = ()
-        self._seen: tuple[int, ...] | None = None
-        self._refused: tuple[int, ...] | None = None
+        self._seen: FileStamp | None = None
+        self._refused: FileStamp | None = None
         self.refresh()
 
     @property
@@ -96,13 +97,14 @@ class PoseLibrary:
     def change(self, changes: Sequence[LibraryChange]) -> None:
         """Make changes, in the file too."""
         self._unwritten += changes
+        self._find_file()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with locked(self.path, _LOCK_SECONDS):
                 self._read()
                 poses = _changed(self._in_file, self._unwritten)
                 write_poses(self.path, self._model, poses)
-                self._seen = _signature(self.path)
+                self._seen = file_stamp(self.path)
             self._in_file = poses
             self._unwritten.clear()
         except (ModelFileError, MeshFileError, OSError) as error:
@@ -114,28 +116,36 @@ class PoseLibrary:
 
     def refresh(self) -> bool:
         """Take in what another program has changed; return whether there was anything."""
-        signature = _signature(self.path)
-        if signature is None or signature in (self._seen, self._refused):
+        self._find_file()
+        stamp = file_stamp(self.path)
+        if stamp is None or stamp in (self._seen, self._refused):
             return False
         try:
             self._read()
         except (ModelFileError, OSError) as error:
-            self._refused = signature
+            self._refused = stamp
             self._tell(f"your pose library could not be read: {error}")
             return False
         self._poses = _changed(self._in_file, self._unwritten)
         return True
 
+    def _find_file(self) -> None:
+        """Take the file that a program which knows the model by another name has begun."""
+        if not self.path.exists():
+            self.path = _path(self._model, self._folder)
+
     def _read(self) -> None:
         """Learn what the file holds; what it held before counts where it is gone or damaged."""
-        signature = _signature(self.path)
-        if signature is None or signature == self._seen:
+        stamp = file_stamp(self.path)
+        if stamp is None or stamp == self._seen:
             return
         try:
             self._in_file = read_pose_file(self.path, self._model).poses
-            self._seen = signature
+            self._seen = stamp
         except (DamagedPosesError, OtherModelError) as error:
-            aside = _unused(self.path.with_name(f"{self.path.stem} damaged.json"))
+            aside = self.path.with_name(f"{self.path.stem} damaged.json")
+            if aside.exists():
+                aside = spare_name(aside)
             self.path.rename(aside)
             self._tell(
                 f"your pose library was damaged and has been set aside as {aside} ({error}); "
@@ -159,23 +169,6 @@ def _changed(poses: Sequence[NamedPose], changes: Sequence[LibraryChange]) -> tu
 
 def _alike(pose: NamedPose, other: NamedPose | None) -> bool:
     return other is not None and pose.name == other.name and to_json(pose) == to_json(other)
-
-
-def _signature(path: Path) -> tuple[int, ...] | None:
-    """Return what differs whenever a file has been written anew; None where it is not there."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_ino, found.st_mtime_ns, found.st_size
-
-
-def _unused(path: Path) -> Path:
-    number, result = 1, path
-    while result.exists():
-        number += 1
-        result = path.with_name(f"{path.stem} {number}{path.suffix}")
-    return result
 
 
 def _path(model: PoseModel, folder: Path) -> Path:

@@ -114,6 +114,19 @@ def test_two_editors_at_once_lose_nothing(
     assert told == []
 
 
+def test_editors_that_know_the_model_by_other_names_begin_one_library(
+    model: PoseModel, tmp_path: Path, told: list[str]
+) -> None:
+    copied = PoseModel("copy", model.embedding, model.card)
+    one, two, watching = (PoseLibrary(m, tmp_path, told.append) for m in (model, copied, copied))
+    add(one, pose(model, "a"))
+    add(two, pose(model, "b"))
+    assert watching.refresh()
+    for library in (two, watching, PoseLibrary(model, tmp_path, told.append)):
+        assert names(library) == ["b", "a"]
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 @pytest.mark.parametrize("damage", ["half", "garbage", "other model"])
 def test_a_damaged_library_is_told_of_and_set_aside(
     model: PoseModel, tmp_path: Path, told: list[str], damage: str
