@@ -9,8 +9,6 @@ from PySide6.QtCore import QObject, QPoint, Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QMenu
 
-from app.wording import heading
-
 if TYPE_CHECKING:
     from app.main_window import MainWindow
 
@@ -30,7 +28,6 @@ class BodyMenu(QObject):
         self._window = window
         self._shadings = tuple(shadings)
         self._cameras = cameras
-        self._domain = 0
 
     @Slot(object, QPoint)
     def open(self, domain: int | None, place: QPoint) -> None:
@@ -41,10 +38,10 @@ class BodyMenu(QObject):
         domain : of the part that was clicked, None beside the body
         """
         window = self._window
-        menu = QMenu(window)
+        menu = QMenu(window) if domain is None else window.part_menus.menu(domain, None)
         menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         if domain is not None:
-            self._add_part(menu, domain)
+            menu.addSeparator()
             window.viewport.highlight_domain(domain)
             menu.aboutToHide.connect(self._on_hidden)
         colours = menu.addMenu("C&olour by")
@@ -55,36 +52,6 @@ class BodyMenu(QObject):
         menu.addSeparator()
         menu.addActions([actions[key] for key in ("resolve", "reset", "undo")])
         menu.popup(place)
-
-    def _add_part(self, menu: QMenu, domain: int) -> None:
-        document = self._window.document
-        self._domain = domain
-        name = document.model.domain_names[domain].replace("&", "&&")
-        is_locked = domain in document.locked_domains
-        menu.addAction(heading(name)).setEnabled(False)
-        lock = menu.addAction(f"{'Un&lock' if is_locked else '&Lock'} {name}")
-        lock.triggered.connect(self._on_lock)
-        reset = menu.addAction(f"&Reset {name}")
-        reset.setEnabled(not is_locked)
-        reset.triggered.connect(self._on_reset)
-        menu.addAction(f"Show the &sliders of {name}").triggered.connect(self._on_sliders)
-        menu.addSeparator()
-
-    @Slot()
-    def _on_lock(self) -> None:
-        document = self._window.document
-        document.set_locked(self._domain, self._domain not in document.locked_domains)
-
-    @Slot()
-    def _on_reset(self) -> None:
-        self._window.document.reset_domain(self._domain)
-
-    @Slot()
-    def _on_sliders(self) -> None:
-        dock = self._window.docks["sliders"]
-        dock.show()
-        dock.raise_()
-        self._window.sliders.show_domain(self._domain)
 
     @Slot()
     def _on_hidden(self) -> None:

@@ -544,6 +544,8 @@ class PoseDocument(PoseHistory):
     def _on_parts(self, changed: tasks.ChangedParts) -> None:
         if changed.model.fingerprint != self.model.fingerprint:
             return
+        # The slider that is being dragged goes with its old name.
+        self.end_gesture()
         self._model, self._model_file = changed.model, changed.file
         self._live.follow(self.model, self.latent, self._predicts)
         self._load_predictor()

@@ -63,14 +63,14 @@ def _kind(path: Path) -> str:
 class FileActions(QObject):
     """Opens, saves, imports and exports, asking for files where it must.
 
-    Whatever a user can mend is raised as `LCollisionError`, for the window to show.
+    Whatever a user can fix is raised as `LCollisionError`, for the window to show.
 
     Parameters
     ----------
     window : that dialogs belong to
     document : opened into and saved from
     settings : remembers the last folder, the recent files and the model
-    attempt : does something and shows what a user can mend of what goes wrong
+    attempt : does something and shows what a user can fix of what goes wrong
 
     Attributes
     ----------
@@ -129,11 +129,12 @@ class FileActions(QObject):
         ------
         LCollisionError : it is a bundled model, or has no file.
         """
+        from app.tasks import is_bundled
         from lcollision_core.model import change_model
 
         document = self._document
         file = Path(document.model_file)
-        if not file.is_file() or file.parent == bundled_folder("models"):
+        if is_bundled(document.model_file):
             raise LCollisionError(
                 f"{document.model.name} comes with the program and stays as it is; copy {file}, "
                 f"open the copy and turn that"

@@ -178,7 +178,7 @@ class MainWindow(QMainWindow):
     # What others may do to it.
 
     def attempt(self, act: Callable[[], object]) -> object:
-        """Do something, and show what a user can mend of what goes wrong.
+        """Do something, and show what a user can fix of what goes wrong.
 
         Returns
         -------
@@ -249,6 +249,8 @@ class MainWindow(QMainWindow):
         dialog = BodyPartsDialog(document.model, is_bundled(document.model_file), taken, self)
         dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         dialog.edited.connect(document.edit_parts)
+        # Of another model these are other parts.
+        document.model_changed.connect(dialog.reject)
         dialog.open()
         if domain is not None:
             dialog.choose(domain)

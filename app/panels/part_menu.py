@@ -58,7 +58,8 @@ class PartMenus(QObject):
             lock.setCheckable(True)
             lock.setChecked(domain in document.locked_domains)
             lock.toggled.connect(lambda locked: document.set_locked(domain, locked))
-            self._add(menu, f"R&eset {name}", lambda: document.reset_domain(domain))
+            reset = self._add(menu, f"R&eset {name}", lambda: document.reset_domain(domain))
+            reset.setEnabled(domain not in document.locked_domains)
             if code is None:
                 self._add(menu, "&Show in sliders", lambda: window.show_in_sliders(domain))
             menu.addSeparator()

@@ -12,6 +12,7 @@ from pytestqt.qtbot import QtBot
 from app.icons import pixmap
 from app.main_window import MainWindow
 from app.shading import Shading
+from app.wording import heading
 from tests.app.windows import PATIENCE, rest, take_picture
 
 
@@ -30,12 +31,11 @@ def chosen(menu: QMenu, start: str) -> QAction:
 def test_a_part_is_locked_reset_and_found_from_the_body(qtbot: QtBot, window: MainWindow) -> None:
     document, scene = window.document, window.viewport.scene
     assert scene is not None
-    name = document.model.domain_names[1]
+    name = heading(document.model.domain_names[1])
     document.set_latent(np.full(document.model.latent_size, 0.1), "Test")
     rest(qtbot, window)
     menu = opened(qtbot, window, 1)
     assert scene.outline.is_shown
-    assert menu.actions()[0].text().lower() == name
     chosen(menu, f"Reset {name}").trigger()
     codes = document.model.latent_space.groups[2].codes
     assert (document.latent[codes] == 0.0).all()
@@ -43,20 +43,21 @@ def test_a_part_is_locked_reset_and_found_from_the_body(qtbot: QtBot, window: Ma
     assert (
         np.count_nonzero(document.latent) == len(document.latent) - (codes.stop - codes.start) - 1
     )
-    assert document.undo_stack.undoText() == f"Reset {name}"
+    assert document.undo_stack.undoText().lower() == f"reset {name}".lower()
     chosen(menu, f"Lock {name}").trigger()
     assert document.locked_domains == {1}
     menu.close()
     qtbot.waitUntil(lambda: not scene.outline.is_shown, timeout=PATIENCE)
     menu = opened(qtbot, window, 1)
+    assert chosen(menu, f"Lock {name}").isChecked()
     assert not chosen(menu, f"Reset {name}").isEnabled()
     window.docks["sliders"].hide()
     window.sliders.filter.setText("nothing")
-    chosen(menu, "Show the sliders").trigger()
+    chosen(menu, "Show in sliders").trigger()
     group = window.sliders.groups[2]
     qtbot.waitUntil(lambda: group.rows != [] and group.rows[0].isVisible(), timeout=PATIENCE)
     assert not group.header.visibleRegion().isEmpty()
-    chosen(menu, f"Unlock {name}").trigger()
+    chosen(menu, f"Lock {name}").trigger()
     assert document.locked_domains == set()
     take_picture(window, "body menu")
     menu.close()
@@ -67,16 +68,16 @@ def test_the_rest_of_the_menu_is_made_of_the_window_s_own_actions(
 ) -> None:
     menu = opened(qtbot, window, None)
     texts = [action.text().replace("&", "") for action in menu.actions()]
-    assert not any(text.startswith(("Lock", "Reset arm", "Show the sliders")) for text in texts)
+    assert not any(text.startswith(("Lock", "Show in sliders")) for text in texts)
     for key in ("reset_camera", "ghost", "resolve", "reset", "undo"):
         assert window.actions_by_key[key] in menu.actions()
     submenus = {a.text().replace("&", ""): a.menu() for a in menu.actions() if a.menu()}
-    assert set(submenus) == {"Colour by", "Camera"}
+    assert set(submenus) == {"Colour by", "Camera view"}
     chosen(submenus["Colour by"], "Exact").trigger()
     assert window.viewport.shading is Shading.EXACT
     assert window.viewport.view is not None
     before = window.viewport.view.position
-    chosen(submenus["Camera"], "Back").trigger()
+    chosen(submenus["Camera view"], "Back").trigger()
     rest(qtbot, window)
     assert np.linalg.norm(window.viewport.view.position - before) > 1.0
     menu.close()

@@ -124,6 +124,7 @@ def test_a_bundled_model_is_edited_in_a_copy_that_opens_in_its_place(
     qtbot: QtBot, window: MainWindow, home: Path
 ) -> None:
     document = window.document
+    document.begin_gesture("Move")
     document.set_code(0, 0.3)
     rest(qtbot, window)
     pose = document.latent
@@ -146,6 +147,7 @@ def test_a_bundled_model_is_edited_in_a_copy_that_opens_in_its_place(
     assert document.model_file == str(file)
     assert PoseModel.load(file).domain_names[0] == document.model.domain_names[0] == "knee"
     assert document.latent is pose
+    assert document.undo_stack.undoText() == "Move"
     assert "my tube" in window.windowTitle()
     # From now on it is the user's own.
     dialog = dialog_of(window)
@@ -170,6 +172,13 @@ def test_names_that_cannot_be_are_said_and_stay_to_be_put_right(own: MainWindow)
     QTest.mouseClick(dialog.save, LEFT)
     assert not dialog.isVisible()
     assert not own.document.busy
+
+
+def test_another_model_that_comes_in_takes_the_dialog_of_this_one_away(own: MainWindow) -> None:
+    dialog = dialog_of(own)
+    type_name(dialog, "knee")
+    own.document.set_model(own.document.model)
+    assert not dialog.isVisible()
 
 
 def test_what_another_command_wrote_meanwhile_stays(qtbot: QtBot, own: MainWindow) -> None:
