@@ -277,7 +277,8 @@ class FileActions(QObject):
         """Settle unsaved changes with the user; False where they want to go on editing."""
         if not (self._document.has_model and self._document.modified):
             return True
-        answer = ask_about_changes(self._window, self._document.pose_name)
+        file = self._document.file
+        answer = ask_about_changes(self._window, self._name, file.name if file else "")
         if answer is Answer.SAVE:
             return self.save()
         return answer is Answer.DISCARD

@@ -35,10 +35,16 @@ class Answer(Enum):
     CANCEL = "cancel"
 
 
-def ask_about_changes(parent: QWidget, pose_name: str) -> Answer:
-    """Ask what becomes of unsaved changes."""
+def ask_about_changes(parent: QWidget, pose_name: str, file_name: str = "") -> Answer:
+    """Ask what becomes of unsaved changes, naming what Save writes: the file, where there is one.
+
+    The pose's name alone would promise that the library's pose of that name changes.
+    """
     box = _box(parent, "Unsaved changes")
-    box.setText(f"Save the changes to “{one_line(pose_name)}”?")
+    if file_name:
+        box.setText(f"Save the changes to “{one_line(file_name)}”?")
+    else:
+        box.setText(f"Save the pose “{one_line(pose_name)}” to a file?")
     box.setInformativeText("They are lost if you do not save them.")
     save = box.addButton("Save", QMessageBox.ButtonRole.AcceptRole)
     discard = box.addButton("Discard", QMessageBox.ButtonRole.DestructiveRole)

@@ -122,7 +122,7 @@ class ResolveCard(Card):
         working.setContentsMargins(0, 0, 0, 0)
         working.setHorizontalSpacing(NORMAL)
         working.setVerticalSpacing(TIGHT)
-        working.addWidget(ElidedLabel("Searching for a pose without collisions…"), 0, 0)
+        working.addWidget(ElidedLabel("Searching for a pose…"), 0, 0)
         working.addWidget(self.bar, 1, 0)
         working.addWidget(self.cancel, 0, 1, 2, 1)
         working.setColumnStretch(0, 1)

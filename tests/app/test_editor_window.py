@@ -435,10 +435,18 @@ def test_changes_are_saved_kept_or_given_up_as_the_user_says(
     document = window.document
     drag(qtbot, window.sliders.row_of(0), by=15)
     assert window.isWindowModified()
-    asked = answer(lambda dialog: dialog.reject())
+    questions: list[str] = []
+
+    def look(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        questions.append(dialog.text())
+        dialog.reject()
+
+    asked = answer(look)
     assert not window.close()
     assert not asked.isActive()
     assert window.isVisible()
+    assert questions == [f"Save the pose “{document.pose_name}” to a file?"]
     path = tmp_path / "mine.json"
     document.save(path)
     assert not window.isWindowModified()
@@ -447,12 +455,15 @@ def test_changes_are_saved_kept_or_given_up_as_the_user_says(
 
     def save(dialog: QDialog) -> None:
         assert isinstance(dialog, QMessageBox)
+        questions.append(dialog.text())
         dialog.buttons()[0].click()
 
     latent = document.latent
     asked = answer(save)
     assert window.close()
     assert not asked.isActive()
+    # Save writes the file, not the pose of the library that this one began as.
+    assert questions[1:] == ["Save the changes to “mine.json”?"]
     assert read_poses(path, document.model)[0].latent.tobytes() == latent.tobytes()
 
 
