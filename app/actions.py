@@ -79,29 +79,29 @@ ACTIONS: dict[str, ActionSpec] = {
     "update": ActionSpec(
         "&Update pose", "Ctrl+U", "Replace the library's pose by this one, which began as it"
     ),
-    "load": ActionSpec("&Load chosen pose", "Ctrl+Return", "Edit the chosen pose"),
+    "load": ActionSpec("&Load selected pose", "Ctrl+Return", "Edit the selected pose"),
     "blend": ActionSpec(
-        "&Blend towards chosen pose", "Ctrl+B", "Go to the slider that blends towards it"
+        "&Blend towards selected pose", "Ctrl+B", "Go to the slider that blends towards it"
     ),
-    "rename": ActionSpec("Re&name…", "F2", "Give the chosen pose of your library another name"),
+    "rename": ActionSpec("Re&name…", "F2", "Give the selected pose of your library another name"),
     "tags": ActionSpec("Ta&gs…", "Ctrl+Shift+T", "Choose by which words a pose is found"),
-    "duplicate": ActionSpec("&Duplicate", "Ctrl+Shift+D", "Copy the chosen poses of your library"),
+    "duplicate": ActionSpec("&Duplicate", "Ctrl+Shift+D", "Copy the selected poses in the library"),
     "mirror_poses": ActionSpec(
         "&Mirror into library",
         "Ctrl+Shift+M",
-        "Add the chosen poses with left and right exchanged to your library",
+        "Add the selected poses with left and right exchanged to your library",
     ),
     "remove": ActionSpec(
         "R&emove", "Ctrl+Delete", "Remove the selected poses from your library", "remove"
     ),
     "add": ActionSpec(
-        "Add &chosen to library", "Ctrl+Shift+K", "Copy poses from here into your library"
+        "Add &selected to library", "Ctrl+Shift+K", "Copy poses from here into your library"
     ),
     "import_poses": ActionSpec(
         "&Import into library…", "Ctrl+Shift+I", "Add the poses of a file to your library"
     ),
     "export_poses": ActionSpec(
-        "E&xport chosen poses…", "Ctrl+Shift+E", "Write the chosen poses to a file"
+        "E&xport selected poses…", "Ctrl+Shift+E", "Write the selected poses to a file"
     ),
     "export_library": ActionSpec(
         "Export libr&ary…", "Ctrl+Alt+E", "Write your whole library to a file, to share or to keep"

@@ -111,7 +111,7 @@ class LibraryActions(QObject):
         tip = ACTIONS["update"].tip if kept else "Load a pose of your library to change it later"
         explain_action(update, tip)
         addable = self._addable()
-        what = "chosen" if chosen or not addable else f"all {len(addable)}"
+        what = "selected" if chosen or not addable else f"all {len(addable)}"
         add.setText(f"Add &{what} to library")
 
     def keep(self) -> None:

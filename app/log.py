@@ -39,13 +39,13 @@ def log_file() -> Path:
 
 
 def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
-    """Write what is logged, what Qt says and what nobody caught into the log file.
+    """Write what is logged, what Qt says and unhandled errors into the log file.
 
     A file that cannot be written is done without: the editor works all the same.
 
     Parameters
     ----------
-    tell : called in the window's thread with what nobody caught there; what other threads did not
+    tell : called in the window's thread with unhandled errors there; what other threads did not
         catch is only logged
     """
     root = logging.getLogger()
@@ -59,7 +59,7 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
         if not issubclass(kind, Exception):
             sys.__excepthook__(kind, error, trace)
             return
-        _log.error("nobody caught this", exc_info=(kind, error, trace))
+        _log.error("unhandled error", exc_info=(kind, error, trace))
         # Qt's threads too tell here of what their slots raise.
         if tell is not None and threading.current_thread() is threading.main_thread():
             tell(unexpected(error))
@@ -67,7 +67,7 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
     def on_thread_exception(caught: threading.ExceptHookArgs) -> None:
         if caught.exc_value is not None:
             held = (caught.exc_type, caught.exc_value, caught.exc_traceback)
-            _log.error("nobody caught this in a thread", exc_info=held)
+            _log.error("unhandled error in a thread", exc_info=held)
 
     sys.excepthook = on_exception
     threading.excepthook = on_thread_exception

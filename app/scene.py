@@ -185,7 +185,7 @@ class Scene:
         self._ghost.touch()
 
     def show_floor(self, shown: bool) -> None:
-        """Draw or hide the floor and the shadow upon it."""
+        """Draw or hide the floor and the shadow on it."""
         self._floor_shown = shown
         self._floor_actor.SetVisibility(shown)
         self._shadow_actor.SetVisibility(shown)
@@ -304,7 +304,7 @@ class Scene:
     def _fade_ghost(self) -> None:
         """Leave of the ghost what the body has moved away from.
 
-        Where both lie upon each other they would be seen in patches, by which is a hair nearer.
+        Where both lie on each other they would be seen in patches, by which is a hair nearer.
         """
         away = np.linalg.norm(self._ghost.vertices - self.surface.vertices, axis=1) / self._height
         share = np.clip((away - _GHOST_NEAR) / (_GHOST_FAR - _GHOST_NEAR), 0.0, 1.0)

@@ -31,11 +31,11 @@ class Theme:
     ----------
     name : "light" or "dark"
     window : behind everything
-    card : of cards and lists, that lie upon the window
+    card : of cards and lists, that lie on the window
     field : of inputs
     border, track : of hairlines; of empty bars and grooves
     text, muted : of what is read, and of what stands beside it
-    accent, on_accent : of what invites, and of text upon it
+    accent, on_accent : of what invites, and of text on it
     free, colliding, waiting : of the three verdicts
     """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class LCollisionError(Exception):
-    """Base of every error that a user can mend; its text is fit to be shown as it is."""
+    """Base of every error that a user can fix; its text is fit to be shown as it is."""
 
 
 class ShapeError(LCollisionError, ValueError):

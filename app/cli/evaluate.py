@@ -42,8 +42,8 @@ def evaluate(
 ) -> None:
     """Score a model's predictor against exact labels.
 
-    On the store that it was trained upon only rows that neither trained it nor chose anything for
-    it count, on any other store of the model every row does. MSE and RANK are in energies divided
+    On the store that it was trained on only rows that neither trained it nor chose anything for it
+    count, on any other store of the model every row does. MSE and RANK are in energies divided
     by the mean of the colliding training samples.
     """
     from lcollision_core.labels import LabelStore
@@ -96,8 +96,8 @@ def require_store_of(store: LabelStore, model: PoseModel) -> None:
 def scores_sentence(metrics: PredictorMetrics) -> str:
     """Put the verdicts' scores into words."""
     return (
-        f"{_percent(metrics.accuracy)} of {metrics.samples} unseen samples right (always saying "
-        f"the commoner: {_percent(metrics.majority_rate)}), false alarms "
+        f"{_percent(metrics.accuracy)} of {metrics.samples} unseen samples right (majority "
+        f"baseline: {_percent(metrics.majority_rate)}), false alarms "
         f"{_percent(metrics.false_positive_rate)} of the free, missed "
         f"{_percent(metrics.false_negative_rate)} of the colliding"
     )

@@ -38,7 +38,7 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 class _Commands(TyperGroup):
-    """Turns the errors that a user can mend into one sentence."""
+    """Turns the errors that a user can fix into one sentence."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
         """Take what the editor alone can be meant by as its command's."""

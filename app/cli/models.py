@@ -257,7 +257,7 @@ def _predictor_sentence(report: dict[str, Any]) -> str:
         return f"predictor {predictor['preset']}, not measured"
     return (
         f"predictor {predictor['preset']}: {100.0 * metrics['accuracy']:.1f} % of unseen samples "
-        f"right (always saying the commoner: {100.0 * metrics['majority_rate']:.1f} %), of "
+        f"right (majority baseline: {100.0 * metrics['majority_rate']:.1f} %), of "
         f"{predictor['rows']} labelled"
     )
 

@@ -1,4 +1,4 @@
-"""``lcollision encode``, ``decode`` and ``sample``: latent poses from and to meshes, by chance."""
+"""``lcollision encode``, ``decode`` and ``sample``: latent poses from and to meshes, or random."""
 
 from __future__ import annotations
 

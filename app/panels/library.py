@@ -98,15 +98,15 @@ class LibraryPanel(QWidget):
         self.keep = ActionButton(keep)
         self.update_button = ActionButton(update)
         self.add_button = ActionButton(add)
-        self._target = ElidedLabel("Choose a pose to blend")
+        self._target = ElidedLabel("Select a pose to blend")
         self._target.setObjectName("caption")
         self._share = labelled("", "caption")
         self.blend = Slider()
         self.blend.setRange(0, _BLEND_STEPS)
         self.blend.setEnabled(False)
-        self.blend.setAccessibleName("Blend towards the chosen pose")
+        self.blend.setAccessibleName("Blend towards the selected pose")
         self.blend.setToolTip(
-            "Drag to blend the pose towards the chosen one; the next begins where this one ends"
+            "Drag to blend the pose towards the selected one; the next begins where this one ends"
         )
         self._lay_out()
         self.training.setChecked(True)
@@ -442,7 +442,7 @@ class LibraryPanel(QWidget):
         chosen = self.chosen
         self.blend.setEnabled(chosen is not None)
         self._target.setText(
-            "Choose a pose to blend" if chosen is None else f"Blend towards {chosen.name}"
+            "Select a pose to blend" if chosen is None else f"Blend towards {chosen.name}"
         )
         self.chosen_changed.emit()
 

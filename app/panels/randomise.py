@@ -1,4 +1,4 @@
-"""A pose by chance: how far to go towards it, and which one."""
+"""A random pose: how far to go towards it, and which one."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class RandomiseCard(Card):
         self.button.setIcon(icon("random"))
 
     def draw(self) -> None:
-        """Ask for the next pose by chance."""
+        """Ask for the next random pose."""
         self.wanted.emit(self.amount.value() / 100, self.seed.value())
         self.seed.setValue((self.seed.value() + 1) % (_LARGEST_SEED + 1))
 

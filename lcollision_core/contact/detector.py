@@ -453,7 +453,7 @@ class _Searcher:
             if np.isfinite(position).all()
             else "is not finite"
         )
-        raise ShapeError(f"vertex {vertex}{where} {what}, at {position}; move or mend the mesh")
+        raise ShapeError(f"vertex {vertex}{where} {what}, at {position}; move or repair the mesh")
 
 
 def _buffer(n_pairs: int) -> Found:

@@ -552,7 +552,7 @@ class PoseModel:
         """16 hexadecimal digits that tell which latent space this is.
 
         Models with one fingerprint understand each other's latent poses: it depends on neither
-        names nor anything that is trained upon the latent space.
+        names nor anything that is trained on the latent space.
         """
         return fingerprint_of(*self.embedding.to_arrays())
 

@@ -38,7 +38,7 @@ class CalibrationBin:
 class PredictorMetrics:
     """Scores over samples that did not train the predictor; rates are shares from 0 to 1.
 
-    None stands for what the samples or the losses trained upon leave undefined.
+    None stands for what the samples or the losses trained on leave undefined.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class PredictorMetrics:
 
 @dataclass(frozen=True)
 class EnergyScores:
-    """Which scores of the energies mean anything: those whose losses were trained upon."""
+    """Which scores of the energies mean anything: those whose losses were trained on."""
 
     depth: bool
     rank: bool

@@ -59,7 +59,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class TrainingFacts:
-    """What a predictor was trained upon.
+    """What a predictor was trained on.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class PredictorRecord:
     Attributes
     ----------
     config : how it was trained
-    facts : what it was trained upon
+    facts : what it was trained on
     metrics : measured on held-out rows, None before they are
     """
 
@@ -183,7 +183,7 @@ class CollisionPredictor:
     embedding : whose latent codes come in
     arrays : the network's state dict
     config : how it was trained
-    facts : what it was trained upon
+    facts : what it was trained on
     metrics : measured on held-out rows, None before they are
     device : that is to predict, "cpu" or "cuda"
     """

@@ -145,7 +145,7 @@ class Ladder:
                 return
 
     def _by_starts(self) -> Iterator[tuple[Step, FloatArray | None]]:
-        """Start between Z* and known free poses, and about Z* by chance."""
+        """Start between Z* and known free poses, and at random about Z*."""
         problem = self._problem
         known = np.where(problem.movable, self._free_latents, problem.target)
         order = np.argsort(problem.search_distance(known), kind="stable")[:_KNOWN_STARTS]

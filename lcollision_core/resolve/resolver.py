@@ -209,7 +209,7 @@ class PoseResolver:
         if target.shape != (size,):
             raise ShapeError(f"a latent pose has {size} numbers, got shape {target.shape}")
         if not np.isfinite(target).all():
-            raise ShapeError("a latent pose has a number that is not finite; mend the pose")
+            raise ShapeError("a latent pose has a number that is not finite; repair the pose")
         return target
 
     def _problem(

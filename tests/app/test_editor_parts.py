@@ -121,7 +121,7 @@ def test_the_log_holds_what_nobody_caught_and_what_qt_says(logging_into: Path) -
     slot.start()
     slot.join()
     text = logging_into.read_text()
-    assert text.count("nobody caught this\n") == 2
+    assert text.count("unhandled error\n") == 2
     assert "lost disk" in text
     assert "missing bone" in text
     assert "test_editor_parts" in text
