@@ -306,6 +306,7 @@ class PoseDocument(PoseHistory):
     def _put_in(self, opened: tasks.OpenedModel) -> None:
         from lcollision_core.model import PoseLibrary, user_poses_folder
 
+        self.retry_library()
         self._model = opened.model
         self._model_file = opened.file
         self._locked = frozenset()
@@ -499,6 +500,7 @@ class PoseDocument(PoseHistory):
         if self._closed:
             return True
         self._closed = True
+        self.retry_library()
         self.cancel_all()
         # As it is deleted it would tell widgets that look at what is gone by then.
         self.undo_stack.blockSignals(True)
@@ -576,7 +578,9 @@ class PoseDocument(PoseHistory):
         self.recovered.emit(read.path)
 
     def _tell_of_library(self, sentence: str) -> None:
-        self.failed.emit(Failure(sentence, ""))
+        # It was told before; by now nobody is there to read it.
+        if not self._closed:
+            self.failed.emit(Failure(sentence, ""))
 
     def _on_encoded(self, imported: tasks.Imported | tasks.WrongScale) -> None:
         if isinstance(imported, tasks.WrongScale):

@@ -352,6 +352,11 @@ class PoseHistory(QObject):
             self.library_changed.emit()
             self._tell_modified()
 
+    def retry_library(self) -> None:
+        """Write what could not be written before, as when the disk has room again."""
+        if self._library is not None and not self._library.is_written:
+            self._library.change(())
+
     def mark_saved(self) -> None:
         """Count the pose as saved, as where the user gives the changes up."""
         self._saved = self.pose

@@ -108,8 +108,9 @@ class PoseLibrary:
             self._in_file = poses
             self._unwritten.clear()
         except (ModelFileError, MeshFileError, OSError) as error:
+            reason = getattr(error, "strerror", None) or error
             self._tell(
-                f"your pose library could not be saved ({error}); export it to another place "
+                f"your pose library could not be saved ({reason}); export it to another place "
                 f"before you close the editor"
             )
         self._poses = _changed(self._in_file, self._unwritten)

@@ -220,6 +220,23 @@ def test_a_pose_of_a_library_that_cannot_be_written_is_still_to_be_saved(
     assert other.close()
 
 
+@pytest.mark.parametrize("end", ["close", "another model"])
+def test_what_the_library_could_not_write_is_written_before_it_goes(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path, end: str
+) -> None:
+    blocked = tmp_path / "blocked"
+    blocked.write_text("a file, where the folder should be")
+    other = PoseDocument(document.model, library_folder=blocked)
+    with qtbot.waitSignal(other.failed):
+        other.add_pose_to_library("A")
+    blocked.unlink()
+    if end == "another model":
+        other.set_model(document.model)
+        assert names(other) == ["A"]
+    assert other.close()
+    assert len(list(blocked.glob("*.json"))) == 1
+
+
 def test_a_pose_that_nobody_touched_is_not_marked_changed(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:

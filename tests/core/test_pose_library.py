@@ -164,6 +164,7 @@ def test_a_library_of_a_later_version_is_neither_read_nor_touched(
     assert not opened.refresh()
     add(opened, pose(model, "b"))
     assert "could not be saved" in told[-1]
+    assert "[Errno" not in told[-1]
     assert "update the program" in told[-1]
     assert names(opened) == ["b"]
     assert library.path.read_text() == later
