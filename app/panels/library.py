@@ -405,6 +405,9 @@ class LibraryPanel(QWidget):
         picture = self._picture(pose)
         self._pictures[pose.latent.tobytes()] = picture
         self.list.item(place).setIcon(picture)
+        if self.list.isRowHidden(place):
+            # Qt gives a hidden item whose picture changes a place again, on top of those shown.
+            self.list.scheduleDelayedItemsLayout()
         self._due.start()
 
     def _picture(self, pose: NamedPose) -> QIcon:

@@ -149,6 +149,24 @@ def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_i
     qtbot.waitUntil(lambda: is_drawn(items[0].icon()), timeout=PATIENCE)
 
 
+def test_pictures_of_poses_that_are_not_searched_for_are_not_seen(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    library = window.library
+    library.allow_pictures()
+    name = library.list.item(library.list.count() - 1).text()
+    library.search.setText(name)
+    assert names_shown(window) == [name]
+    items = [library.list.item(row) for row in range(library.list.count())]
+    qtbot.waitUntil(lambda: not library._due.isActive(), timeout=PATIENCE)
+    assert is_drawn(items[0].icon())
+    window.viewport.setFocus()
+    qtbot.wait(50)
+    seen = library.list.viewport().grab().toImage()
+    library.list.doItemsLayout()
+    assert library.list.viewport().grab().toImage() == seen
+
+
 def test_escape_stops_a_turntable_that_the_status_bar_tells_of(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
