@@ -103,7 +103,7 @@ def _converted(value: Any, hint: Any, name: str) -> Any:
             return None
         (hint,) = (argument for argument in arguments if argument is not NoneType)
         return _converted(value, hint, name)
-    if origin is tuple and isinstance(value, list):
+    if origin is tuple and isinstance(value, list | tuple):
         return tuple(_converted(one, arguments[0], f"{name}[{i}]") for i, one in enumerate(value))
     if origin is Literal and isinstance(value, str) and value in arguments:
         return value

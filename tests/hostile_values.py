@@ -84,8 +84,8 @@ def changed_arrays(array: np.ndarray) -> Iterator[tuple[str, np.ndarray | None]]
             yield f"as {np.dtype(dtype)}", array.astype(dtype)
     yield "as one number", np.zeros((), array.dtype)
     yield "with an axis more", array[None]
-    yield "flat", array.reshape(-1) if array.ndim > 1 else array[:, None]
-    yield "transposed", array.T if array.ndim > 1 else array[::-1].copy()
+    yield "flat", array.reshape(-1) if array.ndim > 1 else array.reshape(-1, 1)
+    yield "transposed", array.T if array.ndim != 1 else array[::-1].copy()
     for axis in range(array.ndim):
         yield f"without {axis}", np.take(array, [], axis=axis)
         yield f"shorter in {axis}", np.take(array, range(array.shape[axis] - 1), axis=axis)

@@ -35,7 +35,6 @@ _ENCODERS: dict[str, Callable[[npt.NDArray[Any], npt.NDArray[np.int32]], bytes]]
     ".stl": stl.encode,
     ".glb": gltf.encode,
 }
-_LARGEST_COORDINATE = 1e150
 WRITABLE_SUFFIXES = tuple(_ENCODERS)
 """Extensions that `write_mesh` writes, in lower case."""
 
@@ -169,14 +168,12 @@ def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int
         )
 
 
-def first_not_finite(vertices: npt.NDArray[Any]) -> int | None:
+def first_not_finite(vertices: npt.NDArray[Any], largest: float = np.inf) -> int | None:
     """Return the first vertex of (V, 3) `vertices` with a NaN or an infinity, if there is one.
 
-    A coordinate whose square is infinite counts as one.
+    Where `largest` is given, coordinates beyond it count as infinite.
     """
-    finite = np.isfinite(vertices)
-    if vertices.dtype == np.float64:
-        finite &= np.abs(vertices) <= _LARGEST_COORDINATE
+    finite = np.isfinite(vertices) & (np.abs(vertices) <= np.float64(largest))
     if finite.all():
         return None
     return int(np.flatnonzero(~finite.all(axis=1))[0])

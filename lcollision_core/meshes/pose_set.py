@@ -37,6 +37,9 @@ _MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
 _EXTRA_ARRAYS = ("format_version", "names", "notes", "near_exclusion", "up_axis", "vertex_labels")
 _MAX_TEXT_LENGTH = 500
 
+_LARGEST_COORDINATE = 1e150
+"""Whose square is finite."""
+
 
 @dataclass(frozen=True, eq=False)
 class PoseSet:
@@ -241,6 +244,17 @@ def collect_poses(
     return Collected(None, 0, same_topology=False)
 
 
+def _too_far_to_compute(vertices: npt.NDArray[Any]) -> str | None:
+    """Say which of a pose's (V, 3) vertices is not finite, or too far out to be squared."""
+    vertex = first_not_finite(vertices, _LARGEST_COORDINATE)
+    if vertex is None:
+        return None
+    return (
+        f"vertex {vertex} (from 0) at {vertices[vertex].tolist()}, which is not finite or beyond "
+        f"{_LARGEST_COORDINATE:g}; remove or scale that pose"
+    )
+
+
 def _alike(collected: Collected, report: Callable[[LCollisionError], None]) -> Collected:
     """Leave out the poses that are another body, or the same in another unit."""
     poses = collected.pose_set
@@ -319,7 +333,10 @@ def _collect_folder(
                     return Collected(None, len(files), same_topology=False)
                 vertices = np.empty((len(files), topology.n_vertices, 3), dtype=np.float64)
             defect = _disagreement(pose, file.name, mesh.topology, topology)
-            if defect is None and mesh.coarseness:
+            too_far = _too_far_to_compute(mesh.vertices)
+            if defect is None and too_far is not None:
+                report(PoseSetError(f"pose {pose} ({file.name}) has {too_far}"))
+            elif defect is None and mesh.coarseness:
                 report(PoseSetError(f"pose {pose} ({file.name}) is damaged: {mesh.coarseness}"))
             elif defect is None:
                 vertices[len(names)] = mesh.vertices
@@ -389,24 +406,17 @@ def _collect_npz(
         report(MeshFileError(f"{path} cannot be read as a pose set: {error}"))
         return nothing
     names = extras.pop("names") or tuple(f"pose {pose}" for pose in range(len(vertices)))
-    usable = np.array([first_not_finite(pose) is None for pose in vertices])
-    for pose in np.flatnonzero(~usable):
-        vertex = first_not_finite(vertices[pose])
-        report(
-            PoseSetError(
-                f"pose {pose} ({names[pose]}) of {path} has vertex {vertex} (from 0) at "
-                f"{vertices[pose, vertex].tolist()}, which is not finite; remove that pose"
-            )
-        )
-    if not usable.any():
-        return Collected(None, len(vertices), same_topology=True)
-    if vertices.dtype == np.float32:
-        for pose in np.flatnonzero(usable):
-            coarseness = coarseness_of(vertices[pose], topology)
-            if coarseness:
-                where = f"pose {pose} ({names[pose]}) of {path}"
-                report(PoseSetError(f"{where} is damaged: {coarseness}"))
-                usable[pose] = False
+    usable = np.ones(len(vertices), dtype=np.bool_)
+    for pose, mesh in enumerate(vertices):
+        where = f"pose {pose} ({names[pose]}) of {path}"
+        defect = _too_far_to_compute(mesh)
+        if defect is not None:
+            report(PoseSetError(f"{where} has {defect}"))
+        elif mesh.dtype == np.float32 and (coarseness := coarseness_of(mesh, topology)):
+            report(PoseSetError(f"{where} is damaged: {coarseness}"))
+        else:
+            continue
+        usable[pose] = False
     if not usable.any():
         return Collected(None, len(vertices), same_topology=True)
     kept = np.flatnonzero(usable)

@@ -40,12 +40,19 @@ def rounding_step(
     share : the step over the length that a tenth of the edges have at most, those without length
         aside; 0 where no edge has one
     """
-    points = np.asarray(vertices, dtype=np.float64)
-    farthest = min(float(np.abs(points[topology.picked]).max()), float(np.finfo(dtype).max))
-    step = float(np.spacing(np.asarray(farthest, dtype=dtype)))
+    used = np.asarray(vertices, dtype=np.float64)[topology.picked]
+    farthest = float(np.abs(used).max())
+    # Beyond the largest number there is none to step to.
+    nearer = min(farthest, float(np.finfo(dtype).max) / 2.0)
+    step = float(np.spacing(np.asarray(nearer, dtype=dtype)))
+    # Measured as shares of that, as no square of such a share overflows.
+    points = np.zeros((topology.n_vertices, 3))
+    points[topology.picked] = used / (farthest or 1.0)
     lengths = topology.edge_lengths(points)
     lengths = lengths[lengths > 0.0]
-    return step, step / float(np.percentile(lengths, _SHORT_EDGES)) if len(lengths) else 0.0
+    if not len(lengths):
+        return step, 0.0
+    return step, step / farthest / float(np.percentile(lengths, _SHORT_EDGES))
 
 
 def can_hold(vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLike) -> bool:
@@ -78,7 +85,7 @@ def as_stored(
     """
     suffix = Path(path).suffix.lower()
     dtype = np.float32 if suffix in SINGLE_PRECISION else np.float64
-    if float(np.abs(vertices).max()) > np.finfo(dtype).max:
+    if float(np.abs(vertices).max()) > float(np.finfo(dtype).max):
         raise MeshFileError(
             f"{path} cannot be written: a coordinate exceeds float32, which {suffix} stores; "
             f"write .ply or .obj"

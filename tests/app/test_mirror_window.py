@@ -106,7 +106,7 @@ def test_a_free_pose_that_would_collide_is_resolved_or_it_is_said(
     rest(qtbot, window)
     assert document.exact is not None
     assert not document.exact.colliding
-    assert "collided in the mirror image only were resolved" in press_mirror(qtbot, window)
+    assert "pairs of faces of the mirror image were resolved" in press_mirror(qtbot, window)
     assert document.exact is not None
     assert not document.exact.colliding
     assert document.outcome is not None

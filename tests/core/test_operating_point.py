@@ -149,7 +149,7 @@ def test_a_trained_predictor_calls_from_there(
     )
     section = trained.to_section()
     facts = {**section.metadata["facts"], "logit_shift": float("nan")}
-    with pytest.raises(ModelFileError, match="does not fit its latent space; train"):
+    with pytest.raises(ModelFileError, match=r"latent space: facts.logit_shift must be a finite"):
         CollisionPredictor.from_section(
             Section(section.arrays, {**section.metadata, "facts": facts}), embedding
         )
