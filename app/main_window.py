@@ -397,6 +397,8 @@ class MainWindow(QMainWindow):
         document.solve_finished.connect(self._update_actions)
         document.busy_changed.connect(self._on_busy)
         self.viewport.pictures.busy_changed.connect(self._on_busy)
+        # What was told of the pose before is past.
+        document.pose_loaded.connect(self._status.clearMessage)
         document.message.connect(self._status.tell)
         document.failed.connect(self.show_failure)
         self._preparing.begun.connect(self._status.explain)

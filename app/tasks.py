@@ -309,11 +309,16 @@ def resolved(
     """Find the nearest pose that is free where it is exported to."""
 
     def work(progress: Progress, cancel: CancelToken) -> Resolved:
+        from lcollision_core.compiled import seconds_compiling
+
         ghost = drawn_vertices(model, latent)
+        before = seconds_compiling()
         result = model.resolve(
             latent, options, progress=progress, cancel=cancel, placement=placement
         )
-        return Resolved(result, ghost)
+        # Compiling, at the first use, is preparation and no search.
+        searched = max(0.0, result.seconds - (seconds_compiling() - before))
+        return Resolved(replace(result, seconds=searched), ghost)
 
     return work
 

@@ -51,17 +51,34 @@ def _compiled(function: Function, fastmath: bool | set[str]) -> Function:
 
 
 class _Compilations(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Logs that compiling begins, after a pause again: what comes from the cache is none."""
+    """Logs that compiling begins, after a pause again, and adds up how long it takes.
 
-    _last = -math.inf
+    What comes from the cache is none. Numba compiles one function at a time, and within it those
+    that it calls.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._last, self._started, self._depth = -math.inf, 0.0, 0
 
     def on_start(self, _: object) -> None:
-        if time.monotonic() - self._last > _PAUSE_SECONDS:
+        now = time.monotonic()
+        if now - self._last > _PAUSE_SECONDS:
             _log.info("compiling for this processor, which takes some seconds once")
-        self._last = time.monotonic()
+        if self._depth == 0:
+            self._started = now
+        self._depth, self._last = self._depth + 1, now
 
     def on_end(self, _: object) -> None:
-        self._last = time.monotonic()
+        self._depth, self._last = self._depth - 1, time.monotonic()
+        if self._depth == 0:
+            self.seconds += self._last - self._started
 
 
-event.register("numba:compile", _Compilations())
+_compilations = _Compilations()
+event.register("numba:compile", _compilations)
+
+
+def seconds_compiling() -> float:
+    """Return how long this process has spent on compiling so far."""
+    return _compilations.seconds

@@ -400,14 +400,17 @@ class LibraryPanel(QWidget):
             if not self.list.isRowHidden(place)
             and self.list.visualItemRect(self.list.item(place)).intersects(seen)
         )
-        place = next(in_sight, missing[0])
-        pose = self._poses[place]
-        picture = self._picture(pose)
-        self._pictures[pose.latent.tobytes()] = picture
-        self.list.item(place).setIcon(picture)
-        if self.list.isRowHidden(place):
-            # Qt gives a hidden item whose picture changes a place again, on top of those shown.
-            self.list.scheduleDelayedItemsLayout()
+        drawn = self._poses[next(in_sight, missing[0])]
+        key = drawn.latent.tobytes()
+        picture = self._pictures[key] = self._picture(drawn)
+        # A pose may be there under several names.
+        for place in missing:
+            if self._poses[place].latent.tobytes() == key:
+                self.list.item(place).setIcon(picture)
+                if self.list.isRowHidden(place):
+                    # Qt gives a hidden item whose picture changes a place again, on top of those
+                    # shown.
+                    self.list.scheduleDelayedItemsLayout()
         self._due.start()
 
     def _picture(self, pose: NamedPose) -> QIcon:

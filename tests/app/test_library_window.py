@@ -169,7 +169,9 @@ def test_story_save_changes_no_kept_pose(
     changed = document.latent.tobytes()
     assert changed != kept
     take_picture(window, f"library-{theme}-2-saved")
+    assert window.statusBar().currentMessage() == "Saved work.json"
     double_click(qtbot, window, "A")
+    assert window.statusBar().currentMessage() == ""
     assert document.latent.tobytes() == kept
     assert np.array_equal(shown(window), mesh)
     assert own(window) == {"A": kept}

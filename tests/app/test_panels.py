@@ -167,6 +167,18 @@ def test_pictures_of_poses_that_are_not_searched_for_are_not_seen(
     assert library.list.viewport().grab().toImage() == seen
 
 
+def test_a_pose_under_two_names_is_drawn_under_both(qtbot: QtBot, window: MainWindow) -> None:
+    library, document = window.library, window.document
+    for name in ("one", "the same"):
+        document.add_pose_to_library(name)
+    library.choose_own("one")
+    library.allow_pictures()
+    library.redraw()
+    items = [library.list.item(row) for row in range(2)]
+    qtbot.waitUntil(lambda: not library._due.isActive(), timeout=PATIENCE)
+    assert [is_drawn(item.icon()) for item in items] == [True, True]
+
+
 def test_escape_stops_a_turntable_that_the_status_bar_tells_of(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:

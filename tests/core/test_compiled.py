@@ -54,6 +54,17 @@ def test_compiling_is_logged_once_until_it_pauses(
         assert len(caplog.records) == n_logged
 
 
+def test_seconds_of_compiling_are_added_up_and_those_of_running_are_not(tmp_path: Path) -> None:
+    triangular = _module(tmp_path).triangular
+    before = compiled.seconds_compiling()
+    started = time.monotonic()
+    assert triangular(np.uint8(4)) == 10
+    taken = compiled.seconds_compiling() - before
+    assert 0.0 < taken <= time.monotonic() - started
+    assert triangular(np.uint8(5)) == 15
+    assert compiled.seconds_compiling() - before == taken
+
+
 def test_a_loop_runs_where_nothing_can_be_cached(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
