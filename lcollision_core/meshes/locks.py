@@ -95,8 +95,8 @@ def shortened(name: str, n_bytes: int) -> str:
 def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
     """Open and lock the lock's file, or return None where another holds it."""
     try:
-        # Opening a pipe would wait for its reader for ever.
-        if lock.exists():
+        # Opening a pipe would wait for its reader for ever; another holder removes the lock's file.
+        with suppress(FileNotFoundError):
             require_regular(lock)
         file = lock.open("ab", buffering=0)
     except OSError as error:

@@ -13,7 +13,8 @@ from threading import Barrier, Thread
 import pytest
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes import atomic_write, file_stamp, locked, spare_name
+from lcollision_core.meshes import atomic_write, file_stamp, locked, locks, spare_name
+from lcollision_core.regular_files import require_regular
 
 _READ_THEN_WRITE = """
 import sys, time
@@ -55,6 +56,25 @@ def test_two_processes_lose_nobodys_change(tmp_path: Path) -> None:
     ]
     assert [change.wait() for change in changes] == [0, 0, 0]
     assert sorted(path.read_text()) == ["a", "b", "c"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_lock_may_vanish_while_it_is_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, lock = tmp_path / "names", tmp_path / ".names.lock"
+    lock.write_text("")
+    looked: list[Path] = []
+
+    def look(file: Path) -> None:
+        looked.append(file)
+        file.unlink()  # as its last holder does
+        require_regular(file)
+
+    monkeypatch.setattr(locks, "require_regular", look)
+    with locked(path):
+        assert looked == [lock]
+        path.write_text("mine")
     assert list(tmp_path.iterdir()) == [path]
 
 
