@@ -29,8 +29,9 @@ class CodeEffect:
 
     Attributes
     ----------
-    domain : index from 0 of the domain that moves most, for its size; a domain's own code moves
-        that domain, unless it hardly moves beside another that it carries along
+    domain : index from 0 of the domain that the name is of: the code's own in the first group,
+        where each domain has one code, however far it swings what hangs on it; a code of a domain's
+        group is of that domain, unless it hardly moves beside another that it carries along
     motion : "up", "down", "forward", "back", "left" or "right" for a shift of that domain; "bend
         up" and so on where it turns, after its far end; "twist" about its long axis; "still" where
         nothing moves
@@ -74,6 +75,9 @@ def code_effects(
     weights = np.asarray(attention_mask, dtype=np.float64) ** 2
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), _TINY)
     own = np.repeat(np.arange(len(group_sizes)) - 1, group_sizes)
+    one_each = group_sizes[0] == len(weights)
+    if one_each:
+        own[: group_sizes[0]] = np.arange(group_sizes[0])
     positions = decode(np.zeros((1, len(high))))[0]
     effects: list[CodeEffect] = []
     for start in range(0, len(high), _CHUNK):
@@ -82,7 +86,14 @@ def code_effects(
         poses[codes - start, codes] = _STEP * high[codes]
         moved = decode(poses) - positions
         effects.extend(
-            _effect(motion, positions, weights, axes, int(own[code]))
+            _effect(
+                motion,
+                positions,
+                weights,
+                axes,
+                int(own[code]),
+                0.0 if one_each and code < group_sizes[0] else _OWN,
+            )
             for code, motion in zip(codes, moved, strict=True)
         )
     return tuple(effects)
@@ -123,11 +134,16 @@ def code_names(
 
 
 def _effect(
-    moved: FloatArray, positions: FloatArray, weights: FloatArray, axes: FloatArray, own: int
+    moved: FloatArray,
+    positions: FloatArray,
+    weights: FloatArray,
+    axes: FloatArray,
+    own: int,
+    least_share: float,
 ) -> CodeEffect:
     motion = weights @ (moved**2).sum(axis=1)
     domain = int(motion.argmax())
-    if own >= 0 and motion[own] >= _OWN * motion[domain]:
+    if own >= 0 and motion[own] >= least_share * motion[domain]:
         domain = own
     share = weights[domain]
     total = float(share @ (moved**2).sum(axis=1))

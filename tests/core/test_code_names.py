@@ -99,6 +99,18 @@ def test_a_domains_own_code_moves_it_unless_it_carries_another_along() -> None:
     assert found[1:] == (CodeEffect(1, "up"), CodeEffect(0, "back"))
 
 
+def test_a_domains_code_of_the_whole_body_is_named_after_it_however_it_swings_others() -> None:
+    def decode(latent: FloatArray) -> FloatArray:
+        bodies = np.repeat(BODY[None], len(latent), axis=0)
+        for body, (of_arm, of_trunk) in zip(bodies, latent, strict=True):
+            body[len(ARM) :] += [0, 0, 0.1 * of_trunk]
+            body[: len(ARM)] += [0, 0.2 * of_arm + 2.0 * of_trunk, 0]
+        return bodies
+
+    found = code_effects(decode, np.ones(2), MASK, (2, 0, 0), UP, FRONT)
+    assert found == (CodeEffect(0, "back"), CodeEffect(1, "up"))
+
+
 def test_names_within_a_group_differ() -> None:
     up, arm_up, twist = CodeEffect(0, "up"), CodeEffect(1, "up"), CodeEffect(0, "twist")
     effects = [up, arm_up, up, up, arm_up, twist, twist, arm_up]
