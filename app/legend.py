@@ -107,7 +107,9 @@ class LegendStrip(QWidget):
         for width, draw in self._blocks(ramp_width):
             if x > NORMAL and x + width > self.width() - CLOSE:
                 x, y = float(NORMAL), y + height + CLOSE
-            placed.append((draw, QRectF(x, y, width, height)))
+            # In a row of its own, no wider than that is.
+            shown = min(width, self.width() - CLOSE - x)
+            placed.append((draw, QRectF(x, y, shown, height)))
             x += width + WIDE
         return placed
 

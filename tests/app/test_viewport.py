@@ -263,7 +263,7 @@ def test_the_legend_is_laid_out_while_nothing_is_painted(qtbot: QtBot, viewport:
     assert watch.meanwhile == []
 
 
-@pytest.mark.parametrize("width", [240, 300, 340, 420, 900])
+@pytest.mark.parametrize("width", [160, 240, 300, 340, 420, 900])
 def test_the_legend_lies_beneath_the_mesh_and_holds_still_while_a_pose_changes(
     qtbot: QtBot,
     document: PoseDocument,
