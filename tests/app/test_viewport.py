@@ -34,6 +34,7 @@ from tests.app.views import (
     pixels,
     place_of,
     rest,
+    steady_pixels,
 )
 
 
@@ -522,13 +523,13 @@ def test_another_model_takes_the_place_of_the_first(
 ) -> None:
     document.set_model(document.model)
     rest(qtbot, viewport)
-    old, picture = viewport.scene, pixels(viewport)
+    old, picture = viewport.scene, steady_pixels(qtbot, viewport)
     viewport.highlight_domain(1)
     document.set_model(document.model)
     rest(qtbot, viewport)
     assert viewport.scene is not old
     assert len(viewport.findChildren(Canvas)) == 1
-    assert not changed(picture, pixels(viewport)).any()
+    assert not changed(picture, steady_pixels(qtbot, viewport)).any()
 
 
 def test_nothing_is_drawn_at_rest(qtbot: QtBot, viewport: Viewport) -> None:
