@@ -437,11 +437,7 @@ class FileActions(QObject):
 
 def _unused(folder: Path, name: str, suffix: str) -> Path:
     """Return a file of a folder that is not there yet, called as a pose is."""
-    from lcollision_core.meshes import file_stem
+    from lcollision_core.meshes import file_stem, spare_name
 
-    stem, number = file_stem(name), 1
-    path = folder / f"{stem}{suffix}"
-    while path.exists():
-        number += 1
-        path = folder / f"{stem} {number}{suffix}"
-    return path
+    path = folder / f"{file_stem(name)}{suffix}"
+    return spare_name(path) if path.exists() else path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,15 +66,6 @@ class SkinGeometry:
     def n_points(self) -> int:
         """P."""
         return len(self.point_vertices)
-
-    def groups(self) -> Iterator[tuple[slice, npt.NDArray[np.int32], Float32Array]]:
-        """Yield each group's codes, the (n,) points that they move and their (codes, 9 n) table."""
-        start = 0
-        for first, last, left, right in self.blocks.tolist():
-            stop = start + (last - first) * (right - left)
-            table = self.tables[start:stop].reshape(last - first, right - left)
-            yield slice(first, last), self.target[left // N_FEATURES : right // N_FEATURES], table
-            start = stop
 
     @classmethod
     def of(
