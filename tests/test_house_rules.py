@@ -85,7 +85,7 @@ def _warn(kind: type[Warning], module: str) -> None:
 
 @pytest.mark.parametrize("kind", [DeprecationWarning, FutureWarning, UserWarning])
 def test_warnings_of_our_code_are_errors_and_those_of_others_are_not(kind: type[Warning]) -> None:
-    for module in ("app.main_window", "lcollision_core.meshes", "tests.conftest", __name__):
+    for module in ("app.window.main_window", "lcollision_core.meshes", "tests.conftest", __name__):
         with pytest.raises(kind):
             _warn(kind, module)
     with warnings.catch_warnings(record=True) as caught:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.editor import why_no_window
+from app.window.editor import why_no_window
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.model import find_model

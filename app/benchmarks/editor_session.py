@@ -15,18 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rich  # noqa: F401 - what the command would have loaded by then, as the next line
+import typer  # noqa: F401
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
 
 from app.benchmarks.timing import median_seconds
-from app.camera import CAMERAS
-from app.cli import main  # noqa: F401 - what the command would have loaded by then
-from app.document import PoseDocument
-from app.editor import make_application
-from app.engine import Failure
-from app.main_window import MainWindow
-from app.settings import Settings
-from app.shading import Shading
-from app.start_up import StartUp
+from app.editing.document import PoseDocument
+from app.editing.settings import Settings
+from app.view.camera import CAMERAS
+from app.view.shading import Shading
+from app.window.editor import make_application
+from app.window.main_window import MainWindow
+from app.window.start_up import StartUp
+from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 
 _EVENTS = 60

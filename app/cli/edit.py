@@ -24,7 +24,7 @@ def edit(
     ] = None,
 ) -> None:
     """Open the editor."""
-    from app.editor import open_editor
+    from app.window.editor import open_editor
     from lcollision_core.errors import LCollisionError
 
     if file is not None and file.is_dir():

@@ -10,11 +10,11 @@ import pytest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from app.document import PoseDocument
-from app.frames import PoseShower
-from app.main_window import MainWindow
-from app.theme import LIGHT, apply_theme
-from app.viewport import Viewport
+from app.editing.document import PoseDocument
+from app.view.theme import LIGHT, apply_theme
+from app.view.viewport import Viewport
+from app.window.main_window import MainWindow
+from app.work.frames import FrameEvaluator
 from lcollision_core.model import PoseModel, find_model
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
@@ -54,8 +54,8 @@ def editor_model() -> PoseModel:
 def compiled_body() -> None:
     """Compile what a window with the bundled body needs: the first time that takes a minute."""
     model = PoseModel.load(find_model("body"))
-    shower = PoseShower(model)
-    shower.verdict(shower.frame(model.training_latent[0].astype(np.float64), 0))
+    evaluator = FrameEvaluator(model)
+    evaluator.verdict(evaluator.frame(model.training_latent[0].astype(np.float64), 0))
     model.require_predictor().logit_and_gradient(model.training_latent[:1])
 
 

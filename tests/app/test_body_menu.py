@@ -9,9 +9,9 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QMenu
 from pytestqt.qtbot import QtBot
 
-from app.icons import pixmap
-from app.main_window import MainWindow
-from app.shading import Shading
+from app.view.icons import pixmap
+from app.view.shading import Shading
+from app.window.main_window import MainWindow
 from app.wording import heading
 from tests.app.windows import PATIENCE, rest, take_picture
 

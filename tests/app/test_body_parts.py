@@ -13,12 +13,12 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QColorDialog, QLabel, QLineEdit, QMenu, QWidget
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.body_parts import BodyPartsDialog
-from app.dialogs.failure import FailureDialog
-from app.document import PoseDocument
-from app.main_window import MainWindow
-from app.tasks import PartEdits
+from app.editing.document import PoseDocument
+from app.window.dialogs.body_parts import BodyPartsDialog
+from app.window.dialogs.failure import FailureDialog
+from app.window.main_window import MainWindow
 from app.wording import heading
+from app.work.jobs import PartEdits
 from lcollision_core.model import PoseModel, change_model, user_models_folder
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
 

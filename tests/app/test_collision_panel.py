@@ -14,10 +14,10 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QLabel, QScrollArea, QWidget
 from pytestqt.qtbot import QtBot
 
-from app.document import PoseDocument, PosePrediction
-from app.frames import PoseShower
-from app.main_window import MainWindow
-from app.theme import current_theme
+from app.editing.document import PoseDocument, PosePrediction
+from app.view.theme import current_theme
+from app.window.main_window import MainWindow
+from app.work.frames import FrameEvaluator
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
@@ -69,7 +69,7 @@ def test_the_panel_keeps_the_width_that_its_cards_need_also_where_a_layout_says_
     qtbot: QtBot, document: PoseDocument, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = PosePrediction(np.zeros(2), 0.0, 9.0, 1.0)
-    monkeypatch.setattr(PoseShower, "_predict", lambda *_: told)
+    monkeypatch.setattr(FrameEvaluator, "_predict", lambda *_: told)
     settings = settings_in(tmp_path)
     before = open_window(qtbot, document, settings)
     shrink_and_grow(qtbot, before)
@@ -122,7 +122,7 @@ def test_the_estimate_steps_back_once_the_check_has_spoken(
 ) -> None:
     document, card, headline = window.document, window.collision.prediction, window.collision.exact
     told = PosePrediction(np.zeros(2), 0.0, 0.0, 0.99 if collides == right else 0.01)
-    monkeypatch.setattr(PoseShower, "_predict", lambda *_: told)
+    monkeypatch.setattr(FrameEvaluator, "_predict", lambda *_: told)
     said = "Probably colliding" if collides == right else "Probably clear"
     alarm = getattr(current_theme(), "colliding" if collides == right else "free")
     document.set_latent(colliding if collides else np.zeros_like(colliding) + 1e-3, "Test")

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
-from app.document import Failure, PoseDocument
-from app.frames import PoseShower, keep_torch_to_one_thread
-from app.tasks import drawn_vertices
+from app.editing.document import Failure, PoseDocument
 from app.wording import counted
+from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
+from app.work.jobs import drawn_vertices
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
 from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
@@ -67,7 +67,7 @@ def test_the_frame_is_what_the_model_decodes_and_predicts(
 
 def test_normals_of_a_straight_tube_point_away_from_it(editor_model: PoseModel) -> None:
     straight = editor_model.reference.astype(np.float32)
-    normals = PoseShower(editor_model).normals(straight)
+    normals = FrameEvaluator(editor_model).normals(straight)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
     np.testing.assert_allclose(normals[-2:], [[0, -1, 0], [0, 1, 0]], atol=1e-5)
     inner = slice(SIDES, -2 - SIDES)
@@ -147,7 +147,7 @@ def test_steps_a_while_apart_do_not_merge(
     document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [100.0]
-    monkeypatch.setattr("app.commands.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("app.editing.commands.time.monotonic", lambda: now[0])
     document.set_code(0, 0.1)
     now[0] += 1.5
     document.set_code(0, 0.2)

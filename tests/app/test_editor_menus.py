@@ -10,9 +10,9 @@ from PySide6.QtGui import QAction, QImage
 from PySide6.QtWidgets import QDialog, QMenu
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.questions import ask_about_recovery, ask_to_replace, ask_to_switch
-from app.main_window import MainWindow
-from app.recovery import LostPose, Session
+from app.editing.recovery import LostPose, Session
+from app.window.dialogs.questions import ask_about_recovery, ask_to_replace, ask_to_switch
+from app.window.main_window import MainWindow
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import PoseModel, user_models_folder
 from tests.app.windows import PATIENCE, answer, rest

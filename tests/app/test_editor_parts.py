@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from PySide6.QtCore import QSettings, QtMsgType, qInstallMessageHandler, qWarning
 
-from app import log
-from app.engine import Failure
-from app.settings import SETTINGS, Settings
-from app.start_up import DEFAULT_MODEL, last_model
+from app.editing.settings import SETTINGS, Settings
+from app.window.start_up import DEFAULT_MODEL, last_model
+from app.work import log
+from app.work.threads import Failure
 
 
 @pytest.fixture

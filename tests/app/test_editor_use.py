@@ -22,16 +22,16 @@ from pytestqt.qtbot import QtBot
 
 from app.benchmarks.editor import EditorTiming
 from app.benchmarks.editor_session import Session, show_first_pose
-from app.camera import sees_all
-from app.dialogs.failure import FailureDialog
-from app.document import PoseDocument
-from app.editor import why_no_window
-from app.engine import Failure
-from app.main_window import MainWindow
-from app.recovery import sessions_folder
-from app.shading import Shading
-from app.start_up import StartUp, opening_pose
-from app.theme import DARK, LIGHT, Theme, visible_colour
+from app.editing.document import PoseDocument
+from app.editing.recovery import sessions_folder
+from app.view.camera import sees_all
+from app.view.shading import Shading
+from app.view.theme import DARK, LIGHT, Theme, visible_colour
+from app.window.dialogs.failure import FailureDialog
+from app.window.editor import why_no_window
+from app.window.main_window import MainWindow
+from app.window.start_up import StartUp, opening_pose
+from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import PoseModel

@@ -28,15 +28,15 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
-from app import tasks
-from app.dialogs.failure import FailureDialog
-from app.document import PoseDocument
-from app.engine import Failure
-from app.main_window import MainWindow
-from app.panels.parts import HANDLE
-from app.preparing import REASON
-from app.shading import Shading
-from app.status_bar import StatusBar
+from app.editing.document import PoseDocument
+from app.view.shading import Shading
+from app.window.dialogs.failure import FailureDialog
+from app.window.main_window import MainWindow
+from app.window.panels.widgets import HANDLE
+from app.window.status_bar import StatusBar
+from app.work import jobs
+from app.work.preparing import REASON
+from app.work.threads import Failure
 from lcollision_core.meshes import read_mesh, write_mesh
 from lcollision_core.model import EncodedPose, PoseModel, read_poses, sample_poses
 from tests.app.windows import (
@@ -570,14 +570,14 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
 ) -> None:
     log, go_on = logging.getLogger("lcollision_core.compiled"), threading.Event()
     caplog.set_level(logging.INFO, log.name)
-    warm_up = tasks.warm_up
+    warm_up = jobs.warm_up
 
     def compiling(model: PoseModel) -> None:
         log.info("compiling for this processor")
         go_on.wait(PATIENCE / 1000)
         warm_up(model)
 
-    monkeypatch.setattr(tasks, "warm_up", compiling)
+    monkeypatch.setattr(jobs, "warm_up", compiling)
     editor_model.save(tmp_path / "tube.safetensors")
     document = PoseDocument()
     window = MainWindow(document, settings_in(tmp_path))

@@ -14,10 +14,11 @@ from PySide6.QtCore import QTimer
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from app.document import PoseDocument
-from app.engine import Failure, LongWork
-from app.frames import LiveFrame, PoseShower
-from app.garbage import GarbageCollector
+from app.editing.document import PoseDocument
+from app.window.garbage import GarbageCollector
+from app.work.frames import FrameEvaluator, LiveFrame
+from app.work.long_work import LongWork
+from app.work.threads import Failure
 from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.model import NamedPose, PoseModel, sample_poses, write_poses
 
@@ -78,17 +79,19 @@ def test_the_mesh_follows_250_events_in_two_seconds_and_ends_right(
 def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    compute = PoseShower.frame
+    compute = FrameEvaluator.frame
     held = {0.1: threading.Event(), 0.2: threading.Event()}
 
-    def starved(shower: PoseShower, latent: npt.NDArray[np.float64], request_id: int) -> LiveFrame:
+    def starved(
+        evaluator: FrameEvaluator, latent: npt.NDArray[np.float64], request_id: int
+    ) -> LiveFrame:
         """Be quick, but late, as a thread is that gets no core."""
-        frame = compute(shower, latent, request_id)
+        frame = compute(evaluator, latent, request_id)
         if latent[0] in held:
             held[latent[0]].wait(10)
         return frame
 
-    monkeypatch.setattr(PoseShower, "frame", starved)
+    monkeypatch.setattr(FrameEvaluator, "frame", starved)
     told: list[float] = []
     document.frame_changed.connect(lambda: told.append(document.frame.latent[0]))
     document.set_code(0, 0.1)
@@ -110,14 +113,14 @@ def test_a_verdict_of_a_pose_that_has_moved_on_is_not_told(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checking, go_on = threading.Event(), threading.Event()
-    check = PoseShower.verdict
+    check = FrameEvaluator.verdict
 
-    def slow(shower: PoseShower, frame: LiveFrame) -> object:
+    def slow(evaluator: FrameEvaluator, frame: LiveFrame) -> object:
         checking.set()
         go_on.wait(10)
-        return check(shower, frame)
+        return check(evaluator, frame)
 
-    monkeypatch.setattr(PoseShower, "verdict", slow)
+    monkeypatch.setattr(FrameEvaluator, "verdict", slow)
     told = []
     document.exact_changed.connect(lambda: told.append(document.exact))
     document.set_code(0, 0.1)
@@ -252,7 +255,7 @@ def test_a_live_worker_that_fails_tells_once_and_goes_on(
         raise MemoryError("no more")
 
     with monkeypatch.context() as broken:
-        broken.setattr(PoseShower, "frame", fail)
+        broken.setattr(FrameEvaluator, "frame", fail)
         for value in (0.1, 0.2, 0.3):
             n_calls = len(calls)
             document.set_code(0, value)
@@ -273,12 +276,12 @@ def test_a_verdict_that_fails_from_pose_to_pose_is_told_once(
     document.failed.connect(failures.append)
     checked = []
 
-    def fail(_: PoseShower, frame: LiveFrame) -> None:
+    def fail(_: FrameEvaluator, frame: LiveFrame) -> None:
         checked.append(frame.latent[0])
         raise MemoryError("no more")
 
     with monkeypatch.context() as broken:
-        broken.setattr(PoseShower, "verdict", fail)
+        broken.setattr(FrameEvaluator, "verdict", fail)
         for value in (0.1, 0.2, 0.3):
             document.set_code(0, value)
             qtbot.waitUntil(lambda value=value: value in checked)
@@ -291,18 +294,18 @@ def test_a_frame_of_another_model_is_not_shown(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started, go_on = threading.Event(), threading.Event()
-    compute = PoseShower.frame
+    compute = FrameEvaluator.frame
 
-    def slow(shower: PoseShower, latent: np.ndarray, request_id: int) -> LiveFrame:
+    def slow(evaluator: FrameEvaluator, latent: np.ndarray, request_id: int) -> LiveFrame:
         started.set()
         go_on.wait(10)
-        return compute(shower, latent, request_id)
+        return compute(evaluator, latent, request_id)
 
     old = document.model
     frames: list[LiveFrame | None] = []
     document.frame_changed.connect(lambda: frames.append(document.frame))
     with monkeypatch.context() as patched:
-        patched.setattr(PoseShower, "frame", slow)
+        patched.setattr(FrameEvaluator, "frame", slow)
         document.set_code(0, 0.7)
         qtbot.waitUntil(started.is_set)
         document.set_model(PoseModel("other", old.embedding, old.card))
@@ -376,19 +379,19 @@ def test_an_answer_that_comes_twice_is_not_taken_for_that_of_a_later_request(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started, go_on = threading.Event(), threading.Event()
-    compute = PoseShower.frame
+    compute = FrameEvaluator.frame
 
-    def slow(shower: PoseShower, latent: np.ndarray, request_id: int) -> LiveFrame:
+    def slow(evaluator: FrameEvaluator, latent: np.ndarray, request_id: int) -> LiveFrame:
         started.set()
         go_on.wait(10)
-        return compute(shower, latent, request_id)
+        return compute(evaluator, latent, request_id)
 
     worker = document._live._worker
     with qtbot.waitSignal(worker.answered) as earlier:
         document.set_code(0, 0.1)
     settle(qtbot, document)
     with monkeypatch.context() as patched:
-        patched.setattr(PoseShower, "frame", slow)
+        patched.setattr(FrameEvaluator, "frame", slow)
         document.set_code(0, 0.2)
         qtbot.waitUntil(started.is_set)
         assert earlier.args is not None

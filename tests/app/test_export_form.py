@@ -9,10 +9,10 @@ import pytest
 from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QLineEdit
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.forms import EXPORT_NAMES, Form, export_form
-from app.main_window import MainWindow
-from app.settings import SETTINGS
-from app.theme import DARK, LIGHT, apply_theme
+from app.editing.settings import SETTINGS
+from app.view.theme import DARK, LIGHT, apply_theme
+from app.window.dialogs.forms import EXPORT_NAMES, Form, export_form
+from app.window.main_window import MainWindow
 from lcollision_core.meshes import read_mesh
 from lcollision_core.model import ExportAxes
 from tests.app.windows import PATIENCE, answer, shown, take_picture

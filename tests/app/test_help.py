@@ -93,7 +93,7 @@ def test_the_editor_opens_what_it_is_given_with_its_command_or_without(
         opened.append((path, model_name))
         return 0
 
-    monkeypatch.setattr("app.editor.open_editor", open_editor)
+    monkeypatch.setattr("app.window.editor.open_editor", open_editor)
     # A file may be called as no command is, even without an extension.
     monkeypatch.chdir(stabbed.parent)
     plain = Path(stabbed.stem)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
-from app.commands import Source
-from app.document import PoseDocument
+from app.editing.commands import Source
+from app.editing.document import PoseDocument
 from lcollision_core.errors import ModelFileError
 from lcollision_core.model import NamedPose, read_pose_file, read_poses, write_poses
 from tests.app.editor_model import another_model

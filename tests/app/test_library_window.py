@@ -20,11 +20,11 @@ from PySide6.QtWidgets import (
 )
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.failure import FailureDialog
-from app.dialogs.names import NameDialog
-from app.document import PoseDocument
-from app.main_window import MainWindow
-from app.panels.pose_grid import THUMBNAIL, lines_of
+from app.editing.document import PoseDocument
+from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.names import NameDialog
+from app.window.main_window import MainWindow
+from app.window.panels.pose_grid import THUMBNAIL, lines_of
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import NamedPose, read_pose_file, read_poses, write_poses
 from tests.app.editor_model import another_model

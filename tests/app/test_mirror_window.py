@@ -12,9 +12,9 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QMenu
 from pytestqt.qtbot import QtBot
 
-from app.document import PoseDocument
-from app.main_window import MainWindow
-from app.theme import DARK, LIGHT, apply_theme
+from app.editing.document import PoseDocument
+from app.view.theme import DARK, LIGHT, apply_theme
+from app.window.main_window import MainWindow
 from app.wording import mirrored_name
 from lcollision_core.model import PoseModel
 from tests.app.windows import (

@@ -9,10 +9,10 @@ import pytest
 from PySide6.QtWidgets import QDialog, QFileDialog, QLabel, QLineEdit
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.failure import FailureDialog
-from app.engine import Failure
-from app.main_window import MainWindow
+from app.window.dialogs.failure import FailureDialog
+from app.window.main_window import MainWindow
 from app.wording import one_line
+from app.work.threads import Failure
 from lcollision_core.meshes import write_pose_set
 from lcollision_core.model import NamedPose, PoseModel, write_poses
 from tests.app.support import STABBED, Lcollision

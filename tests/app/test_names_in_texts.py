@@ -12,14 +12,14 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialog, QLabel, QMenu, QWidget
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.failure import FailureDialog
-from app.dialogs.help import ShortcutsDialog
-from app.dialogs.names import ask_for_name
-from app.dialogs.questions import ask_about_changes
-from app.document import PoseDocument
-from app.engine import Failure
-from app.main_window import MainWindow
-from app.panels.prediction import DomainRow
+from app.editing.document import PoseDocument
+from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.help import ShortcutsDialog
+from app.window.dialogs.names import ask_for_name
+from app.window.dialogs.questions import ask_about_changes
+from app.window.main_window import MainWindow
+from app.window.panels.prediction import DomainRow
+from app.work.threads import Failure
 from lcollision_core.model import PoseModel, sample_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 

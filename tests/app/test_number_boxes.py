@@ -11,11 +11,11 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialogButtonBox, QLabel, QToolTip, QWidget
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.forms import Form, resolve_form, screenshot_form, turntable_form
-from app.main_window import MainWindow
-from app.panels.number_box import QuietIntegerBox, QuietSpinBox
-from app.settings import SETTINGS, Settings
-from app.theme import current_theme
+from app.editing.settings import SETTINGS, Settings
+from app.view.theme import current_theme
+from app.window.dialogs.forms import Form, resolve_form, screenshot_form, turntable_form
+from app.window.main_window import MainWindow
+from app.window.panels.number_box import QuietIntegerBox, QuietSpinBox
 from tests.app.windows import settings_in
 
 LEFT = Qt.MouseButton.LeftButton

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from app import log
-from app.recovery import find_lost_poses
-from app.settings import SETTINGS, Settings
+from app.editing.recovery import find_lost_poses
+from app.editing.settings import SETTINGS, Settings
+from app.work import log
 
 
 @pytest.mark.parametrize("name", ["lcollision/editor.conf", "lcollision.conf"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.outline import PartShape
+from app.view.outline import PartShape
 from lcollision_core.model import PoseModel
 
 

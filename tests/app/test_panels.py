@@ -12,13 +12,13 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QInputDialog, QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
-from app.commands import Source
-from app.document import PoseDocument
-from app.main_window import MainWindow
-from app.panels.code_slider import CodeRow
-from app.panels.pose_grid import THUMBNAIL
-from app.panels.prediction import DomainRow
-from app.turntable import TurntableStyle
+from app.editing.commands import Source
+from app.editing.document import PoseDocument
+from app.view.turntable import TurntableStyle
+from app.window.main_window import MainWindow
+from app.window.panels.code_slider import CodeRow
+from app.window.panels.pose_grid import THUMBNAIL
+from app.window.panels.prediction import DomainRow
 from app.wording import heading
 from lcollision_core.model import NamedPose, PoseModel, write_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from pytestqt.qtbot import QtBot
 
-from app.document import PoseDocument
-from app.recovery import Autosave, Session, find_lost_poses
+from app.editing.document import PoseDocument
+from app.editing.recovery import Autosave, Session, find_lost_poses
 from lcollision_core.model import NamedPose, PoseModel, read_pose_file, read_poses, write_poses
 
 EDITOR = """
@@ -20,8 +20,8 @@ import sys
 from pathlib import Path
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
-from app.document import PoseDocument
-from app.recovery import Autosave
+from app.editing.document import PoseDocument
+from app.editing.recovery import Autosave
 
 application = QGuiApplication(sys.argv)
 document = PoseDocument()

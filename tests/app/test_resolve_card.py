@@ -11,10 +11,10 @@ import pytest
 from PySide6.QtWidgets import QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
-from app import tasks
-from app.main_window import MainWindow
-from app.tasks import Resolved
+from app.window.main_window import MainWindow
 from app.wording import seconds_text
+from app.work import jobs
+from app.work.jobs import Resolved
 from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult, Step
@@ -87,7 +87,7 @@ def test_the_time_told_is_what_was_waited_as_well(
     colliding: npt.NDArray[np.float64],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    real = tasks.resolved
+    real = jobs.resolved
 
     def slow(*arguments: object) -> object:
         work = real(*arguments)  # type: ignore[arg-type]
@@ -104,7 +104,7 @@ def test_the_time_told_is_what_was_waited_as_well(
     resolve(qtbot, window)
     assert not any("of preparation" in text for text in texts(card))
     window.document.undo()
-    monkeypatch.setattr(tasks, "resolved", slow)
+    monkeypatch.setattr(jobs, "resolved", slow)
     resolve(qtbot, window)
     (told,) = (text for text in texts(card) if "of preparation" in text)
     assert told.startswith("194 ms, after ")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.shading import (
+from app.view.shading import (
     COLLIDING_FACE,
     FULL_EXACT,
     FULL_PREDICTED,

@@ -19,13 +19,13 @@ from PySide6.QtWidgets import (
 )
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.failure import FailureDialog
-from app.dialogs.forms import resolve_form, screenshot_form, turntable_form
-from app.dialogs.help import AboutDialog
-from app.document import PoseDocument
-from app.engine import Failure
-from app.main_window import MainWindow
-from app.panels.dock import beside
+from app.editing.document import PoseDocument
+from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.forms import resolve_form, screenshot_form, turntable_form
+from app.window.dialogs.help import AboutDialog
+from app.window.main_window import MainWindow
+from app.window.panels.dock import beside
+from app.work.threads import Failure
 from tests.app.windows import close_window, open_window, rest, settings_in
 
 SMALL = QSize(800, 600)

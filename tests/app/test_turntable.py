@@ -10,10 +10,10 @@ from PIL import Image
 from PySide6.QtWidgets import QApplication, QColorDialog, QDialog, QFileDialog, QLineEdit
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.forms import Form, turntable_form
-from app.main_window import MainWindow
-from app.theme import DARK, LIGHT, apply_theme
-from app.turntable import TurntableStyle
+from app.view.theme import DARK, LIGHT, apply_theme
+from app.view.turntable import TurntableStyle
+from app.window.dialogs.forms import Form, turntable_form
+from app.window.main_window import MainWindow
 from lcollision_core.errors import MeshFileError
 from tests.app.windows import PATIENCE, answer, take_picture
 

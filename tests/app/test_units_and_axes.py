@@ -10,7 +10,7 @@ from PySide6.QtCore import QTimer
 from PySide6.QtWidgets import QApplication, QMessageBox
 from pytestqt.qtbot import QtBot
 
-from app.main_window import MainWindow
+from app.window.main_window import MainWindow
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import read_mesh, write_mesh
 from lcollision_core.model import PoseModel

@@ -15,10 +15,10 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from app.camera import CAMERAS, View, framing, sees_all
-from app.canvas import Canvas, Smoothness
-from app.document import PoseDocument
-from app.viewport import Viewport
+from app.editing.document import PoseDocument
+from app.view.camera import CAMERAS, View, framing, sees_all
+from app.view.canvas import Canvas, Smoothness
+from app.view.viewport import Viewport
 from lcollision_core.model import NamedPose
 from tests.app.views import (
     SIDE,
@@ -259,15 +259,15 @@ def test_the_canvas_draws_a_drag_as_smoothly_as_the_machine_can(
         return drawn
 
     canvas._smoothness = Smoothness()
-    monkeypatch.setattr("app.canvas._SLOW_SECONDS", 1e3)
+    monkeypatch.setattr("app.view.canvas._SLOW_SECONDS", 1e3)
     assert all(drag())
-    monkeypatch.setattr("app.canvas._SLOW_SECONDS", 0.0)
-    monkeypatch.setattr("app.canvas._FAST_SECONDS", 0.0)
+    monkeypatch.setattr("app.view.canvas._SLOW_SECONDS", 0.0)
+    monkeypatch.setattr("app.view.canvas._FAST_SECONDS", 0.0)
     assert not any(drag()[4:])
     rest(qtbot, viewport)
     # At rest it is smooth whatever that takes.
     assert canvas.is_smooth
-    monkeypatch.setattr("app.canvas._FAST_SECONDS", 1e3)
+    monkeypatch.setattr("app.view.canvas._FAST_SECONDS", 1e3)
     document.set_code(0, 0.3)
     rest(qtbot, viewport)
     assert all(drag())

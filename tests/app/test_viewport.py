@@ -15,16 +15,16 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from app.camera import View
-from app.canvas import Canvas
-from app.document import PoseDocument
-from app.engine import Failure
-from app.legend import LegendStrip
-from app.rendering import PoseRenderer
-from app.shading import Shading
-from app.theme import DARK, LIGHT, apply_theme
-from app.turntable import TurntableStyle
-from app.viewport import Viewport
+from app.editing.document import PoseDocument
+from app.view.camera import View
+from app.view.canvas import Canvas
+from app.view.legend import LegendStrip
+from app.view.rendering import PoseRenderer
+from app.view.shading import Shading
+from app.view.theme import DARK, LIGHT, apply_theme
+from app.view.turntable import TurntableStyle
+from app.view.viewport import Viewport
+from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.model import PoseModel, sample_poses
 from tests.app.views import (
@@ -357,7 +357,7 @@ def test_intersecting_faces_are_red_while_the_truth_is_known(
     assert n_red() < n_while_colliding - 20
 
 
-def test_resolve_glides_to_the_new_pose_and_leaves_a_ghost(
+def test_resolve_transitions_to_the_new_pose_and_leaves_a_ghost(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
 ) -> None:
     document.set_latent(colliding, "Jump")

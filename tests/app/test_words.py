@@ -8,9 +8,9 @@ import pytest
 from PySide6.QtWidgets import QDialog
 from pytestqt.qtbot import QtBot
 
-from app.dialogs.forms import resolve_form
-from app.main_window import MainWindow
-from app.shading import Shading
+from app.view.shading import Shading
+from app.window.dialogs.forms import resolve_form
+from app.window.main_window import MainWindow
 from lcollision_core.errors import LCollisionError
 from lcollision_core.model import sample_poses
 from tests.app.test_editor_window import words_on_the_screen

@@ -11,7 +11,7 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from app.viewport import Viewport
+from app.view.viewport import Viewport
 
 SIDE = 420
 

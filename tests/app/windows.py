@@ -16,12 +16,12 @@ from PySide6.QtWidgets import QApplication, QDialog, QWidget
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
-from app.document import PoseDocument
-from app.main_window import MainWindow
-from app.panels.code_slider import CodeRow
-from app.panels.parts import HANDLE
-from app.settings import Settings
-from app.theme import apply_theme, wanted_theme
+from app.editing.document import PoseDocument
+from app.editing.settings import Settings
+from app.view.theme import apply_theme, wanted_theme
+from app.window.main_window import MainWindow
+from app.window.panels.code_slider import CodeRow
+from app.window.panels.widgets import HANDLE
 
 SHOTS = Path(__file__).parents[2] / "out" / "screenshots"
 """Where tests leave pictures of the window, for people to look at."""

@@ -1,0 +1,1 @@
+"""The pose that is edited: document, history, commands, recovery, settings. Signals, no widget."""

@@ -1,0 +1,698 @@
+"""The pose that is being edited, without any widget: what panels and viewport look at."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QObject, Signal, Slot
+
+from app.editing.commands import DocumentState, Source
+from app.editing.history import UNNAMED, PoseHistory, read_only
+from app.wording import counted, heading, height_text, mirrored_text
+from app.work import jobs
+from app.work.frames import ExactVerdict, LiveFrame, PosePrediction
+from app.work.live_pose import LivePose
+from app.work.long_work import Job, LongWork
+from app.work.threads import Failure
+from lcollision_core.errors import LCollisionError, ModelFileError
+
+if TYPE_CHECKING:
+    from lcollision_core.meshes import FileStamp
+    from lcollision_core.model import MirroredPose, NamedPose, PoseModel
+    from lcollision_core.resolve import ResolveOptions
+
+__all__ = ["ExactVerdict", "Failure", "LiveFrame", "PoseDocument", "PosePrediction"]
+
+FloatArray = npt.NDArray[np.float64]
+
+REST_MILLISECONDS = 60
+"""How long a pose stays before it is checked exactly: a hand that pauses has come to rest."""
+
+
+class PoseDocument(PoseHistory):
+    """One model, one working pose of it, the user's library, and their history.
+
+    Lives in the thread of the window and computes nothing there: each change asks two workers,
+    and the newest request wins. Until the first model is in, `has_model` is False and only
+    `open_model`, `set_model` and `close` may be called.
+
+    Every change of the pose or of the library is one step of `undo_stack`. Between
+    `begin_gesture` and `end_gesture` changes show at once but make one step together, and none
+    where they end as they began. A step on a slider outside a gesture, as from the keyboard,
+    merges with the one before when it is the same slider within a second.
+
+    Parameters
+    ----------
+    model : may come later
+    library_folder : of the users' pose libraries; the user's own by default
+
+    Attributes
+    ----------
+    may_replace : asked before a model or a file comes in over edits made while it was read
+
+    Signals
+    -------
+    model_changed : another model is in; latent, library, locks and history are new too
+    latent_changed, locks_changed, ghost_changed, library_changed, file_changed : look again;
+        `library_changed` covers `poses` and `file_poses`, `file_changed` covers `file`,
+        `pose_name` and `changed`
+    frame_changed, exact_changed : `frame`, `exact` are new, or None as they are not yet known
+    pose_loaded : the pose has come in whole, from the library or a file, not by sliders
+    modified_changed : bool
+    outcome_changed : `outcome` is new, or None as the pose has been changed since
+    solve_started, solve_progressed(object), solve_finished(object) : around a Resolve; the last
+        carries its ResolveResult, or None where it was cancelled or failed
+    busy_changed : str, what the long work is, or "" where there is none
+    message : str, one sentence for the status bar
+    failed : Failure, one sentence and its details, for a dialog
+    opened : Path, the file of poses or of a model that is in now
+    wrong_scale : WrongScale, where a mesh to import is in another unit
+    imported : Path, the mesh that has become the pose
+    of_other_model : OtherModel, a file of poses that could not be opened with this model
+    recovered : Path, the poses file that `recover` has put in
+    """
+
+    model_changed = Signal()
+    frame_changed = Signal()
+    exact_changed = Signal()
+    locks_changed = Signal()
+    solve_started = Signal()
+    solve_progressed = Signal(object)
+    solve_finished = Signal(object)
+    busy_changed = Signal(str)
+    message = Signal(str)
+    failed = Signal(object)
+    opened = Signal(object)
+    imported = Signal(object)
+    of_other_model = Signal(object)
+    wrong_scale = Signal(object)
+    recovered = Signal(object)
+
+    def __init__(
+        self,
+        model: PoseModel | None = None,
+        parent: QObject | None = None,
+        library_folder: Path | None = None,
+    ) -> None:
+        super().__init__(parent)
+        self._library_folder = library_folder
+        self._model: PoseModel | None = None
+        self._model_file = ""
+        self._file_stamp: FileStamp | None = None
+        self._predicts = False
+        self._locked: frozenset[int] = frozenset()
+        self._frame: LiveFrame | None = None
+        self._exact: ExactVerdict | None = None
+
+        self._solve: int | None = None
+        self._solve_began = 0.0
+        self._mirroring = self._mirroring_poses = self._incoming = self._loading = 0
+        self._exports: list[int] = []
+        self._closed = False
+        self.may_replace: Callable[[], bool] = lambda: True
+        self._live = LivePose(REST_MILLISECONDS, self)
+        self._live.frame_computed.connect(self._on_frame_computed)
+        self._live.verdict_computed.connect(self._on_verdict_computed)
+        self._live.failed.connect(self.failed)
+        self._long = LongWork(self)
+        self._long.busy_changed.connect(self.busy_changed)
+        self._long.progressed.connect(self._on_progressed)
+        self._long.failed.connect(self.failed)
+        if model is not None:
+            self.set_model(model)
+
+    # What there is to look at.
+
+    @property
+    def has_model(self) -> bool:
+        """Whether the first model is in."""
+        return self._model is not None
+
+    @property
+    def model(self) -> PoseModel:
+        """The model that the pose belongs to."""
+        if self._model is None:
+            raise LCollisionError("no model is open yet; open one first")
+        return self._model
+
+    @property
+    def model_file(self) -> str:
+        """The file that the model was read from, or the name of one that was not."""
+        return self._model_file
+
+    @property
+    def locked_domains(self) -> frozenset[int]:
+        """Domains that Resolve, Randomise, Reset all and blending leave as they are."""
+        return self._locked
+
+    @property
+    def frame(self) -> LiveFrame | None:
+        """The newest computed frame; while a slider moves, an instant behind `latent`."""
+        return self._frame
+
+    @property
+    def exact(self) -> ExactVerdict | None:
+        """The exact check of `latent`; None until it is known."""
+        return self._exact
+
+    @property
+    def solving(self) -> bool:
+        """Whether a Resolve runs."""
+        return self._solve is not None
+
+    @property
+    def busy(self) -> str:
+        """What the long work is, or "" where there is none."""
+        return self._long.busy
+
+    @property
+    def incoming(self) -> str:
+        """What brings another pose or model, or "" where nothing does."""
+        return self._long.label_of(self._incoming)
+
+    @property
+    def can_resolve(self) -> bool:
+        """Whether Resolve can be asked for: the model has a predictor."""
+        return self._model is not None and self._model.has_predictor
+
+    @property
+    def can_mirror(self) -> bool:
+        """Whether the model's mesh has a left and a right that mirror each other."""
+        return self._model is not None and self._model.symmetry is not None
+
+    # Editing.
+
+    def set_code(self, index: int, value: float) -> None:
+        """Set one number of the latent; a number that is not finite is ignored.
+
+        Parameters
+        ----------
+        index : from 0, in the latent's order
+        value : beyond the sliders' range too, as in poses that came in as meshes
+        """
+        if not np.isfinite(value) or value == self.latent[index]:
+            return
+        latent = self.latent.copy()
+        latent[index] = value
+        self._edit(f"Move {self.code_name(index)}", latent, run=index)
+
+    def reset_code(self, index: int) -> None:
+        """Set one number of the latent to 0."""
+        latent = self.latent.copy()
+        latent[index] = 0.0
+        self._edit(f"Reset {self.code_name(index)}", latent)
+
+    def reset_all(self) -> None:
+        """Set all numbers to 0, but for those of locked domains."""
+        self._tell_if_locked()
+        self._edit("Reset all", self._with_locked(np.zeros_like(self.latent)))
+
+    def randomise(self, amount: float, seed: int) -> None:
+        """Move the pose towards a random one, but for its locked domains.
+
+        Parameters
+        ----------
+        amount : 0 leaves the pose, 1 goes all the way to a pose drawn uniformly from the sliders'
+            range
+        seed : equal seeds draw equal poses
+        """
+        self._tell_if_locked()
+        drawn = self.model.latent_space.sample(1, np.random.default_rng(seed))[0]
+        latent = (1.0 - amount) * self.latent + amount * drawn
+        self._edit("Randomise", self._with_locked(latent))
+
+    def mirror(self) -> None:
+        """Exchange left and right of the whole pose, in the long worker.
+
+        Locked domains are mirrored too, as their other side is; where a free pose collides in the
+        mirror, it is resolved, and that leaves them as mirrored. A mirror image that was not
+        changed goes back to the pose that it was made from, to the bit.
+
+        Raises
+        ------
+        LCollisionError : the model has no two sides.
+        """
+        _ = self.model.pose_mirror
+        self.end_gesture()
+        self._long.cancel(self._mirroring)
+        work = jobs.mirrored(self.model, self.pose, self._locked)
+        self._mirroring = self._long.start("Mirroring", work, self._on_mirrored)
+
+    def mirror_poses(self, poses: Sequence[NamedPose]) -> None:
+        """Add the mirror images of poses to the library, in the long worker, as one step.
+
+        "Left" and "right" in a name change places; other names get "mirrored". An image that is
+        there already, as that of an image is, is left out.
+
+        Raises
+        ------
+        LCollisionError : the model has no two sides.
+        """
+        _ = self.model.pose_mirror
+        self._long.cancel(self._mirroring_poses)
+        work = jobs.mirrored_poses(self.model, tuple(poses))
+        label = f"Mirroring {counted(len(poses), 'pose')}"
+        self._mirroring_poses = self._long.start(label, work, self._on_poses_mirrored)
+
+    def code_name(self, index: int) -> str:
+        """Return what a person would call one number of the latent."""
+        group = next(g for g in self.model.latent_space.groups if index < g.codes.stop)
+        name = self.model.code_names[index]
+        return name if group.colour is None else f"{group.name}, {name}"
+
+    def reset_domain(self, domain: int) -> None:
+        """Set all numbers of a domain to 0: its own, and the whole body's that its lock holds."""
+        group = self.model.latent_space.groups[1 + domain]
+        latent = self.latent.copy()
+        latent[domain] = 0.0
+        latent[group.codes] = 0.0
+        self._edit(f"Reset {group.name}", latent)
+
+    def set_locked(self, domain: int, locked: bool) -> None:
+        """Lock a domain against Resolve, Randomise, Reset all and blending, or let it go."""
+        changed = self._locked | {domain} if locked else self._locked - {domain}
+        if changed != self._locked:
+            self._locked = changed
+            self.cancel_resolve()
+            self.locks_changed.emit()
+
+    def training_pose(self, number: int) -> NamedPose:
+        """Return a training pose of the model by its number, from 0."""
+        from lcollision_core.model import NamedPose
+
+        return NamedPose(self.model.pose_names[number], self.model.training_latent[number])
+
+    @property
+    def all_locked(self) -> bool:
+        """Whether every domain is locked, so that nothing but a slider can move the pose."""
+        return self.has_model and len(self._locked) == len(self.model.domain_names)
+
+    # Models and files.
+
+    def set_model(self, model: PoseModel) -> None:
+        """Put in another model, with a new pose and the user's library of it.
+
+        Parameters
+        ----------
+        model : may lack a predictor; `open_model` is kinder to the window, as it compiles and
+            loads in the long worker what a first drag needs
+        """
+        self._put_in(jobs.OpenedModel(model, model.name))
+
+    def _put_in(self, opened: jobs.OpenedModel) -> None:
+        from lcollision_core.model import PoseLibrary, user_poses_folder
+
+        self.retry_library()
+        self._model = opened.model
+        self._model_file = opened.file
+        self._locked = frozenset()
+        self.cancel_resolve()
+        # What is being exported is a snapshot, and goes on.
+        others = (self._mirroring, self._mirroring_poses, self._incoming, self._loading)
+        for number in others:
+            self._long.cancel(number)
+        self._frame = self._exact = self._gesture = self._file = None
+        self._file_poses = ()
+        folder = self._library_folder or user_poses_folder()
+        self._library = PoseLibrary(opened.model, folder, self._tell_of_library)
+        self._held = self._blank()
+        self._saved = self._held.pose
+        self._predicts = False
+        self._live.follow(self.model, self.latent, self._predicts)
+        self._load_predictor()
+        self.undo_stack.clear()
+        # All of it is in before anyone is told: who looks finds poses of that model only, and
+        # may edit at once.
+        for changed in (
+            self.model_changed,
+            self.latent_changed,
+            self.frame_changed,
+            self.exact_changed,
+            self.ghost_changed,
+            self.outcome_changed,
+            self.locks_changed,
+            self.library_changed,
+            self.file_changed,
+        ):
+            changed.emit()
+        self._tell_modified()
+
+    def open_model(self, name_or_path: str | Path) -> None:
+        """Read a model in the long worker and put it in."""
+        self._bring(f"Opening {name_or_path}", jobs.opened_model(name_or_path), self._on_model)
+
+    def edit_parts(self, edits: jobs.PartEdits) -> None:
+        """Rename, recolour or reorder body parts in the model's file, in the long worker.
+
+        The pose, its history and the locks stay; nothing of it can be undone.
+
+        Parameters
+        ----------
+        edits : what changes, and the name of the copy where the model's own file is not to
+        """
+        work = jobs.edited_parts(self.model, self._model_file, edits)
+        self._long.start("Saving the body parts", work, self._on_parts)
+
+    def new_pose(self) -> None:
+        """Start anew: the reference pose, unnamed, no file, no history; the library stays."""
+        self._long.cancel(self._incoming)
+        self._begin(self._blank(), None)
+
+    def open_poses(self, path: str | Path, model_file: str | Path | None = None) -> None:
+        """Read a poses file in the long worker; its working or first pose is edited.
+
+        The library stays as it is: the file's poses are `file_poses`.
+
+        Parameters
+        ----------
+        model_file : the model that comes in too; the poses are the present one's where None. Of
+            a file of another model that is known, `of_other_model` tells.
+        """
+        work = jobs.read(None if model_file else self.model, model_file or "", Path(path))
+        self._bring(f"Opening {Path(path).name}", work, self._on_poses)
+
+    def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
+        """Read what a crash left, as `LostPose` tells of it, and make it the pose, unsaved."""
+        model = self.model if model_file == self._model_file else None
+
+        def put_in(read: jobs.ReadPoses) -> None:
+            self._on_recovered(read, name, file)
+
+        self._bring(f"Recovering {name}", jobs.read(model, model_file, poses_file), put_in)
+
+    @property
+    def file_is_another_s(self) -> bool:
+        """Whether another program has written the file since it was opened or saved here."""
+        from lcollision_core.meshes import file_stamp
+
+        return self._file is not None and file_stamp(self._file) not in (None, self._file_stamp)
+
+    def save(self, path: str | Path | None = None) -> None:
+        """Write the working pose and the file's other poses, and clear the modified mark.
+
+        A pose without a name is called as its file from then on.
+
+        Parameters
+        ----------
+        path : a .json file; the one that was opened or saved last where None
+
+        Raises
+        ------
+        ModelFileError : there is no file yet, or it cannot be written.
+        """
+        from lcollision_core.meshes import file_stamp
+        from lcollision_core.model import name_of_file, write_poses
+
+        self.end_gesture()
+        target = Path(path) if path is not None else self._file
+        if target is None:
+            raise ModelFileError("the pose has no file yet; save it under a name")
+        name = self.pose_name if self.pose_name != UNNAMED else name_of_file(target)
+        pose = replace(self.pose, name=name)
+        write_poses(target, self.model, self.file_poses, pose)
+        self._file_stamp = file_stamp(target)
+        self._keep_saved(pose, target)
+        self.message.emit(f"Saved {target.name}")
+
+    def import_mesh(self, path: str | Path, scale: float = 1.0) -> None:
+        """Encode a mesh of the model's topology in the long worker and make it the pose.
+
+        `scale` brings it into the model's unit; `wrong_scale` tells where it is another.
+        """
+        work = jobs.encoded(self.model, Path(path), scale)
+        self._bring(f"Importing {Path(path).name}", work, self._on_encoded, ask=False)
+
+    def export_mesh(
+        self, path: str | Path, axes: str = "model", scale: float | None = None
+    ) -> None:
+        """Write the mesh on the screen, back in its place, in the format that `path` says.
+
+        Parameters
+        ----------
+        path : of the file
+        axes, scale : see `export_frame`
+        """
+        work = jobs.exported(self.model, self.latent, self.placement, Path(path), axes, scale)
+        self._exports.append(self._long.start(f"Exporting {Path(path).name}", work, self._tell))
+
+    def finish_exports(self) -> None:
+        """Write here and now what still waits to be exported, as before the window closes.
+
+        Raises
+        ------
+        MeshFileError : a file cannot be written; asked again, the others are.
+        """
+        for number in self._exports:
+            self._long.finish(number)
+        self._exports.clear()
+
+    # Resolve.
+
+    def resolve(self, options: ResolveOptions | None = None) -> None:
+        """Find the nearest free pose in the long worker; locked domains stay.
+
+        Parameters
+        ----------
+        options : `locked_domains` is set to the document's
+
+        Raises
+        ------
+        ModelFileError : the model has no predictor.
+        """
+        from lcollision_core.resolve import ResolveOptions
+
+        if not self.can_resolve:
+            raise ModelFileError(
+                f"{self.model.name} cannot resolve, as it has no predictor; train one for it"
+            )
+        self.end_gesture()
+        self.cancel_resolve()
+        chosen = replace(options or ResolveOptions(), locked_domains=self._locked)
+        work = jobs.resolved(self.model, self.latent, self.placement, chosen)
+        self._solve_began = time.monotonic()
+        self._solve = self._long.start("Resolving", work, self._on_resolved, self.cancel_resolve)
+        self.solve_started.emit()
+
+    def cancel_resolve(self) -> None:
+        """Stop a running Resolve; the pose stays as it is."""
+        if self._solve is not None:
+            self._long.cancel(self._solve)
+            self._solve = None
+            self.solve_finished.emit(None)
+
+    def cancel_all(self) -> None:
+        """Stop all long work but the loading of the predictor."""
+        self.cancel_resolve()
+        self._long.cancel_all()
+        self._load_predictor()
+
+    def close(self, timeout: float = 5.0) -> bool:
+        """Stop all work and end the threads, before any window closes.
+
+        Returns
+        -------
+        ended : whether all threads have ended within `timeout` seconds
+        """
+        if self._closed:
+            return True
+        self._closed = True
+        self.retry_library()
+        self.cancel_all()
+        # As it is deleted it would tell widgets that look at what is gone by then.
+        self.undo_stack.blockSignals(True)
+        deadline = time.monotonic() + timeout
+        ended = [self._live.close(deadline), self._long.close(deadline)]
+        return all(ended)
+
+    # What the workers answer.
+
+    @Slot(object)
+    def _on_frame_computed(self, frame: LiveFrame) -> None:
+        self._frame = frame
+        self.frame_changed.emit()
+
+    @Slot(object)
+    def _on_verdict_computed(self, verdict: ExactVerdict) -> None:
+        self._exact = verdict
+        self.exact_changed.emit()
+
+    @Slot(int, object)
+    def _on_progressed(self, number: int, status: object) -> None:
+        if number == self._solve:
+            self.solve_progressed.emit(status)
+
+    def _on_model(self, opened: jobs.OpenedModel) -> None:
+        self._put_in(opened)
+        self.message.emit(f"Opened {opened.model.name}")
+        self.opened.emit(Path(opened.file))
+
+    def _on_poses(self, read: jobs.ReadPoses | jobs.OtherModel) -> None:
+        if isinstance(read, jobs.OtherModel):
+            self.of_other_model.emit(read)
+            return
+        if read.opened is not None:
+            self._put_in(read.opened)
+        held = read.held
+        edited = held.working or held.poses[0]
+        self.begin_with(edited, Source.FILE, read.path, held.poses)
+        self._file_stamp = read.stamp
+        self.message.emit(f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}")
+        self.opened.emit(read.path)
+
+    def _on_parts(self, changed: jobs.ChangedParts) -> None:
+        if changed.model.fingerprint != self.model.fingerprint:
+            return
+        # The slider that is being dragged goes with its old name.
+        self.end_gesture()
+        self._model, self._model_file = changed.model, changed.file
+        self._live.follow(self.model, self.latent, self._predicts)
+        self._load_predictor()
+        for told in (self.model_changed, self.frame_changed, self.exact_changed):
+            told.emit()
+        for told in (self.locks_changed, self.outcome_changed, self.ghost_changed):
+            told.emit()
+        self.file_changed.emit()
+        self.message.emit(f"Saved the body parts in {self.model.name}")
+
+    def _on_recovered(
+        self, read: jobs.ReadPoses | jobs.OtherModel, name: str, file: Path | None
+    ) -> None:
+        from lcollision_core.meshes import file_stamp
+
+        if isinstance(read, jobs.OtherModel):
+            self.failed.emit(Failure(read.sentence, ""))
+            return
+        if read.opened is not None:
+            self._put_in(read.opened)
+        poses = read.held.poses
+        edited = read.held.working or next((p for p in poses if p.name == name), poses[0])
+        self.begin_with(edited, Source.FILE, file, poses)
+        self._file_stamp = file_stamp(file) if file is not None else None
+        self._saved = None
+        self._tell_modified()
+        self.message.emit(f"Recovered {edited.name}")
+        self.recovered.emit(read.path)
+
+    def _tell_of_library(self, sentence: str) -> None:
+        # It was told before; by now nobody is there to read it.
+        if not self._closed:
+            self.failed.emit(Failure(sentence, ""))
+
+    def _on_encoded(self, imported: jobs.Imported | jobs.WrongScale) -> None:
+        if isinstance(imported, jobs.WrongScale):
+            self.wrong_scale.emit(imported)
+            return
+        self._load(f"Import {imported.pose.name}", imported.pose, Source.MESH)
+        self._tell(imported)
+        self.imported.emit(imported.path)
+
+    def _tell(self, done: jobs.Imported | jobs.Exported) -> None:
+        self.message.emit(done.sentence)
+
+    def _on_mirrored(self, image: MirroredPose) -> None:
+        self.end_gesture()
+        pose = self.pose.mirrored(image)
+        pose = replace(pose, latent=read_only(np.array(pose.latent, dtype=np.float64)))
+        after = replace(self._state, pose=pose, ghost=None, outcome=image.resolution)
+        if image.resolution is not None:
+            after = replace(after, outcome_seconds=image.resolution.seconds)
+        self._push("Mirror", after)
+        said = [heading(mirrored_text(image))]
+        if image.lost_freedom and image.resolution is not None and image.resolution.note:
+            said.append(image.resolution.note)
+        if self._locked and not image.restored:
+            said.append("locked parts were mirrored too")
+        self.message.emit("; ".join(said))
+
+    def _on_poses_mirrored(self, images: list[tuple[NamedPose, MirroredPose]]) -> None:
+        added = self.add_to_library([pose for pose, _ in images])
+        if not added:
+            self.message.emit("Your library has these mirror images already")
+            return
+        said = [f"Added {counted(added, 'mirrored pose')} to your library"]
+        if len(images) == 1:
+            said.append(mirrored_text(images[0][1]))
+        else:
+            worst = max(image.fit_error_max for _, image in images)
+            said.append(f"off by at most {height_text(worst)} of the height")
+            for count, words in (
+                (sum(i.pairs_after == 0 < i.pairs_mirrored for _, i in images), "resolved"),
+                (sum(i.lost_freedom for _, i in images), "colliding, though free before"),
+            ):
+                if count:
+                    said.append(f"{count} {words}")
+        self.message.emit("; ".join(said))
+
+    def _on_resolved(self, resolved: jobs.Resolved) -> None:
+        result, self._solve = resolved.result, None
+        seconds = time.monotonic() - self._solve_began
+        self.end_gesture()
+        if np.array_equal(result.latent, self.latent):
+            # Nothing to undo, but the reasons are worth seeing.
+            self._amend(replace(self._state, ghost=None, outcome=result, outcome_seconds=seconds))
+        else:
+            latent = read_only(np.array(result.latent, dtype=np.float64))
+            pose = replace(self.pose, latent=latent, fit_error_mean=None, fit_error_max=None)
+            found = replace(self._state, pose=pose, ghost=resolved.ghost, outcome=result)
+            self._push("Resolve", replace(found, outcome_seconds=seconds))
+        self.solve_finished.emit(result)
+
+    def _load_predictor(self) -> None:
+        """Have predictions soon: the pose is shown, and can be edited, before."""
+        if self.can_resolve and not self._predicts and not self._closed:
+            work = jobs.loaded_predictor(self.model)
+            self._loading = self._long.start("Loading predictions", work, self._on_predictor)
+
+    def _on_predictor(self, model: PoseModel) -> None:
+        if model is self._model:
+            self._predicts = True
+            self._live.follow(self.model, self.latent, self._predicts)
+
+    def _bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:
+        """Start what will bring another pose; the newest such wish wins, also over Resolve.
+
+        What undo does not take back is to `ask` before it comes in over later edits.
+        """
+        self.cancel_resolve()
+        self._long.cancel(self._incoming)
+        known = self._held
+
+        def arrive(value: Any) -> None:
+            self.end_gesture()
+            if not ask or known is None or self._state.same_as(known) or self.may_replace():
+                done(value)
+
+        self._incoming = self._long.start(label, work, arrive)
+        self.busy_changed.emit(self.busy)
+
+    def _blank(self) -> DocumentState:
+        from lcollision_core.model import NamedPose
+
+        return DocumentState(NamedPose(UNNAMED, read_only(self.model.training_latent[0])))
+
+    def _follow_latent(self) -> None:
+        self.cancel_resolve()
+        self._long.cancel(self._mirroring)
+        self._live.follow(self.model, self.latent, self._predicts)
+        if self._exact is not None:
+            self._exact = None
+            self.exact_changed.emit()
+
+    def _tell_if_locked(self) -> None:
+        if self.all_locked:
+            self.message.emit("All body parts are locked; unlock one to move the pose")
+
+    def _with_locked(self, latent: FloatArray) -> FloatArray:
+        """Return the latent with the present codes of locked domains."""
+        for domain in self._locked:
+            # As in Resolve: the domain's own codes, and the whole body's code that is its.
+            latent[domain] = self.latent[domain]
+            codes = self.model.latent_space.groups[1 + domain].codes
+            latent[codes] = self.latent[codes]
+        return latent

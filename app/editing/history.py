@@ -1,0 +1,532 @@
+"""The state of a document and its undo: gestures, merged steps, the library, the modified mark."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QObject, Signal
+from PySide6.QtGui import QUndoStack
+
+from app.editing.commands import ChangeState, DocumentState, Origin, Source
+from app.wording import counted
+from lcollision_core.errors import ModelFileError
+
+if TYPE_CHECKING:
+    from lcollision_core.meshes import RigidTransform
+    from lcollision_core.model import LibraryChange, NamedPose, PoseLibrary
+    from lcollision_core.resolve import ResolveResult
+
+FloatArray = npt.NDArray[np.float64]
+
+UNNAMED = "pose"
+"""What a pose without a name is called."""
+
+UNDO_STEPS = 1000
+"""Kept at most: a step is a few kilobytes, so that memory stays small however long one edits."""
+
+
+class PoseHistory(QObject):
+    """The working pose and the user's library, and how both came to be.
+
+    Every change of either is one step of `undo_stack`. Between `begin_gesture` and `end_gesture`
+    changes of the pose show at once but make one step together, and none where they end as they
+    began. The library is a file of its own, written at every change; the poses of the file that
+    was opened are a third thing, which nothing here changes. `PoseDocument`, which is what the
+    window holds, tells what the signals mean.
+    """
+
+    latent_changed = Signal()
+    ghost_changed = Signal()
+    outcome_changed = Signal()
+    modified_changed = Signal(bool)
+    file_changed = Signal()
+    library_changed = Signal()
+    pose_loaded = Signal()
+
+    def __init__(self, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self._held: DocumentState | None = None
+        self._library: PoseLibrary | None = None
+        self._gesture: tuple[str, DocumentState] | None = None
+        self._file: Path | None = None
+        self._file_poses: tuple[NamedPose, ...] = ()
+        self._saved: NamedPose | None = None
+        self._ghost_shown = True
+        self._told_modified = self._told_changed = False
+        self.undo_stack = QUndoStack(self)
+        self.undo_stack.setUndoLimit(UNDO_STEPS)
+
+    @property
+    def pose(self) -> NamedPose:
+        """The working pose, its arrays read-only."""
+        return self._state.pose
+
+    @property
+    def latent(self) -> FloatArray:
+        """(D,) float64 array, read-only."""
+        return self.pose.latent
+
+    @property
+    def pose_name(self) -> str:
+        """The name under which Save stores the pose."""
+        return self.pose.name
+
+    @property
+    def placement(self) -> RigidTransform | None:
+        """Where the decoded pose belongs, for one that came in as a mesh."""
+        return self.pose.placement
+
+    @property
+    def poses(self) -> tuple[NamedPose, ...]:
+        """The user's library of this model."""
+        return () if self._library is None else self._library.poses
+
+    @property
+    def file_poses(self) -> tuple[NamedPose, ...]:
+        """The poses of the file that was opened, which Save writes as they are."""
+        return self._file_poses
+
+    @property
+    def file(self) -> Path | None:
+        """The poses file that Save writes; None asks for one."""
+        return self._file
+
+    @property
+    def library_pose(self) -> NamedPose | None:
+        """The pose of the library that the working pose came from, as it is there now."""
+        origin = self._state.origin
+        if origin is None or origin.source is not Source.LIBRARY or self._library is None:
+            return None
+        return self._library.find(origin.pose.name)
+
+    @property
+    def changed(self) -> bool:
+        """Whether the working pose differs from the one that it came from."""
+        source = self._source_pose()
+        return source is not None and not source.same_as(self.pose)
+
+    @property
+    def can_update(self) -> bool:
+        """Whether `update_library_pose` has something to do."""
+        return self.library_pose is not None and self.changed
+
+    @property
+    def modified(self) -> bool:
+        """Whether there is something to save.
+
+        A pose that nobody has touched since it was loaded is where it came from, and needs no
+        file.
+        """
+        if self._saved is not None and self._saved.same_as(self.pose):
+            return False
+        origin, library = self._state.origin, self._library
+        if self._file is not None or self._saved is None or origin is None:
+            return True
+        if origin.source is Source.LIBRARY and not (library and library.is_written):
+            return True
+        is_elsewhere = origin.source is not Source.MESH and self._source_pose() is not None
+        return self.changed or not is_elsewhere
+
+    @property
+    def ghost(self) -> npt.NDArray[np.float32] | None:
+        """(V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`, if shown."""
+        return self._state.ghost if self._ghost_shown else None
+
+    @property
+    def vertices_before(self) -> npt.NDArray[np.float32] | None:
+        """(V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`."""
+        return self._state.ghost
+
+    @property
+    def ghost_shown(self) -> bool:
+        """Whether a ghost is drawn where there is one."""
+        return self._ghost_shown
+
+    @property
+    def outcome(self) -> ResolveResult | None:
+        """What the Resolve that ended in this pose reported."""
+        return self._state.outcome
+
+    @property
+    def outcome_seconds(self) -> float:
+        """From asking for the Resolve of `outcome` to its result, with all that it waited for."""
+        return self._state.outcome_seconds
+
+    def show_ghost(self, shown: bool) -> None:
+        """Draw or hide the mesh before Resolve."""
+        if shown != self._ghost_shown:
+            self._ghost_shown = shown
+            self.ghost_changed.emit()
+
+    def begin_gesture(self, label: str) -> None:
+        """Start a drag: what follows until `end_gesture` is one step of undo."""
+        self.end_gesture()
+        self._gesture = (label, self._state)
+
+    def end_gesture(self) -> None:
+        """End a drag; does nothing where none has begun."""
+        if self._gesture is None:
+            return
+        label, before = self._gesture
+        self._gesture = None
+        if not before.same_as(self._state):
+            self.undo_stack.push(ChangeState(label, self._apply, before, self._state))
+        self._tell_modified()
+
+    def cancel_gesture(self) -> None:
+        """End a drag and go back to where it began, as for Escape."""
+        if self._gesture is not None:
+            _, before = self._gesture
+            self._gesture = None
+            self._apply(before)
+
+    def set_latent(self, latent: npt.ArrayLike, label: str) -> None:
+        """Set the whole pose, a (D,) finite array, in one step with this name in the menu."""
+        self._edit(label, np.array(latent, dtype=np.float64))
+
+    def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
+        """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1.
+
+        Locked domains stay as they are.
+        """
+        start = self._gesture[1].pose.latent if self._gesture else self.latent
+        target = np.asarray(latent, dtype=np.float64)
+        blended = target.copy() if share == 1.0 else start + share * (target - start)
+        self._edit("Blend", self._with_locked(blended))
+
+    def undo(self) -> None:
+        """Take back the last step; a drag that has not ended is that step."""
+        self.end_gesture()
+        self.undo_stack.undo()
+
+    def redo(self) -> None:
+        """Do again the step that was taken back last."""
+        self.end_gesture()
+        self.undo_stack.redo()
+
+    def load_pose(self, pose: NamedPose) -> None:
+        """Edit a pose of the library, of the file or of the training set, under its name."""
+        source = Source.TRAINING
+        for held, poses in ((Source.LIBRARY, self.poses), (Source.FILE, self.file_poses)):
+            if any(pose is own for own in poses):
+                source = held
+        self._load(f"Load {pose.name}", pose, source)
+
+    def add_pose_to_library(self, name: str) -> None:
+        """Keep the working pose in the library; a taken name gets a number.
+
+        Parameters
+        ----------
+        name : of the pose, which is called so from then on
+        """
+        added = replace(self.pose, name=self.free_name(name or UNNAMED))
+        self._step(f"Add {added.name}", [(None, added)], self._as_in_library(added))
+
+    def replace_pose_of_library(self, name: str) -> None:
+        """Put the working pose in the place of one of the library, under its name and tags.
+
+        Raises
+        ------
+        ModelFileError : there is no such pose.
+        """
+        old = self._required(name)
+        new = replace(self.pose, name=name, tags=old.tags)
+        self._step(f"Replace {name}", [(old, new)], self._as_in_library(new))
+
+    def update_library_pose(self) -> None:
+        """Let the pose of the library that the working pose came from be as that is now.
+
+        Raises
+        ------
+        ModelFileError : it came from none, or that is no longer there.
+        """
+        old = self.library_pose
+        if old is None:
+            raise ModelFileError(
+                "this pose is not one of your library, or no longer; keep it under a name"
+            )
+        if self.changed:
+            new = replace(self.pose, name=old.name, tags=old.tags)
+            self._step(f"Update {old.name}", [(old, new)], self._as_in_library(new))
+
+    def add_to_library(self, poses: Sequence[NamedPose]) -> int:
+        """Add poses from elsewhere to the library; those whose names are taken get numbers.
+
+        Poses that are there already, under the same name and to the bit, are left out.
+
+        Returns
+        -------
+        added : how many were not there
+        """
+        known = {pose.name: pose for pose in self.poses}
+        added = [p for p in poses if p.name not in known or not known[p.name].same_as(p)]
+        names = self._free_names([pose.name for pose in added])
+        what = added[0].name if len(added) == 1 else counted(len(added), "pose")
+        new = [replace(p, name=name) for p, name in zip(added, names, strict=True)]
+        self._step(f"Add {what}", [(None, pose) for pose in new])
+        return len(new)
+
+    def duplicate_poses(self, poses: Sequence[NamedPose]) -> None:
+        """Add a copy of each of some poses of the library."""
+        names = self._free_names([pose.name for pose in poses])
+        copies = [replace(p, name=name) for p, name in zip(poses, names, strict=True)]
+        self._step(f"Duplicate {_called(poses)}", [(None, copy) for copy in copies])
+
+    def remove_poses_from_library(self, names: Sequence[str]) -> None:
+        """Drop poses of the library.
+
+        Raises
+        ------
+        ModelFileError : there is no such pose.
+        """
+        poses = [self._required(name) for name in names]
+        self._step(f"Remove {_called(poses)}", [(pose, None) for pose in poses])
+
+    def tag_poses(self, names: Sequence[str], tags: Sequence[str]) -> None:
+        """Give poses of the library other tags.
+
+        Raises
+        ------
+        ModelFileError : there is no such pose.
+        """
+        poses = [self._required(name) for name in names]
+        changes = [(p, replace(p, tags=tuple(tags))) for p in poses if p.tags != tuple(tags)]
+        self._step(f"Tag {_called(poses)}", changes)
+
+    def rename_pose(self, old: str, new: str) -> None:
+        """Rename a pose of the library, and the working pose where it came from that one.
+
+        Raises
+        ------
+        ModelFileError : there is no such pose, or the new name is refused.
+        """
+        pose = self._required(old)
+        reason = self.why_not_called(new, old)
+        if reason:
+            raise ModelFileError(reason)
+        if new == old:
+            return
+        renamed = replace(pose, name=new)
+        state = self._state
+        if state.origin is not None and self.library_pose is pose:
+            name = new if state.pose.name == old else state.pose.name
+            origin = replace(state.origin, pose=renamed)
+            state = replace(state, pose=replace(state.pose, name=name), origin=origin)
+        self._step(f"Rename {old}", [(pose, renamed)], state)
+
+    def why_not_called(self, name: str, old: str = "") -> str:
+        """Say in a sentence why no pose of the library can get a name, or return "".
+
+        Parameters
+        ----------
+        old : the present name of the pose, "" for a new one
+        """
+        from lcollision_core.model import MAX_NAME_LENGTH, why_no_name
+
+        if not name:
+            return "a pose needs a name; type one"
+        if why_no_name(name):
+            return f"a name has at most {MAX_NAME_LENGTH} characters; choose a shorter one"
+        taken = self.name_taken_by(name)
+        if taken and taken != old:
+            return f"your library has a pose “{taken}” already; choose another name"
+        return ""
+
+    def name_taken_by(self, name: str) -> str:
+        """Return the name in the library that differs from this one by case at most, or ""."""
+        names = (pose.name for pose in self.poses)
+        return next((other for other in names if other.casefold() == name.casefold()), "")
+
+    def free_name(self, name: str) -> str:
+        """Return a name that no pose of the library has: this one, or with a number."""
+        return self._free_names([name])[0]
+
+    def refresh_library(self) -> None:
+        """Take in what another program has changed in the library's file."""
+        if self._library is not None and self._library.refresh():
+            self.library_changed.emit()
+            self._tell_modified()
+
+    def retry_library(self) -> None:
+        """Write what could not be written before, as when the disk has room again."""
+        if self._library is not None and not self._library.is_written:
+            self._library.change(())
+
+    def mark_saved(self) -> None:
+        """Count the pose as saved, as where the user gives the changes up."""
+        self._saved = self.pose
+        self._tell_modified()
+
+    @property
+    def _state(self) -> DocumentState:
+        if self._held is None:
+            raise ModelFileError("no model is open yet; open one first")
+        return self._held
+
+    def _source_pose(self) -> NamedPose | None:
+        """Return what the working pose came from, as it is there now; None where it is gone."""
+        origin = self._state.origin
+        if origin is None or origin.source is Source.LIBRARY:
+            return self.library_pose
+        return origin.pose
+
+    def _required(self, name: str) -> NamedPose:
+        pose = None if self._library is None else self._library.find(name)
+        if pose is None:
+            raise ModelFileError(f"your library has no pose {name!r}; choose one of your own")
+        return pose
+
+    def _free_names(self, names: Sequence[str]) -> list[str]:
+        """Return names that no pose of the library has: these, or with a number."""
+        from lcollision_core.model import unique_names
+
+        return unique_names([*(pose.name for pose in self.poses), *names])[len(self.poses) :]
+
+    def _as_in_library(self, pose: NamedPose) -> DocumentState:
+        """Return the state whose pose came from one of the library that is equal to it."""
+        working = replace(self.pose, name=pose.name)
+        return replace(self._state, pose=working, origin=Origin(Source.LIBRARY, pose))
+
+    def _step(
+        self,
+        label: str,
+        changes: Sequence[tuple[NamedPose | None, NamedPose | None]],
+        state: DocumentState | None = None,
+    ) -> None:
+        """Change the library, and perhaps the state, by one step.
+
+        Parameters
+        ----------
+        changes : pairs of a pose of the library and what comes in its place; None where one is
+            added at the end, or removed
+        """
+        from lcollision_core.model import LibraryChange
+
+        self.end_gesture()
+        if not changes:
+            return
+        held = list(self.poses)
+        made = []
+        for old, new in changes:
+            place = next((at for at, pose in enumerate(held) if pose is old), len(held))
+            made.append(LibraryChange(old, new, place))
+            held[place : place + 1] = [] if new is None else [new]
+        before = self._state
+        self.undo_stack.push(ChangeState(label, self._apply, before, state or before, changes=made))
+
+    def _load(self, label: str, pose: NamedPose, source: Source) -> None:
+        self._push(label, DocumentState(_working(pose), Origin(source, pose)))
+        self.pose_loaded.emit()
+
+    def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
+        # How far a mesh is from the pose that was fitted to it says nothing of another pose.
+        pose = replace(self.pose, latent=read_only(latent), fit_error_mean=None, fit_error_max=None)
+        self._push(label, replace(self._state, pose=pose, ghost=None, outcome=None), run)
+
+    def _push(self, label: str, state: DocumentState, run: int | None = None) -> None:
+        """Go to another state, as a step of its own or as part of the gesture."""
+        if self._gesture is not None:
+            self._apply(state)
+        elif not state.same_as(self._state):
+            self.undo_stack.push(ChangeState(label, self._apply, self._state, state, run))
+
+    def _amend(self, state: DocumentState) -> None:
+        """Put in a state that the undo steps on both sides of it lead to, in the place of this."""
+        place = self.undo_stack.index()
+        earlier = self.undo_stack.command(place - 1)
+        later = self.undo_stack.command(place)
+        if isinstance(earlier, ChangeState):
+            earlier.after = state
+        if isinstance(later, ChangeState):
+            later.before = state
+        self._apply(state)
+
+    def _keep_saved(self, pose: NamedPose, file: Path) -> None:
+        """Remember what a file holds now, whichever way undo comes back to it."""
+        self._file, self._saved = file, pose
+        origin = self._state.origin
+        if origin is None or origin.source is not Source.LIBRARY:
+            origin = Origin(Source.FILE, pose)
+        self._amend(replace(self._state, pose=pose, origin=origin))
+        self.file_changed.emit()
+
+    def begin_with(
+        self,
+        pose: NamedPose,
+        source: Source = Source.TRAINING,
+        file: Path | None = None,
+        file_poses: tuple[NamedPose, ...] = (),
+    ) -> None:
+        """Put in a pose without a past, which counts as saved.
+
+        Parameters
+        ----------
+        source : where the pose is
+        file, file_poses : that Save writes to, and the poses that it has beside this one
+        """
+        self._begin(DocumentState(_working(pose), Origin(source, pose)), file, file_poses)
+
+    def _begin(
+        self, state: DocumentState, file: Path | None, file_poses: tuple[NamedPose, ...] = ()
+    ) -> None:
+        """Put in a state without a past."""
+        self._gesture = None
+        self._file, self._file_poses, self._saved = file, file_poses, state.pose
+        self._apply(state)
+        self.undo_stack.clear()
+        self.library_changed.emit()
+        self.file_changed.emit()
+        self.pose_loaded.emit()
+
+    def _apply(self, state: DocumentState, changes: Sequence[LibraryChange] = ()) -> None:
+        """Put in a state and tell what has changed: the one place where pose or library change."""
+        before, self._held = self._state, state
+        if changes and self._library is not None:
+            self._library.change(changes)
+        if state.pose.latent is not before.pose.latent:
+            self._follow_latent()
+            self.latent_changed.emit()
+        if state.ghost is not before.ghost:
+            self.ghost_changed.emit()
+        if state.outcome is not before.outcome:
+            self.outcome_changed.emit()
+        if changes:
+            self.library_changed.emit()
+        if state.pose.name != before.pose.name:
+            self.file_changed.emit()
+        self._tell_modified()
+
+    def _follow_latent(self) -> None:
+        """Tell the workers, before the widgets, that the pose is another."""
+
+    def _with_locked(self, latent: FloatArray) -> FloatArray:
+        """Return the latent with the present codes of locked domains."""
+        return latent
+
+    def _tell_modified(self) -> None:
+        if self.changed != self._told_changed:
+            self._told_changed = self.changed
+            self.file_changed.emit()
+        if self.modified != self._told_modified:
+            self._told_modified = self.modified
+            self.modified_changed.emit(self._told_modified)
+
+
+def read_only(array: FloatArray) -> FloatArray:
+    """Return the array itself, from now on read-only, as other threads read it."""
+    array.flags.writeable = False
+    return array
+
+
+def _working(pose: NamedPose) -> NamedPose:
+    """Return a pose to be edited, of arrays of its own."""
+    return replace(pose, latent=read_only(np.array(pose.latent, dtype=np.float64)), tags=())
+
+
+def _called(poses: Sequence[NamedPose]) -> str:
+    return poses[0].name if len(poses) == 1 else counted(len(poses), "pose")

@@ -1,0 +1,338 @@
+"""What survives a crash: the edited pose, written every few seconds, and found at the next start.
+
+Each editor has a session, a folder of its own below `sessions_folder`, which it holds by a lock
+for as long as its process lives: however that ends, the lock ends with it, and the next editor
+that starts can take the session over, but never one that another editor holds.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import time
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QLockFile, QObject, QThread, QTimer, Signal, Slot
+
+from app.editing.document import PoseDocument
+from app.work.threads import Failure, end_thread, single_shot, started_thread
+from lcollision_core.json_values import parse_json
+from lcollision_core.meshes import atomic_write
+from lcollision_core.regular_files import read_regular, require_regular
+
+if TYPE_CHECKING:
+    from lcollision_core.model import NamedPose, PoseModel
+
+_log = logging.getLogger(__name__)
+
+AUTOSAVE_SECONDS = 3.0
+"""The most work that a crash costs, but for the moment that writing takes."""
+
+_LOCK = "lock"
+_POSES = "poses.json"
+_SESSION = "session.json"
+_MAX_SESSION_BYTES = 2**20
+
+
+def sessions_folder() -> Path:
+    """Return the folder of all sessions, which may not exist yet."""
+    from platformdirs import user_state_path
+
+    return user_state_path("lcollision", appauthor=False) / "sessions"
+
+
+class Session:
+    """One editor's folder, held by this process.
+
+    Attributes
+    ----------
+    folder : with the lock, and the poses once there was something to keep
+    """
+
+    def __init__(self, folder: Path, lock: QLockFile) -> None:
+        self.folder = folder
+        self._lock = lock
+
+    @classmethod
+    def new(cls, parent: Path) -> Session:
+        """Make a session; raises OSError where the folder cannot be made."""
+        folder = parent / uuid.uuid4().hex
+        folder.mkdir(parents=True)
+        session = cls.held(folder)
+        if session is None:
+            raise OSError(f"{folder} cannot be locked")
+        return session
+
+    @classmethod
+    def held(cls, folder: Path) -> Session | None:
+        """Take a session over, or return None where a living process holds it.
+
+        Nor is one taken whose lock is no plain file: Qt would wait for a pipe for ever.
+        """
+        try:
+            require_regular(folder / _LOCK)
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            _log.warning("%s is no session: %s", folder, error)
+            return None
+        lock = QLockFile(str(folder / _LOCK))
+        # A lock never grows too old: only the death of its process frees it.
+        lock.setStaleLockTime(0)
+        return cls(folder, lock) if lock.tryLock(0) else None
+
+    def release(self) -> None:
+        """Leave the session to whoever starts next."""
+        self._lock.unlock()
+
+    def discard(self) -> None:
+        """Delete the session and all that it kept."""
+        self._lock.unlock()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+@dataclass(frozen=True, eq=False)
+class LostPose:
+    """What an editor that ended without a word was editing.
+
+    Attributes
+    ----------
+    session : held by this process until it is discarded, released or recovered
+    model : the file of its model, or the name of one
+    pose_name : of the edited pose
+    file : the poses file that it came from or went to
+    locked : its domains that were to stay
+    saved : when it was written last, in seconds since 1970
+    """
+
+    session: Session
+    model: str
+    pose_name: str
+    file: Path | None
+    locked: tuple[int, ...]
+    saved: float
+
+    @property
+    def poses_file(self) -> Path:
+        """An ordinary poses file, with the edited pose in it."""
+        return self.session.folder / _POSES
+
+
+def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
+    """Find what editors that no longer live have left, the newest first, and hold it.
+
+    Sessions that kept nothing are deleted on the way.
+
+    Parameters
+    ----------
+    parent : the folder of all sessions; the user's own by default
+    """
+    found = list(_lost(sessions_folder() if parent is None else parent))
+    return sorted(found, key=lambda lost: lost.saved, reverse=True)
+
+
+def _lost(parent: Path) -> Iterator[LostPose]:
+    for folder in parent.iterdir() if parent.is_dir() else ():
+        session = Session.held(folder) if folder.is_dir() else None
+        if session is None:
+            continue
+        try:
+            held = parse_json(read_regular(folder / _SESSION, _MAX_SESSION_BYTES))
+            yield LostPose(
+                session=session,
+                model=str(held["model"]),
+                pose_name=str(held["pose_name"]),
+                file=Path(held["file"]) if held["file"] else None,
+                locked=tuple(map(int, held.get("locked", ()))),
+                saved=(folder / _POSES).stat().st_mtime,
+            )
+        except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
+            _log.info("nothing to recover in %s: %s", folder, error)
+            session.discard()
+
+
+@dataclass(frozen=True, eq=False)
+class _Snapshot:
+    """What is to be written; None as the working pose deletes what was."""
+
+    session: Session
+    model: PoseModel
+    model_file: str
+    file: Path | None
+    locked: tuple[int, ...]
+    file_poses: tuple[NamedPose, ...]
+    working: NamedPose | None
+
+
+class _Writer(QObject):
+    """Writes snapshots in its own thread, as a disk may take longer than a frame."""
+
+    failed = Signal(object)
+    written = Signal()
+
+    @Slot(object)
+    def write(self, snapshot: _Snapshot) -> None:
+        from lcollision_core.model import write_poses
+
+        folder = snapshot.session.folder
+        try:
+            if snapshot.working is None:
+                (folder / _POSES).unlink(missing_ok=True)
+                (folder / _SESSION).unlink(missing_ok=True)
+                return
+            write_poses(folder / _POSES, snapshot.model, snapshot.file_poses, snapshot.working)
+            held = {
+                "model": snapshot.model_file,
+                "pose_name": snapshot.working.name,
+                "file": str(snapshot.file) if snapshot.file else None,
+                "locked": snapshot.locked,
+            }
+            with atomic_write(folder / _SESSION) as file:
+                file.write(json.dumps(held).encode())
+            self.written.emit()
+        except Exception as error:
+            _log.warning("autosave failed", exc_info=True)
+            self.failed.emit(error)
+
+
+class Autosave(QObject):
+    """Keeps what a document has not saved, until it is saved or given up.
+
+    Parameters
+    ----------
+    document : is looked at whenever it says that it has changed
+    parent_folder : of all sessions; the user's own by default
+    seconds : after a change until it is written, however many changes follow
+
+    Attributes
+    ----------
+    failed : Failure, told once until writing works again
+    written : after each write
+    """
+
+    failed = Signal(object)
+    written = Signal()
+
+    _wanted = Signal(object)
+
+    def __init__(
+        self,
+        document: PoseDocument,
+        parent_folder: Path | None = None,
+        seconds: float = AUTOSAVE_SECONDS,
+    ) -> None:
+        super().__init__(document)
+        self._document = document
+        self._told = False
+        self._recovering: LostPose | None = None
+        self._session: Session | None = None
+        try:
+            self._session = Session.new(parent_folder or sessions_folder())
+        except OSError as error:
+            _log.warning("there is no autosave: %s", error)
+        self._writer = _Writer()
+        self._thread: QThread = started_thread("autosave", self._writer, self)
+        self._wanted.connect(self._writer.write)
+        self._writer.failed.connect(self._on_failed)
+        self._writer.written.connect(self._on_written)
+        self._due: QTimer = single_shot(self, int(1000 * seconds), self._write)
+        for changed in (
+            document.latent_changed,
+            document.locks_changed,
+            document.library_changed,
+            document.file_changed,
+        ):
+            changed.connect(self._on_changed)
+        document.modified_changed.connect(self._on_modified_changed)
+        document.recovered.connect(self._on_recovered)
+
+    def recover(self, lost: LostPose) -> None:
+        """Put a lost pose into the document, unsaved, and go on in its session.
+
+        Should its model be gone, `PoseDocument.failed` tells, and the session is left as it is.
+        """
+        self._recovering = lost
+        self._document.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
+
+    def close(self, timeout: float = 5.0, keep: bool = False) -> bool:
+        """End, and give up what is not saved unless it is to be kept for the next start.
+
+        Parameters
+        ----------
+        timeout : in seconds
+        keep : where the user has not been asked
+
+        Returns
+        -------
+        ended : whether the thread has ended in time
+        """
+        self._due.stop()
+        ended = end_thread(self._thread, time.monotonic() + timeout)
+        if self._session is None:
+            return ended
+        if keep and self._document.modified:
+            if ended:
+                self._writer.write(self._snapshot(self._session))
+            self._session.release()
+        else:
+            self._session.discard()
+        self._session = None
+        return ended
+
+    @Slot()
+    def _on_changed(self) -> None:
+        if self._document.modified and not self._due.isActive():
+            self._due.start()
+
+    @Slot(bool)
+    def _on_modified_changed(self, modified: bool) -> None:
+        if modified:
+            self._on_changed()
+        else:
+            # What is saved must not be offered again after a crash.
+            self._write()
+
+    @Slot()
+    def _write(self) -> None:
+        if self._session is not None and self._document.has_model:
+            self._wanted.emit(self._snapshot(self._session))
+
+    def _snapshot(self, session: Session) -> _Snapshot:
+        document = self._document
+        return _Snapshot(
+            session=session,
+            model=document.model,
+            model_file=document.model_file,
+            file=document.file,
+            locked=tuple(sorted(document.locked_domains)),
+            file_poses=document.file_poses,
+            working=document.pose if document.modified else None,
+        )
+
+    @Slot(object)
+    def _on_recovered(self, poses_file: Path) -> None:
+        lost = self._recovering
+        if lost is not None and lost.poses_file == poses_file:
+            self._recovering = None
+            if self._session is not None:
+                self._session.discard()
+            self._session = lost.session
+            for domain in range(self._document.model.embedding.n_domains):
+                self._document.set_locked(domain, domain in lost.locked)
+
+    @Slot()
+    def _on_written(self) -> None:
+        self._told = False
+        self.written.emit()
+
+    @Slot(object)
+    def _on_failed(self, error: Exception) -> None:
+        if not self._told:
+            self._told = True
+            sentence = f"your changes cannot be kept safe ({error}); save them to a file"
+            self.failed.emit(Failure(sentence, repr(error)))

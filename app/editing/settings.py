@@ -1,0 +1,139 @@
+"""What the editor remembers of a user: one table of key, default and limits."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PySide6.QtCore import QByteArray, QSettings, QStandardPaths
+
+from lcollision_core.regular_files import require_regular
+
+_log = logging.getLogger(__name__)
+
+ORGANISATION = "lcollision"
+APPLICATION = "editor"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One remembered value.
+
+    Attributes
+    ----------
+    default : its type is the setting's type
+    low, high : limits of a number
+    choices : all allowed values of a text; empty allows any
+    """
+
+    default: Any
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+
+
+SETTINGS: dict[str, Setting] = {
+    "theme": Setting("system", choices=("system", "light", "dark")),
+    "shading": Setting("domains", choices=("plain", "domains", "predicted", "exact", "movement")),
+    "show_ghost": Setting(True),
+    "model": Setting("body"),
+    "recent_files": Setting(()),
+    "recent_files_kept": Setting(8, 1, 30),
+    "last_folder": Setting(""),
+    "window_geometry": Setting(QByteArray()),
+    "window_layout": Setting(QByteArray()),
+    "randomise_amount": Setting(0.5, 0.0, 1.0),
+    "resolve_threshold": Setting(0.5, 0.01, 0.99),
+    "resolve_metric": Setting("eye", choices=("eye", "latent")),
+    "resolve_time_budget": Setting(20.0, 0.1, 3600.0),
+    "export_axes": Setting("model", choices=("model", "y-up", "blender", "maya", "unreal")),
+    "export_scale": Setting(1.0, 1e-6, 1e6),
+    "screenshot_width": Setting(1920, 16, 16384),
+    "screenshot_height": Setting(1080, 16, 16384),
+    "screenshot_transparent": Setting(True),
+    "turntable_format": Setting("gif", choices=("gif", "webp", "png")),
+    "turntable_seconds": Setting(4.0, 0.5, 20.0),
+    "turntable_rate": Setting(25, 1, 60),
+    "turntable_width": Setting(640, 16, 4096),
+    "turntable_height": Setting(640, 16, 4096),
+    "turntable_background": Setting("shown", choices=("shown", "plain", "transparent")),
+    "turntable_colour": Setting("#ffffff"),
+}
+"""All settings by key; `Settings` refuses any other key."""
+
+
+class Settings:
+    """The settings of this user, each always of its type and within its limits.
+
+    A value in the store that is of another type or beyond its limits, as after an update or an
+    edit by hand, reads as the default.
+
+    Parameters
+    ----------
+    store : where they are kept; the user's own by default
+    """
+
+    def __init__(self, store: QSettings | None = None) -> None:
+        self._store = _own_store() if store is None else store
+
+    def __getitem__(self, key: str) -> Any:
+        setting = SETTINGS[key]
+        return _accepted(setting, self._store.value(key, setting.default))
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        """Remember a value; one beyond its limits is drawn back to them."""
+        setting = SETTINGS[key]
+        if setting.low is not None and setting.high is not None:
+            value = type(setting.default)(min(max(value, setting.low), setting.high))
+        self._store.setValue(key, list(value) if isinstance(value, tuple) else value)
+
+    def remember_file(self, path: str) -> None:
+        """Put a file first among the recent ones."""
+        others = [recent for recent in self["recent_files"] if recent != path]
+        self["recent_files"] = (path, *others)[: self["recent_files_kept"]]
+
+    def forget_file(self, path: str) -> None:
+        """Drop a file that is gone from the recent ones."""
+        self["recent_files"] = tuple(name for name in self["recent_files"] if name != path)
+
+
+def _own_store() -> QSettings:
+    """Return the user's own store, or an empty one where Qt would wait for a pipe for ever."""
+    folder = Path(
+        QStandardPaths.writableLocation(QStandardPaths.StandardLocation.GenericConfigLocation)
+    )
+    for name in (f"{ORGANISATION}/{APPLICATION}.conf", f"{ORGANISATION}.conf"):
+        try:
+            require_regular(folder / name)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            _log.warning("%s is not used, settings are not kept: %s", folder / name, error)
+            unused = Path(tempfile.mkdtemp(prefix="lcollision-")) / f"{APPLICATION}.ini"
+            return QSettings(str(unused), QSettings.Format.IniFormat)
+    return QSettings(ORGANISATION, APPLICATION)
+
+
+def _accepted(setting: Setting, value: Any) -> Any:
+    """Return a stored value in the setting's type, or the default."""
+    default = setting.default
+    try:
+        if isinstance(default, bool):
+            # An ini file keeps words.
+            accepted: Any = (
+                value if isinstance(value, bool) else {"true": True, "false": False}[value]
+            )
+        elif isinstance(default, tuple):
+            # QSettings gives a list of one back as its item.
+            items = [value] if isinstance(value, str) else list(value or ())
+            accepted = tuple(str(item) for item in items)
+        else:
+            accepted = type(default)(value)
+    except (KeyError, TypeError, ValueError):
+        return default
+    low, high = setting.low, setting.high
+    in_range = low is None or high is None or low <= accepted <= high
+    return accepted if in_range and accepted in (setting.choices or (accepted,)) else default

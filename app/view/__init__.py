@@ -1,0 +1,1 @@
+"""What is drawn: canvas, scene, camera, shading, legend, pictures, animation."""

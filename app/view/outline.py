@@ -1,0 +1,213 @@
+"""The outline of one body part, drawn over whatever the colours of the mesh say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from vtkmodules.util.numpy_support import numpy_to_vtk
+from vtkmodules.vtkCommonCore import vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkPolyData
+
+from app.view.camera import VIEW_ANGLE
+from app.view.drawing import actor_of, cells_of, share_of
+
+if TYPE_CHECKING:
+    from vtkmodules.vtkRenderingCore import vtkActor, vtkRenderer
+
+Float32Array = npt.NDArray[np.float32]
+
+_STROKES = ((1.4, "#ffffff"), (3.0, "#14171c"))
+"""Widths to each side in device-independent pixels, the inner first: seen on any colour."""
+
+_SMOOTHINGS = 4
+
+_BORDER_WIDTH = 1.5
+"""Times the width to one side: on the body a line of both sides would look heavier than the rim."""
+
+_NEARER = (9.0, 6.0)
+"""Pixels that the border is drawn before the skin in which it lies, the inner stroke first."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartShape:
+    """What a body part is on the mesh, in whatever pose.
+
+    Attributes
+    ----------
+    ends : (P, 2) integer array, the mesh edges that the border of the part crosses
+    shares : (P, 1) float32 array, where: 0 at the first end, 1 at the second
+    segments : (S, 2) integer array, pieces of the border between those P points
+    vertices : (Q,) integer array, the vertices of faces that are all the part's
+    faces : (F, 3) integer array, these faces, as places in `vertices`
+    """
+
+    ends: npt.NDArray[np.int64]
+    shares: Float32Array
+    segments: npt.NDArray[np.int64]
+    vertices: npt.NDArray[np.int64]
+    faces: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, attention_mask: npt.NDArray[Any], faces: npt.NDArray[Any], domain: int
+    ) -> PartShape:
+        """Find the vertices that a domain leads, and the line along which it hands over.
+
+        Parameters
+        ----------
+        attention_mask : (K, V) array, each column sums to 1
+        faces : (F, 3) integer array
+        domain : index from 0
+        """
+        own = attention_mask[domain].astype(np.float64)
+        others = np.delete(attention_mask, domain, axis=0).max(axis=0, initial=0.0)
+        lead = _smooth(own - others, faces)
+        if not (lead > 0.0).any():
+            # It leads nowhere: what it moves most is its part.
+            lead = own - 0.5 * own.max()
+        inside = (lead > 0.0)[faces]
+        count = inside.sum(axis=1)
+        crossed = np.flatnonzero((count == 1) | (count == 2))
+        # The corner that is alone on its side: the border leaves the face by its two edges.
+        alone = (inside[crossed] == (count[crossed] == 1)[:, None]).argmax(axis=1)
+        corner, after, before = (
+            faces[crossed, (alone + step) % 3].astype(np.int64) for step in range(3)
+        )
+        pairs = np.sort(np.stack([corner, after, corner, before], axis=1).reshape(-1, 2), axis=1)
+        ends, place = np.unique(pairs, axis=0, return_inverse=True)
+        at_first, at_second = lead[ends[:, 0]], lead[ends[:, 1]]
+        shares = (at_first / (at_first - at_second)).astype(np.float32)
+        vertices, corners = np.unique(faces[count == 3], return_inverse=True)
+        return cls(
+            ends=ends,
+            shares=shares[:, None],
+            segments=place.reshape(-1, 2),
+            vertices=vertices.astype(np.int64),
+            faces=corners.reshape(-1, 3),
+        )
+
+    def border(self, vertices: Float32Array) -> Float32Array:
+        """Return the (P, 3) points of the border on a (V, 3) pose."""
+        first, second = vertices[self.ends[:, 0]], vertices[self.ends[:, 1]]
+        points: Float32Array = first + self.shares * (second - first)
+        return points
+
+
+class Outline:
+    """Draws a part's border on the body and the rim of its silhouette, in a constant width.
+
+    The rim is the part's own skin, a little larger, of which only the far side is drawn: where
+    the body does not hide it, it stands out round the part. No colour of the mesh is touched.
+
+    Parameters
+    ----------
+    renderer : to draw in
+    """
+
+    def __init__(self, renderer: vtkRenderer) -> None:
+        self._renderer = renderer
+        self._shape: PartShape | None = None
+        self._layers = [_Layer(width, colour) for width, colour in _STROKES]
+        for layer in self._layers:
+            for actor in layer.actors:
+                renderer.AddActor(actor)
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a part is outlined."""
+        return self._shape is not None
+
+    def remove(self) -> None:
+        """Take it out of the renderer."""
+        for layer in self._layers:
+            for actor in layer.actors:
+                self._renderer.RemoveActor(actor)
+
+    def show(self, shape: PartShape | None) -> None:
+        """Outline a part from the next `fit` on, or none."""
+        self._shape = shape
+        for layer in self._layers:
+            layer.take(shape)
+
+    def fit(self, vertices: Float32Array, normals: Float32Array, sharpness: float) -> None:
+        """Follow the pose and the camera.
+
+        Parameters
+        ----------
+        vertices, normals : (V, 3) float32 arrays
+        sharpness : device pixels per device-independent one
+        """
+        shape = self._shape
+        if shape is None:
+            return
+        border = shape.border(vertices)
+        skin, outward = vertices[shape.vertices], normals[shape.vertices]
+        eye = np.array(self._renderer.GetActiveCamera().GetPosition(), dtype=np.float32)
+        middle = np.concatenate([border, skin]).mean(axis=0)
+        distance = float(np.linalg.norm(eye - middle))
+        n_pixels = max(1, self._renderer.GetSize()[1]) / sharpness
+        pixel = 2.0 * distance * np.tan(np.radians(0.5 * VIEW_ANGLE)) / n_pixels
+        for layer, nearer in zip(self._layers, _NEARER, strict=True):
+            shell = skin + np.float32(layer.width * pixel) * outward
+            layer.fit(border + np.float32(nearer * pixel / distance) * (eye - border), shell)
+            layer.set_line_width(_BORDER_WIDTH * layer.width * sharpness)
+
+
+class _Layer:
+    """One stroke of the outline: lines along the border, and a shell round the part."""
+
+    def __init__(self, width: float, colour: str) -> None:
+        self.width = width
+        self._lines, self._shell = vtkPolyData(), vtkPolyData()
+        self._line_actor, self._shell_actor = (
+            _flat(held, colour) for held in (self._lines, self._shell)
+        )
+        self._shell_actor.GetProperty().FrontfaceCullingOn()
+
+    @property
+    def actors(self) -> tuple[vtkActor, vtkActor]:
+        return self._line_actor, self._shell_actor
+
+    def take(self, shape: PartShape | None) -> None:
+        if shape is not None:
+            for held, n_points in (
+                (self._lines, len(shape.ends)),
+                (self._shell, len(shape.vertices)),
+            ):
+                points = vtkPoints()
+                points.SetData(numpy_to_vtk(np.zeros((n_points, 3), dtype=np.float32), deep=True))
+                held.SetPoints(points)
+            self._lines.SetLines(cells_of(shape.segments))
+            self._shell.SetPolys(cells_of(shape.faces))
+        for actor in self.actors:
+            actor.SetVisibility(shape is not None)
+
+    def fit(self, border: Float32Array, shell: Float32Array) -> None:
+        for held, points in ((self._lines, border), (self._shell, shell)):
+            held.GetPoints().SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=True))
+
+    def set_line_width(self, width: float) -> None:
+        self._line_actor.GetProperty().SetLineWidth(width)
+
+
+def _smooth(values: npt.NDArray[np.float64], faces: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Average (V,) values over the faces round each vertex, which smooths a border between them."""
+    corners = faces.ravel()
+    n_faces = np.maximum(np.bincount(corners, minlength=len(values)), 1)
+    for _ in range(_SMOOTHINGS):
+        of_faces = np.repeat(values[faces].mean(axis=1), 3)
+        values = np.bincount(corners, of_faces, minlength=len(values)) / n_faces
+    return values
+
+
+def _flat(held: vtkPolyData, colour: str) -> vtkActor:
+    """Return an actor of one colour that no light changes and no pointer hits."""
+    actor = actor_of(held)
+    actor.SetPickable(False)
+    actor.SetVisibility(False)
+    actor.GetProperty().SetColor(*share_of(colour))
+    actor.GetProperty().LightingOff()
+    return actor

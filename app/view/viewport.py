@@ -1,0 +1,561 @@
+"""The mesh in the middle of the window: what is drawn of a document, and what the mouse says."""
+
+from __future__ import annotations
+
+import os
+import time
+from importlib import import_module
+from threading import Thread
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QEvent, QPoint, QPointF, QSize, QTimer, Signal, Slot
+from PySide6.QtGui import QCloseEvent
+from PySide6.QtOpenGLWidgets import QOpenGLWidget
+from PySide6.QtWidgets import QStackedLayout, QVBoxLayout, QWidget
+
+from app.view.animation import CameraTurn, PoseTransition
+from app.view.camera import View, kept_in_view, preset_view, zoomed
+from app.view.legend import DomainTag, LegendStrip
+from app.view.pictures import Pictures
+from app.view.shading import Legend, Shader, Shading
+from app.view.theme import current_theme
+from app.view.waiting import WaitingPage
+from app.wording import heading
+from app.work.frames import FrameEvaluator, LiveFrame
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.view.canvas import Canvas
+    from app.view.outline import PartShape
+    from app.view.scene import Scene
+    from app.view.turntable import Turntable, TurntableStyle
+    from lcollision_core.resolve import ResolveResult
+
+_ROOM = 1.15
+"""How much larger than its first pose a body may grow before a limb leaves the view."""
+
+_ZOOM_SECONDS = 0.5
+"""A wheel that turns on within this goes on towards the same point, if the pointer stays."""
+
+Float32Array = npt.NDArray[np.float32]
+FloatArray = npt.NDArray[np.float64]
+
+
+class Viewport(QWidget):
+    """Draws the newest frame of a document, and nothing twice.
+
+    Cheap to construct: VTK is imported when the first model is in; until then the page
+    `waiting` says what is waited for. Call `shut_down` before the window closes.
+
+    Parameters
+    ----------
+    document : may have no model yet
+    parent : of the widget
+
+    Signals
+    -------
+    domain_hovered : int, the domain under the pointer, or None
+    shading_changed : Shading
+    menu_wanted : int or None, the domain that was clicked with the right button, and QPoint, where
+        on the screen
+    painted : float, the seconds that drawing one picture took; see `Canvas.painted`
+    """
+
+    domain_hovered = Signal(object)
+    shading_changed = Signal(object)
+    menu_wanted = Signal(object, QPoint)
+    painted = Signal(float)
+
+    def __init__(self, document: PoseDocument, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._document = document
+        self._shading = Shading.PLAIN
+        self._highlight: int | None = None
+        self._hovered: int | None = None
+        self._canvas: Canvas | None = None
+        self._scene: Scene | None = None
+        self._shader: Shader | None = None
+        self._evaluator: FrameEvaluator | None = None
+        self._front = np.zeros(3)
+        self._shown: LiveFrame | None = None
+        self._pose_stale = self._colours_stale = self._crossing_stale = False
+        self._place_camera = False
+        self._framed: npt.NDArray[np.float64] | None = None
+        self._transition_to: npt.NDArray[np.float64] | None = None
+        self._loaded: npt.NDArray[np.float64] | None = None
+        self._zoom_anchor: tuple[QPointF, FloatArray, float] | None = None
+
+        self._layout = QStackedLayout()
+        self._layout.setStackingMode(QStackedLayout.StackingMode.StackOne)
+        self.waiting = WaitingPage(document, self)
+        self._layout.addWidget(self.waiting)
+        self._legend = LegendStrip(self)
+        self._legend.hide()
+        # Beneath the mesh, not over it, however close one looks.
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(0)
+        column.addLayout(self._layout, 1)
+        column.addWidget(self._legend)
+        self._tag = DomainTag(self)
+        # A window that gets its first OpenGL widget when it is already shown is made anew, and
+        # flickers.
+        self._first_gl_widget = QOpenGLWidget(self)
+        self._first_gl_widget.resize(1, 1)
+        self._first_gl_widget.lower()
+
+        self._transition = PoseTransition(self)
+        self._transition.moved.connect(self._on_transitiond)
+        self._turn = CameraTurn(self)
+        self._turn.moved.connect(self._on_turned)
+        self.pictures = Pictures(document, self)
+        # VTK takes a second to import: meanwhile the window is alive.
+        self._importer = Thread(target=import_module, args=("app.view.canvas",), name="import VTK")
+        self._importer.start()
+
+        document.model_changed.connect(self._on_model_changed)
+        document.frame_changed.connect(self._on_frame_changed)
+        document.exact_changed.connect(self._on_exact_changed)
+        document.ghost_changed.connect(self._on_ghost_changed)
+        document.outcome_changed.connect(self._on_outcome_changed)
+        document.solve_finished.connect(self._on_solve_finished)
+        document.pose_loaded.connect(self._on_pose_loaded)
+        if document.has_model:
+            # After the window is on the screen.
+            QTimer.singleShot(0, self, self._on_model_changed)
+
+    # What is shown.
+
+    @property
+    def shading(self) -> Shading:
+        """What the colours say."""
+        return self._shading
+
+    @property
+    def shown_frame(self) -> LiveFrame | None:
+        """The frame that the last picture shows, or glides towards."""
+        return self._shown
+
+    @property
+    def canvas(self) -> Canvas | None:
+        """The widget that draws and takes the mouse; None before the first model is in."""
+        return self._canvas
+
+    @property
+    def scene(self) -> Scene | None:
+        """What stands before the camera; likewise."""
+        return self._scene
+
+    @property
+    def hovered_domain(self) -> int | None:
+        """The domain under the pointer."""
+        return self._hovered
+
+    @property
+    def legend(self) -> Legend:
+        """What explains the colours now."""
+        return self._legend.legend
+
+    @property
+    def n_painted(self) -> int:
+        """How many pictures have been drawn since the model came in."""
+        return self._canvas.n_painted if self._canvas is not None else 0
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the mesh is on the screen instead of the waiting page."""
+        return self._canvas is not None and self._shown is not None
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether what is on the screen is the newest pose, smooth, and nothing moves."""
+        return (
+            self._canvas is not None
+            and self._shown is not None
+            and self._shown.latent is self._document.latent
+            and not self._transition.is_running
+            and not self._turn.is_running
+            and self._canvas.is_settled
+        )
+
+    def set_shading(self, shading: Shading) -> None:
+        """Choose what the colours say."""
+        if shading is self._shading:
+            return
+        self._shading = shading
+        self._recolour(crossing=True)
+        self.shading_changed.emit(shading)
+
+    def highlight_domain(self, domain: int | None) -> None:
+        """Outline a domain, or none; the colours say what they said before.
+
+        Parameters
+        ----------
+        domain : index from 0
+        """
+        if domain != self._highlight:
+            self._highlight = domain
+            if self._scene is not None and self._canvas is not None:
+                self._scene.outline.show(None if domain is None else self._shape_of(domain))
+                self._canvas.redraw()
+
+    # The camera.
+
+    def set_camera(self, name: str, glide: bool = True) -> None:
+        """Look at the whole pose from a side.
+
+        Parameters
+        ----------
+        name : one of `app.view.camera.CAMERAS`
+        glide : False jumps there
+
+        Raises
+        ------
+        KeyError : `name` is no preset.
+        """
+        if self._canvas is None or self._scene is None or self._shown is None:
+            return
+        end = self._preset(name, self._shown.vertices)
+        if not glide:
+            self._turn.stop()
+            self._scene.view = end
+            self._canvas.redraw()
+            return
+        self._turn.begin(self._scene.view, end)
+
+    @Slot()
+    def frame_pose(self) -> None:
+        """Look at the document's pose as at a model's first, as soon as it is drawn."""
+        self._framed = self._document.latent
+
+    @property
+    def view(self) -> View | None:
+        """From where the mesh is looked at; None before there is one."""
+        return self._scene.view if self._scene is not None else None
+
+    # Pictures.
+
+    def screenshot(
+        self, path: str | os.PathLike[str], width: int, height: int, transparent: bool
+    ) -> None:
+        """Save what is seen, without legend, in another size.
+
+        Parameters
+        ----------
+        path : a .png file
+        width, height : in pixels; as much is seen from bottom to top as in the window
+        transparent : without background, floor and shadow
+
+        Raises
+        ------
+        MeshFileError : the file cannot be written.
+        """
+        self.pictures.screenshot(self._scene_now(), path, width, height, transparent)
+
+    def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> Turntable:
+        """Begin a film of one turn round what is seen; the document tells when it is saved.
+
+        Parameters
+        ----------
+        path : a .gif or .webp file, or a .png one, whose name without that a new folder of
+            numbered pictures gets
+        style : its size, rate and background
+
+        Raises
+        ------
+        MeshFileError : see `Turntable`.
+        """
+        return self.pictures.turntable(self._scene_now(), path, style)
+
+    def _scene_now(self) -> Scene:
+        """Return the scene with what waits for the next picture on the screen."""
+        if self._scene is None or self._shown is None:
+            raise LCollisionError("the mesh is not on the screen yet; try again in a moment")
+        self._bring_up_to_date()
+        return self._scene
+
+    def shut_down(self) -> None:
+        """Stop everything that moves and free what VTK holds; the widget stays empty."""
+        self._transition.stop()
+        self._turn.stop()
+        self.waiting.stop()
+        self._importer.join()
+        self.pictures.stop()
+        if self._canvas is not None:
+            self._canvas.shut_down()
+            self._layout.removeWidget(self._canvas)
+            self._canvas.deleteLater()
+        self._canvas = self._scene = None
+
+    # Qt's.
+
+    def sizeHint(self) -> QSize:  # noqa: N802 - Qt's name
+        """Return a size at which a body is seen well."""
+        return QSize(720, 720)
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
+        """Follow the theme."""
+        super().changeEvent(event)
+        if event.type() is QEvent.Type.PaletteChange and self._scene is not None:
+            self._scene.set_dark(current_theme().is_dark)
+            self._shader = Shader.of(self._document.model, current_theme().is_dark)
+            self._recolour()
+
+    def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
+        """Free VTK's memory."""
+        self.shut_down()
+        super().closeEvent(event)
+
+    # The document's.
+
+    @Slot()
+    def _on_model_changed(self) -> None:
+        self._importer.join()
+        from app.view.canvas import Canvas
+        from app.view.scene import Scene
+
+        self._transition.stop()
+        self._turn.stop()
+        model = self._document.model
+        if self._canvas is None:
+            self._canvas = Canvas(self._bring_up_to_date, self)
+            self._canvas.hovered.connect(self._on_hovered)
+            self._canvas.painted.connect(self.painted)
+            self._canvas.camera_moved.connect(self._turn.stop)
+            self._canvas.zoom_wanted.connect(self._on_zoom_wanted)
+            self._canvas.menu_wanted.connect(self._on_menu_wanted)
+        view = None
+        if self._scene is not None:
+            # The same body with other names or colours is looked at as before.
+            is_same = (
+                self._evaluator is not None and self._evaluator.model.embedding is model.embedding
+            )
+            view = self._scene.view if is_same else None
+            self._scene.remove()
+        self._scene = Scene(
+            self._canvas,
+            model.faces,
+            model.n_vertices,
+            model.up_axis,
+            model.height,
+            current_theme().is_dark,
+        )
+        self._evaluator = FrameEvaluator(model)
+        self._front = model.front
+        self._tag.hide()
+        self._legend.set_legend(Legend())
+        self._shader = Shader.of(self._document.model, current_theme().is_dark)
+        self._shown = None
+        self._highlight = self._hovered = None
+        self._place_camera = view is None
+        if view is not None:
+            self._scene.view = view
+        if self._document.frame is not None:
+            self._on_frame_changed()
+        self._on_ghost_changed()
+
+    @Slot()
+    def _on_frame_changed(self) -> None:
+        if self._canvas is None or self._document.frame is None:
+            return
+        if self._layout.currentWidget() is not self._canvas:
+            self._layout.addWidget(self._canvas)
+            self._layout.setCurrentWidget(self._canvas)
+            self.waiting.stop()
+            self._legend.show()
+            self._tag.raise_()
+        self._pose_stale = True
+        self._recolour()
+
+    @Slot()
+    def _on_exact_changed(self) -> None:
+        if self._shading in (Shading.EXACT, Shading.PREDICTED):
+            self._recolour(crossing=True)
+
+    @Slot()
+    def _on_ghost_changed(self) -> None:
+        if self._canvas is None or self._scene is None or self._evaluator is None:
+            return
+        ghost = self._document.ghost
+        self._scene.show_ghost(ghost, None if ghost is None else self._evaluator.normals(ghost))
+        self._canvas.redraw()
+
+    @Slot()
+    def _on_outcome_changed(self) -> None:
+        if self._shading is Shading.MOVEMENT:
+            self._recolour()
+
+    @Slot(object)
+    def _on_solve_finished(self, result: ResolveResult | None) -> None:
+        self._transition_to = result.latent if result is not None else None
+
+    @Slot()
+    def _on_pose_loaded(self) -> None:
+        self._loaded = self._document.latent
+
+    # Drawing.
+
+    def _recolour(self, crossing: bool = False) -> None:
+        self._colours_stale = True
+        self._crossing_stale = self._crossing_stale or crossing
+        if self._canvas is not None:
+            self._explain_colours()
+            self._canvas.redraw()
+
+    def _bring_up_to_date(self) -> None:
+        """Write the newest pose and its colours, just before they are drawn.
+
+        However many frames come between two pictures, only the last is written.
+        """
+        frame, scene = self._document.frame, self._scene
+        if scene is None or frame is None:
+            return
+        if self._pose_stale:
+            self._pose_stale = False
+            self._put(scene, frame)
+        if self._colours_stale:
+            self._colours_stale = False
+            self._paint(scene, frame)
+        if self._crossing_stale:
+            self._crossing_stale = False
+            exact = self._document.exact
+            shown = self._shading is Shading.EXACT and exact is not None
+            scene.show_crossing(exact.pairs if exact is not None and shown else None)
+        scene.fit_outline(self.devicePixelRatioF())
+
+    def _put(self, scene: Scene, frame: LiveFrame) -> None:
+        before, self._shown = self._shown, frame
+        self._transition.stop()
+        is_framed = frame.latent is self._framed
+        if is_framed:
+            self._framed = None
+        if self._place_camera or is_framed:
+            self._place_camera = False
+            self._turn.stop()
+            scene.show(frame.vertices, frame.normals)
+            middle = frame.vertices.mean(axis=0)
+            scene.view = self._preset("Three-quarter", middle + _ROOM * (frame.vertices - middle))
+        elif self._transition_to is not None and np.array_equal(self._transition_to, frame.latent):
+            self._transition.begin(scene.surface.vertices.copy(), frame.vertices)
+        else:
+            scene.show(frame.vertices, frame.normals)
+            if frame.latent is self._loaded and before is not None:
+                view = kept_in_view(scene.view, before.vertices, frame.vertices, self._aspect)
+                if view is not None:
+                    self._turn.begin(scene.view, view)
+        self._transition_to = self._loaded = None
+        if self._shading is Shading.EXACT:
+            self._crossing_stale = True
+
+    def _paint(self, scene: Scene, frame: LiveFrame) -> None:
+        assert self._shader is not None
+        scene.paint(self._shader.colours(self._shading, *self._known_of(frame)))
+
+    def _shape_of(self, domain: int) -> PartShape:
+        from app.view.outline import PartShape
+
+        model = self._document.model
+        return PartShape.of(model.attention_mask, model.faces, domain)
+
+    def _known_of(
+        self, frame: LiveFrame
+    ) -> tuple[FloatArray | None, FloatArray | None, FloatArray | None]:
+        """Return the estimate, the exact energy and the movement, None what is not known."""
+        document = self._document
+        predicted, exact, before = frame.prediction, document.exact, document.vertices_before
+        outcome, moved = document.outcome, None
+        if outcome is not None and outcome.latent_distance == 0.0:
+            moved = np.zeros(len(frame.vertices))
+        elif before is not None and frame.latent is document.latent:
+            away = frame.vertices.astype(np.float64) - before
+            moved = np.linalg.norm(away, axis=1) / document.model.height
+        return (
+            predicted.domain_energy if predicted is not None else None,
+            exact.vertex_energy if exact is not None else None,
+            moved,
+        )
+
+    def _explain_colours(self) -> None:
+        """Bring the legend up to date; never before a picture, see `Canvas`."""
+        frame = self._document.frame
+        if self._shader is None or frame is None:
+            return
+        has_predictor = self._document.model.has_predictor
+        self._legend.set_legend(
+            self._shader.legend(self._shading, *self._known_of(frame), has_predictor=has_predictor)
+        )
+
+    def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
+        up_axis = self._document.model.up_axis
+        return preset_view(name, vertices, up_axis, self._front, self._aspect)
+
+    @property
+    def _aspect(self) -> float:
+        seen = self if self._canvas is None else self._canvas
+        return seen.width() / max(1, seen.height())
+
+    # Motion.
+
+    @Slot(object)
+    def _on_transitiond(self, vertices: Float32Array) -> None:
+        if self._scene is None or self._canvas is None or self._evaluator is None:
+            return
+        frame = self._shown
+        arrived = frame is not None and vertices is frame.vertices
+        normals = frame.normals if frame and arrived else self._evaluator.normals(vertices)
+        self._scene.show(vertices, normals)
+        self._canvas.redraw()
+
+    @Slot(object)
+    def _on_turned(self, view: View) -> None:
+        if self._scene is not None and self._canvas is not None:
+            self._scene.view = view
+            self._canvas.redraw()
+
+    @Slot(QPointF, float)
+    def _on_zoom_wanted(self, place: QPointF, factor: float) -> None:
+        if self._scene is None or self._canvas is None:
+            return
+        self._turn.stop()
+        view, now = self._scene.view, time.monotonic()
+        anchor = self._zoom_anchor
+        if anchor is None or anchor[0] != place or now - anchor[2] > _ZOOM_SECONDS:
+            point = self._canvas.point_at(place, self._scene.body, view.focus)
+        else:
+            point = anchor[1]
+        self._zoom_anchor = (place, point, now)
+        vertices, height = self._scene.surface.vertices, self._document.model.height
+        self._scene.view = zoomed(view, point, factor, vertices, height)
+        self._canvas.redraw()
+
+    # The pointer.
+
+    @Slot(QPointF)
+    def _on_menu_wanted(self, place: QPointF) -> None:
+        if self._canvas is not None:
+            where = self._canvas.mapToGlobal(place.toPoint())
+            self.menu_wanted.emit(self._domain_at(place), where)
+
+    def _domain_at(self, place: QPointF) -> int | None:
+        if self._canvas is None or self._scene is None or self._shader is None:
+            return None
+        vertex = self._canvas.pick_vertex(place, self._scene.body)
+        return None if vertex is None else self._shader.leading_domain(vertex)
+
+    @Slot(object)
+    def _on_hovered(self, place: QPointF | None) -> None:
+        if self._canvas is None:
+            return
+        domain = None if place is None or self._shown is None else self._domain_at(place)
+        if domain is None or place is None:
+            self._tag.hide()
+        else:
+            model = self._document.model
+            name = heading(model.domain_names[domain])
+            self._tag.point_at(place, name, model.domain_colours[domain])
+        if domain != self._hovered:
+            self._hovered = domain
+            self.domain_hovered.emit(domain)

@@ -1,0 +1,240 @@
+"""How the body parts of a model are called, coloured and listed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QSize, Qt, Signal, Slot
+from PySide6.QtGui import QColor, QIcon, QKeyEvent, QPainter, QPixmap
+from PySide6.QtWidgets import (
+    QAbstractItemView,
+    QColorDialog,
+    QDialog,
+    QDialogButtonBox,
+    QHBoxLayout,
+    QLineEdit,
+    QListWidget,
+    QListWidgetItem,
+    QPushButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE
+from app.window.panels.widgets import labelled
+from app.work.jobs import PartEdits
+from lcollision_core.errors import ModelFileError
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PoseModel
+
+_DOMAIN, _COLOUR = Qt.ItemDataRole.UserRole, Qt.ItemDataRole.UserRole + 1
+_SWATCH = 16
+_NO_FILE_NAME = frozenset('/\\:*?"<>|.')
+
+
+class BodyPartsDialog(QDialog):
+    """Body parts with names that are typed in place, colours, and the order of the panels.
+
+    Parameters
+    ----------
+    model : whose parts they are
+    copies : whether the changes go to a copy, as the model came with the program
+    taken : names of models that there are, which the copy cannot have
+    parent : the window that it belongs to
+
+    Signals
+    -------
+    edited : PartEdits, once it is accepted with something changed
+    """
+
+    edited = Signal(object)
+
+    def __init__(
+        self, model: PoseModel, copies: bool, taken: Collection[str], parent: QWidget
+    ) -> None:
+        super().__init__(parent)
+        self.setWindowTitle("Body parts")
+        self.resize(420, 480)
+        self._model, self._taken = model, taken
+        self.list = QListWidget()
+        self.list.setAccessibleName("Body parts")
+        self.list.setIconSize(QSize(_SWATCH, _SWATCH))
+        self.list.setDragDropMode(QAbstractItemView.DragDropMode.InternalMove)
+        self.list.setEditTriggers(
+            QAbstractItemView.EditTrigger.DoubleClicked
+            | QAbstractItemView.EditTrigger.EditKeyPressed
+        )
+        for domain in model.domain_order:
+            item = QListWidgetItem(model.domain_names[domain])
+            item.setFlags(item.flags() | Qt.ItemFlag.ItemIsEditable)
+            item.setFlags(item.flags() & ~Qt.ItemFlag.ItemIsDropEnabled)
+            item.setData(_DOMAIN, domain)
+            item.setSizeHint(QSize(0, ROW_HEIGHT + 2))
+            self.list.addItem(item)
+            self._put_colour(item, model.domain_colours[domain])
+        self.list.setCurrentRow(0)
+        sides = QVBoxLayout()
+        sides.setSpacing(CLOSE)
+        self.rename, self.colour, self.up, self.down = (
+            QPushButton(text) for text in ("Rename", "Colour…", "Move up", "Move down")
+        )
+        for button in (self.rename, self.colour, self.up, self.down):
+            button.setAutoDefault(False)
+            sides.addWidget(button)
+        sides.addStretch()
+        middle = QHBoxLayout()
+        middle.setSpacing(NORMAL)
+        middle.addWidget(self.list, 1)
+        middle.addLayout(sides)
+        note = labelled("", "caption")
+        note.setWordWrap(True)
+        note.setText(
+            f"“{model.name}” came with the program and stays as it is: the changes go to a copy "
+            "among your models, which opens in its place with this pose."
+            if copies
+            else "The changes are saved in the model's file. Undo does not take them back."
+        )
+        self.copy_name = QLineEdit(self._free_name())
+        self.copy_name.setAccessibleName("Name of the copy")
+        copy_row = QHBoxLayout()
+        copy_row.addWidget(labelled("Name of the copy", "caption"))
+        copy_row.addWidget(self.copy_name, 1)
+        self.refusal = labelled("", "refusal")
+        self.refusal.setWordWrap(True)
+        self.refusal.hide()
+        self._copies = copies
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
+        self.save = buttons.addButton(
+            "Save as a copy" if copies else "Save", QDialogButtonBox.ButtonRole.AcceptRole
+        )
+        column = QVBoxLayout(self)
+        column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
+        column.setSpacing(NORMAL)
+        column.addLayout(middle, 1)
+        column.addWidget(note)
+        if copies:
+            column.addLayout(copy_row)
+        column.addWidget(self.refusal)
+        column.addWidget(buttons)
+        self.save.setDefault(True)
+        buttons.accepted.connect(self.accept)
+        buttons.rejected.connect(self.reject)
+        self.rename.clicked.connect(self.edit_name)
+        self.colour.clicked.connect(self.choose_colour)
+        self.up.clicked.connect(lambda: self._move(-1))
+        self.down.clicked.connect(lambda: self._move(1))
+        self.list.currentRowChanged.connect(self._on_row)
+        self.list.model().rowsMoved.connect(lambda: self._on_row(self.list.currentRow()))
+        self._on_row(0)
+
+    def choose(self, domain: int) -> None:
+        """Choose a part in the list."""
+        for row in range(self.list.count()):
+            if self.list.item(row).data(_DOMAIN) == domain:
+                self.list.setCurrentRow(row)
+
+    @Slot()
+    def edit_name(self) -> None:
+        """Type another name of the chosen part, in its place."""
+        self.list.setFocus()
+        self.list.editItem(self.list.currentItem())
+
+    @Slot()
+    def choose_colour(self) -> None:
+        """Choose another colour of the chosen part."""
+        item = self.list.currentItem()
+        before = QColor(item.data(_COLOUR))
+        colour = QColorDialog.getColor(before, self, f"Colour of {item.text()}")
+        if colour.isValid():
+            self._put_colour(item, colour.name())
+
+    def edits(self) -> PartEdits:
+        """Return what differs from the model."""
+        model, items = self._model, [self.list.item(row) for row in range(self.list.count())]
+        named = {item.data(_DOMAIN): item.text().strip() for item in items}
+        coloured = {item.data(_DOMAIN): item.data(_COLOUR) for item in items}
+        order = tuple(item.data(_DOMAIN) for item in items)
+        return PartEdits(
+            {k: name for k, name in named.items() if name != model.domain_names[k]},
+            {k: colour for k, colour in coloured.items() if colour != model.domain_colours[k]},
+            order if order != model.domain_order else None,
+            self.copy_name.text().strip() if self._copies else None,
+        )
+
+    def accept(self) -> None:
+        """Hand on what was changed; what cannot be is said, and stays to be put right."""
+        # A name that is still being typed counts.
+        self.save.setFocus()
+        edits = self.edits()
+        if not (edits.names or edits.colours or edits.order):
+            super().accept()
+            return
+        reason = self._why_not(edits)
+        self.refusal.setText(reason)
+        self.refusal.setVisible(bool(reason))
+        if not reason:
+            super().accept()
+            self.edited.emit(edits)
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Let Enter end the typing of a name, not the dialog."""
+        focused = self.focusWidget()
+        typing = focused is not None and (focused is self.list or self.list.isAncestorOf(focused))
+        if not (typing and event.key() in (Qt.Key.Key_Return, Qt.Key.Key_Enter)):
+            super().keyPressEvent(event)
+
+    def _why_not(self, edits: PartEdits) -> str:
+        name = edits.copy_name
+        if name is not None and (not name or len(name) > 60 or _NO_FILE_NAME & set(name)):
+            return "The copy needs a name of up to 60 letters, without a dot or a slash."
+        if name is not None and name in self._taken:
+            return f"There is a model “{name}” already; choose another name for the copy."
+        try:
+            self._model.edit_domains(edits.names, edits.colours, edits.order)
+        except ModelFileError as error:
+            shared = {n for n in edits.names.values() if _count(self.list, n) > 1}
+            if shared:
+                return f"Two body parts are called “{sorted(shared)[0]}”; give each its own name."
+            if any(not n or len(n) > 60 for n in edits.names.values()):
+                return "A body part needs a name of 1 to 60 letters."
+            return str(error)
+        return ""
+
+    def _free_name(self) -> str:
+        number = 2
+        while f"{self._model.name}-{number}" in self._taken:
+            number += 1
+        return f"{self._model.name}-{number}"
+
+    def _put_colour(self, item: QListWidgetItem, colour: str) -> None:
+        item.setData(_COLOUR, colour)
+        sharpness = self.devicePixelRatioF()
+        picture = QPixmap(QSize(_SWATCH, _SWATCH) * sharpness)
+        picture.setDevicePixelRatio(sharpness)
+        picture.fill(Qt.GlobalColor.transparent)
+        painter = QPainter(picture)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        painter.setBrush(QColor(colour))
+        painter.drawRoundedRect(0, 0, _SWATCH, _SWATCH, 4, 4)
+        painter.end()
+        item.setIcon(QIcon(picture))
+
+    def _move(self, by: int) -> None:
+        row = self.list.currentRow()
+        item = self.list.takeItem(row)
+        self.list.insertItem(row + by, item)
+        self.list.setCurrentItem(item)
+
+    @Slot(int)
+    def _on_row(self, row: int) -> None:
+        for button in (self.rename, self.colour):
+            button.setEnabled(row >= 0)
+        self.up.setEnabled(row > 0)
+        self.down.setEnabled(0 <= row < self.list.count() - 1)
+
+
+def _count(held: QListWidget, name: str) -> int:
+    return [held.item(row).text().strip() for row in range(held.count())].count(name)

@@ -1,0 +1,344 @@
+"""Short forms: how large a picture, how long a film, how Resolve works."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import Qt, Slot
+from PySide6.QtGui import QColor, QIcon, QPainter, QPixmap
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QColorDialog,
+    QComboBox,
+    QDialog,
+    QDialogButtonBox,
+    QFormLayout,
+    QLabel,
+    QPushButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.editing.settings import SETTINGS, Settings
+from app.view.theme import NORMAL, WIDE
+from app.window.panels.number_box import QuietIntegerBox, QuietSpinBox
+from app.window.panels.widgets import labelled
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+
+_WIDTH, _BORDER = 400, WIDE + 4
+
+EXPORT_NAMES = {
+    "model": "As the model's",
+    "y-up": "Y up",
+    "blender": "Blender",
+    "maya": "Maya",
+    "unreal": "Unreal",
+}
+"""What the export's axes are called, by `ExportAxes`."""
+
+
+class ColourButton(QPushButton):
+    """Shows a colour, and asks for another when it is pressed.
+
+    Parameters
+    ----------
+    colour : "#rrggbb"; anything else is white
+    title : of the dialog that asks
+    """
+
+    def __init__(self, colour: str, title: str) -> None:
+        super().__init__()
+        self._title = title
+        # A dialog's button that takes Enter would be pressed by it.
+        self.setAutoDefault(False)
+        self.setStyleSheet("text-align: left;")
+        self._show(QColor(colour) if QColor(colour).isValid() else QColor("#ffffff"))
+        self.clicked.connect(self._ask)
+
+    @property
+    def colour(self) -> str:
+        """The colour, "#rrggbb"."""
+        return self._colour.name()
+
+    @Slot()
+    def _ask(self) -> None:
+        chosen = QColorDialog.getColor(self._colour, self, self._title)
+        if chosen.isValid():
+            self._show(chosen)
+
+    def _show(self, colour: QColor) -> None:
+        self._colour = colour
+        picture = QPixmap(self.iconSize())
+        picture.fill(colour)
+        painter = QPainter(picture)
+        # White on white is seen too.
+        painter.setPen(QColor("#888888"))
+        painter.drawRect(picture.rect().adjusted(0, 0, -1, -1))
+        painter.end()
+        self.setIcon(QIcon(picture))
+        self.setText(colour.name())
+
+
+class Form(QDialog):
+    """Fields that show settings and write them back when they are accepted.
+
+    Parameters
+    ----------
+    title : of the dialog
+    action : what the button that accepts is called
+    settings : read and written
+    parent : the window that it belongs to
+    """
+
+    def __init__(self, title: str, action: str, settings: Settings, parent: QWidget) -> None:
+        super().__init__(parent)
+        self.setWindowTitle(title)
+        self.setFixedWidth(_WIDTH)
+        self._settings = settings
+        self._refused = False
+        self._fields: dict[
+            str, QuietIntegerBox | QuietSpinBox | QCheckBox | QComboBox | ColourButton
+        ] = {}
+        self._form = QFormLayout()
+        self._form.setHorizontalSpacing(WIDE)
+        self._form.setVerticalSpacing(NORMAL)
+        self._buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
+        accept = self._buttons.addButton(action, QDialogButtonBox.ButtonRole.AcceptRole)
+        column = QVBoxLayout(self)
+        column.setContentsMargins(_BORDER, _BORDER, _BORDER, WIDE)
+        column.setSpacing(WIDE)
+        self._refusal = labelled("", "refusal")
+        self._refusal.setWordWrap(True)
+        self._refusal.hide()
+        column.addLayout(self._form)
+        column.addWidget(self._refusal)
+        column.addWidget(self._buttons)
+        self._buttons.accepted.connect(self.accept)
+        self._buttons.rejected.connect(self.reject)
+        # Only now that it is the dialog's: or else Enter would cancel.
+        accept.setDefault(True)
+
+    def accept(self) -> None:
+        """Remember what the fields say, and close, unless one has just been refused."""
+        for field in self._fields.values():
+            if isinstance(field, QuietIntegerBox | QuietSpinBox):
+                field.interpretText()
+        if self._refused:
+            self._refused = False
+            return
+        for key, field in self._fields.items():
+            if isinstance(field, QCheckBox):
+                self._settings[key] = field.isChecked()
+            elif isinstance(field, QComboBox):
+                self._settings[key] = field.currentData()
+            elif isinstance(field, ColourButton):
+                self._settings[key] = field.colour
+            else:
+                self._settings[key] = field.value()
+        super().accept()
+
+    def add_whole_number(self, key: str, label: str, suffix: str) -> QuietIntegerBox:
+        """Add a field for a whole number."""
+        field = QuietIntegerBox()
+        setting = SETTINGS[key]
+        field.setRange(int(setting.low or 0), int(setting.high or 0))
+        field.setSuffix(suffix)
+        field.setValue(self._settings[key])
+        self._add(key, label, field)
+        return field
+
+    def add_number(
+        self, key: str, label: str, suffix: str, step: float, tip: str = "", decimals: int = 0
+    ) -> QuietSpinBox:
+        """Add a field for a number, with decimals that follow the step where none are given."""
+        field = QuietSpinBox()
+        setting = SETTINGS[key]
+        field.setDecimals(decimals or (2 if step < 0.1 else 1))
+        field.setRange(setting.low or 0.0, setting.high or 0.0)
+        field.setSingleStep(step)
+        field.setSuffix(suffix)
+        field.setValue(self._settings[key])
+        field.setToolTip(tip)
+        self._add(key, label, field)
+        return field
+
+    def add_choice(self, key: str, label: str, names: dict[str, str], tip: str) -> QComboBox:
+        """Add a field for one of several values, by what they are called."""
+        field = QComboBox()
+        for value, name in names.items():
+            field.addItem(name, value)
+        field.setCurrentIndex(list(names).index(self._settings[key]))
+        field.setToolTip(tip)
+        self._add(key, label, field)
+        return field
+
+    def add_check(self, key: str, label: str) -> None:
+        """Add a box to tick."""
+        field = QCheckBox(label)
+        field.setChecked(self._settings[key])
+        self._fields[key] = field
+        self._form.addRow("", field)
+
+    def add_colour(self, key: str, label: str) -> ColourButton:
+        """Add a button that shows a colour and asks for another."""
+        field = ColourButton(self._settings[key], label)
+        self._fields[key] = field
+        self._form.addRow(label, field)
+        return field
+
+    def add_note(self, text: str) -> QLabel:
+        """Add some lines of explanation."""
+        note = labelled("", "caption")
+        note.setWordWrap(True)
+        self._form.addRow(note)
+        self.explain(note, text)
+        return note
+
+    def explain(self, note: QLabel, text: str) -> None:
+        """Put another text into a note, and make room for it."""
+        note.setText(text)
+        # A form asks for one line of it, however narrow.
+        note.setFixedHeight(note.heightForWidth(_WIDTH - 2 * _BORDER))
+        self.adjustSize()
+
+    def _add(self, key: str, label: str, field: QuietIntegerBox | QuietSpinBox | QComboBox) -> None:
+        self._fields[key] = field
+        self._form.addRow(label, field)
+        if not isinstance(field, QComboBox):
+            field.refused.connect(lambda sentence: self._on_refused(label, sentence))
+            field.lineEdit().textEdited.connect(self._on_edited)
+
+    def _on_refused(self, label: str, sentence: str) -> None:
+        self._refused = True
+        self._refusal.setText(f"{label}: {sentence}")
+        self._refusal.show()
+
+    @Slot()
+    def _on_edited(self) -> None:
+        self._refused = False
+        self._refusal.hide()
+
+
+def screenshot_form(settings: Settings, parent: QWidget) -> Form:
+    """Ask how large a screenshot is to be."""
+    form = Form("Screenshot", "Choose file…", settings, parent)
+    form.add_whole_number("screenshot_width", "Width", " px")
+    form.add_whole_number("screenshot_height", "Height", " px")
+    form.add_check("screenshot_transparent", "Transparent background")
+    return form
+
+
+def export_form(
+    settings: Settings, parent: QWidget, up_axis: int, front: npt.NDArray[np.float64]
+) -> Form:
+    """Ask in which axes and unit a mesh is to be written.
+
+    Parameters
+    ----------
+    settings, parent : see `Form`
+    up_axis : of the model, 0, 1 or 2
+    front : (3,) direction along an axis in which the model looks
+    """
+    from lcollision_core.model import EXPORT_SCALES, ExportAxes
+
+    looks = int(abs(front).argmax())
+    own = f"{'xyz'[up_axis]} is up, front is {'-' if front[looks] < 0.0 else '+'}{'xyz'[looks]}"
+    meanings = {
+        ExportAxes.MODEL: f"As the model's: {own}.",
+        ExportAxes.Y_UP: "y is up, front is +z, in the model's unit.",
+        ExportAxes.BLENDER: "Upright and facing you in Blender's front view, with the settings "
+        "that its importers begin with.",
+        ExportAxes.MAYA: "y is up, front is +z; 100 turns metres into Maya's centimetres.",
+        ExportAxes.UNREAL: "z is up, front is +x once imported; 100 turns metres into Unreal's "
+        "centimetres.",
+    }
+    form = Form("Export mesh", "Choose file…", settings, parent)
+    axes = form.add_choice("export_axes", "Axes", EXPORT_NAMES, "Which way is up in the file")
+    scale = form.add_number(
+        "export_scale", "Scale by", "", 1.0, "How many units of the file make one of the model", 6
+    )
+    # Six decimals are for those who type them.
+    scale.setStepType(QuietSpinBox.StepType.AdaptiveDecimalStepType)
+    meaning = form.add_note(meanings[axes.currentData()])
+    form.add_note("A GLB file is always y up and not scaled, as its standard fixes both.")
+
+    def follow() -> None:
+        scale.setValue(EXPORT_SCALES[axes.currentData()])
+        form.explain(meaning, meanings[axes.currentData()])
+
+    axes.currentIndexChanged.connect(follow)
+    return form
+
+
+def turntable_form(settings: Settings, parent: QWidget) -> Form:
+    """Ask how long, how large and in front of what a turntable is to be, in which format."""
+    from app.view.turntable import FASTEST_GIF
+
+    form = Form("Turntable", "Choose file…", settings, parent)
+    formats = {"gif": "GIF", "webp": "WebP", "png": "PNG sequence"}
+    kind = form.add_choice("turntable_format", "Format", formats, "What is written")
+    form.add_number("turntable_seconds", "Duration", " s", 0.5)
+    rate = form.add_whole_number("turntable_rate", "Frames per second", "")
+    form.add_whole_number("turntable_width", "Width", " px")
+    form.add_whole_number("turntable_height", "Height", " px")
+    backgrounds = {"shown": "As shown", "plain": "One colour", "transparent": "Transparent"}
+    behind = form.add_choice(
+        "turntable_background", "Background", backgrounds, "What stands behind the body"
+    )
+    colour = form.add_colour("turntable_colour", "Colour")
+    note = form.add_note("")
+    most = rate.maximum()
+    meanings = {
+        "gif": f"256 colours, at most {FASTEST_GIF} frames per second, never transparent.",
+        "webp": "All colours, smaller than a GIF.",
+        "png": "A new folder of numbered pictures, as for making an MP4.",
+    }
+
+    def follow() -> None:
+        is_gif = kind.currentData() == "gif"
+        rate.setMaximum(min(most, FASTEST_GIF) if is_gif else most)
+        place = list(backgrounds).index("transparent")
+        behind.setItemData(place, 0 if is_gif else None, Qt.ItemDataRole.UserRole - 1)
+        if is_gif and behind.currentIndex() == place:
+            behind.setCurrentIndex(0)
+        form.explain(note, f"One full turn, current shading. {meanings[kind.currentData()]}")
+
+    def show_colour() -> None:
+        colour.setEnabled(behind.currentData() == "plain")
+
+    follow()
+    show_colour()
+    kind.currentIndexChanged.connect(follow)
+    behind.currentIndexChanged.connect(show_colour)
+    return form
+
+
+def resolve_form(settings: Settings, parent: QWidget) -> Form:
+    """Ask how Resolve is to work."""
+    form = Form("Resolve options", "OK", settings, parent)
+    form.add_choice(
+        "resolve_metric",
+        "Keep close to",
+        {"eye": "the look of the pose", "latent": "the slider values"},
+        "What Resolve tries to change as little as possible",
+    )
+    form.add_number(
+        "resolve_threshold",
+        "Decision threshold of the estimate",
+        "",
+        0.05,
+        "Below it the estimate calls a pose clear; lower is safer but moves the pose more",
+    )
+    form.add_number(
+        "resolve_time_budget",
+        "Time limit",
+        " s",
+        1.0,
+        "After this time Resolve falls back to a known pose without collisions",
+    )
+    form.add_note("The exact check decides in any case.")
+    return form

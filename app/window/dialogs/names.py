@@ -1,0 +1,87 @@
+"""Asking for a name, and saying why one cannot be taken without losing what was typed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QDialog, QInputDialog, QLabel, QLineEdit, QVBoxLayout, QWidget
+
+from app.window.panels.widgets import labelled
+from app.wording import heading, menu_text
+
+_WIDTH = 400
+"""At least, so that no title is cut."""
+
+
+class NameDialog(QInputDialog):
+    """Asks what something is to be called; stays open with its text while the name is refused.
+
+    Parameters
+    ----------
+    parent : the window that it belongs to
+    title, label : of the dialog and of its field
+    proposed : in the field at first
+    refuse : called with what was typed; says in a sentence why it cannot be, or "" where it can
+
+    Attributes
+    ----------
+    reason : shows why the name was refused
+    """
+
+    def __init__(
+        self,
+        parent: QWidget,
+        title: str,
+        label: str,
+        proposed: str,
+        refuse: Callable[[str], str],
+    ) -> None:
+        super().__init__(parent)
+        self.setWindowTitle(title)
+        self.setLabelText(menu_text(label))
+        # Names such as "<b>" in a label are no HTML.
+        for held in self.findChildren(QLabel):
+            held.setTextFormat(Qt.TextFormat.PlainText)
+        self.setTextValue(proposed)
+        self._refuse = refuse
+        self.reason = labelled("", "refusal")
+        self.reason.setWordWrap(True)
+        self.reason.hide()
+        self.textValueChanged.connect(self.reason.hide)
+        self.resize(_WIDTH, self.sizeHint().height())
+        layout = self.layout()
+        assert isinstance(layout, QVBoxLayout)
+        layout.insertWidget(layout.count() - 1, self.reason)
+
+    @property
+    def name(self) -> str:
+        """What was typed, without spaces around it."""
+        return self.textValue().strip()
+
+    def accept(self) -> None:
+        """Close where the name can be taken; else say why not."""
+        reason = self._refuse(self.name)
+        if not reason:
+            super().accept()
+            return
+        self.reason.setText(f"{heading(reason)}.")
+        self.reason.show()
+        field = self.findChild(QLineEdit)
+        if isinstance(field, QLineEdit):
+            field.setFocus()
+            field.selectAll()
+
+
+def ask_for_name(
+    parent: QWidget,
+    title: str,
+    label: str,
+    proposed: str,
+    refuse: Callable[[str], str] = lambda _: "",
+) -> str | None:
+    """Ask what something is to be called; None where the user gives up."""
+    dialog = NameDialog(parent, title, label, proposed, refuse)
+    accepted = dialog.exec() == QDialog.DialogCode.Accepted
+    dialog.deleteLater()
+    return dialog.name if accepted else None

@@ -1,0 +1,443 @@
+"""What the File menu does: every dialog that asks for a file, and what is opened where."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, Qt, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
+
+from app.window.dialogs.forms import export_form, screenshot_form, turntable_form
+from app.window.dialogs.questions import (
+    Choice,
+    ask_about_another_s,
+    ask_about_changes,
+    ask_about_scale,
+    ask_to_switch,
+)
+from app.window.panels.widgets import plain_tip
+from app.wording import menu_text
+from lcollision_core.bundled import bundled_folder
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.editing.settings import Settings
+    from app.view.viewport import Viewport
+    from app.work.jobs import OtherModel, WrongScale
+
+POSES_SUFFIX = ".json"
+MODEL_SUFFIX = ".safetensors"
+"""As in `lcollision_core.model`, which takes too long to import before the window is there."""
+
+_EXPORTS = {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
+_FILMS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png"}
+
+
+def _kinds(*wanted: str) -> str:
+    """Return the filter of a file dialog for "poses", "meshes" and "models"."""
+    suffixes = {"poses": (POSES_SUFFIX,), "meshes": _mesh_suffixes(), "models": (MODEL_SUFFIX,)}
+    masks = {kind: " ".join(f"*{suffix}" for suffix in found) for kind, found in suffixes.items()}
+    filters = [f"{kind.capitalize()} ({masks[kind]})" for kind in wanted]
+    if len(wanted) > 1:
+        filters.insert(0, f"All supported files ({' '.join(masks[kind] for kind in wanted)})")
+    return ";;".join(filters)
+
+
+def _mesh_suffixes() -> tuple[str, ...]:
+    # Loads SciPy: not before the window is on the screen.
+    from lcollision_core.meshes import READABLE_SUFFIXES
+
+    return READABLE_SUFFIXES
+
+
+def _kind(path: Path) -> str:
+    """Name a file's kind after its extension, "FBX"."""
+    return path.suffix.removeprefix(".").upper() or "A file without an extension"
+
+
+class FileActions(QObject):
+    """Opens, saves, imports and exports, asking for files where it must.
+
+    Whatever a user can fix is raised as `LCollisionError`, for the window to show.
+
+    Parameters
+    ----------
+    window : that dialogs belong to
+    document : opened into and saved from
+    settings : remembers the last folder, the recent files and the model
+    attempt : does something and shows what a user can fix of what goes wrong
+
+    Attributes
+    ----------
+    recent_menu, models_menu : list what can be opened by a click
+    """
+
+    def __init__(
+        self,
+        window: QWidget,
+        document: PoseDocument,
+        settings: Settings,
+        attempt: Callable[[Callable[[], object]], object],
+    ) -> None:
+        super().__init__(window)
+        self._attempt = attempt
+        self._window = window
+        self._document = document
+        self._settings = settings
+        self.recent_menu = self._listing("Open &recent", self._fill_recent)
+        self._fill_recent()
+        self.models_menu = self._listing("Mode&ls", self._fill_models)
+        document.may_replace = lambda: bool(attempt(self.may_lose_changes))
+        document.file_changed.connect(self._on_file)
+        document.model_changed.connect(self._on_model)
+        document.imported.connect(self._on_arrived)
+        document.opened.connect(self._on_arrived)
+        document.message.connect(self._on_message)
+        # Once the reading is over, and the window says so.
+        document.of_other_model.connect(self._on_other_model, Qt.ConnectionType.QueuedConnection)
+        document.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
+        self._dropped: tuple[Path, int] | None = None
+        self._told = ""
+
+    def open(self) -> None:
+        """Ask for any file that can be opened, and open it."""
+        path = self.ask_open("Open", "poses", "meshes", "models")
+        if path is not None:
+            self.open_path(path)
+
+    def open_model(self) -> None:
+        """Ask for a model, and open it."""
+        path = self.ask_open("Open a model", "models")
+        if path is not None:
+            self.open_path(path)
+
+    def import_mesh(self) -> None:
+        """Ask for a mesh, and make it the pose."""
+        path = self.ask_open("Import mesh", "meshes")
+        if path is not None:
+            self.open_path(path)
+
+    def turn_upright(self) -> None:
+        """Turn the model by the next axis, in its file, and open it anew.
+
+        Raises
+        ------
+        LCollisionError : it is a bundled model, or has no file.
+        """
+        from app.work.jobs import is_bundled
+        from lcollision_core.model import change_model
+
+        document = self._document
+        file = Path(document.model_file)
+        if is_bundled(document.model_file):
+            raise LCollisionError(
+                f"{document.model.name} comes with the program and stays as it is; copy {file}, "
+                f"open the copy and turn that"
+            )
+        if not self.may_lose_changes():
+            return
+        axis = (document.model.up_axis + 1) % 3
+        change_model(file, lambda model: model.turned_upright(axis))
+        document.open_model(file)
+
+    def open_path(self, path: Path) -> None:
+        """Open a file as what its extension says: poses, a model, or a mesh.
+
+        Raises
+        ------
+        LCollisionError : the extension is none of these, or there is no such file.
+        """
+        self._dropped = None
+        suffix = path.suffix.lower()
+        if not path.is_file():
+            self._settings.forget_file(str(path.resolve()))
+            kind = "it is a folder" if path.is_dir() else "there is no such file"
+            raise LCollisionError(
+                f"Couldn't open {path}: {kind}; choose a file of poses, a mesh or a model"
+            )
+        if suffix == POSES_SUFFIX:
+            if not self.may_lose_changes():
+                return
+            self._document.open_poses(path)
+        elif suffix == MODEL_SUFFIX:
+            if not self.may_lose_changes():
+                return
+            self._document.open_model(path)
+        elif suffix in _mesh_suffixes():
+            self._document.import_mesh(path)
+        else:
+            raise LCollisionError(
+                f"{_kind(path)} isn't supported ({path.name}); open poses ({POSES_SUFFIX}), a "
+                f"mesh ({', '.join(_mesh_suffixes())}) or a model ({MODEL_SUFFIX})"
+            )
+        self._settings["last_folder"] = str(path.resolve().parent)
+
+    def open_dropped(self, paths: Sequence[Path]) -> None:
+        """Open the first of some files that can be opened, and tell of the others once it is.
+
+        Raises
+        ------
+        LCollisionError : as for `open_path`.
+        """
+        known = (POSES_SUFFIX, MODEL_SUFFIX, *_mesh_suffixes())
+        path = next((held for held in paths if held.suffix.lower() in known), paths[0])
+        self.open_path(path)
+        if len(paths) > 1:
+            self._dropped = (path, len(paths))
+
+    def new_pose(self) -> None:
+        """Start anew, once unsaved changes are settled."""
+        if self.may_lose_changes():
+            self._document.new_pose()
+
+    def save(self) -> bool:
+        """Save; ask for a file where there is none.
+
+        Returns
+        -------
+        saved : whether it was, not given up
+        """
+        document = self._document
+        if document.file is None:
+            return self.save_as()
+        if document.file_is_another_s:
+            answer = ask_about_another_s(self._window, document.file.name)
+            if answer is not Choice.SAVE:
+                return answer is Choice.DISCARD and self.save_as()
+        document.save()
+        return True
+
+    def save_as(self) -> bool:
+        """Ask for a file, and save there; returns whether it was saved."""
+        path = self.ask_save("Save poses", self._name, {"Poses": POSES_SUFFIX}, self._document.file)
+        if path is None:
+            return False
+        self._document.save(path)
+        return True
+
+    def export(self) -> None:
+        """Ask for axes, scale and file, and write the mesh on the screen."""
+
+        def write() -> None:
+            path = self.ask_save("Export mesh", self._name, _EXPORTS)
+            if path is not None:
+                settings = self._settings
+                self._document.export_mesh(path, settings["export_axes"], settings["export_scale"])
+
+        model = self._document.model
+        form = export_form(self._settings, self._window, model.up_axis, model.front)
+        self._after(form, write)
+
+    def screenshot(self, viewport: Viewport) -> None:
+        """Ask for size and file, and save a picture of the viewport."""
+
+        def shoot() -> None:
+            path = self.ask_save("Save screenshot", self._name, {"PNG": ".png"})
+            if path is not None:
+                settings = self._settings
+                viewport.screenshot(
+                    path,
+                    settings["screenshot_width"],
+                    settings["screenshot_height"],
+                    settings["screenshot_transparent"],
+                )
+                self._document.message.emit(f"Saved {path.name}")
+
+        self._after(screenshot_form(self._settings, self._window), shoot)
+
+    def turntable(self, viewport: Viewport) -> None:
+        """Ask for format, size, rate, background and file, and save a film of one turn."""
+        from app.view.turntable import TurntableStyle
+
+        def shoot() -> None:
+            settings = self._settings
+            # The chosen format first.
+            chosen = f".{settings['turntable_format']}"
+            kinds = dict(sorted(_FILMS.items(), key=lambda film: film[1] != chosen))
+            path = self.ask_save("Save turntable", self._name, kinds)
+            if path is not None:
+                style = TurntableStyle(
+                    settings["turntable_seconds"],
+                    settings["turntable_width"],
+                    settings["turntable_height"],
+                    settings["turntable_rate"],
+                    settings["turntable_background"],
+                    settings["turntable_colour"],
+                )
+                viewport.turntable(path, style)
+
+        self._after(turntable_form(self._settings, self._window), shoot)
+
+    def may_lose_changes(self) -> bool:
+        """Settle unsaved changes with the user; False where they want to go on editing."""
+        if not (self._document.has_model and self._document.modified):
+            return True
+        file = self._document.file
+        answer = ask_about_changes(self._window, self._name, file.name if file else "")
+        if answer is Choice.SAVE:
+            return self.save()
+        return answer is Choice.DISCARD
+
+    def _listing(self, title: str, fill: Callable[[], None]) -> QMenu:
+        """Make a menu that lists anew what there is whenever it is about to be shown."""
+        menu = QMenu(title, self._window)
+        menu.setToolTipsVisible(True)
+        menu.aboutToShow.connect(fill)
+        return menu
+
+    def _list(self, menu: QMenu, text: str, path: str) -> QAction:
+        """Add a file to a menu, to be opened by a click."""
+        action = menu.addAction(text)
+        action.setData(path)
+        action.setToolTip(plain_tip(path))
+        action.triggered.connect(self._on_listed)
+        return action
+
+    @Slot()
+    def _fill_recent(self) -> None:
+        self.recent_menu.clear()
+        for place, name in enumerate(self._settings["recent_files"], start=1):
+            self._list(self.recent_menu, f"&{place}  {menu_text(Path(name).name)}", name)
+        if self.recent_menu.isEmpty():
+            self.recent_menu.addAction("No files yet").setEnabled(False)
+
+    @Slot()
+    def _fill_models(self) -> None:
+        from lcollision_core.model import list_models
+
+        self.models_menu.clear()
+        for model in list_models():
+            action = self._list(self.models_menu, menu_text(model.name), str(model.path))
+            action.setCheckable(True)
+            action.setChecked(model.path.absolute() == Path(self._document.model_file))
+
+    @Slot()
+    def _on_listed(self) -> None:
+        action = self.sender()
+        if isinstance(action, QAction):
+            path = Path(action.data())
+            self._attempt(lambda: self.open_path(path))
+
+    @Slot()
+    def _on_file(self) -> None:
+        if self._document.file is not None:
+            self._remember(self._document.file)
+
+    @Slot(object)
+    def _on_arrived(self, path: Path) -> None:
+        """Remember a file that is open now, and tell of those that were dropped with it."""
+        if path.suffix.lower() in _mesh_suffixes():
+            self._remember(path)
+        dropped, self._dropped = self._dropped, None
+        if dropped is not None and dropped[0].absolute() == path.absolute():
+            self._document.message.emit(
+                f"{self._told}; of {dropped[1]} files it is the one that was opened"
+            )
+
+    @Slot(str)
+    def _on_message(self, sentence: str) -> None:
+        self._told = sentence
+
+    @Slot(object)
+    def _on_other_model(self, found: OtherModel) -> None:
+        if ask_to_switch(self._window, found.path.name, found.model.name):
+            self._document.open_poses(found.path, found.model.path)
+
+    @Slot()
+    def _on_model(self) -> None:
+        file = Path(self._document.model_file)
+        # By its name a bundled one is found after the program has moved.
+        is_bundled = file.parent == bundled_folder("models")
+        self._settings["model"] = file.stem if is_bundled else str(file)
+        if file.is_file() and not is_bundled:
+            self._remember(file)
+
+    @Slot(object)
+    def _remember(self, path: Path) -> None:
+        """Put a file that has opened first among the recent ones."""
+        self._settings.remember_file(str(path.resolve()))
+
+    @Slot(object)
+    def _offer_scale(self, found: WrongScale) -> None:
+        """Ask whether a mesh in another unit is to be scaled, and import it then."""
+        if ask_about_scale(self._window, found):
+            self._document.import_mesh(found.path, found.factor)
+
+    def _folder(self) -> Path:
+        folder = Path(self._settings["last_folder"] or Path.home())
+        return folder if folder.is_dir() else Path.home()
+
+    @property
+    def _name(self) -> str:
+        """What the pose on the screen is called: never as one that it is no longer."""
+        document = self._document
+        return f"{document.pose_name} changed" if document.changed else document.pose_name
+
+    def ask_open(self, title: str, *kinds: str) -> Path | None:
+        """Ask for a file of some kinds: "poses", "meshes", "models"; None where there is none."""
+        name, _ = QFileDialog.getOpenFileName(
+            self._window, title, str(self._folder()), _kinds(*kinds)
+        )
+        return Path(name) if name else None
+
+    def ask_save(
+        self, title: str, name: str, kinds: dict[str, str], file: Path | None = None
+    ) -> Path | None:
+        """Ask for a file to write; the chosen kind's extension is added to a name without one.
+
+        Where the extension chooses among kinds, another one is left for the writer to refuse.
+
+        Parameters
+        ----------
+        title : of the dialog
+        name : of what is written, from which a file name that is not taken is made
+        kinds : extensions by what the kinds are called
+        file : that is proposed instead, as it holds what is written
+
+        Returns
+        -------
+        path : None where the user gives up
+        """
+        from lcollision_core.meshes import has_known_suffix
+
+        proposed = file or _unused(self._folder(), name, next(iter(kinds.values())))
+        filters = {f"{kind} (*{suffix})": suffix for kind, suffix in kinds.items()}
+        dialog = QFileDialog(self._window, title, str(proposed))
+        dialog.setAcceptMode(QFileDialog.AcceptMode.AcceptSave)
+        dialog.setNameFilters(list(filters))
+        dialog.setDefaultSuffix(next(iter(kinds.values())))
+        dialog.filterSelected.connect(lambda chosen: dialog.setDefaultSuffix(filters[chosen]))
+        path = None
+        while path is None and dialog.exec() == QDialog.DialogCode.Accepted:
+            path = Path(dialog.selectedFiles()[0])
+            chooses = len(kinds) > 1 and has_known_suffix(path)
+            if path.suffix.lower() not in kinds.values() and not chooses:
+                # Qt adds no extension behind a dot, so that it has asked about another file.
+                path = path.with_name(f"{path.name}.{dialog.defaultSuffix()}")
+                if os.path.exists(path):  # noqa: PTH110 - a name that is too long is none, no error
+                    dialog.selectFile(str(path))
+                    path = None
+        dialog.deleteLater()
+        if path is not None:
+            self._settings["last_folder"] = str(path.resolve().parent)
+        return path
+
+    @staticmethod
+    def _after(form: QDialog, act: Callable[[], None]) -> None:
+        accepted = form.exec() == QDialog.DialogCode.Accepted
+        form.deleteLater()
+        if accepted:
+            act()
+
+
+def _unused(folder: Path, name: str, suffix: str) -> Path:
+    """Return a file of a folder that is not there yet, called as a pose is."""
+    from lcollision_core.meshes import file_stem, spare_name
+
+    path = folder / f"{file_stem(name)}{suffix}"
+    return spare_name(path) if path.exists() else path

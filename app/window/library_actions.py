@@ -1,0 +1,249 @@
+"""What can be done with the poses of the browser: the library's, a file's, the training set's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, QPoint, Qt, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QMenu, QWidget
+
+from app.editing.commands import Source
+from app.window.actions import ACTIONS, explain_action
+from app.window.dialogs.names import ask_for_name
+from app.window.dialogs.questions import ask_to_replace
+from app.window.menus import MENUS, SEPARATOR
+from app.wording import counted, menu_text
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.window.file_actions import FileActions
+    from app.window.panels.library import LibraryPanel
+    from lcollision_core.model import NamedPose
+
+LIBRARY_MENU = "&Library"
+
+
+class LibraryActions(QObject):
+    """The acts of the menu Library, which is also the browser's context menu.
+
+    Parameters
+    ----------
+    window : that dialogs belong to
+    document : changed
+    panel : says which poses are chosen
+    files : asks for files
+    actions : by key; their texts and whether they can be chosen follow the panel
+
+    Attributes
+    ----------
+    acts : callables by the actions' keys; each may raise `LCollisionError`
+    """
+
+    def __init__(
+        self,
+        window: QWidget,
+        document: PoseDocument,
+        panel: LibraryPanel,
+        files: FileActions,
+        actions: Mapping[str, QAction],
+    ) -> None:
+        super().__init__(window)
+        self._window, self._document, self._panel = window, document, panel
+        self._files, self._actions = files, actions
+        self.acts: dict[str, Callable[[], object]] = {
+            "keep": self.keep,
+            "update": document.update_library_pose,
+            "load": panel.load_chosen,
+            "blend": self._blend,
+            "rename": self._rename,
+            "tags": self._tag,
+            "duplicate": lambda: document.duplicate_poses(panel.chosen_poses),
+            "mirror_poses": self._mirror,
+            "remove": self._remove,
+            "add": self._add,
+            "import_poses": self._import,
+            "export_poses": self._export_chosen,
+            "export_library": self._export_library,
+            "find_pose": panel.find_pose,
+        }
+        panel.menu_wanted.connect(self._show_menu)
+        for changed in (
+            panel.chosen_changed,
+            document.library_changed,
+            document.file_changed,
+            document.model_changed,
+        ):
+            changed.connect(self.update_actions)
+        self.update_actions()
+
+    @Slot()
+    def update_actions(self) -> None:
+        """Let the actions say what they would do now, and choose only what can be done."""
+        document, panel = self._document, self._panel
+        has_model = document.has_model
+        chosen = panel.chosen_poses
+        own = bool(chosen) and panel.source is Source.LIBRARY
+        one = panel.chosen is not None and len(chosen) == 1
+        allowed = {
+            "keep": True,
+            "update": has_model and document.can_update,
+            "load": one,
+            "blend": one,
+            "rename": own and one,
+            "tags": own,
+            "duplicate": own,
+            "mirror_poses": bool(chosen) and document.can_mirror,
+            "remove": own,
+            "add": bool(self._addable()),
+            "import_poses": True,
+            "export_poses": bool(chosen),
+            "export_library": has_model and bool(document.poses),
+            "find_pose": True,
+        }
+        for key, can in allowed.items():
+            self._actions[key].setEnabled(has_model and can)
+        kept = document.library_pose if has_model else None
+        update, add = self._actions["update"], self._actions["add"]
+        update.setText("&Update pose" if kept is None else f"&Update “{menu_text(kept.name)}”")
+        tip = ACTIONS["update"].tip if kept else "Load a pose of your library to change it later"
+        explain_action(update, tip)
+        addable = self._addable()
+        what = "selected" if chosen or not addable else f"all {len(addable)}"
+        add.setText(f"Add &{what} to library")
+
+    def keep(self) -> None:
+        """Ask for a name, and put the working pose into the library."""
+        document = self._document
+        replaced = ""
+
+        def refuse(name: str) -> str:
+            nonlocal replaced
+            replaced = document.name_taken_by(name)
+            reason = document.why_not_called(name, replaced)
+            if reason or not replaced or ask_to_replace(self._window, replaced):
+                return reason
+            return f"your library has a pose “{replaced}” already; choose another name"
+
+        proposed = document.free_name(document.pose_name)
+        name = ask_for_name(
+            self._window, "Add to library", "Name in your library:", proposed, refuse
+        )
+        if name is None:
+            return
+        if replaced:
+            document.replace_pose_of_library(replaced)
+        else:
+            document.add_pose_to_library(name)
+        self._panel.choose_own(document.pose_name)
+
+    @Slot(QPoint)
+    def _show_menu(self, place: QPoint) -> None:
+        menu = QMenu(self._window)
+        menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        for key in MENUS[LIBRARY_MENU]:
+            if key == SEPARATOR:
+                menu.addSeparator()
+            elif self._actions[key].isEnabled():
+                menu.addAction(self._actions[key])
+        menu.popup(place)
+
+    def _blend(self) -> None:
+        self._panel.blend.setFocus(Qt.FocusReason.ShortcutFocusReason)
+
+    def _rename(self) -> None:
+        chosen, document = self._panel.chosen_own, self._document
+        if chosen is None:
+            return
+        old = chosen.name
+        name = ask_for_name(
+            self._window,
+            "Rename a pose",
+            f"New name of “{old}”:",
+            old,
+            lambda name: document.why_not_called(name, old),
+        )
+        if name is not None:
+            document.rename_pose(old, name)
+            self._panel.choose_own(name)
+
+    def _tag(self) -> None:
+        chosen = self._panel.chosen_poses
+        shared = [tag for tag in chosen[0].tags if all(tag in pose.tags for pose in chosen)]
+        text = ask_for_name(
+            self._window,
+            "Tags",
+            f"Tags of {_called(chosen)}, with commas between them:",
+            ", ".join(shared),
+            lambda text: _why_no_tags(_split(text)),
+        )
+        if text is not None:
+            self._document.tag_poses([pose.name for pose in chosen], _split(text))
+
+    def _mirror(self) -> None:
+        self._document.mirror_poses(self._panel.chosen_poses)
+        # Where they will be.
+        self._panel.own.setChecked(True)
+
+    def _remove(self) -> None:
+        self._document.remove_poses_from_library([p.name for p in self._panel.chosen_poses])
+
+    def _addable(self) -> tuple[NamedPose, ...]:
+        """Return what Add would add: the chosen poses, or of a file all where none is chosen."""
+        panel = self._panel
+        if panel.source is Source.LIBRARY or not self._document.has_model:
+            return ()
+        everything = self._document.file_poses if panel.source is Source.FILE else ()
+        return panel.chosen_poses or everything
+
+    def _add(self) -> None:
+        self._tell_added(self._document.add_to_library(self._addable()))
+
+    def _import(self) -> None:
+        from lcollision_core.model import read_poses
+
+        path = self._files.ask_open("Import into library", "poses")
+        if path is not None:
+            self._tell_added(self._document.add_to_library(read_poses(path, self._document.model)))
+            self._panel.own.setChecked(True)
+
+    def _tell_added(self, added: int) -> None:
+        self._document.message.emit(
+            f"Added {counted(added, 'pose')} to your library"
+            if added
+            else "Your library has these poses already"
+        )
+
+    def _export_chosen(self) -> None:
+        self._export(self._panel.chosen_poses, "Export poses")
+
+    def _export_library(self) -> None:
+        self._export(self._document.poses, "Export library")
+
+    def _export(self, poses: tuple[NamedPose, ...], title: str) -> None:
+        from lcollision_core.model import write_poses
+
+        model = self._document.model
+        name = poses[0].name if len(poses) == 1 else f"{model.name} poses"
+        path: Path | None = self._files.ask_save(title, name, {"Poses": ".json"})
+        if path is not None:
+            write_poses(path, model, poses)
+            self._document.message.emit(f"Exported {counted(len(poses), 'pose')} to {path.name}")
+
+
+def _split(text: str) -> list[str]:
+    return list(dict.fromkeys(tag for tag in map(str.strip, text.split(",")) if tag))
+
+
+def _why_no_tags(tags: list[str]) -> str:
+    from lcollision_core.model import MAX_NAME_LENGTH, MAX_TAGS
+
+    if len(tags) > MAX_TAGS or any(len(tag) > MAX_NAME_LENGTH for tag in tags):
+        return f"a pose has at most {MAX_TAGS} tags of {MAX_NAME_LENGTH} characters; shorten them"
+    return ""
+
+
+def _called(poses: tuple[NamedPose, ...]) -> str:
+    return f"“{poses[0].name}”" if len(poses) == 1 else counted(len(poses), "pose")

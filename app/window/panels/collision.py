@@ -1,0 +1,80 @@
+"""The right panel: the exact check, beneath it the estimate, and Resolve."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QTimer, Signal, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QVBoxLayout, QWidget
+
+from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.window.panels.exact import ExactCard
+from app.window.panels.prediction import PredictionCard
+from app.window.panels.resolve import ResolveCard
+from app.window.panels.widgets import scrolling
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+
+_MIN_WIDTH = 288
+"""In which every card is seen whole, beside a scroll bar."""
+
+
+class CollisionPanel(QWidget):
+    """Three cards, one below the other; the first, the headline, is always in sight.
+
+    Signals
+    -------
+    domain_hovered : int or None, the domain of the row that the pointer is on
+
+    Parameters
+    ----------
+    document : followed and changed
+    resolve_action : what the button of Resolve triggers
+    """
+
+    domain_hovered = Signal(object)
+
+    def __init__(self, document: PoseDocument, resolve_action: QAction) -> None:
+        super().__init__()
+        self._document = document
+        self.setMinimumWidth(_MIN_WIDTH)
+        self.exact = ExactCard(document)
+        self.prediction = PredictionCard(document)
+        self.resolve = ResolveCard(document, resolve_action)
+        page = QWidget()
+        cards = QVBoxLayout(page)
+        cards.setContentsMargins(NORMAL, 0, NORMAL, CLOSE)
+        cards.setSpacing(CLOSE)
+        for card in (self.prediction, self.resolve):
+            cards.addWidget(card)
+        cards.addStretch()
+        headline = QVBoxLayout()
+        headline.setContentsMargins(NORMAL, TIGHT, NORMAL, 0)
+        headline.addWidget(self.exact)
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(CLOSE)
+        column.addLayout(headline)
+        self._area = scrolling(page)
+        column.addWidget(self._area)
+        self.prediction.domain_hovered.connect(self.domain_hovered)
+        document.outcome_changed.connect(self._on_outcome)
+
+    def refresh_icons(self) -> None:
+        """Draw all signs in the theme that has come."""
+        for card in (self.exact, self.prediction, self.resolve):
+            card.refresh_icons()
+
+    @Slot()
+    def _on_outcome(self) -> None:
+        if self._document.outcome is not None:
+            # Not before it has been laid out.
+            QTimer.singleShot(0, self, self._scroll_to_outcome)
+
+    @Slot()
+    def _scroll_to_outcome(self) -> None:
+        """Show all that came of Resolve, or how it begins where there is no room for all."""
+        self._area.ensureWidgetVisible(self.resolve, 0, CLOSE)
+        self._area.ensureWidgetVisible(self.resolve.exactly_free, 0, CLOSE)

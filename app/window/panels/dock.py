@@ -1,0 +1,94 @@
+"""A panel of the window: beside the body where it is docked, and where it floats."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import QEvent, QPoint, QRect, QTimer, Slot
+from PySide6.QtWidgets import QDockWidget, QMainWindow, QWidget
+
+from app.view.theme import CLOSE
+
+
+class Panel(QDockWidget):
+    """A dock that floats beside its window, or where it hides least of the body.
+
+    Where it is dragged off it stays under the pointer.
+
+    Parameters
+    ----------
+    key : under which the layout remembers it
+    title : of the panel
+    content : of the panel
+    window : to which it belongs
+    """
+
+    def __init__(self, key: str, title: str, content: QWidget, window: QMainWindow) -> None:
+        super().__init__(title, window)
+        self._window = window
+        self._dragged = False
+        self.setObjectName(key)
+        self.setWidget(content)
+        self.topLevelChanged.connect(self._on_floating)
+
+    def event(self, event: QEvent) -> bool:
+        """Notice whether the pointer drags the panel."""
+        if event.type() in (QEvent.Type.MouseMove, QEvent.Type.NonClientAreaMouseMove):
+            self._dragged = True
+        elif event.type() in (QEvent.Type.MouseButtonPress, QEvent.Type.MouseButtonDblClick):
+            self._dragged = False
+        return super().event(event)
+
+    @Slot(bool)
+    def _on_floating(self, floating: bool) -> None:
+        if floating and not self._dragged:
+            # Not before it has its frame, and the view what the panel left.
+            QTimer.singleShot(0, self, self._place_beside)
+
+    @Slot()
+    def _place_beside(self) -> None:
+        view = self._window.centralWidget()
+        if view is None or not (self.isFloating() and self.isVisible()):
+            return
+        room = self._window.screen().availableGeometry()
+        # The body stands in the middle of the view.
+        body = QRect(0, 0, view.width() // 2, view.height())
+        body.moveCenter(QRect(view.mapToGlobal(QPoint(0, 0)), view.size()).center())
+        frame = self.frameGeometry()
+        place = beside(frame, self._window.frameGeometry(), body, room)
+        self.move(place)
+
+
+def beside(panel: QRect, window: QRect, body: QRect, room: QRect) -> QPoint:
+    """Find where a panel hides neither its window nor the body in it.
+
+    Parameters
+    ----------
+    panel : its size counts, and its top
+    window : the window's frame
+    body : in the window
+    room : of the screen
+
+    Returns
+    -------
+    corner : right of the window, left, below or above it, where there is room; else at the edge of
+        the screen where it hides least of the body
+    """
+    right, bottom = room.right() + 1 - panel.width(), room.bottom() + 1 - panel.height()
+    top = max(room.top(), min(panel.top(), bottom))
+    left = max(room.left(), min(panel.left(), right))
+    outside = (
+        QPoint(window.right() + CLOSE, top),
+        QPoint(window.left() - CLOSE - panel.width(), top),
+        QPoint(left, window.bottom() + CLOSE),
+        QPoint(left, window.top() - CLOSE - panel.height()),
+    )
+    for corner in outside:
+        if room.contains(QRect(corner, panel.size())):
+            return corner
+    edges = [QPoint(max(right, room.left()), top), QPoint(room.left(), top)]
+    edges += [QPoint(left, max(bottom, room.top())), QPoint(left, room.top())]
+
+    def hidden(corner: QPoint) -> int:
+        over = QRect(corner, panel.size()).intersected(body)
+        return over.width() * over.height() if over.isValid() else 0
+
+    return min(edges, key=hidden)

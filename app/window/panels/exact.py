@@ -1,0 +1,110 @@
+"""What is known of the pose: the exact check, which follows when the hand rests."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from PySide6.QtWidgets import QHBoxLayout, QLabel
+
+from app.view.icons import pixmap
+from app.view.theme import CLOSE, current_theme
+from app.window.panels.widgets import Card, ElidedLabel, labelled, show_verdict, title_row
+from app.wording import counted, overlap_text
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.work.frames import ExactVerdict
+
+_SIGNS = {"free": "check", "colliding": "warning", "waiting": "wait"}
+_SIGN_SIZE = 24
+_SOURCE = "computed on the mesh"
+_BEFORE = "of the pose before"
+
+
+class ExactCard(Card):
+    """The headline of the right panel: the exact verdict, with pairs and depth.
+
+    While a changed pose waits for its check, the verdict of the pose before stays, greyed and
+    said to be that: nothing flickers, and no line comes or goes.
+
+    Parameters
+    ----------
+    document : followed
+    """
+
+    def __init__(self, document: PoseDocument) -> None:
+        super().__init__("", "truth")
+        self._document = document
+        self._sign_name = "wait"
+        self._kind = "waiting"
+        self._sign = QLabel()
+        self._sign.setFixedSize(_SIGN_SIZE, _SIGN_SIZE)
+        self.verdict = labelled("", "headline")
+        self.verdict.setWordWrap(True)
+        self.details = labelled("", "caption")
+        self.details.setWordWrap(True)
+        self.source = ElidedLabel(_SOURCE)
+        line = QHBoxLayout()
+        line.setSpacing(CLOSE)
+        line.addWidget(self._sign)
+        line.addWidget(self.verdict, 1)
+        self.column.addLayout(title_row("Exact check", self.source))
+        self.column.addLayout(line)
+        self.column.addWidget(self.details)
+        document.exact_changed.connect(self._on_exact)
+        document.model_changed.connect(self._on_model)
+        self._on_model()
+
+    @property
+    def is_of_the_pose_before(self) -> bool:
+        """Whether what is said waits for the check of a pose that has changed since."""
+        return self._kind == "waiting" and self._sign_name != "wait"
+
+    def refresh_icons(self) -> None:
+        """Draw the sign in the theme that has come."""
+        ink = getattr(current_theme(), self._kind)
+        sharpness = self.devicePixelRatioF()
+        self._sign.setPixmap(pixmap(self._sign_name, ink, _SIGN_SIZE, sharpness))
+
+    def _on_model(self) -> None:
+        """Forget the verdict of another model's pose."""
+        has_model = self._document.has_model
+        self._sign_name = "wait"
+        self.verdict.setText("Checking…" if has_model else "No pose yet")
+        self.details.setText("Follows a moment after the pose rests")
+        if has_model:
+            # Folds that do not count are told of on a line of their own.
+            lines = 2 if self._document.model.near_exclusion else 1
+            self.details.setMinimumHeight(lines * self.details.fontMetrics().lineSpacing())
+        self._on_exact()
+
+    def _on_exact(self) -> None:
+        verdict = self._document.exact if self._document.has_model else None
+        self._kind = "waiting"
+        if verdict is not None:
+            self._kind = "colliding" if verdict.colliding else "free"
+            self._sign_name = _SIGNS[self._kind]
+            self._say(verdict)
+        self.source.setText(_BEFORE if self.is_of_the_pose_before else _SOURCE)
+        show_verdict(self.verdict, self._kind)
+        show_verdict(self, self._kind)
+        self.refresh_icons()
+
+    def _say(self, verdict: ExactVerdict) -> None:
+        folds = ""
+        if verdict.n_near_pairs:
+            folds = f"\n{counted(verdict.n_near_pairs, 'skin fold')} not counted"
+        if verdict.colliding:
+            self.verdict.setText("Colliding (checked)")
+            pairs = counted(len(verdict.pairs), "pair")
+            self.details.setText(
+                f"{pairs} of triangles, overlap {overlap_text(verdict.energy)}{folds}"
+            )
+            self.details.setToolTip(
+                "How deep all crossing triangles lie in each other, taken together, in per cent "
+                "of the height"
+            )
+        else:
+            self.verdict.setText("No collisions (checked)")
+            self.details.setText(f"No triangle crosses another{folds}")
+            self.details.setToolTip("")

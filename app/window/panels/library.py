@@ -1,0 +1,481 @@
+"""The pose browser: training poses, the user's library and a file's poses, as pictures."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PySide6.QtCore import QItemSelectionModel, QPoint, QSize, Qt, QTimer, Signal, Slot
+from PySide6.QtGui import QAction, QIcon, QImage, QPixmap, QShowEvent
+from PySide6.QtWidgets import (
+    QButtonGroup,
+    QHBoxLayout,
+    QLineEdit,
+    QListWidgetItem,
+    QMenu,
+    QToolButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.editing.commands import Source
+from app.view.camera import preset_view
+from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
+from app.window.panels.action_button import ActionButton
+from app.window.panels.pose_grid import THUMBNAIL, PoseGrid
+from app.window.panels.thumbnail import draw_pose
+from app.window.panels.widgets import ElidedLabel, Slider, labelled, plain_tip, silent
+from app.wording import menu_text, one_line
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.work.frames import FrameEvaluator
+    from lcollision_core.model import NamedPose
+
+_PAUSE = 25
+"""Milliseconds between two pictures, so that the window stays live while they are drawn."""
+
+_HEIGHT_OF_A_ROW = 480
+"""Of the window, so that most of it stays the body's."""
+
+_BLEND_STEPS = 100
+_SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
+"""By whether the theme is dark."""
+
+
+class LibraryPanel(QWidget):
+    """Poses to load by a double click, to blend towards, to keep and to find again.
+
+    Three sources: the poses that the model learned from, the user's library, and the poses of the
+    file that is open, where it has some.
+
+    Signals
+    -------
+    chosen_changed : `chosen`, `chosen_poses` or `source` may be another
+    menu_wanted : QPoint on the screen, where the context menu is to be
+
+    Parameters
+    ----------
+    document : followed and changed
+    keep, update, add : the actions that have buttons here
+    """
+
+    chosen_changed = Signal()
+    menu_wanted = Signal(object)
+
+    def __init__(
+        self, document: PoseDocument, keep: QAction, update: QAction, add: QAction
+    ) -> None:
+        super().__init__()
+        self._document = document
+        self._poses: list[NamedPose] = []
+        self._tag = ""
+        self._pictures: dict[bytes, QIcon] = {}
+        self._evaluator: FrameEvaluator | None = None
+        self._may_draw = False
+        self._due = QTimer(self)
+        self._due.setSingleShot(True)
+        self._due.setInterval(_PAUSE)
+        self.list = PoseGrid()
+        self.list.setAccessibleName("Poses")
+        self._sources = QButtonGroup(self)
+        self.training = self._source_button("Training", "The poses that the model learned from")
+        self.own = self._source_button("Library", "Your own poses of this model, kept for good")
+        self.of_file = self._source_button("This file", "The poses of the file that is open")
+        self.search = QLineEdit()
+        self.search.setPlaceholderText("Find a pose")
+        self.search.setClearButtonEnabled(True)
+        self.search.setAccessibleName("Find a pose by name or tag")
+        self.search.setMinimumWidth(70)
+        self.search.setMaximumWidth(240)
+        self.tags = QToolButton()
+        self.tags.setObjectName("filter")
+        self.tags.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
+        self.tags.setToolTip("Show the poses with one tag only")
+        self._tag_menu = QMenu(self.tags)
+        self.tags.setMenu(self._tag_menu)
+        self.keep = ActionButton(keep)
+        self.update_button = ActionButton(update)
+        self.add_button = ActionButton(add)
+        self._target = ElidedLabel("Select a pose to blend")
+        self._target.setObjectName("caption")
+        self._share = labelled("", "caption")
+        self.blend = Slider()
+        self.blend.setRange(0, _BLEND_STEPS)
+        self.blend.setEnabled(False)
+        self.blend.setAccessibleName("Blend towards the selected pose")
+        self.blend.setToolTip(
+            "Drag to blend the pose towards the selected one; the next begins where this one ends"
+        )
+        self._lay_out()
+        self.training.setChecked(True)
+        self._due.timeout.connect(self._draw_next)
+        self._sources.buttonToggled.connect(self._on_source)
+        self.search.textChanged.connect(self._filter)
+        self._tag_menu.triggered.connect(self._on_tag)
+        self.list.itemDoubleClicked.connect(self._on_double_click)
+        self.list.itemActivated.connect(self.load_chosen)
+        self.list.itemSelectionChanged.connect(self._on_chosen)
+        self.list.currentRowChanged.connect(self._on_chosen)
+        self.list.customContextMenuRequested.connect(self._on_menu)
+        self.list.verticalScrollBar().valueChanged.connect(self._draw_soon)
+        self.blend.sliderPressed.connect(self._on_blend_pressed)
+        self.blend.valueChanged.connect(self._on_blend)
+        self.blend.sliderReleased.connect(self._on_blend_released)
+        document.model_changed.connect(self._on_model)
+        document.library_changed.connect(self._on_library)
+        document.pose_loaded.connect(self._on_pose_loaded)
+        if document.has_model:
+            self._on_model()
+
+    def _lay_out(self) -> None:
+        sources = QHBoxLayout()
+        sources.setSpacing(0)
+        for button in self._sources.buttons():
+            sources.addWidget(button)
+        bar = QHBoxLayout()
+        bar.setSpacing(CLOSE)
+        bar.addLayout(sources)
+        bar.addWidget(self.search, 1)
+        bar.addWidget(self.tags)
+        bar.addStretch()
+        side = QWidget()
+        side.setFixedWidth(182)
+        column = QVBoxLayout(side)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(TIGHT)
+        column.addWidget(self.keep)
+        column.addWidget(self.update_button)
+        column.addWidget(self.add_button)
+        column.addStretch()
+        line = QHBoxLayout()
+        line.addWidget(self._target, 1)
+        line.addWidget(self._share)
+        column.addLayout(line)
+        column.addWidget(self.blend)
+        row = QHBoxLayout()
+        row.setSpacing(NORMAL)
+        row.addWidget(side)
+        row.addWidget(self.list, 1)
+        page = QVBoxLayout(self)
+        page.setContentsMargins(NORMAL, TIGHT, NORMAL, CLOSE)
+        page.setSpacing(CLOSE)
+        page.addLayout(bar)
+        page.addLayout(row, 1)
+        rows = (self.keep, self.update_button, self.add_button, self.blend)
+        order = (*self._sources.buttons(), self.search, self.tags, self.list, *rows)
+        for before, after in pairwise(order):
+            QWidget.setTabOrder(before, after)
+
+    @property
+    def chosen(self) -> NamedPose | None:
+        """The pose that is chosen, of several the one that was chosen last; None for none."""
+        row = self.list.currentRow()
+        item = self.list.item(row)
+        is_chosen = item is not None and item.isSelected() and row < len(self._poses)
+        return self._poses[row] if is_chosen else None
+
+    @property
+    def chosen_poses(self) -> tuple[NamedPose, ...]:
+        """All poses that are chosen, in their order."""
+        rows = sorted(index.row() for index in self.list.selectedIndexes())
+        return tuple(self._poses[row] for row in rows)
+
+    @property
+    def chosen_own(self) -> NamedPose | None:
+        """The chosen pose where the library is shown; None for none or for one of elsewhere."""
+        return self.chosen if self.source is Source.LIBRARY else None
+
+    @property
+    def source(self) -> Source:
+        """Whose poses are shown."""
+        if self.own.isChecked():
+            return Source.LIBRARY
+        return Source.FILE if self.of_file.isChecked() else Source.TRAINING
+
+    def allow_pictures(self) -> None:
+        """Start drawing pictures: everything else is on the screen."""
+        self._may_draw = True
+        self._draw_soon()
+
+    def redraw(self) -> None:
+        """Draw all pictures again, as for another theme."""
+        self._pictures.clear()
+        self.refresh()
+
+    def stop(self) -> None:
+        """Draw no more pictures, as the window goes."""
+        self._due.stop()
+        self._may_draw = False
+
+    def load_chosen(self) -> None:
+        """Edit the selected pose."""
+        if self.chosen is not None:
+            self._document.load_pose(self.chosen)
+
+    def choose_own(self, name: str) -> None:
+        """Show the library, and choose the pose of this name, whatever is searched for.
+
+        Raises
+        ------
+        ValueError : there is none.
+        """
+        self.own.setChecked(True)
+        row = self._names().index(name)
+        if self.list.isRowHidden(row):
+            self._tag = ""
+            self.search.clear()
+            self._filter()
+        self._choose(row)
+        self.list.scrollToItem(self.list.item(row))
+
+    def find_pose(self) -> None:
+        """Let the user type what a pose is called."""
+        self.search.setFocus(Qt.FocusReason.ShortcutFocusReason)
+        self.search.selectAll()
+
+    @Slot()
+    def refresh(self) -> None:
+        """Show the poses as they are now."""
+        document = self._document
+        if not document.has_model:
+            return
+        current, chosen = self.chosen, {pose.name for pose in self.chosen_poses}
+        if self.source is Source.LIBRARY:
+            self._poses = list(document.poses)
+        elif self.source is Source.FILE:
+            self._poses = list(document.file_poses)
+        else:
+            self._poses = [
+                document.training_pose(number) for number in range(len(document.model.pose_names))
+            ]
+        with silent(self.list):
+            self.list.clear()
+            for pose in self._poses:
+                item = QListWidgetItem(one_line(pose.name))
+                tags = f" ({', '.join(pose.tags)})" if pose.tags else ""
+                item.setToolTip(plain_tip(f"{one_line(pose.name + tags)}: double-click to load"))
+                item.setIcon(self._pictures.get(pose.latent.tobytes(), self._blank()))
+                self.list.addItem(item)
+            if current is not None and current.name in self._names():
+                self._choose(self._names().index(current.name))
+            for row, pose in enumerate(self._poses):
+                self.list.item(row).setSelected(pose.name in chosen)
+        for button, text, poses in (
+            (self.own, "Library", document.poses),
+            (self.of_file, "This file", document.file_poses),
+        ):
+            button.setText(f"{text} ({len(poses)})" if poses else text)
+        self.of_file.setVisible(bool(document.file_poses))
+        self.add_button.setVisible(self.source is not Source.LIBRARY)
+        self.own.setProperty("place", "middle" if document.file_poses else "last")
+        self.own.style().polish(self.own)
+        self._list_tags()
+        self._filter()
+
+    def _list_tags(self) -> None:
+        tags = sorted({tag for pose in self._poses for tag in pose.tags}, key=str.casefold)
+        if self._tag not in tags:
+            self._tag = ""
+        self._tag_menu.clear()
+        for tag in ("", *tags):
+            action = self._tag_menu.addAction(menu_text(tag) or "All poses")
+            action.setData(tag)
+            action.setCheckable(True)
+            action.setChecked(tag == self._tag)
+        self.tags.setVisible(bool(tags))
+        self.tags.setText(f"Tag: {menu_text(self._tag)}" if self._tag else "Tags")
+
+    @Slot()
+    def _filter(self) -> None:
+        """Hide what is not searched for, and choose nothing that is hidden."""
+        words = self.search.text().casefold().split()
+        n_shown = 0
+        for row, pose in enumerate(self._poses):
+            text = " ".join((pose.name, *pose.tags)).casefold()
+            shown = all(word in text for word in words) and self._tag in (*pose.tags, "")
+            self.list.setRowHidden(row, not shown)
+            n_shown += shown
+            if not shown:
+                self.list.item(row).setSelected(False)
+        hint = "The poses that you keep are shown here" if not self._poses else "No pose matches"
+        self.list.hint.setText(hint)
+        self.list.hint.setVisible(not n_shown)
+        self._on_chosen()
+        self._draw_soon()
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for one row of pictures, and in a tall window for more."""
+        one, rows = super().sizeHint(), max(self.window().height() // _HEIGHT_OF_A_ROW, 1)
+        return one + QSize(0, (rows - 1) * self.list.gridSize().height())
+
+    def showEvent(self, event: QShowEvent) -> None:  # noqa: N802
+        """Go on with the pictures: none is drawn while nobody sees them."""
+        super().showEvent(event)
+        self._draw_soon()
+
+    def _choose(self, row: int) -> None:
+        only = QItemSelectionModel.SelectionFlag.ClearAndSelect
+        self.list.setCurrentItem(self.list.item(row), only)
+
+    def _names(self) -> list[str]:
+        return [pose.name for pose in self._poses]
+
+    def _source_button(self, text: str, tip: str) -> QToolButton:
+        button = QToolButton()
+        button.setObjectName("segment")
+        button.setProperty("place", "last" if self._sources.buttons() else "first")
+        button.setText(text)
+        button.setToolTip(tip)
+        button.setCheckable(True)
+        button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self._sources.addButton(button)
+        return button
+
+    @staticmethod
+    def _blank() -> QIcon:
+        blank = QPixmap(THUMBNAIL, THUMBNAIL)
+        blank.fill(Qt.GlobalColor.transparent)
+        return QIcon(blank)
+
+    @Slot()
+    def _on_model(self) -> None:
+        self._pictures.clear()
+        self._on_source()
+
+    @Slot()
+    def _on_library(self) -> None:
+        if self.source is Source.FILE and not self._document.file_poses:
+            # Which shows them.
+            self.training.setChecked(True)
+        else:
+            self.refresh()
+
+    @Slot()
+    def _on_pose_loaded(self) -> None:
+        # Only a file's poses come in without a past.
+        if self._document.file_poses and not self._document.undo_stack.count():
+            self.of_file.setChecked(True)
+
+    @Slot()
+    def _on_source(self) -> None:
+        # A pose of another source, or of another model, may have the name of the chosen one.
+        self.list.clearSelection()
+        self.refresh()
+
+    @Slot(QAction)
+    def _on_tag(self, action: QAction) -> None:
+        self._tag = action.data()
+        self._list_tags()
+        self._filter()
+
+    @Slot(QPoint)
+    def _on_menu(self, place: QPoint) -> None:
+        if self.list.itemAt(place) is None:
+            self.list.clearSelection()
+        self.menu_wanted.emit(self.list.viewport().mapToGlobal(place))
+
+    @Slot()
+    def _draw_soon(self) -> None:
+        if self._may_draw and not self._due.isActive():
+            self._due.start()
+
+    @Slot()
+    def _draw_next(self) -> None:
+        """Draw one picture, of those in sight first."""
+        if not self.isVisible():
+            return
+        missing = [
+            place
+            for place, pose in enumerate(self._poses)
+            if pose.latent.tobytes() not in self._pictures
+        ]
+        if not missing:
+            return
+        seen = self.list.viewport().rect()
+        in_sight = (
+            place
+            for place in missing
+            if not self.list.isRowHidden(place)
+            and self.list.visualItemRect(self.list.item(place)).intersects(seen)
+        )
+        drawn = self._poses[next(in_sight, missing[0])]
+        key = drawn.latent.tobytes()
+        picture = self._pictures[key] = self._picture(drawn)
+        # A pose may be there under several names.
+        for place in missing:
+            if self._poses[place].latent.tobytes() == key:
+                self.list.item(place).setIcon(picture)
+                if self.list.isRowHidden(place):
+                    # Qt gives a hidden item whose picture changes a place again, on top of those
+                    # shown.
+                    self.list.scheduleDelayedItemsLayout()
+        self._due.start()
+
+    def _picture(self, pose: NamedPose) -> QIcon:
+        from app.work.frames import FrameEvaluator
+
+        model = self._document.model
+        if self._evaluator is None or self._evaluator.model is not model:
+            self._evaluator = FrameEvaluator(model)
+        sharpness = self.devicePixelRatioF()
+        side = round(THUMBNAIL * sharpness)
+        vertices = model.decode(pose.latent, 1).astype(np.float32)
+        pixels = draw_pose(
+            vertices,
+            self._evaluator.normals(vertices),
+            model.faces,
+            preset_view("Three-quarter", vertices, model.up_axis, model.front, 1.0),
+            side,
+            _SKIN[current_theme().is_dark],
+        )
+        image = QImage(side, side, QImage.Format.Format_RGBA8888)
+        np.frombuffer(image.bits(), dtype=np.uint8)[:] = pixels.ravel()
+        image.setDevicePixelRatio(sharpness)
+        drawn = QPixmap.fromImage(image)
+        picture = QIcon()
+        for mode in (QIcon.Mode.Normal, QIcon.Mode.Selected):
+            picture.addPixmap(drawn, mode)
+        return picture
+
+    @Slot(QListWidgetItem)
+    def _on_double_click(self, item: QListWidgetItem) -> None:
+        self._document.load_pose(self._poses[self.list.row(item)])
+
+    @Slot()
+    def _on_chosen(self) -> None:
+        chosen = self.chosen
+        self.blend.setEnabled(chosen is not None)
+        self._target.setText(
+            "Select a pose to blend" if chosen is None else f"Blend towards {chosen.name}"
+        )
+        self.chosen_changed.emit()
+
+    @Slot()
+    def _on_blend_pressed(self) -> None:
+        if self.chosen is not None:
+            self._document.begin_gesture(f"Blend towards {self.chosen.name}")
+
+    @Slot(int)
+    def _on_blend(self, value: int) -> None:
+        if self.chosen is None:
+            return
+        self._document.blend_towards(self.chosen.latent, value / _BLEND_STEPS)
+        self._share.setText(f"{value} %")
+        if not self.blend.isSliderDown():
+            self._rest_blend()
+
+    @Slot()
+    def _on_blend_released(self) -> None:
+        self._document.end_gesture()
+        self._rest_blend()
+
+    def _rest_blend(self) -> None:
+        """Back to 0: the next blend begins at the pose that this one ended in."""
+        share = self.blend.value()
+        if share and self.chosen is not None:
+            self._document.message.emit(f"Blended {share} % of the way to {self.chosen.name}")
+        with silent(self.blend):
+            self.blend.setValue(0)
+        self._share.setText("")

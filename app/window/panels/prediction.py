@@ -1,0 +1,357 @@
+"""The estimate: what the model believes of the pose at once, and one row for each domain."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QPoint, QPointF, QRectF, QSize, Qt, Signal, Slot
+from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPolygonF
+from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy, QToolButton, QVBoxLayout, QWidget
+
+from app.view.icons import icon
+from app.view.shading import FULL_PREDICTED
+from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme
+from app.window.panels.widgets import (
+    NAME_SHARE,
+    Card,
+    ElidedLabel,
+    HoverRow,
+    fill_with,
+    labelled,
+    longest_name,
+    plain_tip,
+    show_verdict,
+    silent,
+    title_row,
+)
+from app.wording import heading, overlap_text
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+
+EVEN_ODDS = 0.5
+"""Probability above which a pose counts as predicted to collide."""
+
+_BAR_WIDTH = 40
+_TIP = "The model's instant estimate of how likely this pose collides with itself"
+
+
+class ProbabilityMeter(QWidget):
+    """A bar from 0 to 1 with a line at even odds and a mark where the pose stands."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._probability: float | None = None
+        self._is_aside = False
+        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        self.setAccessibleName("Probability of a collision")
+
+    @property
+    def probability(self) -> float | None:
+        """What is shown; None for nothing."""
+        return self._probability
+
+    def show_probability(self, probability: float | None, is_aside: bool = False) -> None:
+        """Move the mark; once the exact check has spoken it is grey, as it is no alarm."""
+        if (probability, is_aside) != (self._probability, self._is_aside):
+            self._probability, self._is_aside = probability, is_aside
+            self.update()
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for the bar and the scale beneath it."""
+        return QSize(160, 22 + self.fontMetrics().height())
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw both halves, the line between them, the mark and the scale."""
+        theme = current_theme()
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        bar = QRectF(1, 9, self.width() - 2, 8)
+        painter.setBrush(QColor(theme.track))
+        painter.drawRoundedRect(bar, 4, 4)
+        middle = bar.left() + EVEN_ODDS * bar.width()
+        if self._probability is not None:
+            verdict = theme.colliding if self._probability > EVEN_ODDS else theme.free
+            ink = QColor(theme.muted if self._is_aside else verdict)
+            place = bar.left() + self._probability * bar.width()
+            filled = QColor(ink)
+            filled.setAlpha(130)
+            painter.setBrush(filled)
+            painter.setClipRect(QRectF(bar.left(), 0, place - bar.left(), self.height()))
+            painter.drawRoundedRect(bar, 4, 4)
+            painter.setClipping(False)
+            painter.setBrush(ink)
+            tip = min(max(place, bar.left() + 4), bar.right() - 4)
+            corners = ((tip - 5, 1), (tip + 5, 1), (tip, 8))
+            painter.drawPolygon(QPolygonF([QPointF(x, y) for x, y in corners]))
+            painter.drawRect(QRectF(tip - 1, 7, 2, 12))
+        painter.setBrush(QColor(theme.text))
+        painter.drawRect(QRectF(middle - 0.75, 6, 1.5, 14))
+        painter.setPen(QColor(theme.muted))
+        scale = QRectF(0, 20, self.width(), self.fontMetrics().height() + 2)
+        for text, side in (
+            ("clear", Qt.AlignmentFlag.AlignLeft),
+            (f"{EVEN_ODDS:g}", Qt.AlignmentFlag.AlignHCenter),
+            ("colliding", Qt.AlignmentFlag.AlignRight),
+        ):
+            painter.drawText(scale, side, text)
+
+
+class EnergyBar(QWidget):
+    """A bar as long as the predicted depth of a domain's collisions.
+
+    Parameters
+    ----------
+    colour : "#rrggbb" of the domain
+    """
+
+    def __init__(self, colour: str) -> None:
+        super().__init__()
+        self._colour = colour
+        self._share = 0.0
+        self.setMinimumWidth(_BAR_WIDTH)
+        # Or else the locks of a model that does not predict would follow the names.
+        policy = self.sizePolicy()
+        policy.setRetainSizeWhenHidden(True)
+        self.setSizePolicy(policy)
+
+    @property
+    def share(self) -> float:
+        """Filled, from 0 to 1."""
+        return self._share
+
+    def show_energy(self, energy: float) -> None:
+        """Fill the bar by the root of an energy in squared heights: that is a depth."""
+        share = min(math.sqrt(max(energy, 0.0)) / FULL_PREDICTED, 1.0)
+        if share != self._share:
+            self._share = share
+            self.update()
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw the track and what is filled of it."""
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        bar = QRectF(0, self.height() / 2 - 4, self.width(), 8)
+        painter.setBrush(QColor(current_theme().track))
+        painter.drawRoundedRect(bar, 4, 4)
+        if self._share > 0.0:
+            painter.setClipRect(QRectF(0, 0, self._share * self.width(), self.height()))
+            fill_with(painter, bar, self._colour, 4)
+
+
+class DomainRow(HoverRow):
+    """Swatch, name, predicted energy and lock of one domain.
+
+    Signals
+    -------
+    lock_toggled : int and bool, the domain and whether it is to be locked
+
+    Parameters
+    ----------
+    domain : index from 0
+    name : of the domain
+    colour : "#rrggbb"
+    name_width : room that the name takes before the bar gets any but the least
+    """
+
+    lock_toggled = Signal(int, bool)
+
+    def __init__(self, domain: int, name: str, colour: str, name_width: int) -> None:
+        super().__init__(domain)
+        self._index = domain
+        self._name = heading(name)
+        self._colour = colour
+        self._lit = False
+        self.bar = EnergyBar(colour)
+        self.lock = QToolButton()
+        self.lock.setCheckable(True)
+        self.lock.setFixedSize(24, 22)
+        self.lock.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.lock.setAccessibleName(f"Lock {self._name}")
+        row = QHBoxLayout(self)
+        row.setContentsMargins(TIGHT + 12 + CLOSE, 0, 0, 0)
+        row.setSpacing(CLOSE)
+        label = ElidedLabel(self._name)
+        label.setMaximumWidth(name_width)
+        row.addWidget(label, NAME_SHARE)
+        row.addWidget(self.bar, 1)
+        row.addWidget(self.lock)
+        self.setFixedHeight(ROW_HEIGHT - 3)
+        self.lock.toggled.connect(self._on_lock)
+        self.show_lock(False)
+
+    def show_lock(self, locked: bool) -> None:
+        """Follow the document."""
+        with silent(self.lock):
+            self.lock.setChecked(locked)
+        theme = current_theme()
+        self.lock.setIcon(icon("lock" if locked else "unlock", None if locked else theme.muted))
+        self.lock.setToolTip(
+            plain_tip(
+                f"{self._name} is locked: click to unlock it"
+                if locked
+                else f"Lock {self._name}: Resolve, Randomise, Reset all and blending leave its "
+                "numbers alone"
+            )
+        )
+
+    def show_energy(self, energy: float | None) -> None:
+        """Show a predicted energy in squared heights; None hides the bar."""
+        self.bar.setVisible(energy is not None)
+        if energy is not None:
+            self.bar.show_energy(energy)
+            self.setToolTip(plain_tip(f"{self._name}: predicted overlap {overlap_text(energy)}"))
+
+    @property
+    def is_lit(self) -> bool:
+        """Whether the viewport's pointer is on this domain."""
+        return self._lit
+
+    def set_lit(self, lit: bool) -> None:
+        """Show that the viewport's pointer is on this domain."""
+        if lit != self._lit:
+            self._lit = lit
+            self.update()
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw the swatch, and a wash of its colour under the pointer."""
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        if self._lit or self.underMouse():
+            wash = QColor(self._colour)
+            wash.setAlpha(60 if self._lit else 36)
+            painter.setBrush(wash)
+            painter.drawRoundedRect(self.rect(), 5, 5)
+        fill_with(painter, QRectF(TIGHT, self.height() / 2 - 6, 12, 12), self._colour, 3)
+
+    def _on_lock(self, locked: bool) -> None:
+        self.lock_toggled.emit(self._index, locked)
+
+
+class PredictionCard(Card):
+    """The estimate, beneath the exact check: small, and grey once that has spoken.
+
+    Signals
+    -------
+    domain_hovered : int or None, the domain of the row that the pointer is on
+    menu_wanted : int, None and QPoint: the domain, and where on the screen a menu of what can be
+        done with it is wanted
+
+    Parameters
+    ----------
+    document : followed; its locks are changed here
+    """
+
+    domain_hovered = Signal(object)
+    menu_wanted = Signal(object, object, QPoint)
+
+    def __init__(self, document: PoseDocument) -> None:
+        super().__init__()
+        self._document = document
+        self.rows: list[DomainRow] = []
+        self.verdict = ElidedLabel("")
+        self.percent = labelled("", "aside")
+        self.meter = ProbabilityMeter()
+        for widget in (self.percent, self.meter):
+            widget.setToolTip(_TIP)
+        self._missing = QLabel(
+            "This model can't estimate collisions, so Resolve is off. Open another "
+            "model, or train one with “lcollision train predictor” in a terminal."
+        )
+        self._missing.setObjectName("caption")
+        self._missing.setWordWrap(True)
+        head = title_row("Estimate", self.verdict)
+        self.verdict.setObjectName("aside")
+        head.addWidget(self.percent)
+        self._rows = QVBoxLayout()
+        self._rows.setSpacing(0)
+        self.column.addLayout(head)
+        self.column.addWidget(self.meter)
+        self.column.addWidget(self._missing)
+        self.column.addSpacing(TIGHT)
+        self.column.addLayout(self._rows)
+        document.model_changed.connect(self._on_model)
+        document.frame_changed.connect(self._on_frame)
+        document.exact_changed.connect(self._on_frame)
+        document.locks_changed.connect(self._on_locks)
+        if document.has_model:
+            self._on_model()
+        else:
+            self._missing.hide()
+
+    def light_domain(self, domain: int | None) -> None:
+        """Show which domain the viewport's pointer is on."""
+        for row in self.rows:
+            row.set_lit(row.domain == domain)
+
+    def refresh_icons(self) -> None:
+        """Draw the locks in the theme that has come."""
+        self._on_locks()
+
+    def _on_model(self) -> None:
+        for row in self.rows:
+            self._rows.removeWidget(row)
+            row.deleteLater()
+        model = self._document.model
+        self.rows = []
+        name_width = longest_name(self, map(heading, model.domain_names))
+        for domain, (name, colour) in enumerate(
+            zip(model.domain_names, model.domain_colours, strict=True)
+        ):
+            row = DomainRow(domain, name, colour, name_width)
+            row.hovered.connect(self.domain_hovered)
+            row.menu_wanted.connect(self._on_menu)
+            row.lock_toggled.connect(self._document.set_locked)
+            self.rows.append(row)
+        before: QWidget | None = None
+        for domain in model.domain_order:
+            row = self.rows[domain]
+            self._rows.addWidget(row)
+            if before is not None:
+                QWidget.setTabOrder(before, row.lock)
+            before = row.lock
+        predicts = self._document.can_resolve
+        for widget in (self.meter, self.verdict, self.percent):
+            widget.setVisible(predicts)
+        self._missing.setVisible(not predicts)
+        self._on_frame()
+        self._on_locks()
+
+    def _on_frame(self) -> None:
+        frame = self._document.frame
+        prediction = frame.prediction if frame is not None else None
+        if prediction is None:
+            self.meter.show_probability(None)
+            self.verdict.setText("…")
+            self.percent.setText("")
+            show_verdict(self.verdict, "waiting")
+            for row in self.rows:
+                row.show_energy(0.0 if self._document.can_resolve else None)
+            return
+        probability = prediction.collision_probability
+        collides = probability > EVEN_ODDS
+        word = "colliding" if collides else "free"
+        exact = self._document.exact
+        self.meter.show_probability(probability, is_aside=exact is not None)
+        overruled = exact is not None and exact.colliding != collides
+        said = "Probably colliding" if collides else "Probably clear"
+        self.verdict.setText("Overruled by the check" if overruled else said)
+        self.percent.setText(f"{100 * probability:.0f} %")
+        for label in (self.verdict, self.percent):
+            show_verdict(label, word if exact is None else "aside")
+        for row, energy in zip(self.rows, prediction.domain_energy, strict=True):
+            row.show_energy(float(energy))
+
+    @Slot(QPoint)
+    def _on_menu(self, place: QPoint) -> None:
+        row = self.sender()
+        if isinstance(row, DomainRow):
+            self.menu_wanted.emit(row.domain, None, place)
+
+    def _on_locks(self) -> None:
+        for row in self.rows:
+            row.show_lock(row.domain in self._document.locked_domains)

@@ -1,0 +1,305 @@
+"""Resolve: start and cancel it, follow it, and read what came of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import Qt, Signal, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import (
+    QApplication,
+    QGridLayout,
+    QHBoxLayout,
+    QLabel,
+    QProgressBar,
+    QPushButton,
+    QSizePolicy,
+    QStackedWidget,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.view.icons import icon, pixmap
+from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
+from app.window.panels.widgets import Card, ElidedLabel, labelled, show_verdict
+from app.wording import heading, height_text, overlap_text, seconds_text
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from lcollision_core.resolve import ResolveResult
+
+_WAITED = 0.5
+"""Seconds of waiting before the search that are worth telling."""
+
+_SIGNS = {True: "check", False: "error", None: "info"}
+_INKS = {"check": "free", "error": "colliding", "info": "muted"}
+
+
+class Fact(QWidget):
+    """One of the three facts of an outcome: yes, no or not known.
+
+    Parameters
+    ----------
+    sentences : for each of the three
+    tip : what the fact means
+    is_aside : small and grey, whatever it says
+    """
+
+    def __init__(self, sentences: dict[bool | None, str], tip: str, is_aside: bool = False) -> None:
+        super().__init__()
+        self._is_aside = is_aside
+        self._sentences = sentences
+        self._truth: bool | None = None
+        self._sign = "info"
+        self._picture = QLabel()
+        self._picture.setFixedSize(18, 18)
+        self._text = labelled("", "aside" if is_aside else "")
+        self._text.setWordWrap(True)
+        if is_aside:
+            show_verdict(self._text, "aside")
+        self.setToolTip(tip)
+        row = QHBoxLayout(self)
+        row.setContentsMargins(0, 0, 0, 0)
+        row.setSpacing(CLOSE)
+        row.addWidget(self._picture)
+        row.addWidget(self._text, 1)
+
+    @property
+    def truth(self) -> bool | None:
+        """What is known."""
+        return self._truth
+
+    @property
+    def sign(self) -> str:
+        """The icon that is shown: "check", "error" or "info"."""
+        return self._sign
+
+    def show_truth(self, truth: bool | None, instead: str = "", sign: str = "info") -> None:
+        """Say yes, no, or that it is not known.
+
+        Parameters
+        ----------
+        truth : what is known
+        instead : said in place of the fact's own sentence, where another fact outweighs this one
+        sign : beside `instead`
+        """
+        self._truth = truth
+        self._sign = "info" if self._is_aside else sign if instead else _SIGNS[truth]
+        ink = getattr(current_theme(), _INKS[self._sign])
+        self._picture.setPixmap(pixmap(self._sign, ink, 18, self.devicePixelRatioF()))
+        self._text.setText(instead or self._sentences[truth])
+
+
+class ResolveCard(Card):
+    """The lower end of the right panel.
+
+    Signals
+    -------
+    options_wanted : the user wants to choose how Resolve works
+
+    Parameters
+    ----------
+    document : resolved and cancelled through it
+    resolve_action : what the button triggers, with its shortcut
+    """
+
+    options_wanted = Signal()
+
+    def __init__(self, document: PoseDocument, resolve_action: QAction) -> None:
+        super().__init__()
+        self._document = document
+        self._action = resolve_action
+        self.button = QPushButton("Resolve")
+        self.button.setObjectName("primary")
+        self.options = QPushButton("Options…")
+        self.options.setToolTip("Choose how Resolve works")
+        self.cancel = QPushButton("Cancel")
+        self.cancel.setToolTip("Stop Resolve and leave the pose as it is (Escape)")
+        self.bar = QProgressBar()
+        self.bar.setTextVisible(False)
+        self.working = QWidget()
+        working = QGridLayout(self.working)
+        working.setContentsMargins(0, 0, 0, 0)
+        working.setHorizontalSpacing(NORMAL)
+        working.setVerticalSpacing(TIGHT)
+        working.addWidget(ElidedLabel("Searching for a pose…"), 0, 0)
+        working.addWidget(self.bar, 1, 0)
+        working.addWidget(self.cancel, 0, 1, 2, 1)
+        working.setColumnStretch(0, 1)
+        self.outcome = QWidget()
+        self._make_outcome()
+        self.resting = QWidget()
+        resting = QHBoxLayout(self.resting)
+        resting.setContentsMargins(0, 0, 0, 0)
+        resting.setSpacing(CLOSE)
+        resting.addWidget(self.button, 1)
+        resting.addWidget(self.options)
+        # One takes the other's place, so that nothing jumps.
+        self.stack = QStackedWidget()
+        self.stack.addWidget(self.resting)
+        self.stack.addWidget(self.working)
+        self._locked = labelled("All body parts are locked: unlock one to resolve", "caption")
+        self._locked.setWordWrap(True)
+        self.stack.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
+        self.column.addWidget(self.stack)
+        self.column.addWidget(self._locked)
+        self.column.addWidget(self.outcome)
+        self.button.clicked.connect(resolve_action.trigger)
+        self.cancel.clicked.connect(document.cancel_resolve)
+        self.options.clicked.connect(self.options_wanted)
+        resolve_action.changed.connect(self._on_action)
+        document.solve_started.connect(self._on_started)
+        document.solve_progressed.connect(self._on_progressed)
+        document.solve_finished.connect(self._on_finished)
+        document.outcome_changed.connect(self._on_outcome)
+        document.locks_changed.connect(self._on_locks)
+        self._on_action()
+        self._on_locks()
+        self._on_outcome()
+
+    def refresh_icons(self) -> None:
+        """Draw the signs in the theme that has come."""
+        self._on_action()
+        self._on_outcome()
+
+    def _make_outcome(self) -> None:
+        self.converged = Fact(
+            {
+                True: "The search finished",
+                False: "The search stopped early",
+                None: "No search was needed",
+            },
+            "Whether the search ended by itself; the exact check alone decides whether the pose "
+            "collides",
+        )
+        self.predicted_free = Fact(
+            {
+                True: "Estimate: probably clear",
+                False: "Estimate: probably colliding",
+                None: "No estimate",
+            },
+            "The model's instant estimate of the pose: where the exact check finds otherwise, the "
+            "check is right",
+            is_aside=True,
+        )
+        self.exactly_free = Fact(
+            {True: "No collisions (checked)", False: "Still colliding", None: "Not checked"},
+            "The exact check of the mesh: this alone tells whether the pose collides",
+        )
+        self._energy, self._moved, self._took = (QLabel() for _ in range(3))
+        self._took.setToolTip(
+            "The search, and the wait before it: what it needs is loaded and compiled once"
+        )
+        self._note = labelled("", "caption")
+        self._note.setWordWrap(True)
+        column = QVBoxLayout(self.outcome)
+        column.setContentsMargins(0, TIGHT, 0, 0)
+        column.setSpacing(TIGHT)
+        for fact in (self.exactly_free, self.converged, self.predicted_free):
+            column.addWidget(fact)
+        numbers = QGridLayout()
+        numbers.setContentsMargins(0, TIGHT, 0, TIGHT)
+        numbers.setHorizontalSpacing(CLOSE)
+        numbers.setVerticalSpacing(2)
+        for place, (name, value) in enumerate(
+            (
+                ("Overlap", self._energy),
+                ("Moved", self._moved),
+                ("Took", self._took),
+            )
+        ):
+            value.setWordWrap(True)
+            numbers.addWidget(labelled(name, "caption"), place, 0, Qt.AlignmentFlag.AlignTop)
+            numbers.addWidget(value, place, 1)
+        numbers.setColumnStretch(1, 1)
+        column.addLayout(numbers)
+        column.addWidget(self._note)
+
+    @Slot()
+    def _on_action(self) -> None:
+        # Hidden while it works, it keeps ready to have the keyboard again.
+        self.button.setEnabled(self._action.isEnabled() or self._document.solving)
+        self.button.setToolTip(self._action.toolTip())
+        theme = current_theme()
+        self.button.setIcon(icon("resolve", theme.on_accent))
+
+    @Slot()
+    def _on_started(self) -> None:
+        self._go_to(self.working, self.cancel)
+        self.outcome.hide()
+        # Until the first report there is no telling how far it is.
+        self.bar.setRange(0, 0)
+
+    def _go_to(self, page: QWidget, button: QPushButton) -> None:
+        """Show another page; the keyboard follows from one to the other, or stays elsewhere."""
+        focused = QApplication.focusWidget()
+        had_focus = focused is not None and self.stack.isAncestorOf(focused)
+        self.stack.setCurrentWidget(page)
+        if had_focus:
+            button.setFocus()
+
+    @Slot(object)
+    def _on_progressed(self, status: object) -> None:
+        if isinstance(status, tuple) and len(status) == 2 and status[1] > 0 and status[0] > 0:
+            done, total = status
+            self.bar.setRange(0, int(total))
+            self.bar.setValue(int(done))
+
+    @Slot(object)
+    def _on_finished(self, result: object) -> None:  # noqa: ARG002
+        self._go_to(self.resting, self.button)
+        # An endless bar is animated even while nobody sees it.
+        self.bar.setRange(0, 1)
+        self._on_outcome()
+
+    @Slot()
+    def _on_locks(self) -> None:
+        self._locked.setVisible(self._document.all_locked)
+
+    @Slot()
+    def _on_outcome(self) -> None:
+        result = self._document.outcome if self._document.has_model else None
+        self.outcome.setVisible(result is not None and not self._document.solving)
+        if result is not None:
+            self._show(result)
+
+    def _show(self, result: ResolveResult) -> None:
+        from lcollision_core.resolve import ALL_LOCKED, Step
+
+        ran = result.solver_status != "not run"
+        exactly_free, predicted_free = result.exactly_free, result.predicted_free
+        self.exactly_free.show_truth(exactly_free)
+        # A search that was cut short has done its work where its pose is free.
+        instead, sign = "", "info"
+        if ran and exactly_free:
+            instead, sign = "The search found a pose without collisions", "check"
+        elif not ran and ALL_LOCKED in (result.note or ""):
+            instead = "No search: all body parts are locked"
+        elif not ran and result.step != Step.UNCHANGED:
+            instead = "No search: the time limit came first"
+        self.converged.show_truth(result.converged if ran else None, instead, sign)
+        overruled = exactly_free is not None and exactly_free != predicted_free
+        word = "clear" if predicted_free else "colliding"
+        self.predicted_free.show_truth(
+            predicted_free, f"Estimate: probably {word}, overruled" if overruled else ""
+        )
+        if result.energy_before is None or result.energy_after is None:
+            self._energy.setText("not measured")
+        else:
+            self._energy.setText(
+                f"{overlap_text(result.energy_before)} → {overlap_text(result.energy_after)}"
+            )
+        mean, largest = result.vertex_distance_mean, result.vertex_distance_max
+        moved = f"{height_text(mean)} of the height,\nat most {height_text(largest)}"
+        self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
+        self._moved.setToolTip("Mean and maximum over the mesh")
+        self._took.setText(_times(result.seconds, self._document.outcome_seconds))
+        self._note.setText(heading(result.note or ""))
+        self._note.setVisible(bool(result.note))
+
+
+def _times(searched: float, in_all: float) -> str:
+    """Say how long the search took, and how long it was waited for where that is longer."""
+    waited = in_all - searched
+    took = seconds_text(searched)
+    return f"{took}, after {seconds_text(waited)} of preparation" if waited > _WAITED else took

@@ -1,0 +1,82 @@
+"""Small pictures of poses, drawn in NumPy.
+
+A second OpenGL context beside the viewport's, for pictures of a few pixels, would switch contexts
+at every one of them, which software drivers do not survive.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from app.view.camera import VIEW_ANGLE, View
+
+_FINENESS = 2
+"""Dots per pixel and axis, averaged afterwards: smooth edges."""
+
+_MOST_CUTS = 10
+_AMBIENT = 0.42
+
+
+def draw_pose(
+    vertices: npt.NDArray[Any],
+    normals: npt.NDArray[Any],
+    faces: npt.NDArray[np.int32],
+    view: View,
+    side: int,
+    colour: tuple[int, int, int],
+) -> npt.NDArray[np.uint8]:
+    """Draw a mesh by dots, the nearest last.
+
+    Parameters
+    ----------
+    vertices, normals : (V, 3) arrays, in the data's unit; of length 1
+    faces : (F, 3) array
+    view : from where; the perspective is left out
+    side : of the picture, in pixels
+    colour : red, green and blue of the lit mesh, from 0 to 255
+
+    Returns
+    -------
+    pixels : (side, side, 4) uint8 array, red, green, blue and alpha, which is 0 beside the mesh
+    """
+    arm = view.position - view.focus
+    reach = float(np.linalg.norm(arm))
+    towards = arm / reach
+    axes = np.stack([np.cross(view.up, towards), view.up, towards])
+    place = (np.asarray(vertices, dtype=np.float64) - view.focus) @ axes.T
+    n_dots = side * _FINENESS
+    place *= 0.5 * n_dots / (reach * math.tan(math.radians(0.5 * VIEW_ANGLE)))
+    lamp = np.array([-0.35, 0.5, 0.8])
+    light = np.clip(normals @ axes.T @ (lamp / np.linalg.norm(lamp)), 0.0, 1.0)
+    a, b, c = (place[corner] for corner in faces.T)
+    turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0.0
+    seen = faces[turned]
+    edges = np.abs(place[seen] - place[np.roll(seen, 1, axis=1)])[..., :2]
+    cuts = int(np.clip(math.ceil(np.quantile(edges, 0.98)) + 1, 1, _MOST_CUTS))
+    weights = _barycentric(cuts)
+    dots = np.einsum("wk,fkd->fwd", weights, place[seen]).reshape(-1, 3)
+    shade = np.einsum("wk,fk->fw", weights, light[seen]).ravel()
+    order = np.argsort(dots[:, 2], kind="stable")
+    columns = np.floor(0.5 * n_dots + dots[order, 0]).astype(np.intp)
+    rows = np.floor(0.5 * n_dots - dots[order, 1]).astype(np.intp)
+    inside = (columns >= 0) & (columns < n_dots) & (rows >= 0) & (rows < n_dots)
+    # Where several dots fall on one place, the last one written, the nearest, stays.
+    picture = np.zeros((n_dots, n_dots, 4))
+    strength = (_AMBIENT + (1.0 - _AMBIENT) * shade[order])[inside, None]
+    picture[rows[inside], columns[inside], :3] = strength * np.array(colour)
+    picture[rows[inside], columns[inside], 3] = 255.0
+    blocks = picture.reshape(side, _FINENESS, side, _FINENESS, 4).sum(axis=(1, 3))
+    hits = np.maximum(blocks[..., 3:] / 255.0, 1.0)
+    blocks[..., :3] /= hits
+    blocks[..., 3] /= _FINENESS**2
+    return np.ascontiguousarray(blocks.round().astype(np.uint8))
+
+
+def _barycentric(cuts: int) -> npt.NDArray[np.float64]:
+    """Return the weights of a triangle's corners at evenly spread places, (W, 3)."""
+    counts = [(i, j, cuts - i - j) for i in range(cuts + 1) for j in range(cuts + 1 - i)]
+    return np.array(counts) / cuts

@@ -1,0 +1,317 @@
+"""Small widgets that the panels share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from html import escape
+
+from PySide6.QtCore import QEvent, QObject, QPoint, QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtGui import (
+    QColor,
+    QContextMenuEvent,
+    QEnterEvent,
+    QMouseEvent,
+    QPainter,
+    QPaintEvent,
+    QPen,
+    QResizeEvent,
+    QWheelEvent,
+)
+from PySide6.QtWidgets import (
+    QFrame,
+    QHBoxLayout,
+    QLabel,
+    QScrollArea,
+    QSizePolicy,
+    QSlider,
+    QVBoxLayout,
+    QWidget,
+)
+
+from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, current_theme, visible_colour
+
+HANDLE = 7.0
+"""Radius of a slider's handle, in device-independent pixels."""
+
+NAME_SHARE = 9
+"""Parts of a row's room to one of its slider or bar, as long as the longest name needs them."""
+
+_FINE = 0.1
+"""Of the pointer's way that a handle follows while Ctrl or Shift is held."""
+
+_FINE_KEYS = Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
+
+
+class Card(QFrame):
+    """A framed group of widgets, one below the other.
+
+    Parameters
+    ----------
+    title : above the group; "" for none
+    kind : "card", or "truth" for what is exact, not predicted
+    """
+
+    def __init__(self, title: str = "", kind: str = "card") -> None:
+        super().__init__()
+        self.setObjectName(kind)
+        self.column = QVBoxLayout(self)
+        self.column.setContentsMargins(NORMAL, NORMAL - 2, NORMAL, NORMAL - 2)
+        self.column.setSpacing(CLOSE)
+        if title:
+            self.column.addWidget(labelled(title, "title"))
+
+
+class ElidedLabel(QLabel):
+    """A label that shortens its text to the room it has, with the whole text as tool tip then.
+
+    Parameters
+    ----------
+    text : to show
+    cut : where it is shortened
+    """
+
+    def __init__(self, text: str, cut: Qt.TextElideMode = Qt.TextElideMode.ElideRight) -> None:
+        super().__init__(text)
+        self._cut = cut
+        self.setTextFormat(Qt.TextFormat.PlainText)
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+
+    def setText(self, text: str) -> None:  # noqa: N802
+        """Show another text."""
+        super().setText(text)
+        self._offer_whole()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+        """See whether the text fits now."""
+        super().resizeEvent(event)
+        self._offer_whole()
+
+    def minimumSizeHint(self) -> QSize:  # noqa: N802
+        """Allow any width."""
+        return QSize(0, super().minimumSizeHint().height())
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw what fits."""
+        painter = QPainter(self)
+        painter.setPen(self.palette().color(self.foregroundRole()))
+        painter.drawText(self.rect(), int(self.alignment()), self._fitting())
+
+    def _fitting(self) -> str:
+        return self.fontMetrics().elidedText(self.text(), self._cut, self.width())
+
+    def _offer_whole(self) -> None:
+        self.setToolTip("" if self._fitting() == self.text() else plain_tip(self.text()))
+
+
+def longest_name(widget: QWidget, names: Iterable[str]) -> int:
+    """Return the width that the longest of some names takes in a widget's font."""
+    return max(widget.fontMetrics().horizontalAdvance(name) for name in names) + 1
+
+
+def title_row(title: str, source: ElidedLabel) -> QHBoxLayout:
+    """Return a card's title, with where its facts come from at the other end."""
+    source.setObjectName("caption")
+    source.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+    row = QHBoxLayout()
+    row.setSpacing(CLOSE)
+    row.addWidget(labelled(title, "title"))
+    row.addWidget(source, 1)
+    return row
+
+
+class HoverRow(QWidget):
+    """A row that tells which domain the pointer is on.
+
+    Signals
+    -------
+    hovered : int, the row's domain; None when the pointer leaves
+    menu_wanted : QPoint, where on the screen a menu of what can be done with the row is wanted
+    """
+
+    hovered = Signal(object)
+    menu_wanted = Signal(QPoint)
+
+    def __init__(self, domain: int | None) -> None:
+        super().__init__()
+        self.domain = domain
+
+    def contextMenuEvent(self, event: QContextMenuEvent) -> None:  # noqa: N802
+        """Ask for the menu."""
+        self.menu_wanted.emit(event.globalPos())
+
+    def enterEvent(self, event: QEnterEvent) -> None:  # noqa: N802
+        """Tell the domain."""
+        self.hovered.emit(self.domain)
+        super().enterEvent(event)
+
+    def leaveEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Tell that the pointer left."""
+        self.hovered.emit(None)
+        super().leaveEvent(event)
+
+
+class Slider(QSlider):
+    """A horizontal slider in the window's own drawing, whose bar grows from `origin`.
+
+    The wheel moves it only when it has the focus.
+
+    Parameters
+    ----------
+    colour : "#rrggbb" of the bar, None for that of the theme
+    """
+
+    def __init__(self, colour: str | None = None) -> None:
+        super().__init__(Qt.Orientation.Horizontal)
+        self._colour = colour
+        self._pointer = self._exact_value = 0.0
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setMinimumWidth(60)
+
+    @property
+    def origin(self) -> float:
+        """Where the bar begins, as a share of the groove from its left end."""
+        return 0.0
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for one row's height."""
+        return QSize(110, ROW_HEIGHT - 4)
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+        """Leave the wheel to the panel's scrolling unless focused."""
+        wheel_if_focused(self, event, super().wheelEvent)
+
+    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Grab the handle: where it is, or from where the groove was pressed."""
+        if event.button() is not Qt.MouseButton.LeftButton:
+            event.ignore()
+            return
+        self.setFocus(Qt.FocusReason.MouseFocusReason)
+        x = event.position().x()
+        self.setSliderDown(True)
+        if abs(x - self._handle_x()) > HANDLE + 2:
+            self.setValue(self._value_at(x))
+        self._pointer, self._exact_value = x, float(self.value())
+
+    def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Move the handle with the pointer; slowly while Ctrl or Shift is held."""
+        if not self.isSliderDown():
+            return
+        x = event.position().x()
+        steps = self.maximum() - self.minimum()
+        way = (x - self._pointer) * steps / max(self.width() - 2 * HANDLE, 1.0)
+        if event.modifiers() & _FINE_KEYS:
+            way *= _FINE
+        # Step by step, so that the handle does not jump as the key is pressed or let go.
+        self._pointer = x
+        self._exact_value += way
+        self.setValue(round(self._exact_value))
+
+    def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: ARG002, N802
+        """Let the handle go."""
+        if self.isSliderDown():
+            self.setSliderDown(False)
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw the groove, the bar from its origin, and the handle."""
+        theme = current_theme()
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        middle = self.height() / 2
+        left, right = HANDLE, self.width() - HANDLE
+        painter.setBrush(QColor(theme.track))
+        painter.drawRoundedRect(QRectF(left, middle - 2, right - left, 4), 2, 2)
+        start = left + (right - left) * self.origin
+        if self.origin > 0.0:
+            painter.setBrush(QColor(theme.muted))
+            painter.drawRect(QRectF(start - 0.5, middle - 5, 1, 10))
+        handle = self._handle_x()
+        lively = self.isEnabled()
+        filled = self._colour or theme.accent if lively else theme.track
+        bar = QRectF(min(start, handle), middle - 2.5, abs(handle - start), 5)
+        if bar.width() > 0.0:
+            fill_with(painter, bar, filled, 0.0)
+        if self.hasFocus():
+            halo = QColor(theme.accent)
+            halo.setAlpha(90)
+            painter.setBrush(halo)
+            painter.drawEllipse(QPointF(handle, middle), HANDLE + 3, HANDLE + 3)
+        painter.setBrush(QColor("#ffffff" if lively else theme.window))
+        bright = lively and (self.hasFocus() or self.underMouse())
+        rim = theme.accent if bright else theme.muted if lively else theme.border
+        painter.setPen(QPen(QColor(rim), 1.6))
+        painter.drawEllipse(QPointF(handle, middle), HANDLE - 1.2, HANDLE - 1.2)
+
+    def _handle_x(self) -> float:
+        share = (self.value() - self.minimum()) / max(self.maximum() - self.minimum(), 1)
+        return HANDLE + (self.width() - 2 * HANDLE) * share
+
+    def _value_at(self, x: float) -> int:
+        share = (x - HANDLE) / max(self.width() - 2 * HANDLE, 1.0)
+        return self.minimum() + round(share * (self.maximum() - self.minimum()))
+
+
+def wheel_if_focused(widget: QWidget, event: QWheelEvent, handle: object) -> None:
+    """Hand a wheel event on, or refuse it so that what is around scrolls."""
+    if widget.hasFocus() and callable(handle):
+        handle(event)
+    else:
+        event.ignore()
+
+
+def fill_with(painter: QPainter, area: QRectF, colour: str, radius: float) -> None:
+    """Fill an area with a body part's own colour, edged where it would not be seen otherwise."""
+    edge = visible_colour(colour)
+    painter.setBrush(QColor(colour))
+    painter.setPen(QPen(edge, 1.0) if edge != QColor(colour) else Qt.PenStyle.NoPen)
+    inset = 0.5 if painter.pen().style() is not Qt.PenStyle.NoPen else 0.0
+    painter.drawRoundedRect(area.adjusted(inset, inset, -inset, -inset), radius, radius)
+    painter.setPen(Qt.PenStyle.NoPen)
+
+
+def plain_tip(text: str) -> str:
+    """Return a tool tip that shows a text to the letter, also one that looks like HTML."""
+    return f"<span>{escape(text)}</span>" if "<" in text else text
+
+
+@contextmanager
+def silent(*widgets: QObject) -> Iterator[None]:
+    """Change widgets without their signals, as they follow the document."""
+    before = [widget.blockSignals(True) for widget in widgets]
+    try:
+        yield
+    finally:
+        for widget, blocked in zip(widgets, before, strict=True):
+            widget.blockSignals(blocked)
+
+
+def labelled(text: str, kind: str = "") -> QLabel:
+    """Return a label of a kind that the style knows: title, caption, verdict, headline, aside.
+
+    It shows its text to the letter, as a name in it may look like HTML.
+    """
+    label = QLabel(text)
+    label.setTextFormat(Qt.TextFormat.PlainText)
+    label.setObjectName(kind)
+    return label
+
+
+def show_verdict(widget: QWidget, verdict: str) -> None:
+    """Colour a widget as "free", "colliding", "waiting" or, beside what is known, "aside"."""
+    if widget.property("verdict") != verdict:
+        widget.setProperty("verdict", verdict)
+        widget.style().unpolish(widget)
+        widget.style().polish(widget)
+
+
+def scrolling(page: QWidget) -> QScrollArea:
+    """Return an area that scrolls a page up and down, never sideways."""
+    page.setObjectName("page")
+    area = QScrollArea()
+    area.setWidget(page)
+    area.setWidgetResizable(True)
+    area.setFrameShape(QFrame.Shape.NoFrame)
+    area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+    area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+    return area

@@ -1,0 +1,143 @@
+"""What is loaded behind the window when it is on the screen already."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, QTimer, Slot
+
+from app.window.dialogs.questions import Choice, ask_about_recovery
+from app.window.file_actions import MODEL_SUFFIX
+from lcollision_core.bundled import bundled_folder
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from app.window.main_window import MainWindow
+    from lcollision_core.model import NamedPose, PoseModel
+
+_log = logging.getLogger(__name__)
+
+DEFAULT_MODEL = "body"
+
+_LIVELY = ("dancer", "thinking")
+"""Training poses of the built-in body that are worth looking at."""
+
+_POLL_MILLISECONDS = 500
+"""Between two chances for Python to look at signals, which Qt's loop would keep from it."""
+
+_LATER_MILLISECONDS = 300
+
+
+class StartUp(QObject):
+    """Fills a window that is on the screen.
+
+    The document opens the model in its long worker, which imports what that takes; then the pose
+    comes in: the given file's, or one worth looking at, and what a crash left is offered.
+
+    Parameters
+    ----------
+    window : shown
+    path : a poses file, a mesh or a model; None for a pose of the editor's own
+    model_name : a model's file or name; the one that was used last where None
+    """
+
+    def __init__(self, window: MainWindow, path: Path | None, model_name: str | None) -> None:
+        super().__init__(window)
+        self._window = window
+        self._document = window.document
+        self._path = path
+        self._model: str | Path = model_name or last_model(window.settings["model"])
+        self._poll = QTimer(self)
+        self._poll.setInterval(_POLL_MILLISECONDS)
+        self._poll.timeout.connect(lambda: None)
+
+    def begin(self) -> None:
+        """Start loading; returns at once."""
+        signal.signal(signal.SIGINT, self._on_signal)
+        signal.signal(signal.SIGTERM, self._on_signal)
+        self._poll.start()
+        if self._path is not None and self._path.suffix.lower() == MODEL_SUFFIX:
+            self._model, self._path = self._path, None
+        self._document.model_changed.connect(self._on_model)
+        self._document.open_model(self._model)
+
+    @Slot()
+    def _on_model(self) -> None:
+        from app.editing.recovery import Autosave
+
+        self._document.model_changed.disconnect(self._on_model)
+        self._window.set_autosave(Autosave(self._document))
+        # The document is about to put in a pose of its own.
+        QTimer.singleShot(0, self, self._on_first_pose)
+        self._document.pose_loaded.connect(self._on_pose_loaded)
+        self._document.recovered.connect(self._window.viewport.frame_pose)
+        self._window.ready.connect(self._on_ready)
+
+    @Slot()
+    def _on_first_pose(self) -> None:
+        if self._path is not None:
+            path = self._path
+            self._window.attempt(lambda: self._window.files.open_path(path))
+            return
+        # What the program does is neither a change to save nor one to take back.
+        self._document.begin_with(opening_pose(self._document.model))
+
+    @Slot()
+    def _on_pose_loaded(self) -> None:
+        # Later ones are seen as the user chose to look.
+        self._document.pose_loaded.disconnect(self._on_pose_loaded)
+        self._window.viewport.frame_pose()
+
+    @Slot()
+    def _on_ready(self) -> None:
+        # Once the pose has been drawn: a question over an empty window would puzzle.
+        QTimer.singleShot(_LATER_MILLISECONDS, self, self._offer_recovery)
+
+    @Slot()
+    def _offer_recovery(self) -> None:
+        from app.editing.recovery import find_lost_poses
+
+        lost = find_lost_poses()
+        for pose in lost:
+            answer = ask_about_recovery(self._window, pose)
+            if answer is Choice.SAVE:
+                self._window.recover(pose)
+                break
+            if answer is Choice.DISCARD:
+                pose.session.discard()
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        _log.info("signal %d: closing", number)
+        # Python tells of signals between any two of its steps, in the middle of a picture too.
+        QTimer.singleShot(0, self._window, self._window.close_unasked)
+
+
+def last_model(remembered: str) -> str:
+    """Return the remembered file, or name of a bundled model, or the default where it is gone."""
+    bundled = bundled_folder("models") / f"{remembered}{MODEL_SUFFIX}"
+    return remembered if bundled.is_file() or Path(remembered).is_file() else DEFAULT_MODEL
+
+
+def opening_pose(model: PoseModel) -> NamedPose:
+    """Return a pose worth looking at.
+
+    The first of the bundled file of poses that is called as the model is; for a model without
+    one, a lively training pose by its name, or the last.
+    """
+    from lcollision_core.model import NamedPose, read_poses
+
+    bundled = bundled_folder("poses") / f"{model.name}.json"
+    if bundled.is_file():
+        try:
+            return read_poses(bundled, model)[0]
+        except LCollisionError as error:
+            # A user's own model may have a bundled one's name.
+            _log.info("no opening pose: %s", error)
+    names = model.pose_names
+    number = next((names.index(name) for name in _LIVELY if name in names), len(names) - 1)
+    return NamedPose(names[number], model.training_latent[number])

@@ -1,0 +1,61 @@
+"""The line at the foot of the window: what has happened, what is being done, which model it is."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import Slot
+from PySide6.QtWidgets import QProgressBar, QStatusBar
+
+from app.view.theme import NORMAL
+from app.window.panels.widgets import labelled
+from app.wording import one_line
+
+_MESSAGE_MILLISECONDS = 8000
+
+
+class StatusBar(QStatusBar):
+    """Shows messages for a while, and long work for as long as it lasts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._work = self._reason = ""
+        self.busy = labelled("")
+        self._bar = QProgressBar()
+        self._bar.setFixedWidth(120)
+        self._bar.setTextVisible(False)
+        self._facts = labelled("", "caption")
+        for widget in (self.busy, self._bar, self._facts):
+            self.addPermanentWidget(widget)
+        self.setSizeGripEnabled(False)
+        self.setContentsMargins(NORMAL, 0, NORMAL, 0)
+        self.show_busy("")
+
+    @Slot(str)
+    def tell(self, sentence: str) -> None:
+        """Show a message for some seconds."""
+        self.showMessage(one_line(sentence), _MESSAGE_MILLISECONDS)
+
+    def show_facts(self, facts: str) -> None:
+        """Say what is true until another model comes."""
+        self._facts.setText(one_line(facts))
+
+    def show_busy(self, work: str) -> None:
+        """Say what is being done, or nothing for ""."""
+        self._work = one_line(work)
+        self._reason = self._reason if work else ""
+        self._show()
+
+    @Slot(str)
+    def explain(self, reason: str) -> None:
+        """Say why what is being done takes long."""
+        if self._work:
+            self._reason = reason
+            self._show()
+        else:
+            self.tell(reason)
+
+    def _show(self) -> None:
+        self.busy.setText(f"{self._work}… {self._reason}".rstrip() if self._work else "")
+        for widget in (self.busy, self._bar):
+            widget.setVisible(bool(self._work))
+        # An endless bar is animated even while nobody sees it.
+        self._bar.setRange(0, 0 if self._work else 1)

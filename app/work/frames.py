@@ -1,0 +1,188 @@
+"""What is computed of a pose for the screen: the mesh, its normals, the prediction, the truth."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PoseModel
+
+Float32Array = npt.NDArray[np.float32]
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrediction:
+    """What the model's network believes of one pose; never the truth.
+
+    Attributes
+    ----------
+    domain_energy : (K,) float64 array, read-only, >= 0, in squared heights
+    energy : their total, in squared heights
+    collision_logit, collision_probability : above 0, and above 0.5, where it is called colliding
+    """
+
+    domain_energy: FloatArray
+    energy: float
+    collision_logit: float
+    collision_probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """One pose as it is drawn; all of it belongs to one latent.
+
+    Attributes
+    ----------
+    request_id : rises from frame to frame
+    latent : (D,) float64 array, read-only
+    vertices : (V, 3) float32 array, read-only, in the data's unit, in the reference's frame
+    normals : (V, 3) float32 array, read-only, of length 1, area-weighted
+    prediction : None for a model without a predictor
+    seconds : what decoding, normals and prediction took
+    """
+
+    request_id: int
+    latent: FloatArray
+    vertices: Float32Array
+    normals: Float32Array
+    prediction: PosePrediction | None
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class ExactVerdict:
+    """The exact check of the vertices of one frame, as they are drawn and exported.
+
+    Attributes
+    ----------
+    request_id : of the frame that was checked
+    pairs : (P, 2) int32 array, read-only, the colliding faces, the smaller first
+    n_near_pairs : pairs that are folds of the skin and do not count
+    energy : of the whole pose, in squared heights
+    vertex_energy : (V,) float64 array, read-only, in squared heights
+    domain_energy : (K,) float64 array, read-only, in squared heights
+    colliding : whether there is a pair that counts
+    seconds : what the check took
+    """
+
+    request_id: int
+    pairs: npt.NDArray[np.int32]
+    n_near_pairs: int
+    energy: float
+    vertex_energy: FloatArray
+    domain_energy: FloatArray
+    colliding: bool
+    seconds: float
+
+
+class FrameEvaluator:
+    """Computes frames and verdicts of one model; used by one thread at a time.
+
+    Parameters
+    ----------
+    model : of all poses
+
+    Attributes
+    ----------
+    predicts : whether frames get predictions, as far as the model has a predictor
+    """
+
+    def __init__(self, model: PoseModel) -> None:
+        self.model = model
+        self.predicts = True
+
+    def frame(self, latent: FloatArray, request_id: int) -> LiveFrame:
+        """Decode, shade and predict one pose.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        request_id : is handed on
+        """
+        start = time.perf_counter()
+        predictor = self.model.predictor if self.predicts else None
+        ahead = None
+        if predictor is not None and not predictor.needs_torch:
+            # On another core, while this one decodes.
+            ahead = _beside().submit(self._predict, latent)
+        try:
+            vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
+            normals = self.normals(vertices)
+        finally:
+            if ahead is not None:
+                wait([ahead])
+        prediction = None
+        if predictor is not None:
+            prediction = self._predict(latent) if ahead is None else ahead.result()
+        return LiveFrame(
+            request_id=request_id,
+            latent=latent,
+            vertices=_frozen(vertices),
+            normals=_frozen(normals),
+            prediction=prediction,
+            seconds=time.perf_counter() - start,
+        )
+
+    def _predict(self, latent: FloatArray) -> PosePrediction:
+        predicted = self.model.predict(latent[None])
+        return PosePrediction(
+            domain_energy=_frozen(predicted.domain_energy[0]),
+            energy=float(predicted.energy[0]),
+            collision_logit=float(predicted.collision_logit[0]),
+            collision_probability=float(predicted.collision_probability[0]),
+        )
+
+    def verdict(self, frame: LiveFrame) -> ExactVerdict:
+        """Check the vertices of a frame exactly."""
+        from lcollision_core.contact import domain_energy
+
+        start = time.perf_counter()
+        found = self.model.detector.detect(frame.vertices)
+        by_domain = domain_energy(found.vertex_energy[None], self.model.attention_mask)[0]
+        return ExactVerdict(
+            request_id=frame.request_id,
+            pairs=_frozen(found.pairs),
+            n_near_pairs=len(found.near_pairs),
+            energy=found.energy,
+            vertex_energy=_frozen(found.vertex_energy),
+            domain_energy=_frozen(by_domain),
+            colliding=found.colliding,
+            seconds=time.perf_counter() - start,
+        )
+
+    def normals(self, vertices: Float32Array) -> Float32Array:
+        """Return the (V, 3) float32 normals of (V, 3) float32 vertices."""
+        from lcollision_core.meshes.normals import vertex_normals
+
+        return vertex_normals(vertices, self.model.faces)
+
+
+@cache
+def _beside() -> ThreadPoolExecutor:
+    """Return the process's one thread that predicts while another decodes."""
+    return ThreadPoolExecutor(1, "prediction")
+
+
+def keep_torch_to_one_thread(model: PoseModel) -> None:
+    """Let torch use one core in the calling thread: a single pose has nothing to spread.
+
+    On a busy machine torch's threads wait for each other: one prediction took 32 ms instead of
+    0.4. Does nothing for a model whose predictions of a pose need no torch.
+    """
+    if model.predictor is not None and model.predictor.needs_torch:
+        import torch
+
+        torch.set_num_threads(1)
+
+
+def _frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,363 @@
+"""The long work of the editor, as functions of a snapshot that run in another thread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from app.wording import counted, fit_error, mirrored_name
+from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
+from app.work.long_work import Job
+from lcollision_core.errors import ModelFileError, WrongScaleError
+from lcollision_core.jobs import CancelToken, Progress
+
+if TYPE_CHECKING:
+    from lcollision_core.meshes import FileStamp, RigidTransform
+    from lcollision_core.model import ListedModel, MirroredPose, NamedPose, PoseFile, PoseModel
+    from lcollision_core.resolve import ResolveOptions, ResolveResult
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedModel:
+    """A model that is ready for the first drag.
+
+    Attributes
+    ----------
+    model : has been used once, so that nothing is left to compile or to load
+    file : that it was read from
+    """
+
+    model: PoseModel
+    file: str
+
+
+@dataclass(frozen=True, eq=False)
+class ReadPoses:
+    """A poses file: at least one pose.
+
+    Attributes
+    ----------
+    path : that was read
+    held : with a working pose or others
+    stamp : of the file as it was read
+    opened : the model that was opened for it, None for the one that was open
+    """
+
+    path: Path
+    held: PoseFile
+    stamp: FileStamp | None
+    opened: OpenedModel | None
+
+
+@dataclass(frozen=True)
+class OtherModel:
+    """A poses file that belongs to another model than the one that is open.
+
+    Attributes
+    ----------
+    path : the file
+    model : that the poses belong to
+    sentence : that tells of it
+    """
+
+    path: Path
+    model: ListedModel
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """A mesh that was read as a pose."""
+
+    path: Path
+    pose: NamedPose
+
+    @property
+    def sentence(self) -> str:
+        """What the status bar says of it."""
+        pose = self.pose
+        return f"Imported {pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}"
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A mesh that was written, and how many pairs of its triangles collide."""
+
+    path: Path
+    n_pairs: int
+
+    @property
+    def sentence(self) -> str:
+        """What the status bar says of it."""
+        state = "no collisions (checked)"
+        if self.n_pairs:
+            state = f"{counted(self.n_pairs, 'pair')} of its triangles collide"
+        return f"Exported {self.path.name}: {state}"
+
+
+@dataclass(frozen=True)
+class PartEdits:
+    """How a user wants body parts called, coloured and listed.
+
+    Attributes
+    ----------
+    names, colours : of those domains that change, by index from 0
+    order : all domains in the order in which to list them, None where it stays
+    copy_name : of the user's own model to make, None to change the model's file
+    """
+
+    names: dict[int, str]
+    colours: dict[int, str]
+    order: tuple[int, ...] | None = None
+    copy_name: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedParts:
+    """The same model with other names, colours or order of its parts, and its file."""
+
+    model: PoseModel
+    file: str
+
+
+@dataclass(frozen=True, eq=False)
+class Resolved:
+    """What Resolve found, and the mesh before, (V, 3) float32, read-only."""
+
+    result: ResolveResult
+    ghost: npt.NDArray[np.float32]
+
+
+def drawn_vertices(model: PoseModel, latent: FloatArray) -> npt.NDArray[np.float32]:
+    """Return the (V, 3) vertices, read-only, that a frame of the pose has, to the bit."""
+    vertices = model.decode(latent, n_threads=1).astype(np.float32)
+    vertices.flags.writeable = False
+    return vertices
+
+
+def opened_model(name_or_path: str | Path) -> Job:
+    """Read a model and warm it up."""
+
+    def work(_: Progress, cancel: CancelToken) -> OpenedModel:
+        from lcollision_core.model import PoseModel, find_model
+
+        path = find_model(name_or_path).absolute()
+        model = PoseModel.load(path)
+        cancel.raise_if_cancelled()
+        warm_up(model)
+        return OpenedModel(model, str(path))
+
+    return work
+
+
+def warm_up(model: PoseModel) -> None:
+    """Compute once, in the thread that has the time, what a first drag needs but predictions."""
+    evaluator = FrameEvaluator(model)
+    evaluator.predicts = False
+    latent = np.zeros(model.latent_size)
+    latent.flags.writeable = False
+    evaluator.verdict(evaluator.frame(latent, 0))
+    _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
+
+
+def loaded_predictor(model: PoseModel) -> Job:
+    """Load what predicts, and use it once: what it compiles or imports may take seconds."""
+
+    def work(_: Progress, __: CancelToken) -> PoseModel:
+        keep_torch_to_one_thread(model)
+        model.predict(np.zeros(model.latent_size))
+        return model
+
+    return work
+
+
+def read(model: PoseModel | None, model_file: str | Path, path: Path) -> Job:
+    """Read a poses file of a model, which is opened first where it is None.
+
+    The work's value is `OtherModel` where the file belongs to another model that is known.
+    """
+
+    def work(progress: Progress, cancel: CancelToken) -> ReadPoses | OtherModel:
+        from lcollision_core.meshes import file_stamp
+        from lcollision_core.model import OtherModelError, read_pose_file
+
+        opened: OpenedModel | None = None
+        owner = model
+        if owner is None:
+            opened = opened_model(model_file)(progress, cancel)
+            owner = opened.model
+        stamp = file_stamp(path)
+        try:
+            held = read_pose_file(path, owner)
+        except OtherModelError as error:
+            if error.model is None:
+                raise
+            return OtherModel(path, error.model, str(error))
+        cancel.raise_if_cancelled()
+        if not held.all_poses:
+            raise ModelFileError(f"{path} holds no poses; open a file that has some")
+        return ReadPoses(path, held, stamp, opened)
+
+    return work
+
+
+@dataclass(frozen=True)
+class WrongScale:
+    """A mesh that is in another unit than the model.
+
+    Attributes
+    ----------
+    path : its file
+    sentence : what is wrong, without what to do
+    factor : what brings it into the model's unit
+    """
+
+    path: Path
+    sentence: str
+    factor: float
+
+
+def encoded(model: PoseModel, path: Path, scale: float = 1.0) -> Job:
+    """Read a mesh of a model's topology as a latent pose, named after its file.
+
+    `scale` brings it into the model's unit. Without the right one it comes back as `WrongScale`.
+    """
+
+    def work(_: Progress, cancel: CancelToken) -> Imported | WrongScale:
+        from lcollision_core.meshes import read_mesh
+        from lcollision_core.model import NamedPose, name_of_file
+
+        mesh = read_mesh(path, topology=model.topology)
+        model.require_topology(mesh.topology, str(path))
+        cancel.raise_if_cancelled()
+        try:
+            encoding = model.encode(mesh.vertices, cancel=cancel, scale=scale)
+        except WrongScaleError as error:
+            return WrongScale(path, str(error).partition(";")[0], error.factor)
+        return Imported(path, NamedPose.of_mesh(name_of_file(path), encoding))
+
+    return work
+
+
+def mirrored(model: PoseModel, pose: NamedPose, locked: frozenset[int]) -> Job:
+    """Exchange left and right; what Resolve must move then leaves the locked domains."""
+
+    def work(progress: Progress, cancel: CancelToken) -> MirroredPose:
+        from lcollision_core.resolve import ResolveOptions
+
+        options = ResolveOptions(locked_domains=locked)
+        return model.mirror(pose.latent, pose.placement, pose.mirror_of, options, progress, cancel)
+
+    return work
+
+
+def mirrored_poses(model: PoseModel, poses: tuple[NamedPose, ...]) -> Job:
+    """Return the mirror images of poses, and what there is to say of each."""
+
+    def work(progress: Progress, cancel: CancelToken) -> list[tuple[NamedPose, MirroredPose]]:
+        from lcollision_core.model import MAX_NAME_LENGTH
+
+        images = []
+        for done, pose in enumerate(poses, 1):
+            image = model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel)
+            name = mirrored_name(pose.name)[:MAX_NAME_LENGTH]
+            images.append((replace(pose.mirrored(image), name=name), image))
+            progress(done, len(poses))
+        return images
+
+    return work
+
+
+def exported(
+    model: PoseModel,
+    latent: FloatArray,
+    placement: RigidTransform | None,
+    path: Path,
+    axes: str,
+    scale: float | None,
+) -> Job:
+    """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
+
+    The check is of what the file holds, in its axes and unit.
+    """
+
+    def work(_: Progress, __: CancelToken) -> Exported:
+        from lcollision_core.model import export_frame, export_mesh
+        from lcollision_core.resolve import exported_vertices
+
+        vertices = exported_vertices(model.decode(latent, n_threads=1), placement)
+        frame = export_frame(model, axes, path, scale)
+        written = export_mesh(path, model, vertices, placement, frame)
+        unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
+        return Exported(path, len(model.detector.detect(written, unit=unit).pairs))
+
+    return work
+
+
+def resolved(
+    model: PoseModel,
+    latent: FloatArray,
+    placement: RigidTransform | None,
+    options: ResolveOptions,
+) -> Job:
+    """Find the nearest pose that is free where it is exported to."""
+
+    def work(progress: Progress, cancel: CancelToken) -> Resolved:
+        from lcollision_core.compiled import seconds_compiling
+
+        ghost = drawn_vertices(model, latent)
+        before = seconds_compiling()
+        result = model.resolve(
+            latent, options, progress=progress, cancel=cancel, placement=placement
+        )
+        # Compiling, at the first use, is preparation and no search.
+        searched = max(0.0, result.seconds - (seconds_compiling() - before))
+        return Resolved(replace(result, seconds=searched), ghost)
+
+    return work
+
+
+def is_bundled(model_file: str) -> bool:
+    """Whether a model came with the program, or from no file, so that it is changed in a copy."""
+    from lcollision_core.bundled import bundled_folder
+
+    path = Path(model_file)
+    return not path.is_file() or path.parent == bundled_folder("models")
+
+
+def edited_parts(model: PoseModel, model_file: str, edits: PartEdits) -> Job:
+    """Write a model's parts into its file, as that is now, or into a copy of the user's own."""
+
+    def work(_: Progress, __: CancelToken) -> ChangedParts:
+        from lcollision_core.meshes import locked
+        from lcollision_core.model import change_model, model_destination
+
+        def change(held: PoseModel) -> PoseModel:
+            if held.fingerprint != model.fingerprint:
+                raise ModelFileError(
+                    f"{model_file} holds another model by now; open it again to change its body "
+                    f"parts"
+                )
+            return held.edit_domains(edits.names, edits.colours, edits.order)
+
+        if edits.copy_name is None:
+            written, path = change_model(model_file, change), Path(model_file)
+        else:
+            path = model_destination(edits.copy_name)
+            with locked(path):
+                if path.exists():
+                    raise ModelFileError(
+                        f"there is a model {edits.copy_name!r} already; choose another name"
+                    )
+                written = change(model)
+                written.save(path)
+        # What the open model has loaded and compiled stays.
+        return ChangedParts(model.with_card(written.card, path.stem), str(path))
+
+    return work

@@ -1,0 +1,177 @@
+"""All that takes longer than a frame: one job after the other, in a thread of their own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from PySide6.QtCore import QObject, Signal, Slot
+
+from app.work.threads import Response, end_thread, guarded, started_thread
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+
+Job = Callable[[Progress, CancelToken], Any]
+"""Long work: called in another thread; its value is the result."""
+
+_PROGRESS_SECONDS = 0.05
+"""Between two reports of progress: more would only keep the window busy."""
+
+
+@dataclass(frozen=True, eq=False)
+class JobRequest:
+    """Long work on a snapshot.
+
+    Attributes
+    ----------
+    request_id : rises from job to job
+    label : what is done, as in "Opening poses.json"
+    work : called in the worker's thread
+    cancel : set by the document to stop the work
+    """
+
+    request_id: int
+    label: str
+    work: Job
+    cancel: CancelToken
+
+
+class LongWorker(QObject):
+    """Does one job after the other, in its own thread."""
+
+    answered = Signal(object)
+    progressed = Signal(int, object)
+
+    @Slot(object)
+    def answer(self, job: JobRequest) -> None:
+        """Do one job, whatever happens."""
+        self.answered.emit(guarded(job.request_id, job.label, self._value, job))
+
+    def _value(self, job: JobRequest) -> object:
+        job.cancel.raise_if_cancelled()
+        last = -_PROGRESS_SECONDS
+
+        def report(*status: Any) -> None:
+            nonlocal last
+            now = time.monotonic()
+            if now - last >= _PROGRESS_SECONDS:
+                last = now
+                self.progressed.emit(job.request_id, status[0] if len(status) == 1 else status)
+
+        return job.work(report, job.cancel)
+
+
+class LongWork(QObject):
+    """Does jobs one after the other in its own thread, and tells of them in the window's.
+
+    `busy_changed` carries the label of the oldest job that is not done, "" where there is none;
+    `failed` a `Failure`; `progressed` the job's number and what its work told.
+    """
+
+    busy_changed = Signal(str)
+    progressed = Signal(int, object)
+    failed = Signal(object)
+
+    _wanted = Signal(object)
+
+    def __init__(self, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self._worker = LongWorker()
+        self._thread = started_thread("long work", self._worker, self)
+        self._wanted.connect(self._worker.answer)
+        self._worker.answered.connect(self._on_answered)
+        self._worker.progressed.connect(self._on_progressed)
+        self._jobs: dict[int, tuple[JobRequest, Callable[[Any], None], Callable[[], None]]] = {}
+        self._last_id = 0
+
+    @property
+    def busy(self) -> str:
+        """What is being done, or ""."""
+        return next((job.label for job, _, _ in self._jobs.values()), "")
+
+    def label_of(self, number: int) -> str:
+        """Return what a job does, or "" where it is done."""
+        return self._jobs[number][0].label if number in self._jobs else ""
+
+    def start(
+        self,
+        label: str,
+        work: Job,
+        done: Callable[[Any], None],
+        failed: Callable[[], None] = lambda: None,
+    ) -> int:
+        """Do some work when what was started before is done.
+
+        Parameters
+        ----------
+        label : as in "Opening poses.json"
+        work : called in the other thread with (progress, cancel)
+        done : called in this thread with the work's value; not after `cancel`
+        failed : called in this thread where the work fails, before `LongWork.failed` tells why
+
+        Returns
+        -------
+        number : of the job
+        """
+        self._last_id += 1
+        job = JobRequest(self._last_id, label, work, CancelToken())
+        self._jobs[job.request_id] = (job, done, failed)
+        self._wanted.emit(job)
+        self.busy_changed.emit(self.busy)
+        return job.request_id
+
+    def cancel(self, number: int) -> None:
+        """Stop a job; nothing more is heard of it. Does nothing where it is done."""
+        held = self._jobs.pop(number, None)
+        if held is not None:
+            held[0].cancel.cancel()
+            self.busy_changed.emit(self.busy)
+
+    def cancel_all(self) -> None:
+        """Stop all jobs."""
+        for number in list(self._jobs):
+            self.cancel(number)
+
+    def finish(self, number: int) -> None:
+        """Do a job here and now, instead of in its turn; does nothing where it is done.
+
+        Raises whatever its work raises.
+        """
+        held = self._jobs.get(number)
+        if held is not None:
+            job, done, _ = held
+            self.cancel(number)
+            done(job.work(no_progress, CancelToken()))
+
+    def close(self, deadline: float) -> bool:
+        """Cancel all jobs and end the thread.
+
+        Parameters
+        ----------
+        deadline : until when to wait, on `time.monotonic`
+
+        Returns
+        -------
+        ended : a thread that has not is left to end with the process
+        """
+        self.cancel_all()
+        return end_thread(self._thread, deadline)
+
+    @Slot(int, object)
+    def _on_progressed(self, number: int, status: object) -> None:
+        if number in self._jobs:
+            self.progressed.emit(number, status)
+
+    @Slot(object)
+    def _on_answered(self, answer: Response) -> None:
+        held = self._jobs.pop(answer.request_id, None)
+        if held is None:
+            return
+        _, done, failed = held
+        if answer.failure is not None:
+            failed()
+            self.failed.emit(answer.failure)
+        elif not answer.cancelled:
+            done(answer.value)
+        self.busy_changed.emit(self.busy)

@@ -1,0 +1,104 @@
+"""Threads that outlive no window, and what every request to them is answered with."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from PySide6.QtCore import QObject, QThread, QTimer
+
+from lcollision_core.errors import CancelledError, LCollisionError
+
+_log = logging.getLogger(__name__)
+
+_SWITCH_SECONDS = 0.001
+"""A worker in plain Python holds the interpreter for so long before the window has its turn."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What went wrong, for people and for the log.
+
+    Attributes
+    ----------
+    sentence : what happened and what to do, fit to be shown as it is
+    details : the traceback
+    """
+
+    sentence: str
+    details: str
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What came of a request: a value, a failure, or neither where it was cancelled."""
+
+    request_id: int
+    value: Any = None
+    failure: Failure | None = None
+    cancelled: bool = False
+
+
+def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
+    """Move a worker, which has no parent, into a thread of its own."""
+    sys.setswitchinterval(_SWITCH_SECONDS)
+    thread = QThread(parent)
+    thread.setObjectName(name)
+    worker.moveToThread(thread)
+    thread.start()
+    return thread
+
+
+def end_thread(thread: QThread, deadline: float) -> bool:
+    """Let a thread end after what it does now, and tell whether it has by the deadline.
+
+    One that has not, as in the first compiling, is kept from being destroyed, at which Qt aborts.
+    """
+    thread.quit()
+    ended = thread.wait(max(1, int(1000 * (deadline - time.monotonic()))))
+    if not ended:
+        thread.setParent(None)
+        _unfinished.append(thread)
+    return ended
+
+
+_unfinished: list[QThread] = []
+
+
+def any_unfinished() -> bool:
+    """Return whether a thread that was left behind by `end_thread` still runs."""
+    return any(not thread.isFinished() for thread in _unfinished)
+
+
+def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], object]) -> QTimer:
+    """Make a timer that calls a slot once each time it is started."""
+    timer = QTimer(parent)
+    timer.setSingleShot(True)
+    timer.setInterval(milliseconds)
+    timer.timeout.connect(slot)
+    return timer
+
+
+def guarded(
+    request_id: int, label: str, work: Callable[..., object], *arguments: object
+) -> Response:
+    """Run some work and turn whatever it raises into an answer."""
+    try:
+        return Response(request_id, work(*arguments))
+    except CancelledError:
+        return Response(request_id, cancelled=True)
+    except LCollisionError as error:
+        _log.info("%s: %s", label, error, exc_info=True)
+        return Response(request_id, failure=Failure(str(error), traceback.format_exc()))
+    except Exception as error:
+        _log.exception("%s failed", label)
+        sentence = (
+            f"{label} failed ({type(error).__name__}: {error}); nothing was changed, try again or "
+            f"look into the log"
+        )
+        return Response(request_id, failure=Failure(sentence, traceback.format_exc()))
