@@ -14,7 +14,7 @@ from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.meshes.body.cache import cached_template
 from lcollision_core.meshes.body.figure import Arm, Figure, Foot, Leg
 from lcollision_core.meshes.body.motions import jump_motion, swing_motion
-from lcollision_core.meshes.body.poses import POSES
+from lcollision_core.meshes.body.poses import authored_poses
 from lcollision_core.meshes.body.skeleton import ANGLES, BONES, Skeleton, limits_of
 from lcollision_core.meshes.body.skinning import Skin
 from lcollision_core.meshes.pose_set import PoseSet
@@ -115,29 +115,28 @@ def make_body(
     template = cached_template(count)
     skin = Skin(template)
     names, figures = figures_of(kind, template.skeleton, seed)
-    angles = joint_angles(figures, template.skeleton)
-    vertices = np.empty((len(figures), count, 3))
-    for pose, figure in enumerate(figures):
+    angles = joint_angles([*figures, authored_poses()["rest"]], template.skeleton)
+    vertices = np.empty((len(angles), count, 3))
+    for pose, figure in enumerate([*figures, authored_poses()["rest"]]):
         row = dict(zip(ANGLES, angles[pose], strict=True))
         vertices[pose] = skin.pose(*template.skeleton.pose(row, *figure.pelvis(template.skeleton)))
-        progress(pose + 1, len(figures))
-    lowest = vertices[..., UP_AXIS].min(axis=1)
+        if pose < len(figures):
+            progress(pose + 1, len(figures))
     # A jump leaves the floor, so a motion has one floor and each authored pose its own.
-    vertices[..., UP_AXIS] -= lowest[:, None] if kind == "body" else lowest[0]
-    rest = POSES["rest"]
-    rest_row = dict(zip(ANGLES, joint_angles([rest], template.skeleton)[0], strict=True))
-    rest_vertices = skin.pose(*template.skeleton.pose(rest_row, *rest.pelvis(template.skeleton)))
-    rest_vertices[:, UP_AXIS] -= rest_vertices[:, UP_AXIS].min()
+    lowest = vertices[..., UP_AXIS].min(axis=1)
+    if kind != "body":
+        lowest[:-1] = lowest[0]
+    vertices[..., UP_AXIS] -= lowest[:, None]
     bone_names, vertex_bone = _parts(template.weights)
     return BodySet(
-        vertices=vertices.astype(np.float32),
+        vertices=vertices[:-1].astype(np.float32),
         faces=template.faces,
-        rest_vertices=rest_vertices.astype(np.float32),
+        rest_vertices=vertices[-1].astype(np.float32),
         pose_names=names,
         vertex_bone=vertex_bone,
         bone_names=bone_names,
         mirror_vertex=template.mirror,
-        joint_angles=angles,
+        joint_angles=angles[:-1],
     )
 
 
@@ -146,7 +145,7 @@ def figures_of(
 ) -> tuple[tuple[str, ...], list[Figure]]:
     """Return the names and figures of a pose set, varied by `seed` as `make_body` says."""
     if kind == "body":
-        names, figures = tuple(POSES), list(POSES.values())
+        names, figures = tuple(authored_poses()), list(authored_poses().values())
     else:
         figures = swing_motion() if kind == "body-swing" else jump_motion(skeleton)
         names = tuple(f"frame {frame}" for frame in range(len(figures)))

@@ -65,14 +65,10 @@ class HalfMesh:
                 if u < v:
                     self._push(queue, u, v)
         heapq.heapify(queue)
-        postponed: list[tuple[float, int, int, int, int]] = []
         while self._n_whole > n_vertices:
             if not queue:
-                if not postponed:
-                    raise ValueError(f"{self._n_whole} vertices cannot be reduced to {n_vertices}")
-                queue, postponed = postponed, []
-            entry = heapq.heappop(queue)
-            _, u, v, version_u, version_v = entry
+                raise ValueError(f"{self._n_whole} vertices cannot be reduced to {n_vertices}")
+            _, u, v, version_u, version_v = heapq.heappop(queue)
             if self._version[u] != version_u or self._version[v] != version_v:
                 continue
             removes = 1 if self._on_rim[u] and self._on_rim[v] else 2
@@ -196,7 +192,7 @@ def relax(
     pairs = pairs[~on_rim[pairs[:, 0]] | on_rim[pairs[:, 1]]]
     degree = np.bincount(pairs[:, 0], minlength=len(vertices))
     for _ in range(n):
-        normals = _vertex_normals(vertices, faces)
+        normals = vertex_normals(vertices, faces)
         normals[on_rim, 0] = 0.0
         centre = np.zeros_like(vertices)
         np.add.at(centre, pairs[:, 0], vertices[pairs[:, 1]])
@@ -258,7 +254,8 @@ def mirror_whole(
     return whole, np.concatenate([faces, image[faces[:, ::-1]]]), mirror
 
 
-def _vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
+def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(V, 3) means of the normals of each vertex's faces by area, of length 1."""
     a, b, c = vertices[faces.T]
     face_normals = np.cross(b - a, c - a)
     normals = np.zeros_like(vertices)

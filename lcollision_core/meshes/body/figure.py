@@ -140,7 +140,7 @@ class Figure:
             angles[f"{side} shrug"] = arm.shrug
         for side, leg in (("left", self.left_leg), ("right", self.right_leg)):
             if isinstance(leg, Foot):
-                own = _reach(skeleton, *self.pelvis(skeleton), leg, side)
+                own = _leg_angles(skeleton, *self.pelvis(skeleton), leg, side)
             else:
                 own = {
                     "hip flexion": leg.flexion,
@@ -190,7 +190,7 @@ def _leg_joints(skeleton: Skeleton) -> list[FloatArray]:
     return [skeleton.positions[BONES.index(f"left {name}")] for name in names]
 
 
-def _reach(
+def _leg_angles(
     skeleton: Skeleton, orientation: FloatArray, location: FloatArray, foot: Foot, side: str
 ) -> dict[str, float]:
     """Joint angles of a leg whose foot stands at `foot`: the cosine rule, knee over toes."""
@@ -203,13 +203,13 @@ def _reach(
     start, target, _ = _standing_leg(
         skeleton, reflect @ orientation @ reflect, location, foot, side
     )
-    reach = orientation.T @ (target - start)
-    distance = min(float(np.linalg.norm(reach)), 0.9995 * (thigh + shin))
+    to_foot = orientation.T @ (target - start)
+    distance = min(float(np.linalg.norm(to_foot)), 0.9995 * (thigh + shin))
     cosine = (thigh**2 + shin**2 - distance**2) / (2 * thigh * shin)
     bend = np.pi - np.arccos(np.clip(cosine, -1.0, 1.0))
     local = np.array([0.0, shin * np.sin(bend), -thigh - shin * np.cos(bend)])
     heading = orientation.T @ turn_z(foot.heading) @ [0.0, -1.0, 0.0]
-    swing = _frame(reach, heading) @ _frame(local, np.array([0.0, -1.0, 0.0])).T
+    swing = _frame(to_foot, heading) @ _frame(local, np.array([0.0, -1.0, 0.0])).T
     flexion, spread, turn = Rotation.from_matrix(swing).as_euler("XYZ", degrees=True)
     lower = orientation @ swing @ turn_x(np.degrees(bend))
     lift, tilt, _ = Rotation.from_matrix(lower.T @ sole).as_euler("XYZ", degrees=True)

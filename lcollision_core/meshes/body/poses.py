@@ -1,10 +1,34 @@
-"""The 71 authored poses."""
+"""The 71 authored poses, read from ``resources/body_poses.json``.
+
+Each pose holds the attributes of `Figure` that are not at their default. A limb that hangs free is
+under "left_leg" or "right_leg", one that stands under "left_foot" or "right_foot".
+"""
 
 from __future__ import annotations
 
-from lcollision_core.meshes.body.figure import Figure
-from lcollision_core.meshes.body.poses_athletic import ATHLETIC
-from lcollision_core.meshes.body.poses_everyday import EVERYDAY
+import json
+from functools import cache
+from typing import Any
 
-POSES: dict[str, Figure] = EVERYDAY | ATHLETIC
-"""Figures by name; the first is the rest pose, free of contact."""
+from lcollision_core.bundled import bundled_file
+from lcollision_core.meshes.body.figure import Arm, Figure, Foot, Leg
+
+_LIMBS = {"arm": Arm, "leg": Leg, "foot": Foot}
+
+
+@cache
+def authored_poses() -> dict[str, Figure]:
+    """Return figures by name; the first is the rest pose, free of contact."""
+    poses = json.loads(bundled_file("body_poses.json").read_text(encoding="utf-8"))
+    return {name: _figure(attributes) for name, attributes in poses.items()}
+
+
+def _figure(attributes: dict[str, Any]) -> Figure:
+    given: dict[str, Any] = {}
+    for key, value in attributes.items():
+        limb = _LIMBS.get(key.partition("_")[2])
+        if limb is not None:
+            given[key.replace("foot", "leg")] = limb(**value)
+        else:
+            given[key] = tuple(value) if isinstance(value, list) else value
+    return Figure(**given)

