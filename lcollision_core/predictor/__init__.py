@@ -9,15 +9,15 @@ from lcollision_core.predictor.predictor import (
     TrainingFacts,
     evaluate_predictor,
 )
-from lcollision_core.predictor.row_split import held_out_rows
-from lcollision_core.predictor.training import (
+from lcollision_core.predictor.training.row_split import held_out_rows
+from lcollision_core.predictor.training.status import (
     PredictorStatus,
     StatusCallback,
     has_begun,
     no_status,
     patches_path,
-    train_predictor,
 )
+from lcollision_core.predictor.training.train import train_predictor
 
 __all__ = [
     "LOSSES",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from lcollision_core.predictor.geometric import GeometricNetwork
-from lcollision_core.predictor.networks import PaperNetwork, PredictorNetwork
+from lcollision_core.predictor.geometric.network import GeometricNetwork
+from lcollision_core.predictor.network import PredictorNetwork
+from lcollision_core.predictor.paper.network import PaperNetwork
 
 NETWORKS: dict[str, type[PredictorNetwork]] = {"default": GeometricNetwork, "paper": PaperNetwork}

@@ -16,7 +16,7 @@ from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
 from lcollision_core.labels import BOX_SCALE
 from lcollision_core.model_file import required_array
-from lcollision_core.predictor.field_kernels import REACHES, SUMS_A_REACH
+from lcollision_core.predictor.inference.field_kernels import REACHES, SUMS_A_REACH
 
 ENCODER_SIZES = (512, 256, 256)
 PREDICTOR_SIZES = (512, 256, 256, 128)

@@ -24,7 +24,8 @@ from lcollision_core.contact import CollisionDetector
 from lcollision_core.labels import LabelStore, is_held_out
 from lcollision_core.model import PoseModel, find_model
 from lcollision_core.model_file import Section
-from lcollision_core.predictor import PRESETS, CollisionPredictor, row_split
+from lcollision_core.predictor import PRESETS, CollisionPredictor
+from lcollision_core.predictor.training import row_split
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 
@@ -223,7 +224,7 @@ def test_ctrl_c_keeps_a_checkpoint_and_says_so(
     output = tmp_path / "stopped.safetensors"
     code = (
         "import os, signal\n"
-        "from lcollision_core.predictor import loop\n"
+        "from lcollision_core.predictor.training import loop\n"
         "loop._LEAST_PATCHES_KEPT = 16\n"
         "report = loop.TrainingLoop._report\n"
         "def interrupted(self, step):\n"

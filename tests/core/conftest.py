@@ -34,6 +34,6 @@ def tube_model(tube_poses: PoseSet) -> PoseModel:
 @pytest.fixture(scope="session")
 def tube_folds(tube_model: PoseModel) -> np.ndarray:
     """Return the sites where its skin folds."""
-    from lcollision_core.predictor.folds import find_fold_sites
+    from lcollision_core.predictor.geometric.folds import find_fold_sites
 
     return find_fold_sites(tube_model.embedding, colliding_latent(tube_model))

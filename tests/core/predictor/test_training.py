@@ -29,15 +29,15 @@ from lcollision_core.predictor import (
     Loss,
     PredictorConfig,
     PredictorStatus,
-    loop,
     train_predictor,
 )
-from lcollision_core.predictor.loop import rate_at
-from lcollision_core.predictor.networks import PredictorNetwork
-from lcollision_core.predictor.patch_labels import PatchLabeller
+from lcollision_core.predictor.network import PredictorNetwork
 from lcollision_core.predictor.predictor import BATCH_ROWS
-from lcollision_core.predictor.row_split import split_rows
-from lcollision_core.predictor.training import has_begun, no_status, patches_path
+from lcollision_core.predictor.training import loop
+from lcollision_core.predictor.training.loop import rate_at
+from lcollision_core.predictor.training.patch_labels import PatchLabeller
+from lcollision_core.predictor.training.row_split import split_rows
+from lcollision_core.predictor.training.status import has_begun, no_status, patches_path
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import PAPER, colliding_latent, config, made_up_rows, weights_of
 
@@ -270,7 +270,7 @@ def test_labelling_patches_goes_on_where_it_was_stopped(
 
 
 PATCHES = """
-from lcollision_core.predictor import loop
+from lcollision_core.predictor.training import loop
 loop._LEAST_PATCHES_KEPT = 100
 labelled, roots = [], loop.PatchLabeller.roots
 def noted(labeller, index, *others):

@@ -22,13 +22,13 @@ from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows
 from lcollision_core.predictor.config import PredictorConfig
-from lcollision_core.predictor.networks import PredictorNetwork, Targets
-from lcollision_core.predictor.patch_labels import PatchLabeller
+from lcollision_core.predictor.network import PredictorNetwork, Targets
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
 from lcollision_core.predictor.presets import NETWORKS
-from lcollision_core.predictor.processes import Processes, joined_processes
-from lcollision_core.predictor.row_split import RowSplit
-from lcollision_core.predictor.training import PredictorStatus, StatusCallback, patches_path
+from lcollision_core.predictor.training.patch_labels import PatchLabeller
+from lcollision_core.predictor.training.processes import Processes, joined_processes
+from lcollision_core.predictor.training.row_split import RowSplit
+from lcollision_core.predictor.training.status import PredictorStatus, StatusCallback, patches_path
 
 _RUN_VERSION = 7
 """Goes up when training changes, so that no checkpoint is continued by other rules."""

@@ -24,21 +24,21 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, silu, smooth_l1_loss
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.predictor.body_points import N_POINTS, skin_cells
-from lcollision_core.predictor.field import contact_field, fold_view, normalised
-from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
-from lcollision_core.predictor.folds import N_MEMBERS, find_fold_sites
-from lcollision_core.predictor.network_kernels import SQUASHED
-from lcollision_core.predictor.networks import (
+from lcollision_core.predictor.geometric.field import contact_field, fold_view, normalised
+from lcollision_core.predictor.geometric.folds import N_MEMBERS, find_fold_sites
+from lcollision_core.predictor.geometric.reduced_body import ReducedBody
+from lcollision_core.predictor.inference.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
+from lcollision_core.predictor.inference.network_kernels import SQUASHED
+from lcollision_core.predictor.inference.points import N_POINTS, skin_cells
+from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
+from lcollision_core.predictor.network import (
     NetworkOutput,
     PredictorNetwork,
     SeededLinear,
+    SkinCells,
     StackedLinear,
     Targets,
 )
-from lcollision_core.predictor.patch_labels import SkinCells
-from lcollision_core.predictor.reduced_body import ReducedBody
-from lcollision_core.predictor.skin_geometry import SkinGeometry
 
 if TYPE_CHECKING:
     from lcollision_core.embedding import Embedding

@@ -12,8 +12,25 @@ from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.model import PoseModel
-from lcollision_core.predictor import PRESETS, patch_labels
-from lcollision_core.predictor.body_points import (
+from lcollision_core.predictor import PRESETS
+from lcollision_core.predictor.geometric.field import (
+    Decoding,
+    contact_field,
+    decode_features,
+    deform,
+    fold_view,
+    normalised,
+)
+from lcollision_core.predictor.geometric.folds import (
+    _MEMBER_REACH,
+    FOLD_REACH,
+    N_MEMBERS,
+    N_SITES,
+    find_fold_sites,
+)
+from lcollision_core.predictor.geometric.network import GeometricNetwork, _Auxiliary
+from lcollision_core.predictor.inference.field_kernels import BLOCK, REACHES
+from lcollision_core.predictor.inference.points import (
     body_points,
     neighbour_order,
     skin_cells,
@@ -22,25 +39,9 @@ from lcollision_core.predictor.body_points import (
     tangent_frames,
     with_tighter_blocks,
 )
-from lcollision_core.predictor.field import (
-    Decoding,
-    contact_field,
-    decode_features,
-    deform,
-    fold_view,
-    normalised,
-)
-from lcollision_core.predictor.field_kernels import BLOCK, REACHES
-from lcollision_core.predictor.folds import (
-    _MEMBER_REACH,
-    FOLD_REACH,
-    N_MEMBERS,
-    N_SITES,
-    find_fold_sites,
-)
-from lcollision_core.predictor.geometric import GeometricNetwork, _Auxiliary
-from lcollision_core.predictor.networks import NetworkOutput, Targets
-from lcollision_core.predictor.patch_labels import PatchLabeller, SkinCells
+from lcollision_core.predictor.network import NetworkOutput, SkinCells, Targets
+from lcollision_core.predictor.training import patch_labels
+from lcollision_core.predictor.training.patch_labels import PatchLabeller
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import colliding_latent, made_up_rows
 

@@ -9,7 +9,7 @@ from lcollision_core.contact import CollisionDetector, SelfCollisions
 from lcollision_core.contact.near import are_pairs_near, near_vertices
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.predictor.body_points import (
+from lcollision_core.predictor.inference.points import (
     farthest_points,
     skin_distances,
     skin_graph,

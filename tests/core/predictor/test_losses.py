@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from lcollision_core.predictor import PRESETS
-from lcollision_core.predictor.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
 from lcollision_core.predictor.metrics import EnergyScores, mean_difference, measure
-from lcollision_core.predictor.networks import NetworkOutput, PaperNetwork, Targets
+from lcollision_core.predictor.network import NetworkOutput, Targets
+from lcollision_core.predictor.paper.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
+from lcollision_core.predictor.paper.network import PaperNetwork
 
 BOTH = EnergyScores(depth=True, rank=True)
 

@@ -18,11 +18,11 @@ import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.predictor import field_kernels, network_kernels
-from lcollision_core.predictor.compiled_skin import PosedSkin, SkinMap
-from lcollision_core.predictor.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
-from lcollision_core.predictor.network_kernels import SQUASHED
-from lcollision_core.predictor.skin_geometry import SkinGeometry
+from lcollision_core.predictor.inference import field_kernels, network_kernels
+from lcollision_core.predictor.inference.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
+from lcollision_core.predictor.inference.network_kernels import SQUASHED
+from lcollision_core.predictor.inference.posed_skin import PosedSkin, SkinMap
+from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
 
 State = Mapping[str, npt.NDArray[Any]]
 Array = npt.NDArray[np.float32]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from lcollision_core.embedding import Embedding
@@ -12,53 +11,15 @@ from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows, StoreIdentity
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.metrics import mean_difference
-from lcollision_core.predictor.operating_point import balanced_logit
 from lcollision_core.predictor.predictor import (
     CollisionPredictor,
     TrainingFacts,
     evaluate_predictor,
     require_model,
 )
-from lcollision_core.predictor.row_split import split_rows
-
-
-@dataclass(frozen=True)
-class PredictorStatus:
-    """How far a training run is.
-
-    Attributes
-    ----------
-    epoch, epochs : passes over the rows, finished and in all
-    done, total : steps of the whole run
-    loss : mean over the steps of this epoch so far, None before the first
-    held_out_accuracy : of some held-out rows after the last epoch, None before that
-    preparing : share of the training rows whose patches are labelled; None once training began
-    """
-
-    epoch: int
-    epochs: int
-    done: int
-    total: int
-    loss: float | None
-    held_out_accuracy: float | None
-    preparing: float | None = None
-
-
-StatusCallback = Callable[[PredictorStatus], None]
-
-
-def no_status(status: PredictorStatus) -> None:
-    """Report to nobody."""
-
-
-def patches_path(checkpoint: Path) -> Path:
-    """Return the file beside a checkpoint that keeps the labelled patches."""
-    return checkpoint.with_name(f"{checkpoint.name}.patches")
-
-
-def has_begun(checkpoint: Path) -> bool:
-    """Whether a stopped run goes on from a checkpoint, or at least from its patches."""
-    return checkpoint.exists() or patches_path(checkpoint).exists()
+from lcollision_core.predictor.training.operating_point import balanced_logit
+from lcollision_core.predictor.training.row_split import split_rows
+from lcollision_core.predictor.training.status import StatusCallback, no_status
 
 
 def train_predictor(
@@ -107,7 +68,7 @@ def train_predictor(
         see `patches_path`, what was labelled up to the last twentieth.
     """
     # Here, so that reading a predictor's types loads no torch.
-    from lcollision_core.predictor.loop import TrainingLoop
+    from lcollision_core.predictor.training.loop import TrainingLoop
 
     config = PRESETS["default"] if config is None else config
     require_model(rows, embedding)

@@ -9,9 +9,9 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from lcollision_core.errors import ShapeError
-from lcollision_core.predictor import field_kernels, skin_kernels
-from lcollision_core.predictor.field_kernels import BEHIND, BLOCK, FADE, REACHES
-from lcollision_core.predictor.skin_kernels import SMALLEST_SQUARED_ANGLE
+from lcollision_core.predictor.inference import field_kernels, skin_kernels
+from lcollision_core.predictor.inference.field_kernels import BEHIND, BLOCK, FADE, REACHES
+from lcollision_core.predictor.inference.skin_kernels import SMALLEST_SQUARED_ANGLE
 
 _SYMMETRIC = [3, 4, 5, 4, 6, 7, 5, 7, 8]
 """Where the features hold the nine entries of S."""

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from lcollision_core.model import PoseModel
-from lcollision_core.predictor.compiled_network import CompiledNetwork
-from lcollision_core.predictor.geometric import GeometricNetwork
+from lcollision_core.predictor.geometric.network import GeometricNetwork
+from lcollision_core.predictor.inference.network import CompiledNetwork
 
 
 @pytest.fixture(scope="module", params=["folds", "no folds"])

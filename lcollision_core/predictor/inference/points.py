@@ -13,7 +13,7 @@ from lcollision_core.meshes.normals import vertex_normals
 from lcollision_core.meshes.topology import FloatArray
 
 N_POINTS = 240
-"""Of a mesh that has as many vertices; see the table in `geometric`."""
+"""Of a mesh that has as many vertices; see the table in docs/experiments.md."""
 
 _LEAST_LENGTH = 1e-9
 

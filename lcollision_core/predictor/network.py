@@ -1,26 +1,20 @@
-"""The networks of the presets: latent codes in, scaled energies and one logit out."""
+"""What the networks of the presets share: latent codes in, scaled energies and one logit out."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import nn
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.labels import LabelRows
 from lcollision_core.predictor.config import PredictorConfig
-from lcollision_core.predictor.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
-from lcollision_core.predictor.patch_labels import SkinCells
-from lcollision_core.predictor.stored_network import (
-    CLASSIFIER_SIZE,
-    ENCODER_SIZES,
-    PREDICTOR_SIZES,
-    UNDIVIDED_SIZE,
-)
 
 
 class NetworkOutput(NamedTuple):
@@ -57,6 +51,30 @@ class Targets(NamedTuple):
     def part(self, start: int, stop: int) -> Targets:
         """Return rows `start` to `stop` - 1."""
         return Targets(*(values[start:stop] for values in self))
+
+
+@dataclass(frozen=True, eq=False)
+class SkinCells:
+    """How the skin is divided, twice.
+
+    Attributes
+    ----------
+    patch : (V,) the patch of each vertex, 0 to P - 1, for contact between parts
+    fold : (V,) the site of each vertex, 0 to S - 1, for folds; all -1 where there are none
+    """
+
+    patch: npt.NDArray[np.int64]
+    fold: npt.NDArray[np.int64]
+
+    @property
+    def n_patches(self) -> int:
+        """P."""
+        return int(self.patch.max()) + 1
+
+    @property
+    def n_folds(self) -> int:
+        """S."""
+        return int(self.fold.max()) + 1
 
 
 class PredictorNetwork(nn.Module, ABC):
@@ -110,6 +128,7 @@ class PredictorNetwork(nn.Module, ABC):
     def forward(self, latent: torch.Tensor) -> NetworkOutput:
         """Predict from (B, D) latent codes."""
 
+    @abstractmethod
     def loss(
         self,
         output: NetworkOutput,
@@ -128,18 +147,6 @@ class PredictorNetwork(nn.Module, ABC):
         config : the terms' weights
         margin : of the ranking loss, scaled
         """
-        own = batch.part(*part)
-        n_rows = len(batch.energy)
-        total = config.entropy_weight / n_rows * entropy_loss(output.logit, own.colliding).sum()
-        if config.depth_weight:
-            divided = own.domain_energy if config.by_domain else own.domain_energy[:, :0]
-            losses = depth_loss(output.domain_energy, divided, own.energy)
-            total = total + config.depth_weight / n_rows * losses.sum()
-        if config.rank_weight:
-            losses = rank_loss(output.domain_energy.sum(dim=1), own.energy, margin)
-            n_pairs = max(ranked_pairs(batch.energy), 1)
-            total = total + config.rank_weight / n_pairs * losses.sum()
-        return total
 
 
 class StackedLinear(nn.Module):
@@ -193,95 +200,3 @@ class SeededLinear(nn.Module):
     def forward(self, values: torch.Tensor) -> torch.Tensor:
         """Map (B, n_in) to (B, n_out)."""
         return torch.addmm(self.bias, values, self.weight)
-
-
-class PaperNetwork(PredictorNetwork):
-    """CSE, one CP for each domain and the classifier, in the paper's sizes, with ReLU.
-
-    S_0 = CSE(Z_all); S_k = CP_k(S_0, Z_k); logit = MLP(S_1, ..., S_K). Without domains (ND) one
-    head on S_0 gives S_sum, and the classifier reads that alone. Tan et al. 2021, sections
-    "Collision Detection Architecture" and "Evaluation".
-
-    Parameters
-    ----------
-    group_sizes : (|Z_0|, |Z_1|, ..., |Z_K|)
-    by_domain : False for ND
-    seed : of the initial weights
-    """
-
-    activation: type[nn.Module] = nn.ReLU
-
-    def __init__(self, group_sizes: Sequence[int], by_domain: bool, seed: int) -> None:
-        super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        self.act = self.activation()
-        sizes = (sum(group_sizes), *ENCODER_SIZES)
-        self.encoder = nn.Sequential(
-            *(
-                layer
-                for n_in, n_out in pairwise(sizes)
-                for layer in (SeededLinear(n_in, n_out, generator), self.activation())
-            )
-        )
-        self.by_domain = by_domain
-        n_outputs = len(group_sizes) - 1 if by_domain else 1
-        state = ENCODER_SIZES[-1]
-        if by_domain:
-            widest = max(group_sizes[1:])
-            self.predictors = nn.ModuleList()
-            n_in = state + widest
-            for number, n_out in enumerate((*PREDICTOR_SIZES, 1)):
-                fan_in = [state + size for size in group_sizes[1:]] if number == 0 else None
-                self.predictors.append(StackedLinear(n_outputs, n_in, n_out, generator, fan_in))
-                n_in = n_out
-            self._code_index = _padded_codes(group_sizes)
-        else:
-            self.undivided = nn.Sequential(
-                SeededLinear(state, UNDIVIDED_SIZE, generator),
-                self.activation(),
-                SeededLinear(UNDIVIDED_SIZE, 1, generator),
-            )
-        self.classifier = nn.Sequential(
-            SeededLinear(n_outputs, CLASSIFIER_SIZE, generator),
-            self.activation(),
-            SeededLinear(CLASSIFIER_SIZE, 1, generator),
-        )
-
-    @classmethod
-    def build(
-        cls,
-        embedding: Embedding,
-        config: PredictorConfig,
-        rows: LabelRows | None = None,  # noqa: ARG003
-        seed: int = 0,
-        near_exclusion: float = 0.0,  # noqa: ARG003
-    ) -> PredictorNetwork:
-        """Make the network of an embedding; the rows do not matter."""
-        return cls(embedding.group_sizes, config.by_domain, seed)
-
-    def forward(self, latent: torch.Tensor) -> NetworkOutput:
-        """Predict from (B, D) latent codes."""
-        state = self.encoder(latent)
-        energy = self._domain_energy(state, latent) if self.by_domain else self.undivided(state)
-        return NetworkOutput(energy, self.classifier(energy)[:, 0])
-
-    def _domain_energy(self, state: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
-        index = self._code_index.to(latent.device)
-        padded = torch.cat([latent, latent.new_zeros((len(latent), 1))], dim=1)
-        codes = padded[:, index].transpose(0, 1)
-        values = torch.cat([state.expand(len(index), -1, -1), codes], dim=2)
-        for layer in self.predictors[:-1]:
-            values = self.act(layer(values))
-        energy: torch.Tensor = self.predictors[-1](values)[:, :, 0].T
-        return energy
-
-
-def _padded_codes(group_sizes: Sequence[int]) -> torch.Tensor:
-    """Return (K, widest) which code of (Z_all, 0) is code j of domain k; past its last, the 0."""
-    latent_size, widest = sum(group_sizes), max(group_sizes[1:])
-    index = torch.full((len(group_sizes) - 1, widest), latent_size)
-    start = group_sizes[0]
-    for domain, size in enumerate(group_sizes[1:]):
-        index[domain, :size] = torch.arange(start, start + size)
-        start += size
-    return index

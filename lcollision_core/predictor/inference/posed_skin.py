@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.acap.features import N_FEATURES
-from lcollision_core.predictor import network_kernels, skin_kernels
-from lcollision_core.predictor.skin_geometry import SkinGeometry
+from lcollision_core.predictor.inference import network_kernels, skin_kernels
+from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
 
 Float32Array = npt.NDArray[np.float32]
 

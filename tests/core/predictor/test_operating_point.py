@@ -16,11 +16,11 @@ from lcollision_core.predictor import (
     CollisionPredictor,
     evaluate_predictor,
     held_out_rows,
-    row_split,
     train_predictor,
 )
-from lcollision_core.predictor.operating_point import balanced_logit
-from lcollision_core.predictor.row_split import split_rows
+from lcollision_core.predictor.training import row_split
+from lcollision_core.predictor.training.operating_point import balanced_logit
+from lcollision_core.predictor.training.row_split import split_rows
 from tests.core.predictor_rows import config, made_up_rows
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +10,8 @@ import numpy.typing as npt
 from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.labels import LabelRows
-from lcollision_core.predictor.folds import FoldDetector
+from lcollision_core.predictor.geometric.folds import FoldDetector
+from lcollision_core.predictor.network import SkinCells
 
 _ROWS_A_BLOCK = 32
 _PATCH_SHARE, _FOLD_SHARE = 0.05, 0.005
@@ -19,30 +19,6 @@ _PATCH_SHARE, _FOLD_SHARE = 0.05, 0.005
 
 _LEAST_ROOT = 1e-3
 """So that the shallowest touch is still told from none in half precision."""
-
-
-@dataclass(frozen=True, eq=False)
-class SkinCells:
-    """How the skin is divided, twice.
-
-    Attributes
-    ----------
-    patch : (V,) the patch of each vertex, 0 to P - 1, for contact between parts
-    fold : (V,) the site of each vertex, 0 to S - 1, for folds; all -1 where there are none
-    """
-
-    patch: npt.NDArray[np.int64]
-    fold: npt.NDArray[np.int64]
-
-    @property
-    def n_patches(self) -> int:
-        """P."""
-        return int(self.patch.max()) + 1
-
-    @property
-    def n_folds(self) -> int:
-        """S."""
-        return int(self.fold.max()) + 1
 
 
 class PatchLabeller:

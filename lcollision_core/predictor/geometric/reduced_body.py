@@ -7,8 +7,8 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from lcollision_core.predictor.field import Decoding, decode_features, deform
-from lcollision_core.predictor.skin_geometry import SkinGeometry
+from lcollision_core.predictor.geometric.field import Decoding, decode_features, deform
+from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
 
 _DAMPING = 1e-8
 

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.predictor.body_points import (
+from lcollision_core.predictor.inference.field_kernels import BLOCK
+from lcollision_core.predictor.inference.points import (
     N_POINTS,
     body_points,
     neighbour_order,
@@ -19,7 +20,6 @@ from lcollision_core.predictor.body_points import (
     tangent_frames,
     with_tighter_blocks,
 )
-from lcollision_core.predictor.field_kernels import BLOCK
 
 DISTANT = 0.10
 """Heights along the surface beyond which two points feel each other."""

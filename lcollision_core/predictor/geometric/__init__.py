@@ -1,0 +1,1 @@
+"""The default network, in torch: what is trained, and what predicts on a GPU."""

@@ -1,0 +1,1 @@
+"""The default network on the CPU: compiled loops in single precision, without torch."""

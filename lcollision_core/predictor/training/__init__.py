@@ -1,0 +1,1 @@
+"""Stage 2: from labelled samples to a trained predictor."""
