@@ -95,6 +95,7 @@ class StartUp(QObject):
 
     @Slot()
     def _on_ready(self) -> None:
+        _log.info("the first pose is on the screen")
         # Once the pose has been drawn: a question over an empty window would puzzle.
         QTimer.singleShot(_LATER_MILLISECONDS, self, self._offer_recovery)
 

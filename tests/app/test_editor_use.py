@@ -96,16 +96,20 @@ def body() -> PoseModel:
     return PoseModel.load("body")
 
 
-def wait_for_file(editor: subprocess.Popen[str], pattern: str) -> Path:
-    """Wait until an editor has written a file into its session; it may have to compile before."""
+def wait_until(editor: subprocess.Popen[str], happened: Callable[[], bool], what: str) -> None:
+    """Wait for what an editor does once it runs; it may have to compile before."""
     deadline = time.monotonic() + 4 * PATIENCE / 1000
-    while time.monotonic() < deadline and editor.poll() is None:
-        found = list(sessions_folder().glob(pattern))
-        if found:
-            return found[0]
+    while not happened():
+        if time.monotonic() > deadline or editor.poll() is not None:
+            editor.kill()
+            raise AssertionError(f"no {what}: {editor.communicate()[1]}")
         time.sleep(0.05)
-    editor.kill()
-    raise AssertionError(f"no {pattern}: {editor.communicate()[1]}")
+
+
+def wait_for_file(editor: subprocess.Popen[str], pattern: str) -> Path:
+    """Wait until an editor has written a file into its session."""
+    wait_until(editor, lambda: any(sessions_folder().glob(pattern)), pattern)
+    return next(sessions_folder().glob(pattern))
 
 
 # Crashes and a clean end.
@@ -164,12 +168,12 @@ def test_it_opens_on_the_built_in_body_and_ends_when_told_to(
 ) -> None:
     editor = start()
     wait_for_file(editor, "*/lock")
-    time.sleep(2.0)
+    (log,) = home.rglob("editor.log")
+    wait_until(editor, lambda: "the first pose is on the screen" in log.read_text(), "first pose")
     editor.send_signal(signal.SIGTERM)
     _, errors = editor.communicate(timeout=PATIENCE / 1000)
     assert editor.returncode == 0, errors
     assert "Error" not in errors
-    (log,) = home.rglob("editor.log")
     assert "ERROR" not in log.read_text()
     assert list(sessions_folder().iterdir()) == []
 
