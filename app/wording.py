@@ -99,16 +99,7 @@ def mirrored_text(mirrored: MirroredPose) -> str:
     return f"mirrored with a {fit_error(mirrored.fit_error_mean, mirrored.fit_error_max)}, {state}"
 
 
-def split_sentence(sentence: str) -> tuple[str, str]:
-    """Split an error's sentence into what happened and what to do, each with its capital."""
-    what, _, advice = sentence.rpartition("; ")
-    if not what:
-        what, advice = advice, ""
-    what, advice = (_with_capital(part) for part in (what, advice))
-    return what, advice + "." * bool(advice and not advice.endswith((".", "?", "!")))
-
-
-def _with_capital(text: str) -> str:
+def with_capital(text: str) -> str:
     """Begin with a capital, unless the first word is a file's name or a number."""
     word = text.partition(" ")[0]
     return text[:1].upper() + text[1:] if word.isalpha() else text

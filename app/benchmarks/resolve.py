@@ -105,7 +105,7 @@ def real_poses(
     colliding = model.detector.are_colliding(pose_set.vertices.astype(np.float32))
     chosen = np.flatnonzero(colliding)[:n_poses]
     if len(chosen) == 0:
-        raise LCollisionError("no pose of the set intersects itself; name another set")
+        raise LCollisionError("no pose of the set intersects itself", "name another set")
     encoded = []
     for pose in chosen:
         encoded.append(model.encode(pose_set.vertices[pose]))
@@ -124,7 +124,9 @@ def score_baseline(model: PoseModel, poses: CollidingPoses) -> ResolveScore:
     """
     if len(model.free_latent) == 0:
         raise LCollisionError(
-            f"the model {model.name!r} knows no free pose to bisect to; train its predictor again"
+            "knows no free pose to bisect to",
+            "train its predictor again",
+            where=f"the model {model.name!r}",
         )
     seconds, latents = [], []
     for target in poses.latents:

@@ -12,7 +12,7 @@ import typer
 from app.cli.console import note, print_json, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.results import note_near_exclusion
-from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
     from app.benchmarks.resolve import ResolveScore, SolverRuns
@@ -93,13 +93,10 @@ def _require_folder(folder: Path) -> None:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise LCollisionError(
-            f"the folder {folder} cannot be made: {error.strerror or error}; name another"
+        raise LCollisionError.because(
+            f"the folder {folder}", "cannot be made", error, "name another"
         ) from error
-    try:
-        require_writable(folder / "convergence.png")
-    except MeshFileError as error:
-        raise LCollisionError(str(error)) from error
+    require_writable(folder / "convergence.png")
 
 
 def _draw(folder: Path, drawn: list[SolverRuns]) -> None:

@@ -78,7 +78,7 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
         with progress_bar("Finding self-collisions") as progress:
             found = detector.summarise(mesh.vertices, n_deepest=_DEEPEST, progress=progress)
     except ShapeError as error:
-        raise MeshFileError(f"{path} cannot be checked: {error}") from error
+        raise MeshFileError.because(path, "cannot be checked", error) from error
     if found.n_coincident_pairs:
         pairs = counted(found.n_coincident_pairs, "pair of faces lies", "pairs of faces lie")
         note(f"{path}: {pairs} exactly on each other: such touch, which counts as no collision")

@@ -63,7 +63,7 @@ def check(
         with progress_bar("Finding self-collisions") as progress:
             found = detector.detect_batch(poses.vertices, progress=progress)
     except ShapeError as error:
-        raise MeshFileError(f"{path} cannot be checked: {error}") from error
+        raise MeshFileError.because(path, "cannot be checked", error) from error
     guess = poses.up
     report: dict[str, Any] = {
         "poses": inspection.n_found,
@@ -135,7 +135,7 @@ def make(
     from lcollision_core.meshes.body import make_body
 
     if output.suffix.lower() != ".npz":
-        raise MeshFileError(f"{output} cannot be written: a pose set is an .npz file; rename it")
+        raise MeshFileError.unwritable(output, "a pose set is an .npz file", "rename it")
     require_writable(output)
     with progress_bar("Posing the body") as progress:
         body = make_body(kind.value, n_vertices=n_vertices, seed=seed, progress=progress)

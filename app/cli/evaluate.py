@@ -112,7 +112,9 @@ def _unseen(store: LabelStore, rows: LabelRows, trained: CollisionPredictor) -> 
     held_out = held_out_rows(rows, trained.config, trained.facts.rows)
     if not len(held_out):
         raise LabelStoreError(
-            f"{store.path} has {counted(len(rows), 'row')}, none of which is held out; label more"
+            f"has {counted(len(rows), 'row')}, none of which is held out",
+            "label more",
+            where=store.path,
         )
     return held_out
 

@@ -107,7 +107,7 @@ def domains(
         number, _, name = request.partition("=")
         if not number.strip().isdecimal() or not name:
             raise LCollisionError(
-                f"{request!r} does not name a domain; write K=NAME, such as 3=tail"
+                "does not name a domain", "write K=NAME, such as 3=tail", where=f"{request!r}"
             )
         renamings[int(number) - 1] = name
     if renamings:
@@ -141,7 +141,9 @@ def _refuse_bundled(path: Path) -> None:
 
     if any(listed.bundled and listed.path == path for listed in list_models()):
         raise LCollisionError(
-            f"{path.stem} is a bundled model and stays as it is; copy {path} and name the copy"
+            "is a bundled model and stays as it is",
+            f"copy {path} and name the copy",
+            where=path.stem,
         )
 
 

@@ -125,8 +125,9 @@ def decode(
     destination = output_named(output)
     if destination.form is OutputForm.POSES and (axes is not MeshAxes.MODEL or scale is not None):
         raise LCollisionError(
-            f"{output} would hold codes, which have neither --axes nor --scale; name a mesh or a "
-            f"folder"
+            "would hold codes, which have neither --axes nor --scale",
+            "name a mesh or a folder",
+            where=output,
         )
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)

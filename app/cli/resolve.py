@@ -163,8 +163,9 @@ def resolve(
     target = output_named(output)
     if keep_detail and target.form is OutputForm.POSES:
         raise LCollisionError(
-            f"{output} would hold codes, which have no room for --keep-detail; name a mesh or a "
-            f"folder"
+            "would hold codes, which have no room for --keep-detail",
+            "name a mesh or a folder",
+            where=output,
         )
     files = expanded(inputs)
     if len(files) > 1:
@@ -229,8 +230,9 @@ def _domain(model: PoseModel, name: str) -> int:
     if name.isdecimal() and 1 <= int(name) <= len(names):
         return int(name) - 1
     raise LCollisionError(
-        f"{model.name} has no domain {name!r}; its domains are {', '.join(model.domain_names)}, "
-        f"or 1 to {len(names)}"
+        f"has no domain {name!r}",
+        f"its domains are {', '.join(model.domain_names)}, or 1 to {len(names)}",
+        where=model.name,
     )
 
 
@@ -247,7 +249,8 @@ def _group_weights(model: PoseModel, wanted: Sequence[str]) -> tuple[float, ...]
             value = float("nan")
         if not equals or not 0.0 < value < float("inf"):
             raise LCollisionError(
-                f"--weight {entry!r} is not DOMAIN=W with a number W above 0, as in 'left arm=5'"
+                "is not DOMAIN=W with a number W above 0, as in 'left arm=5'",
+                where=f"--weight {entry!r}",
             )
         weights[1 + _domain(model, name)] = value
     return tuple(weights)
@@ -282,7 +285,7 @@ def _requests_of(model: PoseModel, path: Path, scale: float) -> Iterator[_Reques
     if path.suffix.lower() == ".json":
         poses = read_poses(path, model)
         if not poses:
-            raise ModelFileError(f"{path} has no poses in it; name a file that has some")
+            raise ModelFileError("has no poses in it", "name a file that has some", where=path)
         for pose in poses:
             yield _Request(f"{path}: {pose.name}", pose)
         return

@@ -100,7 +100,7 @@ def require_output(path: Path, suffix: str) -> Output:
     from lcollision_core.meshes import file_stamp, require_writable
 
     if path.suffix.lower() != suffix:
-        raise LCollisionError(f"{path} cannot be written: it must be a {suffix} file; rename it")
+        raise LCollisionError.unwritable(path, f"it must be a {suffix} file", "rename it")
     require_writable(path)
     return Output(path, OutputForm.POSES, file_stamp(path))
 
@@ -144,13 +144,16 @@ def output_named(name: str) -> Output:
         form = OutputForm.POSES if suffix == ".json" else OutputForm.MESH
         return Output(path, form, file_stamp(path))
     if not must_be_folder and has_known_suffix(path):
-        raise LCollisionError(
-            f"{path} cannot be written: {suffix} is no format known here; use one of "
-            f"{', '.join(WRITABLE_SUFFIXES)}, .json or a folder"
+        raise LCollisionError.unwritable(
+            path,
+            f"{suffix} is no format known here",
+            f"use one of {', '.join(WRITABLE_SUFFIXES)}, .json or a folder",
         )
     require_writable(path)
     if path.exists():
-        raise MeshFileError(f"the folder {path} cannot be made: it is a file; name another")
+        raise MeshFileError(
+            "cannot be made: it is a file", "name another", where=f"the folder {path}"
+        )
     return Output(path, OutputForm.FOLDER, None)
 
 
@@ -163,7 +166,7 @@ def require_one_mesh(output: Output, n_poses: int) -> None:
     """
     if output.form is OutputForm.MESH and n_poses != 1:
         raise LCollisionError(
-            f"{output.path} is one mesh, but there are {n_poses} poses; name a folder"
+            f"is one mesh, but there are {n_poses} poses", "name a folder", where=output.path
         )
 
 

@@ -138,7 +138,7 @@ class PoseDocument(PoseHistory):
     def model(self) -> PoseModel:
         """The model that the pose belongs to."""
         if self._model is None:
-            raise LCollisionError("no model is open yet; open one first")
+            raise LCollisionError("no model is open yet", "open one first")
         return self._model
 
     @property
@@ -412,7 +412,7 @@ class PoseDocument(PoseHistory):
         self.end_gesture()
         target = Path(path) if path is not None else self._file
         if target is None:
-            raise ModelFileError("the pose has no file yet; save it under a name")
+            raise ModelFileError("the pose has no file yet", "save it under a name")
         name = self.pose_name if self.pose_name != UNNAMED else name_of_file(target)
         pose = replace(self.pose, name=name)
         write_poses(target, self.model, self.file_poses, pose)
@@ -469,7 +469,7 @@ class PoseDocument(PoseHistory):
 
         if not self.can_resolve:
             raise ModelFileError(
-                f"{self.model.name} cannot resolve, as it has no predictor; train one for it"
+                "cannot resolve, as it has no predictor", "train one for it", where=self.model.name
             )
         self.end_gesture()
         self.cancel_resolve()
@@ -566,7 +566,7 @@ class PoseDocument(PoseHistory):
         from lcollision_core.meshes import file_stamp
 
         if isinstance(read, jobs.OtherModel):
-            self.failed.emit(Failure(read.sentence, ""))
+            self.failed.emit(read.failure)
             return
         if read.opened is not None:
             self._put_in(read.opened)
@@ -579,10 +579,10 @@ class PoseDocument(PoseHistory):
         self.message.emit(f"Recovered {edited.name}")
         self.recovered.emit(read.path)
 
-    def _tell_of_library(self, sentence: str) -> None:
+    def _tell_of_library(self, error: LCollisionError) -> None:
         # It was told before; by now nobody is there to read it.
         if not self._closed:
-            self.failed.emit(Failure(sentence, ""))
+            self.failed.emit(Failure.of(error))
 
     def _on_encoded(self, imported: jobs.Imported | jobs.WrongScale) -> None:
         if isinstance(imported, jobs.WrongScale):

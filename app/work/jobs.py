@@ -12,6 +12,7 @@ import numpy.typing as npt
 from app.wording import counted, fit_error, mirrored_name
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
 from app.work.long_work import Job
+from app.work.threads import Failure
 from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
@@ -63,12 +64,12 @@ class OtherModel:
     ----------
     path : the file
     model : that the poses belong to
-    sentence : that tells of it
+    failure : that tells of it
     """
 
     path: Path
     model: ListedModel
-    sentence: str
+    failure: Failure
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +199,10 @@ def read(model: PoseModel | None, model_file: str | Path, path: Path) -> Job:
         except OtherModelError as error:
             if error.model is None:
                 raise
-            return OtherModel(path, error.model, str(error))
+            return OtherModel(path, error.model, Failure.of(error))
         cancel.raise_if_cancelled()
         if not held.all_poses:
-            raise ModelFileError(f"{path} holds no poses; open a file that has some")
+            raise ModelFileError("holds no poses", "open a file that has some", where=path)
         return ReadPoses(path, held, stamp, opened)
 
     return work
@@ -214,12 +215,12 @@ class WrongScale:
     Attributes
     ----------
     path : its file
-    sentence : what is wrong, without what to do
+    what : is wrong
     factor : what brings it into the model's unit
     """
 
     path: Path
-    sentence: str
+    what: str
     factor: float
 
 
@@ -239,7 +240,7 @@ def encoded(model: PoseModel, path: Path, scale: float = 1.0) -> Job:
         try:
             encoding = model.encode(mesh.vertices, cancel=cancel, scale=scale)
         except WrongScaleError as error:
-            return WrongScale(path, str(error).partition(";")[0], error.factor)
+            return WrongScale(path, error.headline, error.factor)
         return Imported(path, NamedPose.of_mesh(name_of_file(path), encoding))
 
     return work
@@ -341,8 +342,9 @@ def edited_parts(model: PoseModel, model_file: str, edits: PartEdits) -> Job:
         def change(held: PoseModel) -> PoseModel:
             if held.fingerprint != model.fingerprint:
                 raise ModelFileError(
-                    f"{model_file} holds another model by now; open it again to change its body "
-                    f"parts"
+                    "holds another model by now",
+                    "open it again to change its body parts",
+                    where=model_file,
                 )
             return held.edit_domains(edits.names, edits.colours, edits.order)
 
@@ -353,7 +355,7 @@ def edited_parts(model: PoseModel, model_file: str, edits: PartEdits) -> Job:
             with locked(path):
                 if path.exists():
                     raise ModelFileError(
-                        f"there is a model {edits.copy_name!r} already; choose another name"
+                        f"there is a model {edits.copy_name!r} already", "choose another name"
                     )
                 written = change(model)
                 written.save(path)

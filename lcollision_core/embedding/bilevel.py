@@ -143,7 +143,7 @@ class Embedding:
         """
         rows = np.atleast_1d(np.asarray(latent))
         if rows.ndim != 2 or rows.shape[1] != self.latent_size:
-            raise ShapeError(f"latent must have shape (B, {self.latent_size}), got {rows.shape}")
+            raise ShapeError.must_be("latent", f"of shape (B, {self.latent_size})", rows.shape)
         vertices = np.empty((len(rows), self.topology.n_vertices, 3))
 
         def decode_block(start: int) -> None:
@@ -258,9 +258,11 @@ class Embedding:
         try:
             return cls._read(arrays, from_json(_Values, metadata, "embedding"))
         except (LCollisionError, ValueError) as error:
-            raise ModelFileError(
-                f"the model's embedding does not fit together: {error}; train or copy the model "
-                "again"
+            raise ModelFileError.because(
+                "",
+                "the model's embedding does not fit together",
+                error,
+                "train or copy the model again",
             ) from error
 
     @classmethod

@@ -15,6 +15,7 @@ _LEAST_HEIGHT = 1e-12
 """Of a body, in whatever unit; its inverse is the largest."""
 
 _MAX_TEXT_LENGTH = 1000
+_CARD = "the model's card"
 _ADVICE = "train or copy the model again"
 
 
@@ -84,7 +85,7 @@ class ModelCard:
             ),
         ):
             if not sound:
-                raise ModelFileError(f"the model's card is damaged: {needed}; {_ADVICE}")
+                raise ModelFileError.because(_CARD, "is damaged", needed, _ADVICE)
 
     def to_metadata(self) -> dict[str, Any]:
         """Return JSON values from which `from_metadata` builds the same card."""
@@ -113,4 +114,4 @@ class ModelCard:
         try:
             return from_json(cls, metadata, "card")
         except ValueError as error:
-            raise ModelFileError(f"the model's card is damaged: {error}; {_ADVICE}") from error
+            raise ModelFileError.because(_CARD, "is damaged", error, _ADVICE) from error

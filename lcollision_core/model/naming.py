@@ -119,7 +119,9 @@ def checked_name(name: str) -> str:
     stripped = name.strip()
     if not stripped or len(stripped) > MAX_NAME_LENGTH or not stripped.isprintable():
         raise ModelFileError(
-            f"{name[:80]!r} cannot name a domain; use 1 to {MAX_NAME_LENGTH} printable characters"
+            "cannot name a domain",
+            f"use 1 to {MAX_NAME_LENGTH} printable characters",
+            where=f"{name[:80]!r}",
         )
     return stripped
 

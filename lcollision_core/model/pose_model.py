@@ -98,8 +98,8 @@ class PoseModel:
         if counts != (embedding.n_domains, len(embedding.training_latent)):
             raise ModelFileError(
                 f"the model names {counts[0]} domains and {counts[1]} poses, but has "
-                f"{embedding.n_domains} and {len(embedding.training_latent)}; train or copy the "
-                f"model again"
+                f"{embedding.n_domains} and {len(embedding.training_latent)}",
+                "train or copy the model again",
             )
         self.name = name
         self.card = card
@@ -129,8 +129,9 @@ class PoseModel:
         missing = [name for name in (EMBEDDING, _CARD) if name not in sections]
         if missing:
             raise ModelFileError(
-                f"{path} is unusable: it lacks its section {missing[0]!r}; train or copy the "
-                f"model again"
+                f"is unusable: it lacks its section {missing[0]!r}",
+                "train or copy the model again",
+                where=path,
             )
         try:
             embedding_section, card_section = sections.pop(EMBEDDING), sections.pop(_CARD)
@@ -141,7 +142,7 @@ class PoseModel:
             _ = model.predictor_record, model.free_latent
             return model
         except ModelFileError as error:
-            raise ModelFileError(f"{path} is unusable: {error}") from error
+            raise ModelFileError.because(path, "is unusable", error) from error
 
     @classmethod
     def from_training(
@@ -289,7 +290,7 @@ class PoseModel:
         """
         pose = self._checked(latent)
         if pose.ndim != 1:
-            raise ShapeError(f"one pose is mirrored at a time, got an array of shape {pose.shape}")
+            raise ShapeError("one pose is mirrored at a time", got=f"shape {pose.shape}")
         return self.pose_mirror.mirror(pose, placement, source, options, progress, cancel)
 
     def encode(
@@ -365,21 +366,23 @@ class PoseModel:
             for domain, value in changes.items():
                 if not 0 <= domain < len(values):
                     raise ModelFileError(
-                        f"{self.name} has no domain {domain + 1}; its domains are 1 to "
-                        f"{len(values)}"
+                        f"has no domain {domain + 1}",
+                        f"its domains are 1 to {len(values)}",
+                        where=self.name,
                     )
                 values[domain] = checked_name(value) if values is renamed else value.lower()
         for name in renamed:
             if renamed.count(name) > 1:
-                raise ModelFileError(f"two domains would be called {name!r}; choose another name")
+                raise ModelFileError(f"two domains would be called {name!r}", "choose another name")
         if order is not None and sorted(order) != list(range(len(renamed))):
             raise ModelFileError(
-                f"{list(order)} is no order of the {len(renamed)} domains of {self.name}; name "
-                f"each once"
+                f"is no order of the {len(renamed)} domains of {self.name}",
+                "name each once",
+                where=list(order),
             )
         for colour in coloured:
             if not re.fullmatch("#[0-9a-f]{6}", colour):
-                raise ModelFileError(f"{colour!r} is no colour; write it as in #0077bb")
+                raise ModelFileError("is no colour", "write it as in #0077bb", where=f"{colour!r}")
         return self.with_card(
             replace(
                 self.card,
@@ -425,9 +428,10 @@ class PoseModel:
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         codes = np.asarray(latent, dtype=np.float64)
         if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
-            raise ShapeError(
-                f"a latent pose of {self.name} has {self.latent_size} numbers, got an array of "
-                f"shape {codes.shape}"
+            raise ShapeError.must_be(
+                f"a latent pose of {self.name}",
+                f"{self.latent_size} numbers",
+                f"shape {codes.shape}",
             )
         if not np.isfinite(codes).all():
             raise ShapeError("a latent pose has a number that is not finite")
@@ -477,8 +481,9 @@ class PoseModel:
         predictor = self.predictor
         if predictor is None:
             raise ModelFileError(
-                f"the model {self.name!r} has no predictor; run `lcollision label` and then "
-                f"`lcollision train predictor`"
+                "has no predictor",
+                "run `lcollision label` and then `lcollision train predictor`",
+                where=f"the model {self.name!r}",
             )
         return predictor
 
@@ -499,8 +504,8 @@ class PoseModel:
                 section.arrays, "latent", np.float32, (None, self.latent_size), _LARGEST_CODE
             )
         except ValueError as error:
-            raise ModelFileError(
-                f"the model's free poses are damaged: {error}; train the predictor again"
+            raise ModelFileError.because(
+                "the model's free poses", "are damaged", error, "train the predictor again"
             ) from error
         return _read_only(codes.astype(np.float64))
 
@@ -541,8 +546,10 @@ class PoseModel:
         """
         if self.symmetry is None:
             raise LCollisionError(
-                f"poses of {self.name} cannot be mirrored: its first pose is not symmetric, so "
-                f"that left and right are unknown; train a model whose first pose is"
+                "cannot be mirrored: its first pose is not symmetric, so that left and "
+                "right are unknown",
+                "train a model whose first pose is",
+                where=f"poses of {self.name}",
             )
         resolver = self.resolver if self.has_predictor else None
         return PoseMirror(self.embedding, self.symmetry, self.detector, self.height, resolver)

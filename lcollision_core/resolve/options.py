@@ -83,17 +83,18 @@ class ResolveOptions:
         for name, kind in (("solver", Solver), ("metric", Metric)):
             if getattr(self, name) not in set(kind):
                 raise LCollisionError(
-                    f"there is no {name} {getattr(self, name)!r}; choose one of {', '.join(kind)}"
+                    f"there is no {name} {getattr(self, name)!r}",
+                    f"choose one of {', '.join(kind)}",
                 )
         if not 0.0 < self.threshold < 1.0:
-            raise LCollisionError(
-                f"the threshold must be a probability between 0 and 1, got {self.threshold:g}"
+            raise LCollisionError.must_be(
+                "the threshold", "a probability between 0 and 1", f"{self.threshold:g}"
             )
         if self.margin is not None and not 0.0 <= self.margin < math.inf:
-            raise LCollisionError(f"the margin must be 0 or more, got {self.margin:g}")
+            raise LCollisionError.must_be("the margin", "0 or more", f"{self.margin:g}")
         if self.time_budget is not None and not self.time_budget > 0.0:
-            raise LCollisionError(
-                f"the time budget must be more than 0 seconds, got {self.time_budget:g}"
+            raise LCollisionError.must_be(
+                "the time budget", "more than 0 seconds", f"{self.time_budget:g}"
             )
         if self.group_weights is not None and not all(
             0.0 < weight < math.inf for weight in self.group_weights

@@ -207,9 +207,9 @@ class PoseResolver:
         target: FloatArray = np.array(latent, dtype=np.float64)
         size = self._embedding.latent_size
         if target.shape != (size,):
-            raise ShapeError(f"a latent pose has {size} numbers, got shape {target.shape}")
+            raise ShapeError.must_be("a latent pose", f"{size} numbers", f"shape {target.shape}")
         if not np.isfinite(target).all():
-            raise ShapeError("a latent pose has a number that is not finite; repair the pose")
+            raise ShapeError("a latent pose has a number that is not finite", "repair the pose")
         return target
 
     def _problem(
@@ -220,17 +220,16 @@ class PoseResolver:
         if options.group_weights is not None:
             n_groups = len(self._embedding.group_sizes)
             if len(options.group_weights) != n_groups:
-                raise ShapeError(
-                    f"{n_groups} group weights are needed, got {len(options.group_weights)}"
-                )
+                n_weights = len(options.group_weights)
+                raise ShapeError.must_be("group weights", f"{n_groups} numbers", n_weights)
             code_weights = np.array(options.group_weights, np.float64)[self._group_of_code]
             metric = metric.weighted(code_weights)
         low, high = np.minimum(self._low, target), np.maximum(self._high, target)
         for domain in sorted(options.locked_domains):
             if not 0 <= domain < self._embedding.n_domains:
                 raise LCollisionError(
-                    f"there is no domain {domain + 1} to lock; the model has "
-                    f"{self._embedding.n_domains}"
+                    f"there is no domain {domain + 1} to lock",
+                    f"the model has {self._embedding.n_domains}",
                 )
             locked = self._group_of_code == domain + 1
             locked[domain] = True

@@ -586,7 +586,9 @@ def test_the_built_in_body_from_colliding_to_free(
     assert document.outcome.exactly_free
     assert not document.exact.colliding
     assert document.ghost is not None
-    window.show_failure(Failure("bent.obj has 3 vertices; import a mesh of this model", "details"))
+    window.show_failure(
+        Failure("bent.obj has 3 vertices", "import a mesh of this model", "details")
+    )
     (dialog,) = window.findChildren(FailureDialog)
     qtbot.waitUntil(dialog.isVisible)
     take_picture(window, f"{theme.name}-error")

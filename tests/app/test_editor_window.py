@@ -600,7 +600,7 @@ def test_a_window_that_closes_is_gone_before_its_work_has_ended(
 ) -> None:
     close, seen = window.document.close, []
     window.docks["sliders"].setFloating(True)
-    window.show_failure(Failure("the disk is full; make room", "details"))
+    window.show_failure(Failure("the disk is full", "make room", "details"))
 
     def look() -> bool:
         seen.extend(w for w in QApplication.topLevelWidgets() if w.isVisible())
@@ -620,7 +620,7 @@ def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -
 
 
 def test_a_failure_is_told_once_while_its_dialog_is_open(window: MainWindow) -> None:
-    failure = Failure("the disk is full; make room", "details")
+    failure = Failure("the disk is full", "make room", "details")
     for _ in range(3):
         window.show_failure(failure)
     (dialog,) = failures(window)

@@ -104,7 +104,7 @@ def test_dialogs_show_a_name_to_the_letter(hostile: MainWindow) -> None:
     # Only the label of a field makes shortcuts of "&".
     assert name in looked[0][0]
     assert name.replace("&", "&&") in looked[1][0]
-    dialog = FailureDialog(Failure(f"{name} cannot be read; {name}", ""), hostile)
+    dialog = FailureDialog(Failure(f"{name} cannot be read", name), hostile)
     assert dialog.what.textFormat() is dialog.advice.textFormat() is Qt.TextFormat.PlainText
     dialog.deleteLater()
 

@@ -49,7 +49,7 @@ def read(file: BinaryIO, size: int) -> Polygons:
     require_few(file, b"\nv ", "vertices", _SHORTEST_LINE, size)
     data = read_rest(file)
     if b"\0" in data:
-        raise MeshFileError("it is not a text file, so no OBJ; export the mesh again")
+        raise MeshFileError("it is not a text file, so no OBJ", "export the mesh again")
     data = normalised_text(data)
     if b"\\" in data:
         data = data.replace(b"\\\n", b" ")
@@ -178,15 +178,15 @@ def _parse_vertices(block: list[bytes], first: int) -> npt.NDArray[np.float64]:
         coordinates = line.split()[1:4]
         if len(coordinates) < 3:
             raise MeshFileError(
-                f"vertex {first + row} (from 0) has {len(coordinates)} coordinates, three are "
-                f"needed"
+                f"has {len(coordinates)} coordinates, three are needed",
+                where=f"vertex {first + row} (from 0)",
             )
         try:
             vertices[row] = list(map(float, coordinates))
         except ValueError as error:
             raise MeshFileError(
-                f"vertex {first + row} (from 0) has a coordinate that is no number: "
-                f"{b' '.join(coordinates)[:60]!r}"
+                f"has a coordinate that is no number: {b' '.join(coordinates)[:60]!r}",
+                where=f"vertex {first + row} (from 0)",
             ) from error
     return vertices
 
@@ -199,15 +199,17 @@ def _parse_faces(
     zero = np.flatnonzero(named == 0)
     if len(zero):
         raise MeshFileError(
-            f"face {first + owner[zero[0]]} (from 0) names vertex 0, but OBJ counts vertices from 1"
+            "names vertex 0, but OBJ counts vertices from 1",
+            where=f"face {first + owner[zero[0]]} (from 0)",
         )
     if (named < 0).any():
         counted = vertices_before[owner]
         outside = np.flatnonzero(named < -counted)
         if len(outside):
             raise MeshFileError(
-                f"face {first + owner[outside[0]]} (from 0) names vertex {named[outside[0]]}, "
-                f"but only {counted[outside[0]]} vertices come before it"
+                f"names vertex {named[outside[0]]}, but only {counted[outside[0]]} vertices "
+                "come before it",
+                where=f"face {first + owner[outside[0]]} (from 0)",
             )
         named = np.where(named < 0, counted + named + 1, named)
     return sizes, named - 1
@@ -222,17 +224,18 @@ def _parse_any_faces(
         named = [int(word.partition(b"/")[0]) for row in rows for word in row]
         return sizes, np.array(named, dtype=np.int64)
     except (ValueError, OverflowError) as error:
-        raise MeshFileError(_first_bad_face(block, start)) from error
+        raise _first_bad_face(block, start) from error
 
 
-def _first_bad_face(block: list[bytes], start: int) -> str:
+def _first_bad_face(block: list[bytes], start: int) -> MeshFileError:
+    what = "has a corner that is no vertex number"
     for face, line in enumerate(block, start):
         for word in line.split()[1:]:
             try:
                 np.int64(int(word.partition(b"/")[0]))
             except (ValueError, OverflowError):
-                return f"face {face} (from 0) has a corner that is no vertex number: {word[:30]!r}"
-    return "a face has a corner that is no vertex number"
+                return MeshFileError(f"{what}: {word[:30]!r}", where=f"face {face} (from 0)")
+    return MeshFileError(what, where="a face")
 
 
 def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:

@@ -59,8 +59,8 @@ def read(file: BinaryIO) -> Polygons:
     n_lines = sum(1 for line in BytesIO(data) if line.strip())
     if n_lines < n_vertices + n_faces:
         raise MeshFileError(
-            f"it announces {n_vertices} vertices and {n_faces} faces but has only {n_lines} "
-            f"lines for them; it is truncated"
+            f"it is truncated: it announces {n_vertices} vertices and {n_faces} faces but has only "
+            f"{n_lines} lines for them"
         )
     lines = (line for line in BytesIO(data) if line.strip())
     vertices = [np.empty((0, 3))]
@@ -81,8 +81,8 @@ def _vertices(lines: list[bytes], first: int) -> npt.NDArray[np.float64]:
         short = next((i for i, row in enumerate(rows) if len(row) < 3), None)
         if short is not None:
             raise MeshFileError(
-                f"vertex {first + short} (from 0) has {len(rows[short])} coordinates, three are "
-                f"needed"
+                f"has {len(rows[short])} coordinates, three are needed",
+                where=f"vertex {first + short} (from 0)",
             )
         words = [word for row in rows for word in row[:3]]
     return numbers(words, "the vertices").reshape(-1, 3)
@@ -101,11 +101,12 @@ def _faces(lines: list[bytes], first: int) -> tuple[npt.NDArray[np.int64], npt.N
             named = list(map(int, row[1 : 1 + max(size, 0)]))
         except ValueError as error:
             raise MeshFileError(
-                f"face {first + face} (from 0) has a corner that is no vertex number"
+                "has a corner that is no vertex number", where=f"face {first + face} (from 0)"
             ) from error
         if size < 0 or len(named) < size:
             raise MeshFileError(
-                f"face {first + face} (from 0) announces {size} corners but has {len(named)}"
+                f"announces {size} corners but has {len(named)}",
+                where=f"face {first + face} (from 0)",
             )
         sizes[face] = size
         corners += named

@@ -81,7 +81,7 @@ def read(file: BinaryIO) -> Polygons:
     )
     corners = next(columns["face"][name] for name in _CORNER_NAMES if name in columns["face"])
     if corners.sizes is None:
-        raise MeshFileError("its faces have no list of vertices; export the mesh again")
+        raise MeshFileError("its faces have no list of vertices", "export the mesh again")
     is_single = byte_order is not None and columns["vertex"]["x"].values.dtype.itemsize == 4
     return Polygons(vertices, corners.sizes, corners.values.astype(np.int64), is_single=is_single)
 
@@ -114,15 +114,15 @@ def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
             case ["comment" | "obj_info", *_]:
                 continue
             case _ if not line:
-                raise MeshFileError("its header has no end; it is truncated")
+                raise MeshFileError("its header has no end, it is truncated")
             case _:
                 raise MeshFileError(
                     f"its header has a line that is not understood: {' '.join(words)[:60]!r}"
                 )
     else:
-        raise MeshFileError("its header has no end; it is damaged")
+        raise MeshFileError("its header has no end")
     if not has_format:
-        raise MeshFileError("its header names no format; it is damaged")
+        raise MeshFileError("its header names no format")
     _require_mesh(elements)
     return byte_order, elements
 
@@ -132,8 +132,8 @@ def _require_mesh(elements: list[_Element]) -> None:
     for wanted in ("vertex", "face"):
         if names.count(wanted) != 1:
             raise MeshFileError(
-                f"its header names {names.count(wanted)} elements {wanted!r}, one is needed; "
-                f"export it as a triangle mesh"
+                f"its header names {names.count(wanted)} elements {wanted!r}, one is needed",
+                "export it as a triangle mesh",
             )
     for element in elements:
         properties = [item.name for item in element.properties]
@@ -141,18 +141,18 @@ def _require_mesh(elements: list[_Element]) -> None:
             raise MeshFileError(f"its header names a property of {element.name!r} twice")
     vertex = {item.name: item for item in elements[names.index("vertex")].properties}
     if not all(axis in vertex and vertex[axis].count_dtype is None for axis in "xyz"):
-        raise MeshFileError("its vertices have no x, y and z; export the mesh again")
+        raise MeshFileError("its vertices have no x, y and z", "export the mesh again")
     face = {item.name: item for item in elements[names.index("face")].properties}
     corners = next((face[name] for name in _CORNER_NAMES if name in face), None)
     if corners is None or corners.count_dtype is None or corners.dtype.startswith("f"):
-        raise MeshFileError("its faces have no list vertex_indices; export the mesh again")
+        raise MeshFileError("its faces have no list vertex_indices", "export the mesh again")
 
 
 def _truncated(element: _Element, row: int | None = None) -> MeshFileError:
     where = "" if row is None else f" at {element.name} {row} (from 0)"
     return MeshFileError(
-        f"it announces {element.count} of element {element.name!r} but ends before{where}; "
-        f"it is truncated"
+        f"it is truncated: it announces {element.count} of element {element.name!r} but ends "
+        f"before{where}"
     )
 
 
@@ -284,7 +284,8 @@ class _TextBody:
                     announced = values[offset]
                     if not (0 <= announced <= len(values) and announced.is_integer()):
                         raise MeshFileError(
-                            f"{element.name} {row} (from 0) announces a list of {announced:g} items"
+                            f"announces a list of {announced:g} items",
+                            where=f"{element.name} {row} (from 0)",
                         )
                     length = int(announced)
                     offset += 1
@@ -345,8 +346,8 @@ def _require_vertex_numbers(
     if len(bad):
         row = int(np.searchsorted(np.cumsum(counts), bad[0], side="right"))
         raise MeshFileError(
-            f"{element.name} {row} (from 0) has a corner that is no vertex number: "
-            f"{chosen[bad[0]]:g}"
+            f"has a corner that is no vertex number: {chosen[bad[0]]:g}",
+            where=f"{element.name} {row} (from 0)",
         )
 
 

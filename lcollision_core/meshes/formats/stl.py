@@ -62,11 +62,13 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
         corners = _text_corners(read_rest(file))
     elif n_triangles >= 0:
         raise MeshFileError(
-            f"it announces {n_triangles} triangles, which take {expected} bytes, but has {size}; "
-            f"it is truncated, or no STL file"
+            f"it is truncated or not an STL file: it announces {n_triangles} triangles, which take "
+            f"{expected} bytes, but has {size}"
         )
     else:
-        raise MeshFileError(f"it has {size} bytes, too few for an STL file; export the mesh again")
+        raise MeshFileError(
+            f"it has {size} bytes, too few for an STL file", "export the mesh again"
+        )
     points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0, as which corner is kept is chance
     is_single = not (is_text and expected != size)
     ordered = with_order_of(points, topology, _REORDERED, is_single)
@@ -79,8 +81,8 @@ def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
     n_facets = lowered.count(b"endfacet")
     if n_rows != 3 * n_facets or b"endsolid" not in lowered:
         raise MeshFileError(
-            f"it has {n_facets} complete triangles and {n_rows} corners, and "
-            f"{'an' if b'endsolid' in lowered else 'no'} end line; it is truncated or damaged"
+            f"it is truncated or damaged: it has {n_facets} complete triangles, {n_rows} corners "
+            f"and {'an' if b'endsolid' in lowered else 'no'} end line"
         )
     parts, done = [np.empty(0)], 0
     for rows in blocks_of_lines(match[1] for match in _CORNER.finditer(lowered)):
@@ -89,8 +91,8 @@ def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
         if ragged is not None:
             corner = done + ragged
             raise MeshFileError(
-                f"corner {corner % 3} of triangle {corner // 3} (from 0) has "
-                f"{len(words[ragged])} coordinates, three are needed"
+                f"corner {corner % 3} of triangle {corner // 3} (from 0) has {len(words[ragged])} "
+                "coordinates, three are needed"
             )
         parts.append(numbers([word for row in words for word in row], "the corners"))
         done += len(rows)

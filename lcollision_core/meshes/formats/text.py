@@ -52,7 +52,7 @@ def numbers(words: Sequence[bytes], what: str) -> npt.NDArray[np.float64]:
                 float(word)
             except ValueError as error:
                 raise MeshFileError(
-                    f"{what} hold {word[:30]!r}, which is no number; export the mesh again"
+                    f"hold {word[:30]!r}, which is no number", "export the mesh again", where=what
                 ) from error
         raise
 
@@ -92,7 +92,7 @@ def blocks_of_lines(lines: Iterable[bytes]) -> Iterator[list[bytes]]:
     n_bytes = 0
     for line in lines:
         if len(line) > _CHUNK_BYTES:
-            raise MeshFileError(f"it has a line of {len(line)} bytes; export the mesh again")
+            raise MeshFileError(f"it has a line of {len(line)} bytes", "export the mesh again")
         block.append(line)
         n_bytes += len(line)
         if n_bytes > _CHUNK_BYTES or len(block) >= _BLOCK_LINES:

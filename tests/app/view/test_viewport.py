@@ -97,7 +97,7 @@ def test_where_no_model_could_be_opened_the_page_stands_still_and_offers_another
     qtbot.waitUntil(lambda: document.has_model, timeout=20_000)
     rest(qtbot, shown)
     assert not page.turns
-    document.failed.emit(Failure("later; no matter", ""))
+    document.failed.emit(Failure("later", "no matter"))
     assert shown.is_ready
     assert not page.isVisible()
     qtbot.waitUntil(lambda: not document.busy, timeout=60_000)
@@ -493,7 +493,8 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
     assert "turn.webp" in viewport.pictures.busy
     qtbot.waitUntil(lambda: not film.is_running, timeout=20_000)
     (failure,) = told
-    assert "turn.webp could not be made; try" in failure.sentence
+    assert "turn.webp could not be made" in failure.headline
+    assert failure.next_step.startswith("try")
     assert type(error).__name__ in failure.details
     assert viewport.pictures.busy == ""
     assert list(tmp_path.iterdir()) == []
