@@ -197,7 +197,9 @@ def score_solver(
     feasible = np.array([result.predicted_free for result in alone]) & called
     change = _energy_change(model, poses, alone, feasible)
     seconds = [result.seconds for result in whole]
-    before_walk = [bool(result.exactly_free) and result.step != Step.WALK_BACK for result in whole]
+    before_fall_back = [
+        bool(result.exactly_free) and result.step != Step.FALL_BACK for result in whole
+    ]
     score = ResolveScore(
         solver=str(solver),
         poses=len(whole),
@@ -205,7 +207,7 @@ def score_solver(
         p95_ms=_milliseconds(seconds, 0.95),
         feasible_rate=float(feasible.sum() / called.sum()) if called.any() else None,
         exactly_free_rate=float(np.mean([bool(result.exactly_free) for result in whole])),
-        free_before_walk_back=float(np.mean(before_walk)),
+        free_before_walk_back=float(np.mean(before_fall_back)),
         energy_decrease=-float(change.mean()) if len(change) else None,
         latent_distance=float(np.mean([result.latent_distance for result in whole])),
         vertex_distance=float(np.mean([result.vertex_distance_mean for result in whole])),

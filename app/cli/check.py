@@ -34,7 +34,7 @@ def check(
             min=0.0,
             max=1.0,
             metavar="X",
-            help="Count pairs this near along the surface apart, in heights.",
+            help="Count pairs within X body sizes along the surface apart.",
         ),
     ] = 0.0,
 ) -> None:
@@ -106,7 +106,7 @@ def _sentence(report: dict[str, Any]) -> str:
     if report["colliding"]:
         verdict = (
             f"colliding, {counted(report['pairs'], 'pair of faces', 'pairs of faces')}, "
-            f"energy {report['energy']:.3g} squared heights"
+            f"normalised energy {report['energy']:.3g}"
         )
     else:
         verdict = "free of self-collisions"

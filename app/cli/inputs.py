@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -15,18 +14,7 @@ if TYPE_CHECKING:
     from lcollision_core.meshes import UpGuess
 
 
-class Axis(StrEnum):
-    """An axis of a mesh."""
-
-    X = "x"
-    Y = "y"
-    Z = "z"
-
-    @property
-    def number(self) -> int:
-        """0, 1 or 2."""
-        return "xyz".index(self.value)
-
+Axis = Literal["x", "y", "z"]
 
 ScaleOption = Annotated[
     float,

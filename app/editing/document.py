@@ -268,11 +268,9 @@ class PoseDocument(PoseHistory):
 
     def reset_domain(self, domain: int) -> None:
         """Set all numbers of a domain to 0: its own, and the whole body's that its lock holds."""
-        group = self.model.latent_space.groups[1 + domain]
         latent = self.latent.copy()
-        latent[domain] = 0.0
-        latent[group.codes] = 0.0
-        self._edit(f"Reset {group.name}", latent)
+        latent[self.model.embedding.codes_of([domain])] = 0.0
+        self._edit(f"Reset {self.model.domain_names[domain]}", latent)
 
     def set_locked(self, domain: int, locked: bool) -> None:
         """Lock a domain against Resolve, Randomise, Reset all and blending, or let it go."""
@@ -438,7 +436,7 @@ class PoseDocument(PoseHistory):
         path : of the file
         axes, scale : see `export_frame`
         """
-        work = jobs.exported(self.model, self.latent, self.placement, Path(path), axes, scale)
+        work = jobs.exported(self.model, self.pose, self.outcome, Path(path), axes, scale)
         self._exports.append(self._long.start(f"Exporting {Path(path).name}", work, self._tell))
 
     def finish_exports(self) -> None:
@@ -690,9 +688,4 @@ class PoseDocument(PoseHistory):
 
     def _with_locked(self, latent: FloatArray) -> FloatArray:
         """Return the latent with the present codes of locked domains."""
-        for domain in self._locked:
-            # As in Resolve: the domain's own codes, and the whole body's code that is its.
-            latent[domain] = self.latent[domain]
-            codes = self.model.latent_space.groups[1 + domain].codes
-            latent[codes] = self.latent[codes]
-        return latent
+        return np.where(self.model.embedding.codes_of(self._locked), self.latent, latent)

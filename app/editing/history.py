@@ -185,10 +185,6 @@ class PoseHistory(QObject):
             self._gesture = None
             self._apply(before)
 
-    def set_latent(self, latent: npt.ArrayLike, label: str) -> None:
-        """Set the whole pose, a (D,) finite array, in one step with this name in the menu."""
-        self._edit(label, np.array(latent, dtype=np.float64))
-
     def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
         """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1.
 

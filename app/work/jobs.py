@@ -231,17 +231,15 @@ def encoded(model: PoseModel, path: Path, scale: float = 1.0) -> Job:
     """
 
     def work(_: Progress, cancel: CancelToken) -> Imported | WrongScale:
-        from lcollision_core.meshes import read_mesh
-        from lcollision_core.model import NamedPose, name_of_file
+        from lcollision_core.model import encode_mesh, read_model_mesh
 
-        mesh = read_mesh(path, topology=model.topology)
-        model.require_topology(mesh.topology, str(path))
+        mesh = read_model_mesh(path, model)
         cancel.raise_if_cancelled()
         try:
-            encoding = model.encode(mesh.vertices, cancel=cancel, scale=scale)
+            pose = encode_mesh(mesh, model, scale, cancel)
         except WrongScaleError as error:
             return WrongScale(path, error.headline, error.factor)
-        return Imported(path, NamedPose.of_mesh(name_of_file(path), encoding))
+        return Imported(path, pose)
 
     return work
 
@@ -277,22 +275,26 @@ def mirrored_poses(model: PoseModel, poses: tuple[NamedPose, ...]) -> Job:
 
 def exported(
     model: PoseModel,
-    latent: FloatArray,
-    placement: RigidTransform | None,
+    pose: NamedPose,
+    outcome: ResolveResult | None,
     path: Path,
     axes: str,
     scale: float | None,
 ) -> Job:
     """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
 
-    The check is of what the file holds, in its axes and unit.
+    A pose that Resolve ended in is written with the vertices of its `outcome`. The check is of what
+    the file holds, in its axes and unit.
     """
 
     def work(_: Progress, __: CancelToken) -> Exported:
         from lcollision_core.model import export_frame, export_mesh
-        from lcollision_core.resolve import exported_vertices
 
-        vertices = exported_vertices(model.decode(latent, n_threads=1), placement)
+        placement = pose.placement
+        if outcome is not None and np.array_equal(outcome.latent, pose.latent):
+            vertices = outcome.vertices
+        else:
+            vertices = model.exported_vertices(pose.latent, placement)
         frame = export_frame(model, axes, path, scale)
         written = export_mesh(path, model, vertices, placement, frame)
         unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)

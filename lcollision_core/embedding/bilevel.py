@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -101,6 +101,15 @@ class Embedding:
     def group_sizes(self) -> tuple[int, ...]:
         """(|Z_0|, |Z_1|, ..., |Z_K|)."""
         return tuple(len(part.components) for part in (self.level1, *self.level2))
+
+    def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
+        """Return which codes belong to domains: (D,), true for Z_k and for Z_0's code of each.
+
+        These are the codes that a lock of the domains holds.
+        """
+        chosen = np.zeros(self.n_domains, dtype=np.bool_)
+        chosen[list(domains)] = True
+        return np.concatenate([chosen, np.repeat(chosen, self.group_sizes[1:])])
 
     @property
     def latent_size(self) -> int:

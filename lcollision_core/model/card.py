@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from lcollision_core.errors import ModelFileError
@@ -25,9 +25,9 @@ class ModelCard:
 
     Attributes
     ----------
-    height : one height in the data's unit
+    height : the body size, in the data's unit
     up_axis : 0, 1 or 2 for x, y or z
-    near_exclusion : pairs of faces this near along the surface, in heights, are counted apart
+    near_exclusion : pairs of faces this near along the surface, normalised, are counted apart
     domain_names : K different names
     domain_colours : K strings "#rrggbb"
     pose_names : N names of the training poses
@@ -89,19 +89,10 @@ class ModelCard:
 
     def to_metadata(self) -> dict[str, Any]:
         """Return JSON values from which `from_metadata` builds the same card."""
-        ordered = {"domain_order": list(self.domain_order)} if self.domain_order else {}
-        return {
-            "height": self.height,
-            "up_axis": self.up_axis,
-            "near_exclusion": self.near_exclusion,
-            "domain_names": list(self.domain_names),
-            "domain_colours": list(self.domain_colours),
-            "pose_names": list(self.pose_names),
-            "source": self.source,
-            "licence": self.licence,
-            "provenance": dict(self.provenance),
-            **ordered,
-        }
+        values = asdict(self)
+        if not self.domain_order:
+            del values["domain_order"]
+        return values
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> ModelCard:

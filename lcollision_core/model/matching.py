@@ -41,7 +41,7 @@ def require_same_faces(topology: Topology, needed: Topology, source: str, model:
                 where=source,
             )
     if topology != needed and not np.array_equal(
-        _sorted_faces(topology.faces), _sorted_faces(needed.faces)
+        sorted_faces(topology.faces), sorted_faces(needed.faces)
     ):
         raise PoseSetError(
             f"has other faces than the model {model!r}",
@@ -50,7 +50,7 @@ def require_same_faces(topology: Topology, needed: Topology, source: str, model:
         )
 
 
-def _sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+def sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Turn each face until its least vertex comes first, then sort the faces."""
     turned = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
     rows = np.take_along_axis(faces, turned, axis=1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -16,10 +16,10 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes import RigidTransform, atomic_write
-from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.library import ListedModel, user_models_folder
-from lcollision_core.model.mirror import MirroredPose, MirrorSource
+from lcollision_core.model.mirror import MirroredPose, MirrorSource, pose_bytes
+from lcollision_core.model.naming import unique_names
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.regular_files import read_regular
 
@@ -48,8 +48,9 @@ class NamedPose:
     name : unlike that of the file's other poses
     latent : (D,) float64 array
     placement : where the decoded pose belongs, for one that came in as a mesh; None leaves it in
-        the reference's frame
-    fit_error_mean, fit_error_max : of one that was fitted to a mesh or a mirror image, in heights
+        the model's coordinates
+    fit_error_mean, fit_error_max : of one that was fitted to a mesh or a mirror image,
+        normalised
     tags : under which it is found in a library
     mirror_of : of a mirror image the pose that it was made from, which mirroring it again, while
         it is unchanged, gives back to the bit
@@ -65,16 +66,7 @@ class NamedPose:
 
     def same_as(self, other: NamedPose) -> bool:
         """Whether both have the same latent and placement, to the bit, whatever their names."""
-        return self.latent.tobytes() == other.latent.tobytes() and _placed_alike(
-            self.placement, other.placement
-        )
-
-    @classmethod
-    def of_mesh(cls, name: str, encoded: EncodedPose) -> NamedPose:
-        """Name an encoded mesh."""
-        return cls(
-            name, encoded.latent, encoded.placement, encoded.fit_error_mean, encoded.fit_error_max
-        )
+        return pose_bytes(self.latent, self.placement) == pose_bytes(other.latent, other.placement)
 
     def mirrored(self, image: MirroredPose) -> NamedPose:
         """Return what mirroring this pose gave, under the same name and tags."""
@@ -171,7 +163,9 @@ def write_poses(
             raise ModelFileError.unwritable(
                 path, f"of the pose {pose.name[:80]!r}, {error}", "repair that pose"
             ) from error
-    needs_latest = working is not None or any(pose.tags or _is_scaled(pose) for pose in poses)
+    needs_latest = working is not None or any(
+        pose.tags or (pose.placement is not None and pose.placement.scale != 1.0) for pose in poses
+    )
     document = {
         "format": POSES_FORMAT,
         "format_version": POSES_VERSION if needs_latest else 1,
@@ -244,24 +238,6 @@ def name_of_file(path: Path) -> str:
     """Name a pose after its file, without what a file of poses cannot hold."""
     stem = path.stem.encode(errors="replace").decode()
     return stem[:MAX_NAME_LENGTH]
-
-
-def unique_names(names: Iterable[str]) -> list[str]:
-    """Return the names, numbered where an earlier one differs by case at most: "a", "A 2".
-
-    Numbered names are at most `MAX_NAME_LENGTH` long.
-    """
-    taken: set[str] = set()
-    result = []
-    for name in names:
-        candidate, number = name, 1
-        while candidate.casefold() in taken:
-            number += 1
-            ending = f" {number}"
-            candidate = name[: MAX_NAME_LENGTH - len(ending)] + ending
-        taken.add(candidate.casefold())
-        result.append(candidate)
-    return result
 
 
 def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
@@ -386,10 +362,6 @@ def _placed_from_json(
     return latent, RigidTransform(rotation, translation, scale)
 
 
-def _is_scaled(pose: NamedPose) -> bool:
-    return pose.placement is not None and pose.placement.scale != 1.0
-
-
 def _tags(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list) or len(value) > MAX_TAGS:
         raise ValueError(f"its tags must be a list of at most {MAX_TAGS} texts")
@@ -399,16 +371,6 @@ def _tags(value: Any) -> tuple[str, ...]:
                 f"each of its tags must be a text of 1 to {MAX_NAME_LENGTH} characters"
             )
     return tuple(dict.fromkeys(value))
-
-
-def _placed_alike(one: RigidTransform | None, other: RigidTransform | None) -> bool:
-    if one is None or other is None:
-        return one is other
-    return (
-        np.array_equal(one.rotation, other.rotation)
-        and np.array_equal(one.translation, other.translation)
-        and one.scale == other.scale
-    )
 
 
 def _object(value: Any, name: str) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """The user's own poses of a model: a file in their data folder, written at every change.
 
 Several programs may have one library open. A change is therefore no new content but a difference,
-which is applied to what the file holds by then, under a lock: nobody's poses are lost, nor does
-taking one's own change back take another's.
+which is applied to what the file holds by then, under a lock: no program's poses are lost, and
+undoing a change leaves those of others.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from pathlib import Path
 
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.meshes import FileStamp, file_stamp, locked, spare_name
+from lcollision_core.model.naming import unique_names
 from lcollision_core.model.pose_file import (
     DamagedPosesError,
     NamedPose,
     OtherModelError,
     read_pose_file,
     to_json,
-    unique_names,
     write_poses,
 )
 from lcollision_core.model.pose_model import PoseModel

@@ -50,7 +50,7 @@ from lcollision_core.model_file import (
 
 if TYPE_CHECKING:
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
-    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
+    from lcollision_core.resolve import ExactCheck, PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -64,8 +64,8 @@ _LARGEST_CODE = 1e6
 class PoseModel:
     """A body that can take poses: immutable, and safe to share between threads.
 
-    Poses are NumPy arrays in the unit of the data that the model was trained on, in the frame and
-    position of its reference. Build one with `load` or `from_training`.
+    Poses are NumPy arrays in the unit of the data that the model was trained on, in the coordinates
+    of its reference. Build one with `load` or `from_training`.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class PoseModel:
             embedding = Embedding.from_arrays(embedding_section.arrays, embedding_section.metadata)
             card = ModelCard.from_metadata(card_section.metadata)
             model = cls(path.stem, embedding, card, sections)
-            # What is loaded is sound: the others are used only later, where nobody expects it.
+            # Damage is found now, not when these are used.
             _ = model.predictor_record, model.free_latent
             return model
         except ModelFileError as error:
@@ -212,8 +212,8 @@ class PoseModel:
 
         Returns
         -------
-        vertices : (V, 3) or (B, V, 3) float64 array, in the data's unit, in the reference's frame
-            and position; a pose gets the same bits alone and in any batch
+        vertices : (V, 3) or (B, V, 3) float64 array, in the data's unit, in the model's
+            coordinates; a pose gets the same bits alone and in any batch
 
         Raises
         ------
@@ -223,6 +223,25 @@ class PoseModel:
         vertices = self.embedding.decode(codes.reshape(-1, self.latent_size), n_threads)
         vertices *= self.card.height
         return vertices[0] if codes.ndim == 1 else vertices
+
+    def exported_vertices(
+        self, latent: npt.ArrayLike, placement: RigidTransform | None = None
+    ) -> npt.NDArray[np.floating]:
+        """Decode a (D,) latent pose to the (V, 3) vertices that it is exported with.
+
+        Parameters
+        ----------
+        placement : where the pose is exported to; None leaves it in the model's coordinates
+        """
+        from lcollision_core.resolve import exported_vertices
+
+        return exported_vertices(self.decode(latent, n_threads=1), placement)
+
+    def exact_check(self, placement: RigidTransform | None = None) -> ExactCheck:
+        """Return what tests poses where they are exported to."""
+        from lcollision_core.resolve import ExactCheck
+
+        return ExactCheck(self.embedding, self.detector, self.height, placement)
 
     def predict(self, latent: npt.ArrayLike) -> Prediction:
         """Predict whether poses collide, and how deeply in which domain, without decoding them.
@@ -246,7 +265,7 @@ class PoseModel:
         cancel: CancelToken | None = None,
         placement: RigidTransform | None = None,
     ) -> ResolveResult:
-        """Find the nearest pose that is exactly free of collisions.
+        """Find the nearest collision-free pose.
 
         Parameters
         ----------
@@ -259,7 +278,7 @@ class PoseModel:
         Raises
         ------
         ShapeError : another shape, a number that is not finite or another number of weights.
-        LCollisionError : a locked domain that there is not.
+        LCollisionError : an unknown locked domain.
         ModelFileError : the model has no predictor, or a damaged one.
         CancelledError : `cancel` was set.
         """
@@ -337,10 +356,6 @@ class PoseModel:
         PoseSetError : another number of vertices or faces, or other faces.
         """
         require_same_faces(topology, self.topology, source, self.name)
-
-    def rename_domains(self, names: Mapping[int, str]) -> PoseModel:
-        """Return the same model with some domains called otherwise; see `edit_domains`."""
-        return self.edit_domains(names)
 
     def edit_domains(
         self,
@@ -421,7 +436,7 @@ class PoseModel:
         return self._with_section(_PREDICTOR, predictor.to_section())
 
     def with_free_poses(self, latent: npt.ArrayLike) -> PoseModel:
-        """Return the same model with (F, D) poses that were found exactly free, F >= 0."""
+        """Return the same model with (F, D) poses that were found collision-free, F >= 0."""
         codes = np.asarray(latent, dtype=np.float32).reshape(-1, self.latent_size)
         return self._with_section(_FREE_POSES, Section({"latent": codes}))
 
@@ -489,7 +504,7 @@ class PoseModel:
 
     @cached_property
     def free_latent(self) -> FloatArray:
-        """(F, D) poses that were found exactly free when the predictor was made, read-only.
+        """(F, D) poses that were found collision-free when the predictor was made, read-only.
 
         Raises
         ------
@@ -552,7 +567,7 @@ class PoseModel:
                 where=f"poses of {self.name}",
             )
         resolver = self.resolver if self.has_predictor else None
-        return PoseMirror(self.embedding, self.symmetry, self.detector, self.height, resolver)
+        return PoseMirror(self.embedding, self.symmetry, self.exact_check(), resolver)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -627,7 +642,7 @@ class PoseModel:
 
     @property
     def height(self) -> float:
-        """One height, the unit of reports, in the data's unit."""
+        """The body size, by which lengths are normalised, in the data's unit."""
         return self.card.height
 
     @property
@@ -642,7 +657,7 @@ class PoseModel:
 
     @property
     def near_exclusion(self) -> float:
-        """Pairs of faces this near along the surface, in heights, are folds, not collisions."""
+        """Pairs of faces within this normalised length along the surface are folds, no collisions."""
         return self.card.near_exclusion
 
     @property
@@ -667,7 +682,7 @@ class PoseModel:
 
     @property
     def metrics(self) -> EmbeddingMetrics | None:
-        """What training measured, lengths in heights."""
+        """What training measured, lengths normalised."""
         return self.embedding.metrics
 
 

@@ -1,4 +1,4 @@
-"""Latent poses by chance, all of them or only those that collide or do not."""
+"""Random latent poses: all of them, or only those that collide or do not."""
 
 from __future__ import annotations
 

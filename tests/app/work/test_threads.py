@@ -225,7 +225,7 @@ def test_a_solve_that_fails_leaves_the_editor_usable(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     latent = sample_poses(document.model, 1, 0, colliding=True)[0]
-    document.set_latent(latent, "Jump")
+    document.blend_towards(latent, 1.0)
     failures: list[Failure] = []
     document.failed.connect(failures.append)
     with monkeypatch.context() as broken:
