@@ -14,7 +14,7 @@ _NOT_IN_A_LINE = re.compile(
 )
 
 _FAR = 0.03
-"""Normalised length by which a mesh is hardly ever off the pose nearest to it, unless it is another body."""
+"""Normalised fit error that is hardly ever exceeded, unless the mesh is another body."""
 
 
 _MIRRORED = " mirrored"

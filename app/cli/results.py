@@ -89,8 +89,8 @@ def note_near_exclusion(model: PoseModel) -> None:
     """Say which pairs of faces the figures beside this leave out, where there are any."""
     if model.near_exclusion:
         note(
-            f"pairs of faces within {model.near_exclusion:g} body sizes along the surface are folds "
-            f"of the skin, which are no collisions"
+            f"pairs of faces within {model.near_exclusion:g} body sizes along the surface are "
+            f"folds of the skin, which are no collisions"
         )
 
 

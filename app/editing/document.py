@@ -618,7 +618,7 @@ class PoseDocument(PoseHistory):
             said.append(mirrored_text(images[0][1]))
         else:
             worst = max(image.fit_error_max for _, image in images)
-            said.append(f"off by at most {height_text(worst)} of the height")
+            said.append(f"off by at most {height_text(worst)} of the body size")
             for count, words in (
                 (sum(i.pairs_after == 0 < i.pairs_mirrored for _, i in images), "resolved"),
                 (sum(i.lost_freedom for _, i in images), "colliding, though free before"),

@@ -657,7 +657,7 @@ class PoseModel:
 
     @property
     def near_exclusion(self) -> float:
-        """Pairs of faces within this normalised length along the surface are folds, no collisions."""
+        """Normalised length along the surface within which pairs of faces are folds of the skin."""
         return self.card.near_exclusion
 
     @property

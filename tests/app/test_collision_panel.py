@@ -281,7 +281,7 @@ def test_a_result_says_of_what_the_body_has_moved_its_shares(
     rest(qtbot, window)
     resolve(qtbot, window)
     (moved,) = (text for text in texts(window.collision.resolve) if "at most" in text)
-    assert re.fullmatch(r"[\d.]+ % of the height,\nat most [\d.]+ %", moved)
+    assert re.fullmatch(r"[\d.]+ % of the body size,\nat most [\d.]+ %", moved)
     window.resizeDocks([window.docks["collision"]], [1], Qt.Orientation.Horizontal)
     qtbot.wait(100)
     assert has_room(window)

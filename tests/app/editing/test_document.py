@@ -435,7 +435,7 @@ def test_an_exported_mesh_comes_back_as_the_same_mesh(
     with qtbot.waitSignal(document.message, timeout=20_000) as told:
         document.import_mesh(tmp_path / "placed.obj")
     assert told.args is not None
-    assert "of the height" in told.args[0]
+    assert "of the body size" in told.args[0]
     assert document.pose_name == "placed"
     with qtbot.waitSignal(document.message):
         document.export_mesh(tmp_path / "again.obj")
