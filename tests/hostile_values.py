@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
 from collections.abc import Iterator
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -98,3 +101,17 @@ def changed_arrays(array: np.ndarray) -> Iterator[tuple[str, np.ndarray | None]]
             changed = array.copy()
             changed.reshape(-1)[place] = cast
             yield f"{number} at {place}", changed
+
+
+def _socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+
+
+UNPLAIN_FILES = {
+    "a folder": Path.mkdir,
+    "a named pipe": os.mkfifo,
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+    "a socket": _socket,
+}
+"""What makes something that is no plain file at a path."""

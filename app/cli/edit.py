@@ -29,16 +29,12 @@ def edit(
 
     if file is not None and file.is_dir():
         raise LCollisionError(
-            "is a folder",
-            "name a file of poses, a mesh or a model, or fix all its meshes with "
-            "`lcollision resolve`",
-            where=file,
+            f"{file} is a folder; name a file of poses, a mesh or a model, or fix all its meshes "
+            "with `lcollision resolve`"
         )
     if file is not None and not file.is_file():
         raise LCollisionError(
-            "is not there",
-            "name a file of poses, a mesh or a model, or none to begin anew",
-            where=file,
+            f"{file} is not there; name a file of poses, a mesh or a model, or none to begin anew"
         )
     raise typer.Exit(open_editor(file, model_name))
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,7 +15,18 @@ if TYPE_CHECKING:
     from lcollision_core.meshes import UpGuess
 
 
-Axis = Literal["x", "y", "z"]
+class Axis(StrEnum):
+    """An axis of a mesh."""
+
+    X = "x"
+    Y = "y"
+    Z = "z"
+
+    @property
+    def number(self) -> int:
+        """0, 1 or 2."""
+        return "xyz".index(self.value)
+
 
 ScaleOption = Annotated[
     float,
@@ -44,9 +56,7 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
         held, _ = mesh_files(path)
         if not held:
             raise MeshFileError(
-                "holds no mesh",
-                f"name a folder of {', '.join(READABLE_SUFFIXES)} files",
-                where=path,
+                f"{path} holds no mesh; name a folder of {', '.join(READABLE_SUFFIXES)} files"
             )
         files += held
     return files
@@ -54,10 +64,8 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
 
 def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
     """Say that a mesh cannot be encoded, and which option helps where it has another unit."""
-    next_step = error.next_step
-    if isinstance(error, WrongScaleError):
-        next_step = f"scale it with --scale {error.factor:.6g}"
-    return MeshFileError(f"cannot be encoded: {error.headline}", next_step, where=path)
+    advice = f" with --scale {error.factor:.6g}" if isinstance(error, WrongScaleError) else ""
+    return MeshFileError(f"{path} cannot be encoded: {error}{advice}")
 
 
 def up_sentence(guess: UpGuess) -> str:

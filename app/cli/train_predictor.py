@@ -6,8 +6,9 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +20,30 @@ from lcollision_core.errors import CancelledError
 
 if TYPE_CHECKING:
     from lcollision_core.predictor import PredictorStatus, StatusCallback
+
+
+class Preset(StrEnum):
+    """What ``--preset`` takes."""
+
+    DEFAULT = "default"
+    PAPER = "paper"
+
+
+class LossName(StrEnum):
+    """What ``--loss`` takes: the rows of the paper's Table 1."""
+
+    FULL = "full"
+    NO_RANK = "no-rank"
+    NO_DEPTH = "no-depth"
+    ENTROPY = "entropy"
+
+
+class Device(StrEnum):
+    """What ``--device`` takes."""
+
+    AUTO = "auto"
+    CPU = "cpu"
+    CUDA = "cuda"
 
 
 def predictor(
@@ -36,13 +61,11 @@ def predictor(
         ),
     ],
     preset: Annotated[
-        Literal["default", "paper"],
-        typer.Option(help="What measures best, or the paper's network and training."),
-    ] = "default",
+        Preset, typer.Option(help="What measures best, or the paper's network and training.")
+    ] = Preset.DEFAULT,
     loss: Annotated[
-        Literal["full", "no-rank", "no-depth", "entropy"],
-        typer.Option(help="Of the paper's losses, leave out ranking, depth, or both."),
-    ] = "full",
+        LossName, typer.Option(help="Of the paper's losses, leave out ranking, depth, or both.")
+    ] = LossName.FULL,
     no_domains: Annotated[
         bool, typer.Option("--no-domains", help="Predict the whole body's energy alone (ND).")
     ] = False,
@@ -54,14 +77,13 @@ def predictor(
         int, typer.Option(min=0, metavar="S", help="Equal seeds, equal predictors.")
     ] = 0,
     device: Annotated[
-        Literal["auto", "cpu", "cuda"],
-        typer.Option(help="Where to train; auto takes a GPU when there is one."),
-    ] = "auto",
+        Device, typer.Option(help="Where to train; auto takes a GPU when there is one.")
+    ] = Device.AUTO,
 ) -> None:
     """Learn to predict collisions from labelled samples.
 
     Three tenths of the rows are held out to measure the predictor; from 170 000 rows on, a tenth of
-    these sets the decision threshold of the preset default. A checkpoint beside
+    these sets the place from which the preset default calls a pose colliding. A checkpoint beside
     the output lets a run that was stopped or killed go on when it is started again; it is removed
     at the end. To use several devices or machines, start it with `torchrun -m app train predictor
     ...`.
@@ -80,7 +102,7 @@ def predictor(
     model = PoseModel.load(model_name)
     store = LabelStore.open(store_path)
     require_store_of(store, model)
-    config = PRESETS[preset].with_loss(loss)
+    config = PRESETS[preset.value].with_loss(loss.value)
     # torchrun starts this command many times; the first process writes for all.
     leads = os.environ.get("RANK", "0") == "0"
     if leads and has_begun(checkpoint):
@@ -96,7 +118,7 @@ def predictor(
                 model.embedding,
                 replace(config, by_domain=not no_domains),
                 store=store.identity,
-                device=device,
+                device=device.value,
                 checkpoint=checkpoint,
                 progress=progress,
                 cancel=cancel,
@@ -111,7 +133,7 @@ def predictor(
         if not len(free_latent):
             note(
                 "no pose of this body that was tried is free of collision; Resolve has nowhere "
-                "to fall back to and may leave poses colliding"
+                "to walk back to and may leave poses colliding"
             )
         written = save_trained(
             destination,
@@ -143,7 +165,7 @@ def _training_bar(leads: bool) -> Iterator[StatusCallback]:
                 return
             facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
             if status.held_out_accuracy is not None:
-                facts.append(f"{100.0 * status.held_out_accuracy:.1f} % accuracy")
+                facts.append(f"{100.0 * status.held_out_accuracy:.1f} % right")
             epoch = f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}"
             draw(status.done, status.total, facts, epoch)
 

@@ -26,20 +26,12 @@ class Failure:
 
     Attributes
     ----------
-    headline : what happened, and where
-    next_step : what to do; empty where there is nothing
+    sentence : what happened and what to do, fit to be shown as it is
     details : the traceback
     """
 
-    headline: str
-    next_step: str = ""
-    details: str = ""
-
-    @classmethod
-    def of(cls, error: LCollisionError) -> Failure:
-        """Tell of an error that the user can fix."""
-        details = "".join(traceback.format_exception(error))
-        return cls(error.headline, error.next_step, details)
+    sentence: str
+    details: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +94,11 @@ def guarded(
         return Response(request_id, cancelled=True)
     except LCollisionError as error:
         _log.info("%s: %s", label, error, exc_info=True)
-        return Response(request_id, failure=Failure.of(error))
+        return Response(request_id, failure=Failure(str(error), traceback.format_exc()))
     except Exception as error:
         _log.exception("%s failed", label)
-        failure = Failure(
-            f"{label} failed ({type(error).__name__}: {error})",
-            "nothing was changed, try again or look into the log",
-            traceback.format_exc(),
+        sentence = (
+            f"{label} failed ({type(error).__name__}: {error}); nothing was changed, try again or "
+            f"look into the log"
         )
-        return Response(request_id, failure=failure)
+        return Response(request_id, failure=Failure(sentence, traceback.format_exc()))

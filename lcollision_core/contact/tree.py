@@ -5,18 +5,15 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.compiled import compiled
 from lcollision_core.contact.arrays import FaceTree, PoseWork
 from lcollision_core.contact.kernels import LEAF_SIZE
-from lcollision_core.contact.tree_kernels import split_faces
 
+FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 
-COMPILED_FROM = 100_000
-"""Faces from which on building the tree is worth a compiled loop. Both ways find the same pairs,
-in another order, so that sums of energies may differ in the last bit."""
 
-
-def build_tree(vertices: npt.NDArray[np.float64], faces: IntArray) -> FaceTree:
+def build_tree(vertices: FloatArray, faces: IntArray) -> FaceTree:
     """Build the tree by median splits of the face centroids along their longest extent.
 
     Parameters
@@ -28,64 +25,105 @@ def build_tree(vertices: npt.NDArray[np.float64], faces: IntArray) -> FaceTree:
     -------
     FaceTree, balanced: all leaves but the last are full.
     """
-    centroids = vertices[faces].mean(axis=1)
-    split = _split if len(faces) < COMPILED_FROM else _split_compiled
-    order, left, right, leaf, size = split(centroids)
     n_leaves = -(-len(faces) // LEAF_SIZE)
+    order = np.arange(len(faces), dtype=np.int32)
+    left, right, leaf, size = (np.empty(2 * n_leaves - 1, dtype=np.int32) for _ in range(4))
+    _split_faces(vertices[faces].mean(axis=1), LEAF_SIZE, order, left, right, leaf, size)
     slot_face = np.full(n_leaves * LEAF_SIZE, -1, dtype=np.int32)
     slot_face[: len(faces)] = order
     corners = np.full((n_leaves * LEAF_SIZE, 3), -1, dtype=np.int32)
     corners[: len(faces)] = faces[order]
     by_leaf = corners.reshape(n_leaves, LEAF_SIZE, 3).transpose(0, 2, 1)
-    return FaceTree(
-        slot_face=slot_face,
-        corners=np.ascontiguousarray(by_leaf).reshape(-1),
-        left=left,
-        right=right,
-        leaf=leaf,
-        size=size,
-    )
+    return FaceTree(slot_face, np.ascontiguousarray(by_leaf).reshape(-1), left, right, leaf, size)
 
 
-def _split(centroids: npt.NDArray[np.float64]) -> tuple[IntArray, ...]:
-    """Return the faces leaf by leaf, and left, right, leaf and size of each node."""
-    order = np.arange(len(centroids))
-    left: list[int] = []
-    right: list[int] = []
-    leaf: list[int] = []
-    size: list[int] = []
+@compiled
+def _select(keys: FloatArray, items: IntArray, start: int, stop: int, wanted: int) -> None:
+    """Reorder `keys` and `items` from `start` to `stop`: none after index `wanted` is smaller.
 
-    def split(start: int, stop: int) -> int:
-        node = len(left)
-        left.append(-1)
-        right.append(-1)
-        leaf.append(-1)
-        size.append(stop - start)
-        if stop - start <= LEAF_SIZE:
-            leaf[node] = start // LEAF_SIZE
-            return node
-        members = order[start:stop]
-        points = centroids[members]
-        axis = int(np.argmax(np.ptp(points, axis=0)))
-        n_leaves = -(-(stop - start) // LEAF_SIZE)
-        middle = start + n_leaves // 2 * LEAF_SIZE
-        order[start:stop] = members[np.argpartition(points[:, axis], middle - start)]
-        left[node] = split(start, middle)
-        right[node] = split(middle, stop)
-        return node
+    Quickselect with random pivots and equal keys set apart, so that neither sorted nor equal keys
+    take long.
+    """
+    low, high, state = start, stop, 12345
+    while high - low > 1:
+        state = (state * 1103515245 + 12345) % 2147483648
+        pivot = keys[low + state % (high - low)]
+        less, k, more = low, low, high
+        while k < more:
+            key = keys[k]
+            if key < pivot:
+                keys[k], keys[less] = keys[less], key
+                items[k], items[less] = items[less], items[k]
+                less += 1
+                k += 1
+            elif key > pivot:
+                more -= 1
+                keys[k], keys[more] = keys[more], key
+                items[k], items[more] = items[more], items[k]
+            else:
+                k += 1
+        if wanted < less:
+            high = less
+        elif wanted >= more:
+            low = more
+        else:
+            return
 
-    split(0, len(centroids))
-    nodes = (np.array(values, dtype=np.int32) for values in (left, right, leaf, size))
-    return (order.astype(np.int32), *nodes)
 
+@compiled
+def _split_faces(
+    centroids: FloatArray,
+    leaf_size: int,
+    order: IntArray,
+    left: IntArray,
+    right: IntArray,
+    leaf: IntArray,
+    size: IntArray,
+) -> None:
+    """Split faces at the medians of their longest extents, parents before children.
 
-def _split_compiled(centroids: npt.NDArray[np.float64]) -> tuple[IntArray, ...]:
-    """Do as `_split`, in a tenth of the time, once compiled; equal centroids may fall otherwise."""
-    n_nodes = 2 * -(-len(centroids) // LEAF_SIZE) - 1
-    order = np.arange(len(centroids), dtype=np.int32)
-    left, right, leaf, size = (np.empty(n_nodes, dtype=np.int32) for _ in range(4))
-    split_faces(centroids, LEAF_SIZE, order, left, right, leaf, size)
-    return order, left, right, leaf, size
+    Parameters
+    ----------
+    centroids : (F, 3) float64 array
+    leaf_size : faces in a leaf; all but the last are full
+    order : (F,) int32 array, 0 to F - 1, overwritten by the faces leaf by leaf
+    left, right, leaf, size : (n,) int32 arrays of a `FaceTree` of n nodes, overwritten
+    """
+    keys = np.empty(len(order))
+    starts, nodes = np.zeros(64, dtype=np.int64), np.zeros(64, dtype=np.int64)
+    stops = np.full(64, len(order), dtype=np.int64)
+    n_waiting = 1
+    while n_waiting > 0:
+        n_waiting -= 1
+        start, stop, node = starts[n_waiting], stops[n_waiting], nodes[n_waiting]
+        left[node] = right[node] = leaf[node] = -1
+        size[node] = stop - start
+        if stop - start <= leaf_size:
+            leaf[node] = start // leaf_size
+            continue
+        longest, axis = -1.0, 0
+        for c in range(3):
+            least, most = np.inf, -np.inf
+            for k in range(start, stop):
+                least = min(least, centroids[order[k], c])
+                most = max(most, centroids[order[k], c])
+            if most - least > longest:
+                longest, axis = most - least, c
+        for k in range(start, stop):
+            keys[k] = centroids[order[k], axis]
+        n_left = -(-(stop - start) // leaf_size) // 2
+        middle = start + n_left * leaf_size
+        _select(keys, order, start, stop, middle)
+        left[node] = node + 1
+        # A subtree of n leaves has 2 n - 1 nodes.
+        right[node] = node + 2 * n_left
+        starts[n_waiting], stops[n_waiting], nodes[n_waiting] = middle, stop, right[node]
+        starts[n_waiting + 1], stops[n_waiting + 1], nodes[n_waiting + 1] = (
+            start,
+            middle,
+            left[node],
+        )
+        n_waiting += 2
 
 
 def allocate_work(tree: FaceTree) -> PoseWork:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes.formats.polygons import first_at_each_place
+from lcollision_core.meshes.formats.polygons import first_at_each_position
 from lcollision_core.meshes.pose_set import PoseSet, collect_poses, degenerate_faces
 from lcollision_core.meshes.topology import Topology
 
@@ -64,7 +64,7 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
     """
     points = np.asarray(vertices)
     if points.shape != (topology.n_vertices, 3):
-        raise ShapeError.must_be("vertices", f"({topology.n_vertices}, 3)", points.shape)
+        raise ShapeError(f"vertices must be ({topology.n_vertices}, 3), got {points.shape}")
     watertight = topology.is_watertight
     n_boundary = len(topology.boundary_edges)
     n_non_manifold = len(topology.non_manifold_edges)
@@ -123,7 +123,7 @@ def _count(number: int, one: str, several: str) -> str:
 
 
 def _duplicates(points: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
-    first = first_at_each_place(points)
+    first = first_at_each_position(points)
     return np.flatnonzero(first != np.arange(len(first))).astype(np.int32)
 
 

@@ -44,9 +44,7 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
     while (file := _taken(lock, path)) is None:
         if time.monotonic() >= give_up:
             raise MeshFileError(
-                "is being written by another command",
-                "wait for that to end, then try again",
-                where=path,
+                f"{path} is being written by another command; wait for that to end, then try again"
             )
         time.sleep(_SECONDS_BETWEEN_TRIES)
     try:
@@ -102,8 +100,8 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
             require_regular(lock)
         file = lock.open("ab", buffering=0)
     except OSError as error:
-        raise MeshFileError.because(
-            path, "cannot be changed", error, "choose another place"
+        raise MeshFileError(
+            f"{path} cannot be changed: {error.strerror or error}; choose another place"
         ) from error
     try:
         lock_open_file(file)
@@ -114,8 +112,8 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
         pass
     except OSError as error:
         file.close()
-        raise MeshFileError.because(
-            path, "cannot be locked", error, "copy it to another disk"
+        raise MeshFileError(
+            f"{path} cannot be locked: {error.strerror or error}; copy it to another disk"
         ) from error
     file.close()
     return None

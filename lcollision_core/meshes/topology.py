@@ -11,7 +11,6 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from lcollision_core.errors import PoseSetError, ShapeError
-from lcollision_core.meshes.mesh_kernels import count_fans, sort_edges, unique_edges
 
 IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
@@ -34,8 +33,8 @@ class Topology:
     def __init__(self, faces: npt.ArrayLike, n_vertices: int) -> None:
         checked = np.asarray(faces)
         if checked.ndim != 2 or checked.shape[1] != 3 or checked.dtype.kind not in "iu":
-            raise ShapeError.must_be(
-                "faces", "an (F, 3) integer array", f"{checked.dtype} {checked.shape}"
+            raise ShapeError(
+                f"faces must be an (F, 3) integer array, got {checked.dtype} {checked.shape}"
             )
         if len(checked) == 0:
             raise ShapeError("the mesh has no faces")
@@ -43,18 +42,15 @@ class Topology:
         if len(out_of_range):
             face = int(out_of_range[0])
             raise PoseSetError(
-                f"names vertices {checked[face].tolist()}, but there are {n_vertices} "
-                f"vertices (0 to {n_vertices - 1})",
-                where=f"face {face}",
+                f"face {face} names vertices {checked[face].tolist()}, "
+                f"but there are {n_vertices} vertices (0 to {n_vertices - 1})"
             )
         repeated = np.flatnonzero(
             (checked == np.roll(checked, 1, axis=1)).any(axis=1),
         )
         if len(repeated):
             face = int(repeated[0])
-            raise PoseSetError(
-                f"names a vertex twice: {checked[face].tolist()}", where=f"face {face}"
-            )
+            raise PoseSetError(f"face {face} names a vertex twice: {checked[face].tolist()}")
         self.faces: IntArray = np.array(checked, dtype=np.int32, order="C")
         self.faces.flags.writeable = False
         self.n_vertices = int(n_vertices)
@@ -74,20 +70,22 @@ class Topology:
         return hash((self.n_vertices, self.faces.tobytes()))
 
     @cached_property
-    def _edge_order(self) -> IntArray:
-        """(3 F,) directed edges by their vertices, 3 f + c leading on from corner c of face f."""
-        order = np.empty(3 * self.n_faces, dtype=np.int32)
-        sort_edges(self.faces, self.n_vertices, order)
-        return order
+    def _edge_ends(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Of edge 3 f + c, from corner c of face f to the next, the lower and the upper vertex."""
+        after = np.roll(self.faces, -1, axis=1)
+        low, high = np.minimum(self.faces, after), np.maximum(self.faces, after)
+        return low.ravel().astype(np.int64), high.ravel().astype(np.int64)
 
     @cached_property
     def _edges_and_counts(self) -> tuple[IntArray, IntArray, bool]:
-        edges = np.empty((3 * self.n_faces, 2), dtype=np.int32)
-        counts = np.empty(3 * self.n_faces, dtype=np.int32)
-        n_edges, is_watertight = unique_edges(self.faces, self._edge_order, edges, counts)
-        unique = edges[:n_edges].copy()
-        unique.flags.writeable = False
-        return unique, counts[:n_edges].copy(), is_watertight
+        low, high = self._edge_ends
+        keys, which, counts = np.unique(
+            low * self.n_vertices + high, return_inverse=True, return_counts=True
+        )
+        edges = np.stack(np.divmod(keys, self.n_vertices), axis=1).astype(np.int32)
+        edges.flags.writeable = False
+        n_forward = np.bincount(which, self.faces.ravel() == low)
+        return edges, counts, bool((counts == 2).all() and (n_forward == 1).all())
 
     @property
     def edges(self) -> IntArray:
@@ -108,9 +106,23 @@ class Topology:
     @property
     def pinched_vertices(self) -> IntArray:
         """Indices of the vertices whose faces form several fans that touch in the vertex alone."""
-        fans = np.empty(self.n_vertices, dtype=np.int32)
-        count_fans(self.faces, self._edge_order, fans)
-        return np.flatnonzero(fans > 1).astype(np.int32)
+        # Corners of neighbouring faces at the same end of the edge between them are one fan.
+        low, high = self._edge_ends
+        corners = np.arange(3 * self.n_faces).reshape(-1, 3)
+        after = np.roll(corners, -1, axis=1).ravel()
+        is_forward = self.faces.ravel() == low
+        order = np.lexsort((high, low))
+        one, two = order[:-1], order[1:]
+        same = (low[one] == low[two]) & (high[one] == high[two])
+        one, two = one[same], two[same]
+        at_low, at_high = np.where(is_forward, [corners.ravel(), after], [after, corners.ravel()])
+        rows = np.concatenate([at_low[one], at_high[one]])
+        columns = np.concatenate([at_low[two], at_high[two]])
+        graph = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), 2 * (len(order),))
+        n_fans, fan = csgraph.connected_components(graph, directed=False)
+        vertex = np.empty(n_fans, dtype=np.int64)
+        vertex[fan] = self.faces.ravel()
+        return np.flatnonzero(np.bincount(vertex) > 1).astype(np.int32)
 
     @property
     def is_watertight(self) -> bool:

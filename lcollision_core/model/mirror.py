@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import RigidTransform, Topology
-from lcollision_core.model.matching import sorted_faces
 
 if TYPE_CHECKING:
-    from lcollision_core.resolve import ExactCheck, PoseResolver, ResolveOptions, ResolveResult
+    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
 
 _TOLERANCE = 1e-3
-"""Normalised: how far a vertex may lie from its partner's mirror image."""
+"""In heights: how far a vertex may lie from its partner's mirror image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class MirrorSource:
     Attributes
     ----------
     latent : (D,) float64 array
-    placement : where the decoded pose belongs, None for the model's own coordinates
+    placement : where the decoded pose belongs, None for the reference's frame
     image : the fingerprint of the mirror image; any other pose has another source
     """
 
@@ -75,12 +75,12 @@ class MirrorSource:
 
 @dataclass(frozen=True, eq=False)
 class MirroredPose:
-    """A pose with left and right exchanged. Lengths are normalised.
+    """A pose with left and right exchanged. Lengths are in heights.
 
     Attributes
     ----------
     latent : (D,) float64 array
-    placement : where the decoded pose belongs, None for the model's own coordinates
+    placement : where the decoded pose belongs, None for the reference's frame
     fit_error_mean, fit_error_max : distance of the decoded vertices from the exact mirror image
     restored : it is the pose that the given one was mirrored from, to the bit
     pairs_before : colliding pairs of faces of the given pose, by the exact check
@@ -107,43 +107,48 @@ class MirroredPose:
         return self.pairs_before == 0 < self.pairs_after
 
 
-def pose_bytes(latent: npt.NDArray[Any], placement: RigidTransform | None) -> bytes:
-    """Return bytes that are equal for equal poses in equal places, and for no others.
+def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | None) -> str:
+    """Return 16 hexadecimal digits that tell a pose and its place, to the bit.
 
     Parameters
     ----------
     latent : (D,) array
-    placement : None for the model's own coordinates
+    placement : None for the reference's frame
     """
-    arrays: list[npt.ArrayLike] = [latent]
+    digest = hashlib.sha256(np.asarray(latent, dtype="<f8").tobytes())
     if placement is not None:
-        arrays += [placement.rotation, placement.translation]
+        for array in (placement.rotation, placement.translation):
+            digest.update(np.asarray(array, dtype="<f8").tobytes())
         if placement.scale != 1.0:
-            arrays.append(placement.scale)
-    return b"".join(np.asarray(array, dtype="<f8").tobytes() for array in arrays)
+            digest.update(np.asarray(placement.scale, dtype="<f8").tobytes())
+    return digest.hexdigest()[:16]
 
 
-def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | None) -> str:
-    """Return 16 hexadecimal digits that tell a pose and its place, to the bit."""
-    return hashlib.sha256(pose_bytes(latent, placement)).hexdigest()[:16]
-
-
-@dataclass(frozen=True, eq=False)
 class PoseMirror:
     """Exchanges left and right of one model's poses; immutable, safe between threads.
 
-    Attributes
+    Parameters
     ----------
     embedding : decodes latent poses, and finds those of meshes
     symmetry : of the mesh, in the data's unit
-    check : the exact check of the model's poses
+    detector : the exact check, in the data's unit
+    height : one height in the data's unit
     resolver : of what collides in the mirror only; None leaves it colliding
     """
 
-    embedding: Embedding
-    symmetry: Symmetry
-    check: ExactCheck
-    resolver: PoseResolver | None
+    def __init__(
+        self,
+        embedding: Embedding,
+        symmetry: Symmetry,
+        detector: CollisionDetector,
+        height: float,
+        resolver: PoseResolver | None,
+    ) -> None:
+        self._embedding = embedding
+        self._symmetry = symmetry
+        self._detector = detector
+        self._height = height
+        self._resolver = resolver
 
     def mirror(
         self,
@@ -162,7 +167,7 @@ class PoseMirror:
         Parameters
         ----------
         latent : (D,) finite array
-        placement : where the decoded pose belongs, None for the model's own coordinates
+        placement : where the decoded pose belongs, None for the reference's frame
         source : what the pose was mirrored from, or None: where it is still that image, what
             comes back is the source, to the bit
         options : of the Resolve; its locked domains keep what they have in the mirror
@@ -173,30 +178,32 @@ class PoseMirror:
         ------
         ShapeError, LCollisionError, CancelledError : as of `PoseModel.resolve`.
         """
-        pose, height = np.array(latent, dtype=np.float64), self.check.height
-        check = replace(self.check, placement=placement)
+        from lcollision_core.resolve.exact import ExactCheck
+
+        pose = np.array(latent, dtype=np.float64)
+        check = ExactCheck(self._embedding, self._detector, self._height, placement)
         decoded = check.decode(pose)[0]
-        pairs_before = len(check.find(check.exported(decoded)).pairs)
-        image = self.symmetry.image(decoded * height) / height
-        place = None if placement is None else self.symmetry.image_of_placement(placement)
+        pairs_before = len(check.find(decoded).pairs)
+        image = self._symmetry.image(decoded * self._height) / self._height
+        place = None if placement is None else self._symmetry.image_of_placement(placement)
         restored = source is not None and source.is_of(pose, placement)
         if source is not None and restored:
             found, place = source.latent, source.placement
         else:
             # In its place: a rigid motion left to the fit would be one more thing to undo, and
-            # the codes hold it nearly as well.
-            fit = self.embedding.encode(image[None], cancel=cancel, in_place=True)
+            # the codes hold it all but as well.
+            fit = self._embedding.encode(image[None], cancel=cancel, in_place=True)
             found = fit.latent[0].astype(np.float64)
-        check = replace(check, placement=place)
+        check = ExactCheck(self._embedding, self._detector, self._height, place)
         mirrored = check.decode(found)[0]
-        pairs_mirrored = pairs_after = len(check.find(check.exported(mirrored)).pairs)
+        pairs_mirrored = pairs_after = len(check.find(mirrored).pairs)
         resolution = None
-        if not restored and pairs_before == 0 < pairs_mirrored and self.resolver is not None:
-            resolution = self.resolver.resolve(found, options, progress, cancel, place)
+        if not restored and pairs_before == 0 < pairs_mirrored and self._resolver is not None:
+            resolution = self._resolver.resolve(found, options, progress, cancel, place)
             if resolution.exactly_free:
                 found, pairs_after = resolution.latent, 0
                 mirrored = check.decode(found)[0]
-        picked = self.embedding.topology.picked
+        picked = self._embedding.topology.picked
         distances = np.linalg.norm((mirrored - image)[picked], axis=1)
         return MirroredPose(
             latent=found,
@@ -241,9 +248,14 @@ def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int)
         partner = np.arange(topology.n_vertices, dtype=np.int32)
         partner[used] = used[nearest]
         is_exchange = distance.max() < tolerance and (nearest[nearest] == everyone).all()
-        if is_exchange and np.array_equal(
-            sorted_faces(partner[faces[:, ::-1]]), sorted_faces(faces)
-        ):
+        if is_exchange and _turned(partner[faces[:, ::-1]]) == _turned(faces):
             partner.flags.writeable = False
             return Symmetry(partner, axis, offset)
     return None
+
+
+def _turned(faces: npt.NDArray[np.int32]) -> set[tuple[int, int, int]]:
+    """Return the faces as a set, each turned until its least vertex comes first."""
+    turns = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
+    rows = np.take_along_axis(faces, turns, axis=1)
+    return {(int(a), int(b), int(c)) for a, b, c in rows}

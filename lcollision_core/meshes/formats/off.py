@@ -1,10 +1,12 @@
-"""Object File Format (OFF), text form."""
+"""Object File Format (OFF), text form.
+
+An own reader, because trimesh reorders the triangles of mixed polygons, drops faces that end early
+without a word, and writes ten digits.
+"""
 
 from __future__ import annotations
 
 import re
-from io import BytesIO
-from itertools import islice
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -13,15 +15,15 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import Polygons, read_rest, require_plausible_count
 from lcollision_core.meshes.formats.text import (
-    blocks_of_lines,
     decimals,
-    normalised_text,
-    numbers,
-    plain_integers,
+    number_rows,
+    plain_lines,
+    points,
+    vertex_numbers,
 )
 
-_HEADER = re.compile(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?C?N?OFF\b([^\n]*)", re.IGNORECASE)
-_COUNTS = re.compile(rb"(?:\s*(?:#[^\n]*\n)?)*(-?\d+)\s+(-?\d+)")
+_HEADER = re.compile(rb"\s*(?:ST)?C?N?OFF\b([^\n]*)", re.IGNORECASE)
+_COUNTS = re.compile(rb"\s*(-?\d+)\s+(-?\d+)[^\n]*\n")
 _HEAD_BYTES = 1 << 16
 
 
@@ -40,80 +42,51 @@ def read(file: BinaryIO) -> Polygons:
     ------
     MeshFileError : the header is no OFF header, or a vertex or face is missing or not readable.
     """
-    head = normalised_text(file.read(_HEAD_BYTES))
-    header = _HEADER.match(head)
-    if header is None or b"BINARY" in header[1].upper():
-        raise MeshFileError("it does not start with OFF as a text OFF file does")
-    counts = _COUNTS.match(head, header.start(1))
-    if counts is None:
-        raise MeshFileError("the counts of vertices and faces are missing after OFF")
-    n_vertices, n_faces = int(counts[1]), int(counts[2])
+    head = plain_lines(file.read(_HEAD_BYTES))
+    n_vertices, n_faces, _ = _read_head(head)
     require_plausible_count(n_vertices, "vertices")
     require_plausible_count(n_faces, "faces")
     file.seek(0)
-    data = normalised_text(read_rest(file))[counts.end() :]
+    data = plain_lines(read_rest(file))
     # The rest of the line of counts is the number of edges, which readers ignore.
-    data = data.partition(b"\n")[2]
-    if b"#" in data:
-        data = re.sub(rb"#[^\n]*", b"", data)
-    n_lines = sum(1 for line in BytesIO(data) if line.strip())
-    if n_lines < n_vertices + n_faces:
+    data = re.sub(rb"\n\s+", b"\n", data[_read_head(data)[2] :]).lstrip()
+    ends = np.flatnonzero(np.frombuffer(data, dtype=np.uint8) == ord("\n")) + 1
+    if len(ends) < n_vertices + n_faces:
         raise MeshFileError(
-            f"it is truncated: it announces {n_vertices} vertices and {n_faces} faces but has only "
-            f"{n_lines} lines for them"
+            f"it announces {n_vertices} vertices and {n_faces} faces but has only {len(ends)} "
+            f"lines for them; it is truncated"
         )
-    lines = (line for line in BytesIO(data) if line.strip())
-    vertices = [np.empty((0, 3))]
-    for block in blocks_of_lines(islice(lines, n_vertices)):
-        vertices.append(_vertices(block, sum(map(len, vertices))))
-    sizes, corners = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for block in blocks_of_lines(islice(lines, n_faces)):
-        block_sizes, block_corners = _faces(block, sum(map(len, sizes)))
-        sizes.append(block_sizes)
-        corners.append(block_corners)
-    return Polygons(np.concatenate(vertices), np.concatenate(sizes), np.concatenate(corners))
+    middle, end = (int(ends[n - 1]) if n else 0 for n in (n_vertices, n_vertices + n_faces))
+    return Polygons(points(data[:middle], "vertex"), *_faces(data[middle:end]))
 
 
-def _vertices(lines: list[bytes], first: int) -> npt.NDArray[np.float64]:
-    words = b" ".join(lines).split()
-    if len(words) != 3 * len(lines):
-        rows = [line.split() for line in lines]
-        short = next((i for i, row in enumerate(rows) if len(row) < 3), None)
-        if short is not None:
-            raise MeshFileError(
-                f"has {len(rows[short])} coordinates, three are needed",
-                where=f"vertex {first + short} (from 0)",
-            )
-        words = [word for row in rows for word in row[:3]]
-    return numbers(words, "the vertices").reshape(-1, 3)
+def _read_head(text: bytes) -> tuple[int, int, int]:
+    """Return the counts of vertices and faces, and where the line that holds them ends."""
+    header = _HEADER.match(text)
+    if header is None or b"BINARY" in header[1].upper():
+        raise MeshFileError("it does not start with OFF as a text OFF file does")
+    counts = _COUNTS.match(text, header.start(1))
+    if counts is None:
+        raise MeshFileError("the counts of vertices and faces are missing after OFF")
+    return int(counts[1]), int(counts[2]), counts.end()
 
 
-def _faces(lines: list[bytes], first: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    table = plain_integers(b"\n".join(lines))
-    if table is not None and len(table) == 4 * len(lines) and (table[::4] == 3).all():
-        return table[::4], table.reshape(-1, 4)[:, 1:].reshape(-1)
-    sizes = np.empty(len(lines), dtype=np.int64)
-    corners: list[int] = []
-    for face, line in enumerate(lines):
-        row = line.split()
-        try:
-            size = int(row[0])
-            named = list(map(int, row[1 : 1 + max(size, 0)]))
-        except ValueError as error:
-            raise MeshFileError(
-                "has a corner that is no vertex number", where=f"face {first + face} (from 0)"
-            ) from error
-        if size < 0 or len(named) < size:
-            raise MeshFileError(
-                f"announces {size} corners but has {len(named)}",
-                where=f"face {first + face} (from 0)",
-            )
-        sizes[face] = size
-        corners += named
-    try:
-        return sizes, np.array(corners, dtype=np.int64)
-    except OverflowError as error:
-        raise MeshFileError("a face has a vertex number that is far too large") from error
+def _faces(text: bytes) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    values, n_words = number_rows(text, "face")
+    starts = np.cumsum(n_words) - n_words
+    announced = values[starts]
+    is_count = (announced >= 0) & (announced == np.floor(announced))
+    missing = np.flatnonzero(~(is_count & (announced < n_words)))
+    if len(missing):
+        face = missing[0]
+        raise MeshFileError(
+            f"face {face} (from 0) announces {announced[face]:g} corners but has "
+            f"{n_words[face] - 1}"
+        )
+    sizes = announced.astype(np.int64)
+    place = np.arange(len(values)) - np.repeat(starts, n_words)
+    is_corner = (place > 0) & (place <= np.repeat(sizes, n_words))
+    return sizes, vertex_numbers(values[is_corner], sizes)
 
 
 def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:

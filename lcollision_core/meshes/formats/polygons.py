@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.mesh_kernels import find_equal_rows
 from lcollision_core.meshes.topology import Topology
 
 MAX_FACES = 5_000_000
@@ -22,8 +21,6 @@ compared with it before anything of that size is allocated.
 
 MAX_FILE_BYTES = 1 << 29
 """The largest mesh file that is read, in bytes: as text it takes some ten times that in memory."""
-
-_CHUNK_BYTES = 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +81,15 @@ def with_order_of(
     return Polygons.triangles(vertices, topology.faces.astype(np.int64), (note,), is_single)
 
 
-def first_at_each_place(points: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+def first_at_each_position(points: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
     """Return (n,) for each of (n, 3) points the index of the first at its coordinates."""
     # -0.0 becomes 0.0: equal coordinates, equal bits.
-    places = np.ascontiguousarray(points, dtype=np.float64) + 0.0
-    first = np.empty(len(places), dtype=np.int32)
-    find_equal_rows(places.view(np.uint64), first)
+    bits = (np.ascontiguousarray(points, dtype=np.float64) + 0.0).view(np.uint64)
+    order = np.lexsort(bits.T)
+    is_new = np.ones(len(order), dtype=np.bool_)
+    is_new[1:] = (bits[order[1:]] != bits[order[:-1]]).any(axis=1)
+    first = np.empty_like(order)
+    first[order] = order[is_new][np.cumsum(is_new) - 1]
     return first
 
 
@@ -116,9 +116,7 @@ def triangulate(polygons: Polygons) -> tuple[npt.NDArray[np.int64], tuple[str, .
     too_small = np.flatnonzero(sizes < 3)
     if len(too_small):
         face = int(too_small[0])
-        raise MeshFileError(
-            f"has {sizes[face]} corners, three are needed", where=f"face {face} (from 0)"
-        )
+        raise MeshFileError(f"face {face} (from 0) has {sizes[face]} corners, three are needed")
     quads = int((sizes == 4).sum())
     larger = int((sizes > 4).sum())
     if not quads and not larger:
@@ -145,10 +143,10 @@ def triangulate(polygons: Polygons) -> tuple[npt.NDArray[np.int64], tuple[str, .
 def require_plausible_count(count: int, what: str) -> None:
     """Raise `MeshFileError` when a file announces fewer than none, or more than `MAX_FACES`."""
     if count < 0:
-        raise MeshFileError(f"it is damaged: it announces {count} {what}")
+        raise MeshFileError(f"it announces {count} {what}; the file is damaged")
     if count > MAX_FACES:
         raise MeshFileError(
-            f"it holds {count} {what}, at most {MAX_FACES} can be read", "decimate the mesh"
+            f"it holds {count} {what}, at most {MAX_FACES} can be read; decimate the mesh"
         )
 
 
@@ -158,37 +156,7 @@ def read_rest(file: BinaryIO) -> bytes:
     size = file.seek(0, os.SEEK_END) - start
     if size > MAX_FILE_BYTES:
         raise MeshFileError(
-            f"it is larger than {MAX_FILE_BYTES >> 20} MiB", "decimate the mesh or split the file"
+            f"it is larger than {MAX_FILE_BYTES >> 20} MiB; decimate the mesh or split the file"
         )
     file.seek(start)
     return file.read(size)
-
-
-def require_few(file: BinaryIO, keyword: bytes, what: str, shortest: int, size: int) -> None:
-    """Refuse a text file in which `keyword` occurs more than `MAX_FACES` times.
-
-    Counts in chunks, so that a file of gigabytes is refused in little memory; the file's position
-    is left at its start.
-
-    Parameters
-    ----------
-    file : open binary file at its start
-    keyword : bytes that occur once a face, or once a vertex
-    what : plural noun for the message
-    shortest : the fewest bytes that one of them can take, which spares small files the count
-    size : the file's size in bytes
-    """
-    if size <= shortest * MAX_FACES:
-        return
-    count = 0
-    tail = b""
-    while chunk := file.read(_CHUNK_BYTES):
-        joined = tail + chunk
-        count += joined.count(keyword)
-        if count > MAX_FACES:
-            raise MeshFileError(
-                f"it holds more than {MAX_FACES} {what}, the most that can be read",
-                "decimate the mesh",
-            )
-        tail = joined[len(joined) - len(keyword) + 1 :]
-    file.seek(0)

@@ -1,4 +1,8 @@
-"""STL, binary and text: triangles that repeat their corners' coordinates."""
+"""STL, binary and text: triangles that repeat their corners' coordinates.
+
+An own reader, because trimesh takes a text file that ends early for an empty one, and refuses a
+binary one with something after its triangles.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +15,17 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.polygons import (
     Polygons,
-    first_at_each_place,
+    first_at_each_position,
     read_rest,
-    require_few,
     require_plausible_count,
     with_order_of,
 )
-from lcollision_core.meshes.formats.text import blocks_of_lines, numbers
+from lcollision_core.meshes.formats.text import number_rows
 from lcollision_core.meshes.topology import Topology
 
 _HEADER_BYTES = 84
 _CORNER = re.compile(rb"\bvertex\s([^\n\r]*)")
 _TRIANGLE = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_SHORTEST_FACET = len(b"facet vertex0 0 0 vertex0 0 0 vertex0 0 0 endfacet")
 _JOINED = "STL stores no shared vertices; corners at equal coordinates were joined"
 _REORDERED = "STL stores no shared vertices; corners were put back into the set's vertex order"
 
@@ -58,17 +60,14 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
         corners = np.frombuffer(body, dtype=_TRIANGLE)["corners"].astype(np.float64)
     elif is_text:
         file.seek(0)
-        require_few(file, b"endfacet", "triangles", _SHORTEST_FACET, size)
         corners = _text_corners(read_rest(file))
     elif n_triangles >= 0:
         raise MeshFileError(
-            f"it is truncated or not an STL file: it announces {n_triangles} triangles, which take "
-            f"{expected} bytes, but has {size}"
+            f"it announces {n_triangles} triangles, which take {expected} bytes, but has {size}; "
+            f"it is truncated, or no STL file"
         )
     else:
-        raise MeshFileError(
-            f"it has {size} bytes, too few for an STL file", "export the mesh again"
-        )
+        raise MeshFileError(f"it has {size} bytes, too few for an STL file; export the mesh again")
     points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0, as which corner is kept is chance
     is_single = not (is_text and expected != size)
     ordered = with_order_of(points, topology, _REORDERED, is_single)
@@ -76,31 +75,28 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
 
 
 def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
-    lowered = data.lower()
-    n_rows = sum(1 for _ in _CORNER.finditer(lowered))
-    n_facets = lowered.count(b"endfacet")
-    if n_rows != 3 * n_facets or b"endsolid" not in lowered:
+    data = data.lower()
+    n_facets, has_end = data.count(b"endfacet"), b"endsolid" in data
+    require_plausible_count(n_facets, "triangles")
+    rows = _CORNER.findall(data)
+    if len(rows) != 3 * n_facets or not has_end:
         raise MeshFileError(
-            f"it is truncated or damaged: it has {n_facets} complete triangles, {n_rows} corners "
-            f"and {'an' if b'endsolid' in lowered else 'no'} end line"
+            f"it has {n_facets} complete triangles and {len(rows)} corners, and "
+            f"{'an' if has_end else 'no'} end line; it is truncated or damaged"
         )
-    parts, done = [np.empty(0)], 0
-    for rows in blocks_of_lines(match[1] for match in _CORNER.finditer(lowered)):
-        words = [row.split() for row in rows]
-        ragged = next((i for i, row in enumerate(words) if len(row) != 3), None)
-        if ragged is not None:
-            corner = done + ragged
-            raise MeshFileError(
-                f"corner {corner % 3} of triangle {corner // 3} (from 0) has {len(words[ragged])} "
-                "coordinates, three are needed"
-            )
-        parts.append(numbers([word for row in words for word in row], "the corners"))
-        done += len(rows)
-    return np.concatenate(parts)
+    del data
+    corners, sizes = number_rows(b"\n".join([*rows, b""]), "corner")
+    ragged = np.flatnonzero(sizes != 3)
+    if len(ragged):
+        raise MeshFileError(
+            f"corner {ragged[0] % 3} of triangle {ragged[0] // 3} (from 0) has "
+            f"{sizes[ragged[0]]} coordinates, three are needed"
+        )
+    return corners
 
 
 def _joined(points: npt.NDArray[np.float64], is_single: bool) -> Polygons:
-    first = first_at_each_place(points)
+    first = first_at_each_position(points)
     is_first = first == np.arange(len(first))
     number = np.cumsum(is_first) - 1
     faces = number[first].reshape(-1, 3)

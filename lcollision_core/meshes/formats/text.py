@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from array import array
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 
-_CHUNK_BYTES = 1 << 23
-_BLOCK_LINES = 1 << 18
-_BLANK = re.compile(rb"\s")
+_BLANKS = bytes.maketrans(b"\t\v\f", b"   ")
 
 
 def decimals(values: npt.NDArray[Any]) -> tuple[str, ...]:
@@ -32,93 +31,110 @@ def decimals(values: npt.NDArray[Any]) -> tuple[str, ...]:
     return tuple(map(str, flat if flat.dtype == np.float32 else flat.tolist()))
 
 
-def numbers(words: Sequence[bytes], what: str) -> npt.NDArray[np.float64]:
-    """Parse decimals.
+def plain_lines(data: bytes) -> bytes:
+    """Return text whose lines end in a newline, without byte order mark, tabs or # comments."""
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if b"#" in data:
+        data = re.sub(rb"#[^\n]*", b"", data)
+    if any(blank in data for blank in b"\t\v\f"):
+        data = data.translate(_BLANKS)
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    return data if data.endswith(b"\n") else data + b"\n"
+
+
+def number_rows(
+    text: bytes, name: str, dtype: type[np.generic] | None = None
+) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
+    """Parse lines of blank-separated decimals.
 
     Parameters
     ----------
-    words : the decimals
-    what : plural noun for the message, such as "the vertices"
+    text : lines that end in a newline
+    name : what a line is called in the message, such as "vertex"
+    dtype : of the values; by default int64 where all are digits, else float64
+
+    Returns
+    -------
+    values : all numbers; whole ones beyond int64 become its largest
+    sizes : how many there are in each line
 
     Raises
     ------
     MeshFileError : a word is no number.
     """
-    try:
-        return np.array(list(map(float, words)), dtype=np.float64)
-    except ValueError:
+    # What stands nowhere else marks the ends of lines.
+    if dtype is not np.float64 and text and not text.translate(None, b" \n0123456789"):
+        values = np.fromstring(text.replace(b"\n", b" -1 "), dtype=np.int64, sep=" ")
+        is_end = values < 0
+    elif (parsed := _plain_decimals(text.replace(b"\n", b" nan "))) is not None:
+        values, is_end = parsed, np.isnan(parsed)
+    else:
+        is_end = np.empty(0, dtype=np.bool_)
+    ends = np.flatnonzero(is_end)
+    if len(ends) == text.count(b"\n"):
+        return values[~is_end], np.diff(ends, prepend=-1) - 1
+    found, sizes = array("d"), array("q")
+    for row, line in enumerate(BytesIO(text)):
+        words = line.split()
+        sizes.append(len(words))
         for word in words:
             try:
-                float(word)
+                found.append(float(word))
             except ValueError as error:
                 raise MeshFileError(
-                    f"hold {word[:30]!r}, which is no number", "export the mesh again", where=what
+                    f"{name} {row} (from 0) holds {word[:30]!r}, which is no number; export the "
+                    f"mesh again"
                 ) from error
-        raise
+    return np.array(found, dtype=np.float64), np.array(sizes, dtype=np.int64)
 
 
-def numbers_of_text(text: bytes, what: str) -> npt.NDArray[np.float64]:
-    """Parse blank-separated decimals in chunks: words take ten times their text in memory.
+def points(text: bytes, name: str) -> npt.NDArray[np.float64]:
+    """Parse lines that begin with three coordinates, (n, 3).
+
+    Parameters are those of `number_rows`.
+
+    Raises
+    ------
+    MeshFileError : a line holds fewer, or a word that is no number.
+    """
+    values, sizes = number_rows(text, name)
+    short = np.flatnonzero(sizes < 3)
+    if len(short):
+        raise MeshFileError(
+            f"{name} {short[0]} (from 0) has {sizes[short[0]]} coordinates, three are needed"
+        )
+    starts = np.cumsum(sizes) - sizes
+    return values[starts[:, None] + np.arange(3)]
+
+
+def vertex_numbers(
+    values: npt.NDArray[Any], sizes: npt.NDArray[np.int64], name: str = "face"
+) -> npt.NDArray[np.int64]:
+    """Return the corners of polygons as whole numbers.
 
     Parameters
     ----------
-    text : the decimals
-    what : plural noun for the message
+    values : (sum of sizes,) array
+    sizes : (P,) corners of each polygon
+    name : what a polygon is called in the message
 
     Raises
     ------
-    MeshFileError : a word is no number.
+    MeshFileError : a value is no whole number, such as 1.5 or infinity, or far too large.
     """
-    parts, start = [np.empty(0)], 0
-    while start < len(text):
-        # To the end of the word at hand; no number is as long as what is looked at for it.
-        blank = _BLANK.search(text, start + _CHUNK_BYTES, start + 2 * _CHUNK_BYTES)
-        end = blank.start() if blank else start + 2 * _CHUNK_BYTES
-        chunk = text[start:end]
-        plain = plain_decimals(chunk)
-        parts.append(numbers(chunk.split(), what) if plain is None else plain)
-        start = end
-    return np.concatenate(parts)
+    bad = np.flatnonzero(~(np.abs(values) < 2**53) | (values != np.floor(values)))
+    if len(bad):
+        row = int(np.searchsorted(np.cumsum(sizes), bad[0], side="right"))
+        raise MeshFileError(
+            f"{name} {row} (from 0) has a corner that is no vertex number: {values[bad[0]]:g}"
+        )
+    return values.astype(np.int64)
 
 
-def blocks_of_lines(lines: Iterable[bytes]) -> Iterator[list[bytes]]:
-    """Group lines into blocks of bounded length, as lists of words take much memory.
-
-    Raises
-    ------
-    MeshFileError : a line is longer than all that a mesh can say in one.
-    """
-    block: list[bytes] = []
-    n_bytes = 0
-    for line in lines:
-        if len(line) > _CHUNK_BYTES:
-            raise MeshFileError(f"it has a line of {len(line)} bytes", "export the mesh again")
-        block.append(line)
-        n_bytes += len(line)
-        if n_bytes > _CHUNK_BYTES or len(block) >= _BLOCK_LINES:
-            yield block
-            block, n_bytes = [], 0
-    if block:
-        yield block
-
-
-def plain_integers(text: bytes) -> npt.NDArray[np.int64] | None:
-    """Parse blank-separated digits quickly; None where the text holds anything else.
-
-    Numbers beyond int64 become its largest, which no index check lets through.
-    """
-    # With nothing but digits and blanks there is nothing that numpy's parser could trip over.
-    if not text or text.isspace() or text.translate(None, b" \n0123456789"):
-        return None
-    return np.fromstring(text, dtype=np.int64, sep=" ")
-
-
-def plain_decimals(text: bytes) -> npt.NDArray[np.float64] | None:
-    """Parse blank-separated decimals quickly; None where there is anything else.
-
-    Besides decimals the text may hold the word `nan`.
-    """
-    if text.translate(None, b" \t\n\r0123456789+-.eEna"):
+def _plain_decimals(text: bytes) -> npt.NDArray[np.float64] | None:
+    """Parse decimals, and the word `nan`, quickly; None where there is anything else."""
+    if text.translate(None, b" \n0123456789+-.eEna"):
         return None
     blank = np.frombuffer(text, dtype=np.uint8) <= ord(" ")
     n_words = int(np.count_nonzero(blank[:-1] & ~blank[1:])) + int(len(blank) > 0 and not blank[0])
@@ -130,10 +146,3 @@ def plain_decimals(text: bytes) -> npt.NDArray[np.float64] | None:
             return None
     # "1.2.3" is read as two.
     return values if len(values) == n_words else None
-
-
-def normalised_text(data: bytes) -> bytes:
-    """Return text with line ends as a lone newline and without a byte order mark."""
-    if b"\r" in data:
-        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    return data.removeprefix(b"\xef\xbb\xbf")

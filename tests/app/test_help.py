@@ -1,0 +1,134 @@
+"""The command line before any command runs: quick, light, and complete."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.app.support import Lcollision
+
+
+def _loaded_modules(code: str) -> set[str]:
+    """Run code in a fresh interpreter and return the top-level modules that it loaded."""
+    report = "import sys; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    result = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True
+    )
+    return set(result.stdout.splitlines()[-1].split())
+
+
+HEAVY = {"numpy", "scipy", "numba", "torch", "trimesh", "vtkmodules", "pyvista", "PySide6"}
+
+
+def test_importing_the_command_line_loads_nothing_heavy() -> None:
+    loaded = _loaded_modules("import app.cli.main")
+    assert "typer" in loaded
+    assert loaded & HEAVY == set()
+
+
+def test_importing_the_core_loads_nothing_heavy() -> None:
+    loaded = _loaded_modules("import lcollision_core")
+    assert "lcollision_core" in loaded
+    assert loaded & HEAVY == set()
+
+
+def test_contact_and_meshes_load_neither_torch_nor_a_front_end() -> None:
+    loaded = _loaded_modules("import lcollision_core.contact, lcollision_core.meshes.body")
+    assert "numba" in loaded
+    assert loaded & {"torch", "anny", "vtkmodules", "pyvista", "PySide6"} == set()
+
+
+def _commands(*words: str) -> set[str]:
+    """Return the commands that `--help` lists under others."""
+    result = subprocess.run(
+        [sys.executable, "-m", "app", *words, "--help"], capture_output=True, text=True, check=True
+    )
+    _, _, listed = result.stdout.partition("Commands:\n")
+    return set(re.findall(r"^  (\w+)", listed, re.MULTILINE))
+
+
+def test_readme_and_help_name_the_same_commands() -> None:
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    rows = re.findall(r"^\| (`lcollision.*?) \| ", readme, re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`lcollision ([a-z]+)", row)}
+    assert named == _commands()
+    for group in ("dataset", "train", "benchmark"):
+        shown = re.findall(rf"`lcollision {group} ([a-z\\|]+)", readme)
+        assert set("|".join(shown).replace("\\", "").split("|")) == _commands(group)
+
+
+def test_version_is_that_of_the_package() -> None:
+    from importlib.metadata import version
+
+    result = subprocess.run(
+        [sys.executable, "-m", "app", "--version"], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == f"lcollision {version('lcollision')}"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["nonsense"], "No such command 'nonsense'; see lcollision --help"),
+        (["chek"], "No such command 'chek'"),
+        (["missing.obj"], "missing.obj is not there; name a file of poses, a mesh or a model"),
+        (["edit", "missing.obj"], "missing.obj is not there; name a file of poses, a mesh or a"),
+        ([str(Path(__file__).parent)], "is a folder; name a file of poses, a mesh or a model, or"),
+        (["--model"], "Option '--model' requires an argument"),
+        (["--bogus"], "No such option: --bogus; see lcollision --help"),
+        (["check"], "Missing argument 'MESH...'; see lcollision check --help"),
+        (["dataset", "check", "--bogus"], "--bogus; see lcollision dataset check --help"),
+    ],
+)
+def test_wrong_words_get_one_sentence(
+    lcollision: Lcollision, words: list[str], sentence: str
+) -> None:
+    result = lcollision(*words)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith("lcollision: ")
+    assert sentence in result.stderr
+
+
+@pytest.mark.parametrize("command", [[], ["edit"]], ids=["alone", "edit"])
+def test_the_editor_opens_what_it_is_given_with_its_command_or_without(
+    lcollision: Lcollision, stabbed: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    opened: list[tuple[Path | None, str | None]] = []
+
+    def open_editor(path: Path | None, model_name: str | None) -> int:
+        opened.append((path, model_name))
+        return 0
+
+    monkeypatch.setattr("app.window.editor.open_editor", open_editor)
+    # A file may be called as no command is, even without an extension.
+    monkeypatch.chdir(stabbed.parent)
+    plain = Path(stabbed.stem)
+    plain.write_bytes(stabbed.read_bytes())
+    for words in (
+        [],
+        [stabbed],
+        [plain],
+        ["--model", "body"],
+        ["--model=body", stabbed],
+        [stabbed, "--model", "body"],
+    ):
+        assert lcollision(*command, *words).exit_code == 0
+    assert opened == [
+        (None, None),
+        (stabbed, None),
+        (plain, None),
+        (None, "body"),
+        (stabbed, "body"),
+        (stabbed, "body"),
+    ]
+
+
+def test_a_group_alone_shows_its_commands(lcollision: Lcollision) -> None:
+    result = lcollision("dataset")
+    assert "\n  check" in result.stdout + result.stderr

@@ -1,0 +1,416 @@
+"""``lcollision train predictor``, ``evaluate`` and ``benchmark predictor``, end to end."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from app.benchmarks import predictor as timing
+from app.cli.models import measured_model_sentence
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.labels import LabelStore, is_held_out
+from lcollision_core.model import PoseModel, find_model
+from lcollision_core.model_file import Section
+from lcollision_core.predictor import PRESETS, CollisionPredictor
+from lcollision_core.predictor.training import row_split
+from tests.app.support import Lcollision
+from tests.bending_tube import bending_tube
+
+N_ROWS = 2000
+SECONDS_TO_WAIT = 120.0
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a small model, without a predictor."""
+    from lcollision_core.embedding.config import EmbeddingConfig
+    from lcollision_core.embedding.training import train_embedding
+
+    poses = bending_tube()
+    config = EmbeddingConfig(
+        n_domains=2, n_domain_codes=3, level1_epochs=30, level2_epochs=5, held_out_stride=0
+    )
+    path = tmp_path_factory.mktemp("model") / "tube.safetensors"
+    PoseModel.from_training("tube", train_embedding(poses, config), poses).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def store(model: Path) -> Path:
+    """Return its labelled samples."""
+    path = model.with_name("store")
+    command = [sys.executable, "-m", "app", "label", model, "-n", str(N_ROWS), "-o", path]
+    subprocess.run(command, check=True, capture_output=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(model: Path, store: Path) -> Path:
+    """Return a model with the paper's predictor, trained by the command itself."""
+    path = model.with_name("trained.safetensors")
+    command = [sys.executable, "-m", "app", "train", "predictor", model, store, "-o", path]
+    result = subprocess.run(
+        [*command, "--preset", "paper", "--seed", "3"], check=True, capture_output=True, text=True
+    )
+    assert result.stdout == ""
+    said = _without_progress(result.stderr)
+    assert said.startswith(f"lcollision: wrote {path}: ")
+    assert f" of {3 * N_ROWS // 10} unseen samples right" in said
+    assert not path.with_name("trained.safetensors.checkpoint").exists()
+    return path
+
+
+def _without_progress(said: str) -> str:
+    """Leave out the lines by which a slow machine tells how far its training is."""
+    lines = said.splitlines(keepends=True)
+    return "".join(
+        line for line in lines if not re.match(r"lcollision: epoch \d+ of \d+: \d+ %", line)
+    )
+
+
+def _refusal(lcollision: Lcollision, *arguments: object) -> str:
+    """Run a command that must fail for bad input, and return its one sentence."""
+    result = lcollision(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("lcollision: ")
+    return line
+
+
+def test_a_trained_predictor_beats_the_majority_on_real_labels(
+    lcollision: Lcollision, trained: Path, store: Path
+) -> None:
+    result = lcollision("evaluate", trained, store, "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    curve = report.pop("calibration")
+    assert [report.pop(name) for name in ("model", "level1_codes", "domain_codes")] == [
+        "trained",
+        2,
+        [3, 3],
+    ]
+    assert report.pop("near_exclusion") == 0.0
+    rows = LabelStore.open(store).load()
+    held_out = rows.colliding[is_held_out(np.arange(N_ROWS))]
+    assert report.pop("colliding_share") == held_out.mean()
+    assert set(report) == {
+        "threshold",
+        "samples",
+        "accuracy",
+        "false_positive_rate",
+        "false_negative_rate",
+        "majority_rate",
+        "energy_mse",
+        "ranking_margin",
+        "spearman",
+        "calibration_error",
+    }
+    assert report["samples"] == 3 * N_ROWS // 10
+    assert report["accuracy"] > report["majority_rate"] + 0.03
+    assert report["spearman"] > 0.7
+    assert sum(entry["samples"] for entry in curve) == report["samples"]
+    # What training measured on the rows it held out is what the file holds.
+    predictor = PoseModel.load(trained).predictor
+    assert predictor is not None
+    assert predictor.metrics is not None
+    assert report["accuracy"] == predictor.metrics.accuracy
+    assert predictor.config == PRESETS["paper"]
+    assert predictor.facts.rows == N_ROWS
+    assert predictor.facts.seed == 3
+
+
+def test_rows_that_set_where_to_call_do_not_count(
+    lcollision: Lcollision,
+    trained: Path,
+    store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(row_split, "LEAST_BALANCING", 10)
+    model = PoseModel.load(trained)
+    section = model.require_predictor().to_section()
+    config = {**section.metadata["config"], "balanced": True}
+    balanced = CollisionPredictor.from_section(
+        Section(section.arrays, {**section.metadata, "config": config}), model.embedding
+    )
+    path = tmp_path / "balanced.safetensors"
+    model.with_predictor(balanced).save(path)
+    report = json.loads(lcollision("evaluate", path, store, "--json").stdout)
+    held_out = 3 * N_ROWS // 10
+    assert report["samples"] == held_out - held_out // 10
+
+
+def test_all_rows_of_another_store_count(
+    lcollision: Lcollision, trained: Path, model: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    assert lcollision("label", model, "-n", 300, "-o", other, "--seed", 8).exit_code == 0
+    report = json.loads(lcollision("evaluate", trained, other, "--json").stdout)
+    rows = LabelStore.open(other).load()
+    prediction = PoseModel.load(trained).predict(rows.latent)
+    called = prediction.collision_probability > 0.5
+    assert report["samples"] == 300
+    assert report["accuracy"] == np.mean(called == rows.colliding)
+    later = json.loads(lcollision("evaluate", trained, other, "--threshold", 0.9, "--json").stdout)
+    assert later["threshold"] == 0.9
+    missed = (prediction.collision_probability <= 0.9)[rows.colliding]
+    assert later["false_negative_rate"] == missed.mean() > report["false_negative_rate"]
+    text = lcollision("evaluate", trained, other, "--rows", 200).stdout
+    assert text.startswith("trained, preset paper: ")
+    assert " of 200 unseen samples right" in text
+    share = 100.0 * rows.colliding[:200].mean()
+    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion"
+    assert f"\n  {sizes}; {share:.1f} % of these 200 samples collide\n" in text
+
+
+def test_a_killed_training_goes_on_to_the_same_model(
+    lcollision: Lcollision, model: Path, store: Path, tmp_path: Path
+) -> None:
+    killed, whole = tmp_path / "killed.safetensors", tmp_path / "whole.safetensors"
+    options = ("--preset", "paper", "--no-domains", "--rows", 600)
+    eager = (
+        "from lcollision_core.embedding import checkpoint\n"
+        "checkpoint._SECONDS_BETWEEN_WRITES = 0.0\n"
+        f"import torch; torch.set_num_threads({torch.get_num_threads()})\n"
+        "from app.cli.main import main\n"
+        "main()\n"
+    )
+    command = [sys.executable, "-c", eager, "train", "predictor", model, store, "-o", killed]
+    process = subprocess.Popen([*map(str, command), *map(str, options)])
+    checkpoint = killed.with_name(killed.name + ".checkpoint")
+    deadline = time.monotonic() + SECONDS_TO_WAIT
+    while not checkpoint.exists():
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.kill()
+    process.wait()
+    assert process.returncode == -signal.SIGKILL
+    assert not killed.exists()
+    results = [
+        lcollision("train", "predictor", model, store, "-o", path, *options)
+        for path in (killed, whole)
+    ]
+    assert results[0].stderr.startswith(f"lcollision: going on from {checkpoint}\n")
+    wrote, measured = _without_progress(results[1].stderr).splitlines()[:2]
+    assert wrote.startswith(f"lcollision: wrote {whole}: ")
+    share = 100.0 * LabelStore.open(store).load(600).colliding.mean()
+    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion"
+    assert measured == f"lcollision: {sizes}; {share:.1f} % of its box collides"
+    assert not checkpoint.exists()
+    assert killed.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
+@pytest.mark.parametrize(("preset", "kept"), [("paper", ""), ("default", ".patches")])
+def test_ctrl_c_keeps_a_checkpoint_and_says_so(
+    model: Path, store: Path, tmp_path: Path, preset: str, kept: str
+) -> None:
+    """The preset default begins with labelling patches, which are kept some rows at a time."""
+    output = tmp_path / "stopped.safetensors"
+    code = (
+        "import os, signal\n"
+        "from lcollision_core.predictor.training import loop\n"
+        "loop._LEAST_PATCHES_KEPT = 16\n"
+        "report = loop.TrainingLoop._report\n"
+        "def interrupted(self, step):\n"
+        "    report(self, step)\n"
+        "    if self._config.preset == 'paper' or self._patches_path.exists():\n"
+        "        loop.TrainingLoop._report = report\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "loop.TrainingLoop._report = interrupted\n"
+        "from app.cli.main import main\n"
+        "main()\n"
+    )
+    command = [sys.executable, "-c", code, "train", "predictor", model, store, "-o", output]
+    result = subprocess.run(
+        [*command, "--preset", preset],
+        capture_output=True,
+        text=True,
+        timeout=SECONDS_TO_WAIT,
+        check=False,
+    )
+    checkpoint = output.with_name(output.name + ".checkpoint")
+    assert result.returncode == 130
+    assert _without_progress(result.stderr) == (
+        f"lcollision: stopped; run the same command again to go on from {checkpoint}\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == [f"{checkpoint.name}{kept}"]
+
+
+def _finish_with(
+    monkeypatch: pytest.MonkeyPatch, trained: Path, meanwhile: Callable[[], object]
+) -> None:
+    """Let training do something else to the files, and come out with what is trained already."""
+    finished = PoseModel.load(trained).predictor
+
+    def train(*_: object, **__: object) -> CollisionPredictor | None:
+        meanwhile()
+        return finished
+
+    monkeypatch.setattr("lcollision_core.predictor.train_predictor", train)
+
+
+def test_a_renaming_during_the_training_stays(
+    lcollision: Lcollision,
+    model: Path,
+    store: Path,
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = Path(shutil.copy(model, tmp_path / "tube.safetensors"))
+    _finish_with(monkeypatch, trained, lambda: lcollision("domains", path, "--name", "2=left foot"))
+    result = lcollision("train", "predictor", path, store, "-o", path)
+    assert result.exit_code == 0, result.output
+    kept = PoseModel.load(path)
+    assert kept.domain_names == ("part 1", "left foot")
+    assert kept.has_predictor
+    assert len(kept.free_latent) > 0
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("change", ["another body", "no model", "gone"])
+def test_what_replaced_the_model_during_the_training_stays(
+    lcollision: Lcollision,
+    model: Path,
+    store: Path,
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    change: str,
+) -> None:
+    path = Path(shutil.copy(model, tmp_path / "tube.safetensors"))
+    changes: dict[str, Callable[[], object]] = {
+        "another body": lambda: shutil.copy(find_model("body"), path),
+        "no model": lambda: path.write_bytes(b"another program's"),
+        "gone": path.unlink,
+    }
+    _finish_with(monkeypatch, trained, changes[change])
+    result = lcollision("train", "predictor", path, store, "-o", path)
+    assert result.exit_code == 0, result.output
+    if change == "gone":
+        assert PoseModel.load(path).has_predictor
+        assert list(tmp_path.iterdir()) == [path]
+        return
+    beside = tmp_path / "tube 2.safetensors"
+    assert f"{path} was replaced" in result.stderr
+    assert f"the trained one is {beside}" in result.stderr
+    assert PoseModel.load(beside).has_predictor
+    stays = find_model("body").read_bytes() if change == "another body" else b"another program's"
+    assert path.read_bytes() == stays
+
+
+def test_what_cannot_be_trained_or_evaluated_is_refused(
+    lcollision: Lcollision, model: Path, store: Path, trained: Path, tmp_path: Path
+) -> None:
+    from lcollision_core.embedding.config import EmbeddingConfig
+    from lcollision_core.embedding.training import train_embedding
+
+    output = tmp_path / "m.safetensors"
+    few = bending_tube(9)
+    config = EmbeddingConfig(
+        n_domains=2, n_domain_codes=2, level1_epochs=1, level2_epochs=1, held_out_stride=0
+    )
+    other = tmp_path / "other.safetensors"
+    PoseModel.from_training("other", train_embedding(few, config), few).save(other)
+    assert "not the model " in _refusal(
+        lcollision, "train", "predictor", other, store, "-o", output
+    )
+    assert "has no predictor; run" in _refusal(lcollision, "evaluate", model, store)
+    assert "there is no label store" in _refusal(
+        lcollision, "train", "predictor", model, tmp_path / "none", "-o", output
+    )
+    assert "only the preset paper can be trained with the loss no-rank" in _refusal(
+        lcollision, "train", "predictor", model, store, "-o", output, "--loss", "no-rank"
+    )
+    too_many = ("--rows", N_ROWS + 1)
+    assert f"has {N_ROWS} rows, not {N_ROWS + 1}" in _refusal(
+        lcollision, "train", "predictor", model, store, "-o", output, *too_many
+    )
+    assert "none of which is held out" in _refusal(
+        lcollision, "evaluate", trained, store, "--rows", 5
+    )
+    nearer = tmp_path / "nearer.safetensors"
+    loaded = PoseModel.load(trained)
+    changed = PoseModel("nearer", loaded.embedding, replace(loaded.card, near_exclusion=0.2), {})
+    assert loaded.predictor is not None
+    changed.with_predictor(loaded.predictor).save(nearer)
+    assert "near exclusion of 0.0, not" in _refusal(lcollision, "evaluate", nearer, store)
+    assert measured_model_sentence(changed).endswith("for 2 parts, near exclusion 0.2 heights")
+    assert not output.exists()
+
+
+def test_the_benchmark_times_the_predictor_beside_the_exact_check(
+    lcollision: Lcollision, trained: Path, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(timing, "TABLE_POSES", 900)
+    result = lcollision("benchmark", "predictor", "--model", trained, "-n", 300, "--json")
+    assert result.exit_code == 0, result.output
+    row = json.loads(result.stdout)[0]
+    assert (row["device"], row["preset"], row["batch"]) == ("cpu", "paper", 500)
+    assert (row["model"], row["level1_codes"], row["domain_codes"]) == ("trained", 2, [3, 3])
+    assert row["near_exclusion"] == 0.0
+    assert (row["table_poses"], row["exact_poses"], row["fcl_poses"]) == (900, 300, 8)
+    truth = row["exact_ms_per_pose"] + row["decode_ms_per_pose"]
+    assert row["speedup"] == pytest.approx(1e3 * truth / row["us_per_pose"])
+    assert row["exact_seconds"] == pytest.approx(0.9 * truth)
+    assert row["fcl_seconds"] > row["exact_seconds"]
+    assert 0.0 < row["gemm_fraction"] < 3.0
+    assert row["gradient_ms"] > 0.0
+    loaded = PoseModel.load(trained)
+    vertices = loaded.decode(timing.drawn_poses(loaded, 300))
+    detector = CollisionDetector(loaded.topology, loaded.reference)
+    assert row["colliding_share"] == detector.are_colliding(vertices).mean()
+    text = lcollision("benchmark", "predictor", "--model", trained, "-n", 20).stdout
+    assert text.startswith("trained: |Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion\n")
+    assert "s for 900 (scaled up from 20, " in text
+    assert "has no predictor" in _refusal(lcollision, "benchmark", "predictor", "--model", model)
+
+
+def test_floating_point_operations_are_those_of_the_layers(trained: Path) -> None:
+    predictor = PoseModel.load(trained).predictor
+    assert predictor is not None
+    size, codes = predictor.latent_size, 3
+    encoder = size * 512 + 512 * 256 + 256 * 256
+    each = (256 + codes) * 512 + 512 * 256 + 256 * 256 + 256 * 128 + 128
+    assert predictor.flops(7) == 7 * 2 * (encoder + 2 * each + 2 * 64 + 64)
+
+
+@pytest.mark.parametrize("command", ["info", "models"])
+def test_describing_a_predictor_loads_no_torch(trained: Path, tmp_path: Path, command: str) -> None:
+    """Torch takes longer to import than all else that these commands do."""
+    users = tmp_path / "lcollision" / "models"
+    users.mkdir(parents=True)
+    shutil.copy(trained, users / "tube.safetensors")
+    words = ["info", "tube"] if command == "info" else ["models"]
+    code = (
+        "import sys\n"
+        "from app.cli.main import app\n"
+        f"app({words!r}, standalone_mode=False)\n"
+        "print('torch' in sys.modules)"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "XDG_DATA_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    *lines, torch_is_loaded = ended.stdout.splitlines()
+    assert any("predictor paper:" in line for line in lines)
+    assert torch_is_loaded == "False"

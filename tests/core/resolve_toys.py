@@ -1,0 +1,70 @@
+"""Small problems whose answers are known, for the tests of Resolve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.resolve.metric import LatentMetric
+from lcollision_core.resolve.problem import CollisionModel, ResolveProblem, Watch
+
+
+@dataclass(eq=False)
+class HalfSpace:
+    """Calls a pose free where normal . Z <= offset; counts the batches that it is asked for."""
+
+    normal: FloatArray
+    offset: float
+    n_calls: int = field(default=0)
+
+    def logit_and_gradient(self, latent: npt.NDArray) -> tuple[FloatArray, FloatArray]:
+        self.n_calls += 1
+        return latent @ self.normal - self.offset, np.tile(self.normal, (len(latent), 1))
+
+
+@dataclass(eq=False)
+class Ball:
+    """Calls a pose free outside of a ball (sign 1) or inside of it (sign -1).
+
+    The logit is smooth but at the centre; beyond `reach` from the centre, where one is given, it
+    is a plateau without a slope, as far as a solver can tell.
+    """
+
+    centre: FloatArray
+    radius: float
+    sign: float = 1.0
+    steepness: float = 10.0
+    reach: float = np.inf
+
+    def logit_and_gradient(self, latent: npt.NDArray) -> tuple[FloatArray, FloatArray]:
+        apart = latent - self.centre
+        distance = np.linalg.norm(apart, axis=1)
+        logit = self.sign * self.steepness * (self.radius - distance)
+        away = apart / np.maximum(distance, 1e-12)[:, None]
+        gradient = -self.sign * self.steepness * away
+        gradient[distance > self.reach] = 0.0
+        return logit, gradient
+
+
+def toy_problem(
+    model: CollisionModel,
+    target: FloatArray,
+    reach: float = 10.0,
+    watch: Watch | None = None,
+    code_weights: FloatArray | None = None,
+) -> ResolveProblem:
+    """Make the problem with the plain distance, within `reach` of 0."""
+    size = len(target)
+    return ResolveProblem(
+        target=target,
+        metric=LatentMetric.latent(size),
+        code_weights=np.ones(size) if code_weights is None else code_weights,
+        low=np.full(size, -reach),
+        high=np.full(size, reach),
+        limit=0.0,
+        model=model,
+        watch=watch or Watch(),
+    )
