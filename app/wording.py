@@ -14,19 +14,19 @@ _NOT_IN_A_LINE = re.compile(
 )
 
 _FAR = 0.03
-"""Heights by which a mesh is hardly ever off the pose nearest to it, unless it is another body."""
+"""Normalised fit error that is hardly ever exceeded, unless the mesh is another body."""
 
 
 _MIRRORED = " mirrored"
 
 
 def overlap_text(energy: float) -> str:
-    """Write an energy in squared heights as the depth that it stands for, as in "1.1 %"."""
+    """Write an normalised energy as the depth that it stands for, as in "1.1 %"."""
     return "none" if energy == 0.0 else height_text(math.sqrt(energy))
 
 
 def height_text(distance: float) -> str:
-    """Write a distance in heights as a share of the height, as in "1.1 %"."""
+    """Write a normalised distance as a share of the body size, as in "1.1 %"."""
     percent = 100.0 * distance
     if 0.0 < percent < 0.05:
         return "below 0.1 %"
@@ -59,10 +59,10 @@ def one_line(text: str) -> str:
 
 
 def fit_error(mean: float | None, most: float | None) -> str:
-    """Say how far off the nearest pose of a mesh is, in heights; None is not off at all."""
+    """Say how far off the nearest pose of a mesh is, normalised; None is not off at all."""
     mean, most = mean or 0.0, most or 0.0
     far = ", which is far: is it this body, in the model's vertex order?" if mean > _FAR else ""
-    return f"fit error of {100.0 * mean:.3f} % of the height, at most {100.0 * most:.2f} %{far}"
+    return f"fit error of {100.0 * mean:.3f} % of the body size, at most {100.0 * most:.2f} %{far}"
 
 
 def mirrored_name(name: str) -> str:
@@ -99,16 +99,7 @@ def mirrored_text(mirrored: MirroredPose) -> str:
     return f"mirrored with a {fit_error(mirrored.fit_error_mean, mirrored.fit_error_max)}, {state}"
 
 
-def split_sentence(sentence: str) -> tuple[str, str]:
-    """Split an error's sentence into what happened and what to do, each with its capital."""
-    what, _, advice = sentence.rpartition("; ")
-    if not what:
-        what, advice = advice, ""
-    what, advice = (_with_capital(part) for part in (what, advice))
-    return what, advice + "." * bool(advice and not advice.endswith((".", "?", "!")))
-
-
-def _with_capital(text: str) -> str:
+def with_capital(text: str) -> str:
     """Begin with a capital, unless the first word is a file's name or a number."""
     word = text.partition(" ")[0]
     return text[:1].upper() + text[1:] if word.isalpha() else text

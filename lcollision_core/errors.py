@@ -1,10 +1,98 @@
-"""The errors that users see: each message is one sentence saying what, where, and what to do."""
+"""The errors that users see: what went wrong, where, what was expected, and what to do."""
 
 from __future__ import annotations
 
+import copyreg
+from typing import Any, Final, Self
+
 
 class LCollisionError(Exception):
-    """Base of every error that a user can fix; its text is fit to be shown as it is."""
+    """Base of every error that a user can fix; its text is one sentence, composed here alone.
+
+    The sentence is "WHERE WHAT, expected EXPECTED, got GOT; NEXT STEP" without the parts that
+    are empty, and "WHERE must be EXPECTED, got GOT; NEXT STEP" where `what` is empty.
+
+    Parameters
+    ----------
+    what : what is wrong, said of `where`, as in "cannot be read"
+    next_step : what the user can do, as in "export the mesh again"; empty if there is nothing
+    where : the file, the pose or the option that it is said of, as in "pose 12 (mesh012.obj)"
+    expected, got : what was needed, and what is there instead
+
+    Attributes
+    ----------
+    what, next_step, where, expected, got : the same as texts
+    """
+
+    def __init__(
+        self,
+        what: str,
+        next_step: str = "",
+        *,
+        where: object = "",
+        expected: object = "",
+        got: object = "",
+    ) -> None:
+        super().__init__(what)
+        self.what: Final = what
+        self.next_step: Final = next_step
+        self.where: Final = str(where)
+        self.expected: Final = str(expected)
+        self.got: Final = str(got)
+
+    @classmethod
+    def must_be(cls, where: object, expected: object, got: object, next_step: str = "") -> Self:
+        """Make the error "WHERE must be EXPECTED, got GOT; NEXT STEP"."""
+        return cls("", next_step, where=where, expected=expected, got=got)
+
+    @classmethod
+    def because(cls, where: object, what: str, reason: object, next_step: str = "") -> Self:
+        """Make the error "WHERE WHAT: REASON; NEXT STEP".
+
+        The reason may be an error. Its own next step, if it has one, is taken instead.
+        """
+        if isinstance(reason, LCollisionError):
+            next_step, reason = reason.next_step or next_step, reason.headline
+        elif isinstance(reason, OSError):
+            reason = reason.strerror or reason
+        return cls(f"{what}: {reason}", next_step, where=where)
+
+    @classmethod
+    def unreadable(cls, path: object, reason: object, next_step: str = "") -> Self:
+        """Make the error "PATH cannot be read: REASON; NEXT STEP"."""
+        return cls.because(path, "cannot be read", reason, next_step)
+
+    @classmethod
+    def unwritable(cls, path: object, reason: object, next_step: str = "") -> Self:
+        """Make the error "PATH cannot be written: REASON; NEXT STEP"."""
+        return cls.because(path, "cannot be written", reason, next_step)
+
+    @classmethod
+    def too_new(cls, where: object, version: object, known: int) -> Self:
+        """Make the error for a file of a later format version than the one that is known."""
+        what = f"has format version {version}, this program reads up to {known}"
+        return cls(what, "update the program", where=where)
+
+    @classmethod
+    def like(cls, error: LCollisionError, where: str | None = None) -> Self:
+        """Make an error with the fields of another one, whatever its class, or about `where`."""
+        where = error.where if where is None else where
+        what, next_step = error.what, error.next_step
+        return cls(what, next_step, where=where, expected=error.expected, got=error.got)
+
+    @property
+    def headline(self) -> str:
+        """The sentence without the next step."""
+        said = f"{self.where} {self.what or f'must be {self.expected}'}".lstrip()
+        said += f", expected {self.expected}" if self.what and self.expected else ""
+        return f"{said}, got {self.got}" if self.got else said
+
+    def __str__(self) -> str:
+        return f"{self.headline}; {self.next_step}" if self.next_step else self.headline
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # The fields are no positional arguments, by which exceptions are copied to other processes.
+        return copyreg.__newobj__, (type(self), self.what), self.__dict__  # type: ignore[attr-defined]
 
 
 class ShapeError(LCollisionError, ValueError):
@@ -31,13 +119,13 @@ class WrongScaleError(PoseSetError):
     factor : what its coordinates are to be multiplied by
     """
 
-    def __init__(self, message: str, factor: float) -> None:
-        super().__init__(message)
-        self.factor = factor
+    def __init__(self, what: str, next_step: str = "", *, factor: float) -> None:
+        super().__init__(what, next_step)
+        self.factor: Final = factor
 
 
 class MissingExtraError(LCollisionError):
-    """An optional dependency is not installed; the message names the extra that brings it."""
+    """An optional dependency is not installed; the next step names the extra that brings it."""
 
 
 class CancelledError(LCollisionError):

@@ -127,8 +127,8 @@ def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Sectio
             {name: dict(section.metadata) for name, section in sections.items()}
         )
     except (TypeError, ValueError) as error:
-        raise ModelFileError(
-            f"{path} cannot be written: its metadata is no JSON ({error}); keep plain values there"
+        raise ModelFileError.unwritable(
+            path, f"its metadata is no JSON ({error})", "keep plain values there"
         ) from error
     document = _canonical_json(
         {
@@ -142,7 +142,7 @@ def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Sectio
         with atomic_write(path) as file:
             file.write(encoded)
     except MeshFileError as error:
-        raise ModelFileError(str(error)) from error
+        raise ModelFileError.like(error) from error
 
 
 def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
@@ -165,12 +165,11 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
         with open_regular(path) as file:
             return _read_open_file(file, path)
     except FileNotFoundError as error:
-        raise ModelFileError(f"{path} does not exist; check the name") from error
+        raise ModelFileError("does not exist", "check the name", where=path) from error
     except RecursionError as error:
         _refuse_damaged(path, error)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ModelFileError(f"{path} cannot be read: {reason}; check the file") from error
+        raise ModelFileError.unreadable(path, error, "check the file") from error
 
 
 def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
@@ -201,7 +200,7 @@ def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
     except SafetensorError as error:
         _refuse_damaged(path, error)
     except OSError as error:
-        raise ModelFileError(f"{path} cannot be read: {error.strerror or error}") from error
+        raise ModelFileError.unreadable(path, error) from error
     return Section(arrays, metadata)
 
 
@@ -211,10 +210,12 @@ def _read_open_file(file: BinaryIO, path: str | os.PathLike[str]) -> dict[str, S
 
     size = os.fstat(file.fileno()).st_size
     if size == 0:
-        raise ModelFileError(f"{path} is empty; copy or train the model again")
+        raise ModelFileError("is empty", "copy or train the model again", where=path)
     if size > MAX_FILE_BYTES:
         raise ModelFileError(
-            f"{path} has {size} bytes, more than the {MAX_FILE_BYTES} of any model; check the name"
+            f"has {size} bytes, more than the {MAX_FILE_BYTES} of any model",
+            "check the name",
+            where=path,
         )
     # The header first, so that a file of another kind is refused before it fills the memory.
     header = _read_header(file, size, path)
@@ -222,8 +223,11 @@ def _read_open_file(file: BinaryIO, path: str | os.PathLike[str]) -> dict[str, S
     content = file.read()
     if len(content) != size or header.end_of_data != size:
         raise ModelFileError(
-            f"{path} has {len(content)} bytes, but should have {header.end_of_data}: it was "
-            f"truncated or added to; copy or train the model again"
+            "was truncated or added to",
+            "copy or train the model again",
+            where=path,
+            expected=f"{header.end_of_data} bytes",
+            got=len(content),
         )
     try:
         tensors = load(content)
@@ -241,8 +245,9 @@ def _read_open_file(file: BinaryIO, path: str | os.PathLike[str]) -> dict[str, S
             _refuse_damaged(path)
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ModelFileError(
-                f"{path} is unusable: its {full_name} holds a number that is not finite; train "
-                f"the model again"
+                f"is unusable: its {full_name} holds a number that is not finite",
+                "train the model again",
+                where=path,
             )
         array.flags.writeable = False
         arrays[section_name][name] = array
@@ -261,7 +266,7 @@ class _Header:
 
 def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _Header:
     foreign = ModelFileError(
-        f"{path} is no model of this program; name a file that `lcollision train` wrote"
+        "is no model of this program", "name a file that `lcollision train` wrote", where=path
     )
     length = int.from_bytes(file.read(8), "little")
     if size < 8 or length > MAX_HEADER_BYTES:
@@ -270,7 +275,9 @@ def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _He
     if not text.startswith(b"{"):
         raise foreign
     if len(text) < length:
-        raise ModelFileError(f"{path} was truncated at {size} bytes; copy or train the model again")
+        raise ModelFileError(
+            f"was truncated at {size} bytes", "copy or train the model again", where=path
+        )
     try:
         header = parse_json(text)
         metadata = header.pop("__metadata__", {})
@@ -279,10 +286,7 @@ def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _He
         document = parse_json(metadata[_METADATA_KEY].encode())
         version = document["format_version"]
         if isinstance(version, int) and version > FORMAT_VERSION:
-            raise ModelFileError(
-                f"{path} has format version {quoted(version)}, this program reads up "
-                f"to {FORMAT_VERSION}; update the program"
-            )
+            raise ModelFileError.too_new(path, quoted(version), FORMAT_VERSION)
         if version != FORMAT_VERSION or isinstance(version, bool):
             _refuse_damaged(path)
         if not all(isinstance(section, dict) for section in document["sections"].values()):
@@ -299,7 +303,7 @@ def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _He
 
 
 def _refuse_damaged(path: str | os.PathLike[str], cause: Exception | None = None) -> NoReturn:
-    raise ModelFileError(f"{path} is damaged; copy or train the model again") from cause
+    raise ModelFileError("is damaged", "copy or train the model again", where=path) from cause
 
 
 def _canonical_json(value: Any) -> str:
@@ -310,10 +314,12 @@ def _require_storable(full_name: str, name: str, array: npt.NDArray[Any]) -> Non
     if "/" in name:
         raise ModelFileError(f"a model cannot hold an array called {name!r}: it has a slash")
     if array.dtype not in _DTYPES.values():
-        raise ModelFileError(f"a model cannot hold {full_name} of dtype {array.dtype}; convert it")
+        raise ModelFileError(
+            f"a model cannot hold {full_name} of dtype {array.dtype}", "convert it"
+        )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ModelFileError(
-            f"a model cannot hold {full_name}: it has a number that is not finite; train again"
+            f"a model cannot hold {full_name}: it has a number that is not finite", "train again"
         )
 
 

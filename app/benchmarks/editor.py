@@ -87,8 +87,8 @@ def time_editor(
     reason = why_no_window(os.environ, sys.platform)
     if reason is not None:
         raise LCollisionError(
-            f"there is no display to open a window on ({reason}); run it on a desktop, or in "
-            f'xvfb-run -a -s "-screen 0 1600x1000x24"'
+            f"there is no display to open a window on ({reason})",
+            'run it on a desktop, or in xvfb-run -a -s "-screen 0 1600x1000x24"',
         )
     rows = []
     for place, model in enumerate(models):
@@ -122,16 +122,16 @@ def _run(model: Path, n_actions: int) -> dict[str, Any]:
             )
         except subprocess.TimeoutExpired as error:
             raise LCollisionError(
-                f"the editor hangs on {model}: no answer in {error.timeout:.0f} s; start it with "
-                f"`lcollision edit --model {model}` to see why"
+                f"the editor hangs on {model}: no answer in {error.timeout:.0f} s",
+                f"start it with `lcollision edit --model {model}` to see why",
             ) from error
     try:
         answer = json.loads(ended.stdout.splitlines()[-1])
     except (IndexError, ValueError) as error:
         last = (ended.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise LCollisionError(
-            f"the editor ended early on {model} with status {ended.returncode} ({last}); start it "
-            f"with `lcollision edit --model {model}` to see why"
+            f"the editor ended early on {model} with status {ended.returncode} ({last})",
+            f"start it with `lcollision edit --model {model}` to see why",
         ) from error
     assert isinstance(answer, dict)
     return answer

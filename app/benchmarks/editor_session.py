@@ -297,7 +297,7 @@ class Session(QObject):
 
     @Slot(object)
     def _on_failed(self, failure: Failure) -> None:
-        self._errors.append(failure.sentence)
+        self._errors.append(failure.headline)
 
     def _on_exception(self, kind: type[BaseException], error: BaseException, trace: Any) -> None:
         self._errors.append(f"{kind.__name__}: {error}")
@@ -334,7 +334,7 @@ def show_first_pose(window: MainWindow, model: str) -> None:
     StartUp(window, None, model).begin()
     loop.exec()
     if failures:
-        raise LCollisionError(failures[0].sentence)
+        raise LCollisionError(failures[0].headline, failures[0].next_step)
 
 
 def run(model: str, n_actions: int, started: float) -> None:

@@ -105,7 +105,7 @@ def real_poses(
     colliding = model.detector.are_colliding(pose_set.vertices.astype(np.float32))
     chosen = np.flatnonzero(colliding)[:n_poses]
     if len(chosen) == 0:
-        raise LCollisionError("no pose of the set intersects itself; name another set")
+        raise LCollisionError("no pose of the set intersects itself", "name another set")
     encoded = []
     for pose in chosen:
         encoded.append(model.encode(pose_set.vertices[pose]))
@@ -124,7 +124,9 @@ def score_baseline(model: PoseModel, poses: CollidingPoses) -> ResolveScore:
     """
     if len(model.free_latent) == 0:
         raise LCollisionError(
-            f"the model {model.name!r} knows no free pose to bisect to; train its predictor again"
+            "knows no free pose to bisect to",
+            "train its predictor again",
+            where=f"the model {model.name!r}",
         )
     seconds, latents = [], []
     for target in poses.latents:
@@ -195,7 +197,9 @@ def score_solver(
     feasible = np.array([result.predicted_free for result in alone]) & called
     change = _energy_change(model, poses, alone, feasible)
     seconds = [result.seconds for result in whole]
-    before_walk = [bool(result.exactly_free) and result.step != Step.WALK_BACK for result in whole]
+    before_fall_back = [
+        bool(result.exactly_free) and result.step != Step.FALL_BACK for result in whole
+    ]
     score = ResolveScore(
         solver=str(solver),
         poses=len(whole),
@@ -203,7 +207,7 @@ def score_solver(
         p95_ms=_milliseconds(seconds, 0.95),
         feasible_rate=float(feasible.sum() / called.sum()) if called.any() else None,
         exactly_free_rate=float(np.mean([bool(result.exactly_free) for result in whole])),
-        free_before_walk_back=float(np.mean(before_walk)),
+        free_before_walk_back=float(np.mean(before_fall_back)),
         energy_decrease=-float(change.mean()) if len(change) else None,
         latent_distance=float(np.mean([result.latent_distance for result in whole])),
         vertex_distance=float(np.mean([result.vertex_distance_mean for result in whole])),

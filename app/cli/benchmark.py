@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +11,7 @@ import typer
 from app.cli.benchmark_editor import editor
 from app.cli.benchmark_predictor import predictor
 from app.cli.benchmark_resolve import resolve
-from app.cli.console import note, print_json, progress_bar
+from app.cli.console import note, print_json, print_table, progress_bar
 
 app = typer.Typer(help="Measure what docs/results.md quotes.", no_args_is_help=True)
 app.command("predictor")(predictor)
@@ -57,25 +56,13 @@ def detection(
 
 
 def _print(rows: list[dict[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None)
-    for heading in ("vertices", "tool", "threads", "mode", "ms per pose", "x ours", "agrees"):
-        table.add_column(heading, justify="left" if heading in {"tool", "mode"} else "right")
-    ours = 1.0
+    lines, ours = [], 1.0
     for row in rows:
         # The row that each set begins with.
         if (row["tool"], row["threads"], row["mode"]) == ("lcollision", 1, "all"):
             ours = row["ms_per_pose"]
-        table.add_row(
-            str(row["vertices"]),
-            row["tool"],
-            str(row["threads"]),
-            row["mode"],
-            f"{row['ms_per_pose']:.2f}",
-            f"{row['ms_per_pose'] / ours:.1f}",
-            "yes" if row["agrees"] else "NO",
-        )
-    # In a pipe rich would fold the table to 80 columns.
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+        time, agrees = row["ms_per_pose"], "yes" if row["agrees"] else "NO"
+        names = (str(row[name]) for name in ("vertices", "tool", "threads", "mode"))
+        lines.append((*names, f"{time:.2f}", f"{time / ours:.1f}", agrees))
+    headings = ("vertices", "tool", "threads", "mode", "ms per pose", "x ours", "agrees")
+    print_table(headings, lines, {"tool", "mode"})

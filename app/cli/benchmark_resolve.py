@@ -1,18 +1,17 @@
-"""``lcollision benchmark resolve``: how near, how surely and how fast poses are freed."""
+"""``lcollision benchmark resolve``: how near, how surely and how fast poses are resolved."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.console import note, print_json, progress_bar
+from app.cli.console import note, print_json, print_table, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.results import note_near_exclusion
-from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
     from app.benchmarks.resolve import ResolveScore, SolverRuns
@@ -93,13 +92,10 @@ def _require_folder(folder: Path) -> None:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise LCollisionError(
-            f"the folder {folder} cannot be made: {error.strerror or error}; name another"
+        raise LCollisionError.because(
+            f"the folder {folder}", "cannot be made", error, "name another"
         ) from error
-    try:
-        require_writable(folder / "convergence.png")
-    except MeshFileError as error:
-        raise LCollisionError(str(error)) from error
+    require_writable(folder / "convergence.png")
 
 
 def _draw(folder: Path, drawn: list[SolverRuns]) -> None:
@@ -112,15 +108,9 @@ def _draw(folder: Path, drawn: list[SolverRuns]) -> None:
 
 
 def _print(rows: list[ResolveScore]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None)
-    headings = ("solver", "median ms", "p95 ms", "feasible", "energy gone", "exactly free")
-    for heading in (*headings, "before walk back", "latent distance", "vertices moved"):
-        table.add_column(heading, justify="left" if heading == "solver" else "right")
-    for row in rows:
-        table.add_row(
+    headings = ("solver", "median ms", "p95 ms", "feasible", "energy gone", "collision-free")
+    lines = (
+        (
             row.solver,
             f"{row.median_ms:.0f}",
             f"{row.p95_ms:.0f}",
@@ -131,7 +121,10 @@ def _print(rows: list[ResolveScore]) -> None:
             f"{row.latent_distance:.4f}",
             f"{100.0 * row.vertex_distance:.3f} %",
         )
-    Console(width=None if sys.stdout.isatty() else 140).print(table)
+        for row in rows
+    )
+    others = ("before falling back", "latent distance", "vertices moved")
+    print_table((*headings, *others), lines, {"solver"})
 
 
 def _percent(share: float | None) -> str:

@@ -34,7 +34,7 @@ def check(
             min=0.0,
             max=1.0,
             metavar="X",
-            help="Count pairs this near along the surface apart, in heights.",
+            help="Count pairs within X body sizes along the surface apart.",
         ),
     ] = 0.0,
 ) -> None:
@@ -78,7 +78,7 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
         with progress_bar("Finding self-collisions") as progress:
             found = detector.summarise(mesh.vertices, n_deepest=_DEEPEST, progress=progress)
     except ShapeError as error:
-        raise MeshFileError(f"{path} cannot be checked: {error}") from error
+        raise MeshFileError.because(path, "cannot be checked", error) from error
     if found.n_coincident_pairs:
         pairs = counted(found.n_coincident_pairs, "pair of faces lies", "pairs of faces lie")
         note(f"{path}: {pairs} exactly on each other: such touch, which counts as no collision")
@@ -106,7 +106,7 @@ def _sentence(report: dict[str, Any]) -> str:
     if report["colliding"]:
         verdict = (
             f"colliding, {counted(report['pairs'], 'pair of faces', 'pairs of faces')}, "
-            f"energy {report['energy']:.3g} squared heights"
+            f"normalised energy {report['energy']:.3g}"
         )
     else:
         verdict = "free of self-collisions"

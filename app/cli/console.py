@@ -104,22 +104,7 @@ def progress_bar(task: str) -> Iterator[Progress]:
     if not sys.stderr.isatty():
         yield no_progress
         return
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    columns = (
-        rich_progress.TextColumn(task),
-        rich_progress.BarColumn(),
-        rich_progress.MofNCompleteColumn(),
-        rich_progress.TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with rich_progress.Progress(*columns, console=console, transient=True) as bars:
-        bar = bars.add_task(task, total=None)
-
-        def show(done: int, total: int) -> None:
-            bars.update(bar, completed=done, total=total)
-
+    with _bar(task, "count", "time") as show:
         yield show
 
 
@@ -135,22 +120,28 @@ def status_bar(task: str, *, rows: bool = False) -> Iterator[ShowStatus]:
     if not sys.stderr.isatty():
         yield _StatusLines(task, rows)
         return
-    from rich import progress as rich_progress
+    with _bar(task, *(("count",) if rows else ("share", "time"))) as show:
+        yield show
+
+
+@contextmanager
+def _bar(task: str, *amounts: str) -> Iterator[ShowStatus]:
+    """Draw a bar that vanishes at the end; amounts are of "count", "share" and "time"."""
+    from rich import progress
     from rich.console import Console
 
-    amount: tuple[rich_progress.ProgressColumn, ...] = (
-        rich_progress.TaskProgressColumn(),
-        rich_progress.TimeRemainingColumn(),
-    )
-    if rows:
-        amount = (rich_progress.MofNCompleteColumn(),)
+    kinds: dict[str, type[progress.ProgressColumn]] = {
+        "count": progress.MofNCompleteColumn,
+        "share": progress.TaskProgressColumn,
+        "time": progress.TimeRemainingColumn,
+    }
     columns = (
-        rich_progress.TextColumn("{task.description}"),
-        rich_progress.BarColumn(),
-        *amount,
-        rich_progress.TextColumn("{task.fields[facts]}"),
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        *(kinds[amount]() for amount in amounts),
+        progress.TextColumn("{task.fields[facts]}"),
     )
-    with rich_progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
         bar = bars.add_task(task, total=None, facts="")
 
         def show(
@@ -165,3 +156,17 @@ def status_bar(task: str, *, rows: bool = False) -> Iterator[ShowStatus]:
             )
 
         yield show
+
+
+def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], left: set[str]) -> None:
+    """Print a table; the columns of these headings are aligned to the left, others to the right."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None)
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in left else "right")
+    for row in rows:
+        table.add_row(*row)
+    # In a pipe rich would fold the table to 80 columns.
+    Console(width=None if sys.stdout.isatty() else 140).print(table)

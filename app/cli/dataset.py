@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -13,14 +12,6 @@ from app.cli.inputs import up_sentence
 from app.wording import counted
 
 app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no_args_is_help=True)
-
-
-class BodyKind(StrEnum):
-    """The pose sets of the built-in body."""
-
-    BODY = "body"
-    BODY_SWING = "body-swing"
-    BODY_JUMP = "body-jump"
 
 
 @app.command("check")
@@ -36,7 +27,7 @@ def check(
             min=0.0,
             max=1.0,
             metavar="X",
-            help="Count pairs this near along the surface apart, in heights. "
+            help="Count pairs within X body sizes along the surface apart. "
             "Default: what the set says.",
         ),
     ] = None,
@@ -63,7 +54,7 @@ def check(
         with progress_bar("Finding self-collisions") as progress:
             found = detector.detect_batch(poses.vertices, progress=progress)
     except ShapeError as error:
-        raise MeshFileError(f"{path} cannot be checked: {error}") from error
+        raise MeshFileError.because(path, "cannot be checked", error) from error
     guess = poses.up
     report: dict[str, Any] = {
         "poses": inspection.n_found,
@@ -111,13 +102,16 @@ def _print(path: Path, report: dict[str, Any], up: str) -> None:
     for pose in report["colliding"]:
         tell(
             f"    {pose['pose']}: {counted(pose['pairs'], 'pair')}, "
-            f"energy {pose['energy']:.3g} squared heights"
+            f"normalised energy {pose['energy']:.3g}"
         )
 
 
 @app.command("make")
 def make(
-    kind: Annotated[BodyKind, typer.Argument(metavar="KIND", help="Which pose set to make.")],
+    kind: Annotated[
+        Literal["body", "body-swing", "body-jump"],
+        typer.Argument(metavar="KIND", help="Which pose set to make."),
+    ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT.npz", help="The file to write.")
     ],
@@ -135,10 +129,10 @@ def make(
     from lcollision_core.meshes.body import make_body
 
     if output.suffix.lower() != ".npz":
-        raise MeshFileError(f"{output} cannot be written: a pose set is an .npz file; rename it")
+        raise MeshFileError.unwritable(output, "a pose set is an .npz file", "rename it")
     require_writable(output)
     with progress_bar("Posing the body") as progress:
-        body = make_body(kind.value, n_vertices=n_vertices, seed=seed, progress=progress)
+        body = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)
     write_pose_set(output, body.pose_set)
     topology = body.pose_set.topology
     note(f"wrote {len(body.pose_set)} poses of {topology.n_vertices} vertices to {output}")

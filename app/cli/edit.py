@@ -29,12 +29,16 @@ def edit(
 
     if file is not None and file.is_dir():
         raise LCollisionError(
-            f"{file} is a folder; name a file of poses, a mesh or a model, or fix all its meshes "
-            "with `lcollision resolve`"
+            "is a folder",
+            "name a file of poses, a mesh or a model, or fix all its meshes with "
+            "`lcollision resolve`",
+            where=file,
         )
     if file is not None and not file.is_file():
         raise LCollisionError(
-            f"{file} is not there; name a file of poses, a mesh or a model, or none to begin anew"
+            "is not there",
+            "name a file of poses, a mesh or a model, or none to begin anew",
+            where=file,
         )
     raise typer.Exit(open_editor(file, model_name))
 

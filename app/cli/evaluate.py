@@ -34,8 +34,8 @@ def evaluate(
             min=0.0,
             max=1.0,
             metavar="P",
-            help="Probability above which a pose is called colliding: a higher one gives fewer "
-            "false alarms and misses more.",
+            help="Decision threshold, the probability above which a pose is called colliding: a "
+            "higher one gives fewer false positives and more false negatives.",
         ),
     ] = 0.5,
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
@@ -63,7 +63,7 @@ def evaluate(
         share = {"colliding_share": float(rows.colliding.mean())}
         print_json(measured_model(model) | share | {"threshold": threshold} | metrics.to_metadata())
         return
-    called = "" if threshold == 0.5 else f", called from a probability of {threshold:g} on"
+    called = "" if threshold == 0.5 else f", decision threshold {threshold:g}"
     tell(f"{model.name}, preset {trained.preset}{called}: {scores_sentence(metrics)}")
     tell(
         f"  {measured_model_sentence(model)}; {_percent(rows.colliding.mean())} of these "
@@ -96,10 +96,10 @@ def require_store_of(store: LabelStore, model: PoseModel) -> None:
 def scores_sentence(metrics: PredictorMetrics) -> str:
     """Put the verdicts' scores into words."""
     return (
-        f"{_percent(metrics.accuracy)} of {metrics.samples} unseen samples right (majority "
-        f"baseline: {_percent(metrics.majority_rate)}), false alarms "
-        f"{_percent(metrics.false_positive_rate)} of the free, missed "
-        f"{_percent(metrics.false_negative_rate)} of the colliding"
+        f"accuracy {_percent(metrics.accuracy)} on {metrics.samples} unseen samples (majority "
+        f"baseline: {_percent(metrics.majority_rate)}), false positive rate "
+        f"{_percent(metrics.false_positive_rate)}, false negative rate "
+        f"{_percent(metrics.false_negative_rate)}"
     )
 
 
@@ -112,7 +112,9 @@ def _unseen(store: LabelStore, rows: LabelRows, trained: CollisionPredictor) -> 
     held_out = held_out_rows(rows, trained.config, trained.facts.rows)
     if not len(held_out):
         raise LabelStoreError(
-            f"{store.path} has {counted(len(rows), 'row')}, none of which is held out; label more"
+            f"has {counted(len(rows), 'row')}, none of which is held out",
+            "label more",
+            where=store.path,
         )
     return held_out
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -15,18 +14,7 @@ if TYPE_CHECKING:
     from lcollision_core.meshes import UpGuess
 
 
-class Axis(StrEnum):
-    """An axis of a mesh."""
-
-    X = "x"
-    Y = "y"
-    Z = "z"
-
-    @property
-    def number(self) -> int:
-        """0, 1 or 2."""
-        return "xyz".index(self.value)
-
+Axis = Literal["x", "y", "z"]
 
 ScaleOption = Annotated[
     float,
@@ -56,7 +44,9 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
         held, _ = mesh_files(path)
         if not held:
             raise MeshFileError(
-                f"{path} holds no mesh; name a folder of {', '.join(READABLE_SUFFIXES)} files"
+                "holds no mesh",
+                f"name a folder of {', '.join(READABLE_SUFFIXES)} files",
+                where=path,
             )
         files += held
     return files
@@ -64,8 +54,10 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
 
 def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
     """Say that a mesh cannot be encoded, and which option helps where it has another unit."""
-    advice = f" with --scale {error.factor:.6g}" if isinstance(error, WrongScaleError) else ""
-    return MeshFileError(f"{path} cannot be encoded: {error}{advice}")
+    next_step = error.next_step
+    if isinstance(error, WrongScaleError):
+        next_step = f"scale it with --scale {error.factor:.6g}"
+    return MeshFileError(f"cannot be encoded: {error.headline}", next_step, where=path)
 
 
 def up_sentence(guess: UpGuess) -> str:

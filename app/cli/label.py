@@ -63,7 +63,7 @@ def label(
 
     if workers is not None and scheduler is not None:
         raise LCollisionError(
-            "--workers and --scheduler exclude each other; the cluster has its own workers"
+            "--workers and --scheduler exclude each other", "the cluster has its own workers"
         )
     if check == (count is not None):
         raise LCollisionError("give either -n N, the samples that the store is to hold, or --check")

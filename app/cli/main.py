@@ -87,7 +87,7 @@ def _drop_what_is_buffered() -> None:
 
 
 def _refuse_usage(error: Any) -> NoReturn:
-    sentence = error.format_message().rstrip(".")
+    sentence = error.format_message().rstrip(".").replace("Value error, ", "")
     if "\n" in sentence:  # a group without a command: its help, not an error
         raise error
     program = error.ctx.command_path if error.ctx else "lcollision"

@@ -40,7 +40,7 @@ def mirror(
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
     if not named:
-        raise ModelFileError(f"{poses} has no poses in it; name a file that has some")
+        raise ModelFileError("has no poses in it", "name a file that has some", where=poses)
     # Asked first: a model without two sides is refused before the work.
     _ = model.pose_mirror
     found: list[MirroredPose] = []

@@ -16,6 +16,9 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
 
+_ERRORS = ("level1_mean", "mean", "max", "held_out_mean", "held_out_max", "pca_held_out_mean")
+_MASKS = ("connected_share", "domains_per_vertex")
+
 ModelArgument = Annotated[
     str, typer.Argument(metavar="M", help="A model file, or the name of a model.")
 ]
@@ -67,7 +70,7 @@ def info(
         typer.Option(metavar="MASKS.png", help="Draw the domains, darker where they own more."),
     ] = None,
 ) -> None:
-    """Say what a model holds and how exact it is; lengths are in heights."""
+    """Say what a model holds and how exact it is; lengths are normalised."""
     from lcollision_core.model import PoseModel
 
     if figure is not None:
@@ -87,7 +90,7 @@ def info(
     tell(f"  {error_sentence(report)}")
     tell(f"  {_predictor_sentence(report)}")
     if report["near_exclusion"]:
-        tell(f"  pairs of faces within {report['near_exclusion']} heights count apart")
+        tell(f"  pairs of faces within {report['near_exclusion']} body sizes count apart")
     _print_domains(report)
 
 
@@ -107,12 +110,12 @@ def domains(
         number, _, name = request.partition("=")
         if not number.strip().isdecimal() or not name:
             raise LCollisionError(
-                f"{request!r} does not name a domain; write K=NAME, such as 3=tail"
+                "does not name a domain", "write K=NAME, such as 3=tail", where=f"{request!r}"
             )
         renamings[int(number) - 1] = name
     if renamings:
         _refuse_bundled(path)
-        model = change_model(path, lambda model: model.rename_domains(renamings))
+        model = change_model(path, lambda model: model.edit_domains(renamings))
     else:
         model = PoseModel.load(path)
     _print_domains(describe(model))
@@ -132,7 +135,7 @@ def upright(
         model = PoseModel.load(path)
     else:
         _refuse_bundled(path)
-        model = change_model(path, lambda model: model.turned_upright(up.number))
+        model = change_model(path, lambda model: model.turned_upright("xyz".index(up)))
     typer.echo(f"{model.name}: {'xyz'[model.up_axis]} is up")
 
 
@@ -141,12 +144,14 @@ def _refuse_bundled(path: Path) -> None:
 
     if any(listed.bundled and listed.path == path for listed in list_models()):
         raise LCollisionError(
-            f"{path.stem} is a bundled model and stays as it is; copy {path} and name the copy"
+            "is a bundled model and stays as it is",
+            f"copy {path} and name the copy",
+            where=path.stem,
         )
 
 
 def describe(model: PoseModel) -> dict[str, Any]:
-    """Return the fields of ``lcollision info --json``; lengths in heights.
+    """Return the fields of ``lcollision info --json``; lengths are normalised.
 
     A domain's vertices are those of which it owns more than any other domain does.
     """
@@ -174,21 +179,9 @@ def describe(model: PoseModel) -> dict[str, Any]:
             for group, n_vertices in zip(groups, owned, strict=True)
         ],
         "latent_size": model.latent_size,
-        "reconstruction": metrics
-        and {
-            "level1_mean": metrics.level1_mean,
-            "mean": metrics.mean,
-            "max": metrics.max,
-            "held_out_mean": metrics.held_out_mean,
-            "held_out_max": metrics.held_out_max,
-            "pca_held_out_mean": metrics.pca_held_out_mean,
-        },
+        "reconstruction": metrics and {name: getattr(metrics, name) for name in _ERRORS},
         "acap": metrics and {"mean": metrics.acap_mean, "max": metrics.acap_max},
-        "masks": metrics
-        and {
-            "connected_share": metrics.connected_share,
-            "domains_per_vertex": metrics.domains_per_vertex,
-        },
+        "masks": metrics and {name: getattr(metrics, name) for name in _MASKS},
         "predictor": _describe_predictor(model),
         "near_exclusion": model.near_exclusion,
         "up_axis": "xyz"[model.up_axis],
@@ -216,8 +209,8 @@ def measured_model_sentence(model: PoseModel) -> str:
     least, most = min(others), max(others)
     each = f"{least}" if least == most else f"{least} to {most}"
     near = model.near_exclusion
-    rule = f"near exclusion {near:g} heights" if near else "no near exclusion"
-    return f"|Z_0| = {first}, |Z_k| = {each} for {counted(len(others), 'part')}, {rule}"
+    rule = f"near exclusion {near:g}" if near else "no near exclusion"
+    return f"|Z_0| = {first}, |Z_k| = {each} for {counted(len(others), 'domain')}, {rule}"
 
 
 def note_if_beside(written: Path, destination: Path) -> None:
@@ -256,8 +249,8 @@ def _predictor_sentence(report: dict[str, Any]) -> str:
     if metrics is None:
         return f"predictor {predictor['preset']}, not measured"
     return (
-        f"predictor {predictor['preset']}: {100.0 * metrics['accuracy']:.1f} % of unseen samples "
-        f"right (majority baseline: {100.0 * metrics['majority_rate']:.1f} %), of "
+        f"predictor {predictor['preset']}: accuracy {100.0 * metrics['accuracy']:.1f} % on unseen "
+        f"samples (majority baseline: {100.0 * metrics['majority_rate']:.1f} %), of "
         f"{predictor['rows']} labelled"
     )
 
@@ -275,7 +268,7 @@ def error_sentence(report: dict[str, Any]) -> str:
     if errors is None:
         return "not measured"
     sentence = (
-        f"vertex error {_percent(errors['mean'])} of the height, at most "
+        f"vertex error {_percent(errors['mean'])} of the body size, at most "
         f"{_percent(errors['max'])}; level 1 alone {_percent(errors['level1_mean'])}"
     )
     if errors["held_out_mean"] is not None:
@@ -286,8 +279,8 @@ def error_sentence(report: dict[str, Any]) -> str:
     return sentence
 
 
-def _percent(heights: float) -> str:
-    return f"{100.0 * heights:.2f} %"
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.2f} %"
 
 
 def _print_domains(report: dict[str, Any]) -> None:

@@ -13,9 +13,8 @@ from app.cli.inputs import ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import (
+    FormatOption,
     MeshAxes,
-    MeshFormat,
-    OutputForm,
     output_named,
     require_format_holds,
     require_output,
@@ -49,14 +48,17 @@ def encode(
     """
     import numpy as np
 
-    from lcollision_core.meshes import read_mesh
-    from lcollision_core.model import NamedPose, PoseModel, name_of_file, unique_names
+    from lcollision_core.model import (
+        PoseModel,
+        encode_mesh,
+        name_of_file,
+        read_model_mesh,
+        unique_names,
+    )
 
     destination = require_output(output, ".json")
     model = PoseModel.load(model_name)
-    files = [read_mesh(path, topology=model.topology) for path in expanded(meshes)]
-    for mesh in files:
-        model.require_topology(mesh.topology, str(mesh.source))
+    files = [read_model_mesh(path, model) for path in expanded(meshes)]
     names = unique_names(name_of_file(mesh.source) for mesh in files)
     vertices = np.stack([mesh.vertices for mesh in files])
     with (
@@ -69,10 +71,10 @@ def encode(
             for place, (name, mesh) in enumerate(zip(names, files, strict=True)):
                 if place not in unfinished.finished:
                     try:
-                        encoded = model.encode(mesh.vertices, cancel, scale)
+                        pose = encode_mesh(mesh, model, scale, cancel)
                     except PoseSetError as error:
                         raise cannot_encode(mesh.source, error) from error
-                    unfinished.keep(place, NamedPose.of_mesh(name, encoded), {})
+                    unfinished.keep(place, replace(pose, name=name), {})
                 progress(place + 1, len(files))
         poses = [
             replace(unfinished.finished[place][0], name=name) for place, name in enumerate(names)
@@ -97,13 +99,11 @@ def decode(
             help="A mesh file for one pose, a folder for several, or a .json file.",
         ),
     ],
-    mesh_format: Annotated[
-        MeshFormat, typer.Option("--format", help="Of the meshes in a folder.")
-    ] = MeshFormat.OBJ,
+    mesh_format: FormatOption = "obj",
     axes: Annotated[
         MeshAxes,
         typer.Option(help="For which program: its axes, and its unit for a model in metres."),
-    ] = MeshAxes.MODEL,
+    ] = "model",
     scale: Annotated[
         float | None,
         typer.Option(
@@ -123,10 +123,11 @@ def decode(
     from lcollision_core.model import PoseModel, read_poses
 
     destination = output_named(output)
-    if destination.form is OutputForm.POSES and (axes is not MeshAxes.MODEL or scale is not None):
+    if destination.form == "poses" and (axes != "model" or scale is not None):
         raise LCollisionError(
-            f"{output} would hold codes, which have neither --axes nor --scale; name a mesh or a "
-            f"folder"
+            "would hold codes, which have neither --axes nor --scale",
+            "name a mesh or a folder",
+            where=output,
         )
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)

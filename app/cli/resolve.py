@@ -1,8 +1,8 @@
-"""``lcollision resolve``: the nearest poses that are free of self-collisions, proved exactly."""
+"""``lcollision resolve``: the nearest poses that are free of self-collisions by the exact check."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,10 +14,7 @@ from app.cli.inputs import ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import (
-    MeshFormat,
-    Output,
-    OutputForm,
-    WrittenPoses,
+    FormatOption,
     note_near_exclusion,
     output_named,
     require_format_holds,
@@ -34,26 +31,6 @@ if TYPE_CHECKING:
 
     from lcollision_core.model import NamedPose, PoseModel
     from lcollision_core.resolve import ResolveOptions, ResolveResult
-
-_Detailed = Mapping[int, "npt.NDArray[np.float64]"]
-"""Meshes with what encoding lost of them, (V, 3), by the place of their request."""
-
-_FIELDS = (
-    "solver_status",
-    "predicted_free",
-    "exactly_free",
-    "step",
-    "energy_before",
-    "energy_after",
-    "pairs_before",
-    "pairs_after",
-    "latent_distance",
-    "vertex_distance_mean",
-    "vertex_distance_max",
-    "iterations",
-    "evaluations",
-    "seconds",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +65,14 @@ def resolve(
         str, typer.Option(metavar="NAME", help="sqp, auglag (the paper's), slsqp or ccsaq.")
     ] = "sqp",
     metric: Annotated[
-        str, typer.Option(metavar="eye|latent", help="What is kept small: moves seen, or codes.")
+        str,
+        typer.Option(metavar="eye|latent", help="What is kept small: moves of vertices, or codes."),
     ] = "eye",
     threshold: Annotated[
         float,
-        typer.Option(metavar="P", help="Probability up to which a pose is predicted free."),
+        typer.Option(
+            metavar="P", help="Decision threshold: up to this probability a pose is predicted free."
+        ),
     ] = 0.5,
     margin: Annotated[
         float | None,
@@ -126,9 +106,7 @@ def resolve(
         typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one for each core."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the solver's starts.")] = 0,
-    mesh_format: Annotated[
-        MeshFormat, typer.Option("--format", help="Of the meshes in a folder.")
-    ] = MeshFormat.OBJ,
+    mesh_format: FormatOption = "obj",
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
 ) -> None:
     """Move poses to the nearest ones that are free of self-collisions.
@@ -138,9 +116,10 @@ def resolve(
     mesh, what comes back is its nearest pose; --keep-detail adds what that lacks. What is done
     when it is stopped is kept in a file beside the output, and the same command goes on from there.
 
-    What freed a pose is told as a step: solver, the paper's problem; margin, the same with more
-    distance from collision; polish, of shallow contacts; start, from elsewhere; walk-back, towards
-    a pose known to be free; neighbour, the correction of the frame before (--sequence).
+    The step that resolved a pose is one of: solver, the paper's problem; margin, the same with more
+    distance from collision; polish, of shallow contacts; start, a restart elsewhere; walk-back,
+    falling back to a pose known to be free; neighbour, the correction of the frame before
+    (--sequence).
     """
     import numpy as np
 
@@ -161,10 +140,11 @@ def resolve(
     )
     resolver = model.resolver
     target = output_named(output)
-    if keep_detail and target.form is OutputForm.POSES:
+    if keep_detail and target.form == "poses":
         raise LCollisionError(
-            f"{output} would hold codes, which have no room for --keep-detail; name a mesh or a "
-            f"folder"
+            "would hold codes, which cannot keep detail",
+            "name a mesh or a folder, or leave out --keep-detail",
+            where=output,
         )
     files = expanded(inputs)
     if len(files) > 1:
@@ -180,15 +160,14 @@ def resolve(
         ) as unfinished,
         cancel_on_interrupt() as cancel,
     ):
-        finished = _results(unfinished)
+        finished = _results(model, unfinished)
 
         def keep(place: int, result: ResolveResult) -> None:
-            finished[place] = result
             pose = replace(requests[place].pose, latent=result.latent)
             unfinished.keep(place, pose, _facts(result))
 
         with progress_bar("Resolving poses") as progress:
-            resolver.resolve_many(
+            results = resolver.resolve_many(
                 np.array([request.pose.latent for request in requests]),
                 options,
                 workers,
@@ -196,20 +175,41 @@ def resolve(
                 cancel,
                 placements=[request.pose.placement for request in requests],
                 sequence=sequence,
-                done=dict(finished),
+                done=finished,
                 keep=keep,
             )
-        results = [finished[place] for place in range(len(requests))]
-        detailed = _detailed(model, requests, results) if keep_detail else {}
-        written = _write(target, model, requests, results, mesh_format, detailed)
+        detailed = _detailed(model, requests, results) if keep_detail else [None] * len(requests)
+        written = write_result(
+            target,
+            model,
+            [replace(r.pose, latent=f.latent) for r, f in zip(requests, results, strict=True)],
+            mesh_format,
+            [
+                result.vertices if mesh is None else mesh
+                for result, mesh in zip(results, detailed, strict=True)
+            ],
+        )
     written.note()
-    _report(model, requests, results, written.files, detailed, as_json)
+    rows: list[dict[str, Any]] = []
+    for request, result, file, mesh in zip(requests, results, written.files, detailed, strict=True):
+        if result.note:
+            note(f"{request.source}: {result.note}")
+        named = {"source": request.source, "output": str(file)}
+        rows.append(named | _facts(result) | {"near_exclusion": model.near_exclusion})
+        for untold in ("converged", "note"):
+            del rows[-1][untold]
+        if not as_json:
+            tell(f"{request.source}: {_sentence(request, result, mesh is not None)}")
+    if as_json:
+        print_json(rows)
+    else:
+        note_near_exclusion(model)
     if sequence:
         before = np.array([request.pose.latent for request in requests])
         change = largest_correction_change(model.embedding, before, results)
         note(
             f"from frame to frame the correction changes by at most {100.0 * change:.3f} % of "
-            f"the height, in the mean over vertices"
+            f"the body size, in the mean over vertices"
         )
     if failed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
@@ -229,8 +229,9 @@ def _domain(model: PoseModel, name: str) -> int:
     if name.isdecimal() and 1 <= int(name) <= len(names):
         return int(name) - 1
     raise LCollisionError(
-        f"{model.name} has no domain {name!r}; its domains are {', '.join(model.domain_names)}, "
-        f"or 1 to {len(names)}"
+        f"has no domain {name!r}",
+        f"its domains are {', '.join(model.domain_names)}, or 1 to {len(names)}",
+        where=model.name,
     )
 
 
@@ -247,7 +248,8 @@ def _group_weights(model: PoseModel, wanted: Sequence[str]) -> tuple[float, ...]
             value = float("nan")
         if not equals or not 0.0 < value < float("inf"):
             raise LCollisionError(
-                f"--weight {entry!r} is not DOMAIN=W with a number W above 0, as in 'left arm=5'"
+                "is not DOMAIN=W with a number W above 0, as in 'left arm=5'",
+                where=f"--weight {entry!r}",
             )
         weights[1 + _domain(model, name)] = value
     return tuple(weights)
@@ -276,27 +278,23 @@ def _read(model: PoseModel, inputs: Sequence[Path], scale: float) -> tuple[list[
 
 
 def _requests_of(model: PoseModel, path: Path, scale: float) -> Iterator[_Request]:
-    from lcollision_core.meshes import read_mesh
-    from lcollision_core.model import NamedPose, name_of_file, read_poses
+    from lcollision_core.model import encode_mesh, read_model_mesh, read_poses
 
     if path.suffix.lower() == ".json":
         poses = read_poses(path, model)
         if not poses:
-            raise ModelFileError(f"{path} has no poses in it; name a file that has some")
+            raise ModelFileError("has no poses in it", "name a file that has some", where=path)
         for pose in poses:
             yield _Request(f"{path}: {pose.name}", pose)
         return
-    mesh = read_mesh(path, topology=model.topology)
+    mesh = read_model_mesh(path, model)
     if mesh.coarseness:
         note(f"{path}: {mesh.coarseness}")
-    model.require_topology(mesh.topology, str(path))
     try:
-        encoded = model.encode(mesh.vertices, scale=scale)
+        pose = encode_mesh(mesh, model, scale)
     except LCollisionError as error:
         raise cannot_encode(path, error) from error
-    pose = NamedPose.of_mesh(name_of_file(path), encoded)
-    fit = fit_error(encoded.fit_error_mean, encoded.fit_error_max)
-    note(f"{path} is encoded with a {fit}")
+    note(f"{path} is encoded with a {fit_error(pose.fit_error_mean, pose.fit_error_max)}")
     yield _Request(str(path), pose, mesh.vertices)
 
 
@@ -304,123 +302,60 @@ def _depends_on(
     model: PoseModel, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return what the results follow from: arrays, and JSON values."""
-    import numpy as np
+    from lcollision_core.model import fingerprint_of_pose
 
     predictor = model.require_predictor().to_section()
-    placed = [request.pose.placement for request in requests]
-    frames = [
-        [*p.rotation.ravel(), *p.translation, p.scale] if p else [np.nan] * 13 for p in placed
-    ]
-    arrays = {
-        **{f"predictor/{name}": array for name, array in predictor.arrays.items()},
-        "free": model.free_latent,
-        "latent": np.array([request.pose.latent for request in requests]),
-        "placement": np.array(frames),
-    }
-    locked = sorted(options.locked_domains)
+    arrays = {f"predictor/{name}": array for name, array in predictor.arrays.items()}
+    poses = [request.pose for request in requests]
     values = {
         "command": "resolve",
-        **asdict(replace(options, locked_domains=frozenset())),
-        "locked_domains": locked,
+        **asdict(options),
+        "locked_domains": sorted(options.locked_domains),
+        "poses": [fingerprint_of_pose(pose.latent, pose.placement) for pose in poses],
         "predictor": dict(predictor.metadata),
         "height": model.height,
         "near_exclusion": model.near_exclusion,
         "sequence": sequence,
     }
-    return arrays, values
+    return arrays | {"free": model.free_latent}, values
 
 
 def _facts(result: ResolveResult) -> dict[str, Any]:
-    """Return all of a result but its latent, as JSON values."""
-    return {
-        field.name: getattr(result, field.name)
-        for field in fields(result)
-        if field.name != "latent"
-    }
+    """Return all of a result but its arrays, as JSON values."""
+    names = (field.name for field in fields(result))
+    return {name: getattr(result, name) for name in names if name not in ("latent", "vertices")}
 
 
-def _results(unfinished: UnfinishedPoses) -> dict[int, ResolveResult]:
+def _results(model: PoseModel, unfinished: UnfinishedPoses) -> dict[int, ResolveResult]:
     """Return the results of an earlier run, by place."""
     from lcollision_core.resolve import ResolveResult, Step
 
     try:
         return {
-            place: ResolveResult(pose.latent, **{**facts, "step": Step(facts["step"])})
+            place: ResolveResult(
+                latent=pose.latent,
+                vertices=model.exported_vertices(pose.latent, pose.placement),
+                **{**facts, "step": Step(facts["step"])},
+            )
             for place, (pose, facts) in unfinished.finished.items()
         }
     except (KeyError, TypeError, ValueError) as error:
         raise unfinished.damaged() from error
 
 
-def _write(
-    output: Output,
-    model: PoseModel,
-    requests: Sequence[_Request],
-    results: Sequence[ResolveResult],
-    mesh_format: MeshFormat,
-    detailed: _Detailed,
-) -> WrittenPoses:
-    poses = [
-        replace(request.pose, latent=result.latent)
-        for request, result in zip(requests, results, strict=True)
-    ]
-    meshes = [detailed.get(place) for place in range(len(requests))]
-    return write_result(output, model, poses, mesh_format, meshes)
-
-
 def _detailed(
     model: PoseModel, requests: Sequence[_Request], results: Sequence[ResolveResult]
-) -> _Detailed:
-    """Return the fixed meshes that are free with what encoding lost of them, by place."""
-    pairs = enumerate(zip(requests, results, strict=True))
-    made = {place: _with_detail(model, request, result) for place, (request, result) in pairs}
-    return {place: mesh for place, mesh in made.items() if mesh is not None}
+) -> list[npt.NDArray[np.float64] | None]:
+    """Return the resolved meshes with what encoding lost of them, None where that collides."""
+    from lcollision_core.model import with_detail
 
-
-def _with_detail(
-    model: PoseModel, request: _Request, result: ResolveResult
-) -> npt.NDArray[np.float64] | None:
-    """Return the fixed mesh with what encoding lost of it, or None where that would collide."""
-    import numpy as np
-
-    from lcollision_core.resolve import ExactCheck
-
-    placement = request.pose.placement
-    if request.mesh is None or placement is None:
-        return None
-    before, after = model.decode(np.stack([request.pose.latent, result.latent]))
-    # Where the pose did not move, only rounded.
-    moved: npt.NDArray[np.float64] = request.mesh + (
-        placement.apply(after) - placement.apply(before)
-    )
-    check = ExactCheck(model.embedding, model.detector, model.height, placement)
-    if not check.is_free_mesh(moved):
-        note(f"{request.source}: with its detail the fixed mesh would collide, so it has none")
-        return None
-    return moved
-
-
-def _report(
-    model: PoseModel,
-    requests: Sequence[_Request],
-    results: Sequence[ResolveResult],
-    files: Sequence[Path],
-    detailed: _Detailed,
-    as_json: bool,
-) -> None:
-    rows: list[dict[str, Any]] = []
-    for place, (request, result) in enumerate(zip(requests, results, strict=True)):
-        if result.note:
-            note(f"{request.source}: {result.note}")
-        facts = {name: getattr(result, name) for name in _FIELDS}
-        named = {"source": request.source, "output": str(files[place])}
-        rows.append(named | facts | {"near_exclusion": model.near_exclusion})
-        if not as_json:
-            tell(f"{request.source}: {_sentence(request, result, place in detailed)}")
-    if as_json:
-        print_json(rows)
-    else:
-        note_near_exclusion(model)
+    detailed: list[npt.NDArray[np.float64] | None] = []
+    for request, result in zip(requests, results, strict=True):
+        mesh = request.mesh
+        detailed.append(None if mesh is None else with_detail(model, mesh, request.pose, result))
+        if mesh is not None and detailed[-1] is None:
+            note(f"{request.source}: with its detail the fixed mesh would collide, so it has none")
+    return detailed
 
 
 def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str:
@@ -428,7 +363,7 @@ def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str
     from lcollision_core.resolve import Step
 
     moved = (
-        f"moved by {100.0 * result.vertex_distance_mean:.2f} % of the height, at most "
+        f"moved by {100.0 * result.vertex_distance_mean:.2f} % of the body size, at most "
         f"{100.0 * result.vertex_distance_max:.1f} %"
     )
     pairs = result.pairs_before if result.exactly_free else result.pairs_after
@@ -441,11 +376,11 @@ def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str
     elif result.step == Step.UNCHANGED:
         said = ["free as it is"]
     else:
-        said = [f"freed of {counted_pairs}", f"exactly free, by the step {result.step!s}", moved]
+        said = [f"resolved {counted_pairs} by the step {result.step!s}", "checked", moved]
     if has_detail:
         said.append("with its detail")
     elif request.mesh is not None:
-        fit = f"{100.0 * (request.pose.fit_error_mean or 0.0):.2f} % of the height off"
+        fit = f"{100.0 * (request.pose.fit_error_mean or 0.0):.2f} % of the body size off"
         said.append(f"given back as its fit, {fit}")
     elif result.step == Step.UNCHANGED:
         said.append("unchanged")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from enum import Enum, StrEnum, auto
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
 
 from app.cli.console import note
 from app.wording import counted
@@ -22,32 +23,11 @@ if TYPE_CHECKING:
     from lcollision_core.model import NamedPose, PoseModel
 
 
-class MeshFormat(StrEnum):
-    """The formats that a folder of meshes may have."""
+MeshFormat = Literal["obj", "ply", "off", "stl", "glb"]
+MeshAxes = Literal["model", "y-up", "blender", "maya", "unreal"]
+"""The axes that a mesh may be written in: `ExportAxes`, which takes long to import."""
 
-    OBJ = "obj"
-    PLY = "ply"
-    OFF = "off"
-    STL = "stl"
-    GLB = "glb"
-
-
-class MeshAxes(StrEnum):
-    """The axes that a mesh may be written in: `ExportAxes`, which takes long to import."""
-
-    MODEL = "model"
-    Y_UP = "y-up"
-    BLENDER = "blender"
-    MAYA = "maya"
-    UNREAL = "unreal"
-
-
-class OutputForm(Enum):
-    """What an output is to be."""
-
-    POSES = auto()
-    MESH = auto()
-    FOLDER = auto()
+FormatOption = Annotated[MeshFormat, typer.Option("--format", help="Of the meshes in a folder.")]
 
 
 @dataclass(frozen=True)
@@ -62,7 +42,7 @@ class Output:
     """
 
     path: Path
-    form: OutputForm
+    form: Literal["poses", "mesh", "folder"]
     before: FileStamp | None
 
 
@@ -100,17 +80,17 @@ def require_output(path: Path, suffix: str) -> Output:
     from lcollision_core.meshes import file_stamp, require_writable
 
     if path.suffix.lower() != suffix:
-        raise LCollisionError(f"{path} cannot be written: it must be a {suffix} file; rename it")
+        raise LCollisionError.unwritable(path, f"it must be a {suffix} file", "rename it")
     require_writable(path)
-    return Output(path, OutputForm.POSES, file_stamp(path))
+    return Output(path, "poses", file_stamp(path))
 
 
 def note_near_exclusion(model: PoseModel) -> None:
     """Say which pairs of faces the figures beside this leave out, where there are any."""
     if model.near_exclusion:
         note(
-            f"pairs of faces within {model.near_exclusion:g} heights along the surface are folds "
-            f"of the skin, which are no collisions"
+            f"pairs of faces within {model.near_exclusion:g} body sizes along the surface are "
+            f"folds of the skin, which are no collisions"
         )
 
 
@@ -136,22 +116,24 @@ def output_named(name: str) -> Output:
     path = Path(name)
     suffix = path.suffix.lower()
     if os.path.isdir(name):  # noqa: PTH112 - a name that is too long is none, and no error
-        require_writable(path / f"pose.{MeshFormat.OBJ}")
-        return Output(path, OutputForm.FOLDER, None)
+        require_writable(path / "pose.obj")
+        return Output(path, "folder", None)
     must_be_folder = name.endswith(("/", os.sep))
     if not must_be_folder and suffix in {".json", *WRITABLE_SUFFIXES}:
         require_writable(path)
-        form = OutputForm.POSES if suffix == ".json" else OutputForm.MESH
-        return Output(path, form, file_stamp(path))
+        return Output(path, "poses" if suffix == ".json" else "mesh", file_stamp(path))
     if not must_be_folder and has_known_suffix(path):
-        raise LCollisionError(
-            f"{path} cannot be written: {suffix} is no format known here; use one of "
-            f"{', '.join(WRITABLE_SUFFIXES)}, .json or a folder"
+        raise LCollisionError.unwritable(
+            path,
+            f"{suffix} is no format known here",
+            f"use one of {', '.join(WRITABLE_SUFFIXES)}, .json or a folder",
         )
     require_writable(path)
     if path.exists():
-        raise MeshFileError(f"the folder {path} cannot be made: it is a file; name another")
-    return Output(path, OutputForm.FOLDER, None)
+        raise MeshFileError(
+            "cannot be made: it is a file", "name another", where=f"the folder {path}"
+        )
+    return Output(path, "folder", None)
 
 
 def require_one_mesh(output: Output, n_poses: int) -> None:
@@ -161,9 +143,9 @@ def require_one_mesh(output: Output, n_poses: int) -> None:
     ------
     LCollisionError : they are not one.
     """
-    if output.form is OutputForm.MESH and n_poses != 1:
+    if output.form == "mesh" and n_poses != 1:
         raise LCollisionError(
-            f"{output.path} is one mesh, but there are {n_poses} poses; name a folder"
+            f"is one mesh, but there are {n_poses} poses", "name a folder", where=output.path
         )
 
 
@@ -171,7 +153,7 @@ def require_format_holds(
     output: Output,
     model: PoseModel,
     poses: Sequence[NamedPose],
-    mesh_format: MeshFormat = MeshFormat.OBJ,
+    mesh_format: MeshFormat = "obj",
 ) -> None:
     """Refuse a format that cannot hold a pose where it lies, before the work for it is done.
 
@@ -181,12 +163,12 @@ def require_format_holds(
     """
     from lcollision_core.meshes import as_stored
 
-    if output.form is OutputForm.POSES:
+    if output.form == "poses":
         return
     for pose in poses:
         if pose.placement is not None:
             name = f"{pose.name}.{mesh_format}"
-            path = output.path / name if output.form is OutputForm.FOLDER else output.path
+            path = output.path / name if output.form == "folder" else output.path
             as_stored(path, pose.placement.apply(model.reference), model.topology)
 
 
@@ -194,7 +176,7 @@ def write_result(
     output: Output,
     model: PoseModel,
     poses: Sequence[NamedPose],
-    mesh_format: MeshFormat = MeshFormat.OBJ,
+    mesh_format: MeshFormat = "obj",
     vertices: Sequence[npt.NDArray[np.floating] | None] | None = None,
     axes: str = "model",
     scale: float | None = None,
@@ -233,7 +215,7 @@ def write_result(
             export_mesh(file, model, mesh.astype(float), pose.placement, frame)
 
     path = output.path
-    if output.form is OutputForm.FOLDER:
+    if output.form == "folder":
         names = [f"{stem}.{mesh_format}" for stem in file_stems(pose.name for pose in poses)]
         n_replaced = sum((path / name).exists() for name in names)
         with atomic_files(path) as unfinished:
@@ -247,7 +229,7 @@ def write_result(
                 f"{output.path} was changed by another command meanwhile and stays as it is; the "
                 f"result goes to {path}"
             )
-        if output.form is OutputForm.POSES:
+        if output.form == "poses":
             write_poses(path, model, poses)
         else:
             write([path])

@@ -41,11 +41,11 @@ def embedding(
         ),
     ],
     n_domains: Annotated[
-        int, typer.Option("--domains", min=1, max=64, metavar="K", help="Parts of the body.")
+        int, typer.Option("--domains", min=1, max=64, metavar="K", help="Domains of the body.")
     ] = 10,
     n_codes: Annotated[
         int,
-        typer.Option("--domain-codes", min=1, max=64, metavar="k", help="Numbers of each part."),
+        typer.Option("--domain-codes", min=1, max=64, metavar="k", help="Codes of each domain."),
     ] = 10,
     near_exclusion: Annotated[
         float | None,
@@ -53,7 +53,7 @@ def embedding(
             min=0.0,
             max=0.99,
             metavar="X",
-            help="Count pairs this near along the surface apart, in heights. "
+            help="Count pairs within X body sizes along the surface apart. "
             "Default: what the set says.",
         ),
     ] = None,
@@ -90,7 +90,7 @@ def embedding(
     if scale != 1.0:
         poses = poses.scaled(scale)
     if up is not None:
-        poses = replace(poses, up_axis=up.number)
+        poses = replace(poses, up_axis="xyz".index(up))
     else:
         guess = poses.up
         if not guess.is_sure:

@@ -6,9 +6,8 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -20,30 +19,6 @@ from lcollision_core.errors import CancelledError
 
 if TYPE_CHECKING:
     from lcollision_core.predictor import PredictorStatus, StatusCallback
-
-
-class Preset(StrEnum):
-    """What ``--preset`` takes."""
-
-    DEFAULT = "default"
-    PAPER = "paper"
-
-
-class LossName(StrEnum):
-    """What ``--loss`` takes: the rows of the paper's Table 1."""
-
-    FULL = "full"
-    NO_RANK = "no-rank"
-    NO_DEPTH = "no-depth"
-    ENTROPY = "entropy"
-
-
-class Device(StrEnum):
-    """What ``--device`` takes."""
-
-    AUTO = "auto"
-    CPU = "cpu"
-    CUDA = "cuda"
 
 
 def predictor(
@@ -61,11 +36,13 @@ def predictor(
         ),
     ],
     preset: Annotated[
-        Preset, typer.Option(help="What measures best, or the paper's network and training.")
-    ] = Preset.DEFAULT,
+        Literal["default", "paper"],
+        typer.Option(help="What measures best, or the paper's network and training."),
+    ] = "default",
     loss: Annotated[
-        LossName, typer.Option(help="Of the paper's losses, leave out ranking, depth, or both.")
-    ] = LossName.FULL,
+        Literal["full", "no-rank", "no-depth", "entropy"],
+        typer.Option(help="Of the paper's losses, leave out ranking, depth, or both."),
+    ] = "full",
     no_domains: Annotated[
         bool, typer.Option("--no-domains", help="Predict the whole body's energy alone (ND).")
     ] = False,
@@ -77,13 +54,14 @@ def predictor(
         int, typer.Option(min=0, metavar="S", help="Equal seeds, equal predictors.")
     ] = 0,
     device: Annotated[
-        Device, typer.Option(help="Where to train; auto takes a GPU when there is one.")
-    ] = Device.AUTO,
+        Literal["auto", "cpu", "cuda"],
+        typer.Option(help="Where to train; auto takes a GPU when there is one."),
+    ] = "auto",
 ) -> None:
     """Learn to predict collisions from labelled samples.
 
     Three tenths of the rows are held out to measure the predictor; from 170 000 rows on, a tenth of
-    these sets the place from which the preset default calls a pose colliding. A checkpoint beside
+    these sets the decision threshold of the preset default. A checkpoint beside
     the output lets a run that was stopped or killed go on when it is started again; it is removed
     at the end. To use several devices or machines, start it with `torchrun -m app train predictor
     ...`.
@@ -102,7 +80,7 @@ def predictor(
     model = PoseModel.load(model_name)
     store = LabelStore.open(store_path)
     require_store_of(store, model)
-    config = PRESETS[preset.value].with_loss(loss.value)
+    config = PRESETS[preset].with_loss(loss)
     # torchrun starts this command many times; the first process writes for all.
     leads = os.environ.get("RANK", "0") == "0"
     if leads and has_begun(checkpoint):
@@ -118,7 +96,7 @@ def predictor(
                 model.embedding,
                 replace(config, by_domain=not no_domains),
                 store=store.identity,
-                device=device.value,
+                device=device,
                 checkpoint=checkpoint,
                 progress=progress,
                 cancel=cancel,
@@ -133,7 +111,7 @@ def predictor(
         if not len(free_latent):
             note(
                 "no pose of this body that was tried is free of collision; Resolve has nowhere "
-                "to walk back to and may leave poses colliding"
+                "to fall back to and may leave poses colliding"
             )
         written = save_trained(
             destination,
@@ -165,7 +143,7 @@ def _training_bar(leads: bool) -> Iterator[StatusCallback]:
                 return
             facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
             if status.held_out_accuracy is not None:
-                facts.append(f"{100.0 * status.held_out_accuracy:.1f} % right")
+                facts.append(f"{100.0 * status.held_out_accuracy:.1f} % accuracy")
             epoch = f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}"
             draw(status.done, status.total, facts, epoch)
 

@@ -88,7 +88,7 @@ class UnfinishedPoses:
 
     def damaged(self) -> LCollisionError:
         """Return the error for a file whose facts are not those that were kept."""
-        return LCollisionError(f"{self.path} is damaged; delete it to begin anew")
+        return LCollisionError("is damaged", "delete it to begin anew", where=self.path)
 
     def _go_on(self) -> None:
         from lcollision_core.model import read_poses
@@ -97,8 +97,9 @@ class UnfinishedPoses:
         record = json.loads(self.path.read_bytes()).get("unfinished")
         if not isinstance(record, dict) or record.get("key") != self._key:
             raise LCollisionError(
-                f"{self.path} has poses of another run (its model, options, inputs or program "
-                f"differ); move or delete it, or name another output"
+                "has poses of another run (its model, options, inputs or program differ)",
+                "move or delete it, or name another output",
+                where=self.path,
             )
         try:
             for pose, facts in zip(poses, record["done"], strict=True):

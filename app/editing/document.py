@@ -138,7 +138,7 @@ class PoseDocument(PoseHistory):
     def model(self) -> PoseModel:
         """The model that the pose belongs to."""
         if self._model is None:
-            raise LCollisionError("no model is open yet; open one first")
+            raise LCollisionError("no model is open yet", "open one first")
         return self._model
 
     @property
@@ -268,11 +268,9 @@ class PoseDocument(PoseHistory):
 
     def reset_domain(self, domain: int) -> None:
         """Set all numbers of a domain to 0: its own, and the whole body's that its lock holds."""
-        group = self.model.latent_space.groups[1 + domain]
         latent = self.latent.copy()
-        latent[domain] = 0.0
-        latent[group.codes] = 0.0
-        self._edit(f"Reset {group.name}", latent)
+        latent[self.model.embedding.codes_of([domain])] = 0.0
+        self._edit(f"Reset {self.model.domain_names[domain]}", latent)
 
     def set_locked(self, domain: int, locked: bool) -> None:
         """Lock a domain against Resolve, Randomise, Reset all and blending, or let it go."""
@@ -412,7 +410,7 @@ class PoseDocument(PoseHistory):
         self.end_gesture()
         target = Path(path) if path is not None else self._file
         if target is None:
-            raise ModelFileError("the pose has no file yet; save it under a name")
+            raise ModelFileError("the pose has no file yet", "save it under a name")
         name = self.pose_name if self.pose_name != UNNAMED else name_of_file(target)
         pose = replace(self.pose, name=name)
         write_poses(target, self.model, self.file_poses, pose)
@@ -438,7 +436,7 @@ class PoseDocument(PoseHistory):
         path : of the file
         axes, scale : see `export_frame`
         """
-        work = jobs.exported(self.model, self.latent, self.placement, Path(path), axes, scale)
+        work = jobs.exported(self.model, self.pose, self.outcome, Path(path), axes, scale)
         self._exports.append(self._long.start(f"Exporting {Path(path).name}", work, self._tell))
 
     def finish_exports(self) -> None:
@@ -469,7 +467,7 @@ class PoseDocument(PoseHistory):
 
         if not self.can_resolve:
             raise ModelFileError(
-                f"{self.model.name} cannot resolve, as it has no predictor; train one for it"
+                "cannot resolve, as it has no predictor", "train one for it", where=self.model.name
             )
         self.end_gesture()
         self.cancel_resolve()
@@ -566,7 +564,7 @@ class PoseDocument(PoseHistory):
         from lcollision_core.meshes import file_stamp
 
         if isinstance(read, jobs.OtherModel):
-            self.failed.emit(Failure(read.sentence, ""))
+            self.failed.emit(read.failure)
             return
         if read.opened is not None:
             self._put_in(read.opened)
@@ -579,10 +577,10 @@ class PoseDocument(PoseHistory):
         self.message.emit(f"Recovered {edited.name}")
         self.recovered.emit(read.path)
 
-    def _tell_of_library(self, sentence: str) -> None:
+    def _tell_of_library(self, error: LCollisionError) -> None:
         # It was told before; by now nobody is there to read it.
         if not self._closed:
-            self.failed.emit(Failure(sentence, ""))
+            self.failed.emit(Failure.of(error))
 
     def _on_encoded(self, imported: jobs.Imported | jobs.WrongScale) -> None:
         if isinstance(imported, jobs.WrongScale):
@@ -620,7 +618,7 @@ class PoseDocument(PoseHistory):
             said.append(mirrored_text(images[0][1]))
         else:
             worst = max(image.fit_error_max for _, image in images)
-            said.append(f"off by at most {height_text(worst)} of the height")
+            said.append(f"off by at most {height_text(worst)} of the body size")
             for count, words in (
                 (sum(i.pairs_after == 0 < i.pairs_mirrored for _, i in images), "resolved"),
                 (sum(i.lost_freedom for _, i in images), "colliding, though free before"),
@@ -690,9 +688,4 @@ class PoseDocument(PoseHistory):
 
     def _with_locked(self, latent: FloatArray) -> FloatArray:
         """Return the latent with the present codes of locked domains."""
-        for domain in self._locked:
-            # As in Resolve: the domain's own codes, and the whole body's code that is its.
-            latent[domain] = self.latent[domain]
-            codes = self.model.latent_space.groups[1 + domain].codes
-            latent[codes] = self.latent[codes]
-        return latent
+        return np.where(self.model.embedding.codes_of(self._locked), self.latent, latent)

@@ -185,10 +185,6 @@ class PoseHistory(QObject):
             self._gesture = None
             self._apply(before)
 
-    def set_latent(self, latent: npt.ArrayLike, label: str) -> None:
-        """Set the whole pose, a (D,) finite array, in one step with this name in the menu."""
-        self._edit(label, np.array(latent, dtype=np.float64))
-
     def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
         """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1.
 
@@ -248,7 +244,7 @@ class PoseHistory(QObject):
         old = self.library_pose
         if old is None:
             raise ModelFileError(
-                "this pose is not one of your library, or no longer; keep it under a name"
+                "this pose is not one of your library, or no longer", "keep it under a name"
             )
         if self.changed:
             new = replace(self.pose, name=old.name, tags=old.tags)
@@ -306,9 +302,8 @@ class PoseHistory(QObject):
         ModelFileError : there is no such pose, or the new name is refused.
         """
         pose = self._required(old)
-        reason = self.why_not_called(new, old)
-        if reason:
-            raise ModelFileError(reason)
+        if (refusal := self.why_not_called(new, old)) is not None:
+            raise refusal
         if new == old:
             return
         renamed = replace(pose, name=new)
@@ -319,8 +314,8 @@ class PoseHistory(QObject):
             state = replace(state, pose=replace(state.pose, name=name), origin=origin)
         self._step(f"Rename {old}", [(pose, renamed)], state)
 
-    def why_not_called(self, name: str, old: str = "") -> str:
-        """Say in a sentence why no pose of the library can get a name, or return "".
+    def why_not_called(self, name: str, old: str = "") -> ModelFileError | None:
+        """Say why no pose of the library can get a name, or return None where one can.
 
         Parameters
         ----------
@@ -329,13 +324,15 @@ class PoseHistory(QObject):
         from lcollision_core.model import MAX_NAME_LENGTH, why_no_name
 
         if not name:
-            return "a pose needs a name; type one"
+            return ModelFileError("a pose needs a name", "type one")
         if why_no_name(name):
-            return f"a name has at most {MAX_NAME_LENGTH} characters; choose a shorter one"
+            what = f"a name has at most {MAX_NAME_LENGTH} characters"
+            return ModelFileError(what, "choose a shorter one")
         taken = self.name_taken_by(name)
         if taken and taken != old:
-            return f"your library has a pose “{taken}” already; choose another name"
-        return ""
+            what = f"your library has a pose “{taken}” already"
+            return ModelFileError(what, "choose another name")
+        return None
 
     def name_taken_by(self, name: str) -> str:
         """Return the name in the library that differs from this one by case at most, or ""."""
@@ -365,7 +362,7 @@ class PoseHistory(QObject):
     @property
     def _state(self) -> DocumentState:
         if self._held is None:
-            raise ModelFileError("no model is open yet; open one first")
+            raise ModelFileError("no model is open yet", "open one first")
         return self._held
 
     def _source_pose(self) -> NamedPose | None:
@@ -378,7 +375,7 @@ class PoseHistory(QObject):
     def _required(self, name: str) -> NamedPose:
         pose = None if self._library is None else self._library.find(name)
         if pose is None:
-            raise ModelFileError(f"your library has no pose {name!r}; choose one of your own")
+            raise ModelFileError(f"your library has no pose {name!r}", "choose one of your own")
         return pose
 
     def _free_names(self, names: Sequence[str]) -> list[str]:

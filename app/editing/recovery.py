@@ -334,5 +334,5 @@ class Autosave(QObject):
     def _on_failed(self, error: Exception) -> None:
         if not self._told:
             self._told = True
-            sentence = f"your changes cannot be kept safe ({error}); save them to a file"
-            self.failed.emit(Failure(sentence, repr(error)))
+            headline = f"your changes cannot be kept safe ({error})"
+            self.failed.emit(Failure(headline, "save them to a file", repr(error)))

@@ -176,23 +176,6 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         seen: npt.NDArray[np.float64] = np.array(point) / scale
         return seen
 
-    def place_of(self, point: npt.NDArray[Any]) -> QPointF:
-        """Return where a point of the scene is seen.
-
-        Parameters
-        ----------
-        point : (3,) array, in the data's unit
-
-        Returns
-        -------
-        place : in the widget, in device-independent pixels
-        """
-        ratio = self.devicePixelRatioF()
-        self.renderer.SetWorldPoint(*np.asarray(point, dtype=np.float64).tolist(), 1.0)
-        self.renderer.WorldToDisplay()
-        x, y, _ = self.renderer.GetDisplayPoint()
-        return QPointF(x / ratio, self.height() - 1 - y / ratio)
-
     def shut_down(self) -> None:
         """Stop the timers and free what is on the graphics card; nothing is drawn afterwards."""
         if self._shut:

@@ -28,7 +28,7 @@ COLLIDING_FACE = "#e0191f"
 
 _SKIN = {False: "#e9e5df", True: "#d3d1ce"}
 _RAMP_STEPS = 256
-_UNIT = "in % of the height"
+_UNIT = "in % of the body size"
 _RAMPS = {
     # Hues of their own, so that nobody takes what is believed for what is known.
     "predicted": ("#f2a93b", "#cf3f6f", "#5b1a78"),

@@ -105,10 +105,10 @@ class Turntable(QObject):
         parent: QObject | None = None,
     ) -> None:
         super().__init__(parent)
-        reason = _why_not(path, style)
-        if reason:
+        refusal = _refusal(path, style)
+        if refusal is not None:
             renderer.close()
-            raise MeshFileError(reason)
+            raise refusal
         self._renderer: PoseRenderer | None = renderer
         self._view = view
         self._style = style
@@ -234,11 +234,11 @@ class Turntable(QObject):
     def _failure(self, error: Exception) -> Failure:
         """Tell of what was raised, while it is handled."""
         if isinstance(error, LCollisionError):
-            return Failure(str(error), traceback.format_exc())
+            return Failure.of(error)
         _log.exception("no film")
         return Failure(
-            f"the turntable {self.path.name} could not be made; try a shorter turn or another "
-            f"kind of file ({', '.join(FILMS)})",
+            f"the turntable {self.path.name} could not be made",
+            f"try a shorter turn or another kind of file ({', '.join(FILMS)})",
             traceback.format_exc(),
         )
 
@@ -253,24 +253,25 @@ class Turntable(QObject):
             self.finished.emit(outcome)
 
 
-def _why_not(path: Path, style: TurntableStyle) -> str:
-    """Say why a film cannot be written so, or return "" where it can."""
+def _refusal(path: Path, style: TurntableStyle) -> MeshFileError | None:
+    """Say why a film cannot be written so, or return None where it can."""
     suffix = path.suffix.lower()
-    if suffix not in FILMS:
-        return f"{path.name} can't be written as a turntable; name it {', '.join(FILMS)}"
-    if suffix == ".png" and path.with_suffix("").exists():
-        return f"{path.with_suffix('')} is there already; choose a new name for the PNG sequence"
-    if suffix == ".gif" and style.background == "transparent":
-        return f"{path.name} cannot have a transparent background; choose WebP or PNG"
-    if suffix == ".gif" and style.rate > FASTEST_GIF:
-        return (
-            f"{path.name} cannot have {style.rate} frames a second, a GIF has at most "
-            f"{FASTEST_GIF}; choose fewer, WebP or PNG"
-        )
+    where: str | Path = path.name
     n_bytes = style.n_frames * style.width * style.height * (1 if suffix == ".gif" else 4)
-    if suffix != ".png" and n_bytes > _MOST_BYTES:
-        return (
-            f"{path.name} would have {style.n_frames} frames of {style.width} by {style.height} "
-            f"pixels, which is too much for one file; choose less or a PNG sequence"
-        )
-    return ""
+    if suffix not in FILMS:
+        what, next_step = "can't be written as a turntable", f"name it {', '.join(FILMS)}"
+    elif suffix == ".png" and path.with_suffix("").exists():
+        where = path.with_suffix("")
+        what, next_step = "is there already", "choose a new name for the PNG sequence"
+    elif suffix == ".gif" and style.background == "transparent":
+        what, next_step = "cannot have a transparent background", "choose WebP or PNG"
+    elif suffix == ".gif" and style.rate > FASTEST_GIF:
+        what = f"cannot have {style.rate} frames a second, a GIF has at most {FASTEST_GIF}"
+        next_step = "choose fewer, WebP or PNG"
+    elif suffix != ".png" and n_bytes > _MOST_BYTES:
+        size = f"{style.n_frames} frames of {style.width} by {style.height} pixels"
+        what = f"would have {size}, which is too much for one file"
+        next_step = "choose less or a PNG sequence"
+    else:
+        return None
+    return MeshFileError(what, next_step, where=where)

@@ -273,7 +273,7 @@ class Viewport(QWidget):
     def _scene_now(self) -> Scene:
         """Return the scene with what waits for the next picture on the screen."""
         if self._scene is None or self._shown is None:
-            raise LCollisionError("the mesh is not on the screen yet; try again in a moment")
+            raise LCollisionError("the mesh is not on the screen yet", "try again in a moment")
         self._bring_up_to_date()
         return self._scene
 

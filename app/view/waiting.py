@@ -19,7 +19,7 @@ from PySide6.QtWidgets import QPushButton, QWidget
 
 from app.view.icons import pixmap
 from app.view.theme import current_theme
-from app.wording import split_sentence
+from app.wording import with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -98,8 +98,8 @@ class WaitingPage(QWidget):
         if self._stopped or self._document.has_model:
             return
         self._timer.stop()
-        what, _ = split_sentence(failure.sentence)
-        self._text, self._failed = f"{what}; open another model.", True
+        text = with_capital(failure.headline)
+        self._text, self._failed = f"{text}; open another model.", True
         self._place_button()
         self.button.show()
         self.update()

@@ -136,8 +136,9 @@ class FileActions(QObject):
         file = Path(document.model_file)
         if is_bundled(document.model_file):
             raise LCollisionError(
-                f"{document.model.name} comes with the program and stays as it is; copy {file}, "
-                f"open the copy and turn that"
+                "comes with the program and stays as it is",
+                f"copy {file}, open the copy and turn that",
+                where=document.model.name,
             )
         if not self.may_lose_changes():
             return
@@ -158,7 +159,7 @@ class FileActions(QObject):
             self._settings.forget_file(str(path.resolve()))
             kind = "it is a folder" if path.is_dir() else "there is no such file"
             raise LCollisionError(
-                f"Couldn't open {path}: {kind}; choose a file of poses, a mesh or a model"
+                f"Couldn't open {path}: {kind}", "choose a file of poses, a mesh or a model"
             )
         if suffix == POSES_SUFFIX:
             if not self.may_lose_changes():
@@ -172,8 +173,10 @@ class FileActions(QObject):
             self._document.import_mesh(path)
         else:
             raise LCollisionError(
-                f"{_kind(path)} isn't supported ({path.name}); open poses ({POSES_SUFFIX}), a "
-                f"mesh ({', '.join(_mesh_suffixes())}) or a model ({MODEL_SUFFIX})"
+                f"isn't supported ({path.name})",
+                f"open poses ({POSES_SUFFIX}), a mesh ({', '.join(_mesh_suffixes())}) or a "
+                f"model ({MODEL_SUFFIX})",
+                where=_kind(path),
             )
         self._settings["last_folder"] = str(path.resolve().parent)
 

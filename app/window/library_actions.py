@@ -122,7 +122,7 @@ class LibraryActions(QObject):
         def refuse(name: str) -> str:
             nonlocal replaced
             replaced = document.name_taken_by(name)
-            reason = document.why_not_called(name, replaced)
+            reason = str(document.why_not_called(name, replaced) or "")
             if reason or not replaced or ask_to_replace(self._window, replaced):
                 return reason
             return f"your library has a pose “{replaced}” already; choose another name"
@@ -163,7 +163,7 @@ class LibraryActions(QObject):
             "Rename a pose",
             f"New name of “{old}”:",
             old,
-            lambda name: document.why_not_called(name, old),
+            lambda name: str(document.why_not_called(name, old) or ""),
         )
         if name is not None:
             document.rename_pose(old, name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import traceback
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -188,7 +187,7 @@ class MainWindow(QMainWindow):
             return act()
         except LCollisionError as error:
             _log.info("shown to the user: %s", error, exc_info=True)
-            self.show_failure(Failure(str(error), traceback.format_exc()))
+            self.show_failure(Failure.of(error))
             return None
 
     def set_autosave(self, autosave: Autosave) -> None:
@@ -205,7 +204,7 @@ class MainWindow(QMainWindow):
     def show_failure(self, failure: Failure) -> None:
         """Tell what went wrong, in a dialog that leaves all else running; once while it is open."""
         told = [held for held in self.findChildren(FailureDialog) if held.isVisible()]
-        if failure.sentence in [held.failure.sentence for held in told]:
+        if failure.headline in [held.failure.headline for held in told]:
             return
         dialog = FailureDialog(failure, self)
         dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from app.wording import counted, fit_error, mirrored_name
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
 from app.work.long_work import Job
+from app.work.threads import Failure
 from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
@@ -63,12 +64,12 @@ class OtherModel:
     ----------
     path : the file
     model : that the poses belong to
-    sentence : that tells of it
+    failure : that tells of it
     """
 
     path: Path
     model: ListedModel
-    sentence: str
+    failure: Failure
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +199,10 @@ def read(model: PoseModel | None, model_file: str | Path, path: Path) -> Job:
         except OtherModelError as error:
             if error.model is None:
                 raise
-            return OtherModel(path, error.model, str(error))
+            return OtherModel(path, error.model, Failure.of(error))
         cancel.raise_if_cancelled()
         if not held.all_poses:
-            raise ModelFileError(f"{path} holds no poses; open a file that has some")
+            raise ModelFileError("holds no poses", "open a file that has some", where=path)
         return ReadPoses(path, held, stamp, opened)
 
     return work
@@ -214,12 +215,12 @@ class WrongScale:
     Attributes
     ----------
     path : its file
-    sentence : what is wrong, without what to do
+    what : is wrong
     factor : what brings it into the model's unit
     """
 
     path: Path
-    sentence: str
+    what: str
     factor: float
 
 
@@ -230,17 +231,15 @@ def encoded(model: PoseModel, path: Path, scale: float = 1.0) -> Job:
     """
 
     def work(_: Progress, cancel: CancelToken) -> Imported | WrongScale:
-        from lcollision_core.meshes import read_mesh
-        from lcollision_core.model import NamedPose, name_of_file
+        from lcollision_core.model import encode_mesh, read_model_mesh
 
-        mesh = read_mesh(path, topology=model.topology)
-        model.require_topology(mesh.topology, str(path))
+        mesh = read_model_mesh(path, model)
         cancel.raise_if_cancelled()
         try:
-            encoding = model.encode(mesh.vertices, cancel=cancel, scale=scale)
+            pose = encode_mesh(mesh, model, scale, cancel)
         except WrongScaleError as error:
-            return WrongScale(path, str(error).partition(";")[0], error.factor)
-        return Imported(path, NamedPose.of_mesh(name_of_file(path), encoding))
+            return WrongScale(path, error.headline, error.factor)
+        return Imported(path, pose)
 
     return work
 
@@ -276,22 +275,26 @@ def mirrored_poses(model: PoseModel, poses: tuple[NamedPose, ...]) -> Job:
 
 def exported(
     model: PoseModel,
-    latent: FloatArray,
-    placement: RigidTransform | None,
+    pose: NamedPose,
+    outcome: ResolveResult | None,
     path: Path,
     axes: str,
     scale: float | None,
 ) -> Job:
     """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
 
-    The check is of what the file holds, in its axes and unit.
+    A pose that Resolve ended in is written with the vertices of its `outcome`. The check is of what
+    the file holds, in its axes and unit.
     """
 
     def work(_: Progress, __: CancelToken) -> Exported:
         from lcollision_core.model import export_frame, export_mesh
-        from lcollision_core.resolve import exported_vertices
 
-        vertices = exported_vertices(model.decode(latent, n_threads=1), placement)
+        placement = pose.placement
+        if outcome is not None and np.array_equal(outcome.latent, pose.latent):
+            vertices = outcome.vertices
+        else:
+            vertices = model.exported_vertices(pose.latent, placement)
         frame = export_frame(model, axes, path, scale)
         written = export_mesh(path, model, vertices, placement, frame)
         unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
@@ -341,8 +344,9 @@ def edited_parts(model: PoseModel, model_file: str, edits: PartEdits) -> Job:
         def change(held: PoseModel) -> PoseModel:
             if held.fingerprint != model.fingerprint:
                 raise ModelFileError(
-                    f"{model_file} holds another model by now; open it again to change its body "
-                    f"parts"
+                    "holds another model by now",
+                    "open it again to change its body parts",
+                    where=model_file,
                 )
             return held.edit_domains(edits.names, edits.colours, edits.order)
 
@@ -353,7 +357,7 @@ def edited_parts(model: PoseModel, model_file: str, edits: PartEdits) -> Job:
             with locked(path):
                 if path.exists():
                     raise ModelFileError(
-                        f"there is a model {edits.copy_name!r} already; choose another name"
+                        f"there is a model {edits.copy_name!r} already", "choose another name"
                     )
                 written = change(model)
                 written.save(path)

@@ -194,8 +194,8 @@ class LivePose(QObject):
         if request is None or request.model is not self._model:
             return
         if answer.failure is not None:
-            if answer.failure.sentence != self._told.get(type(request)):
-                self._told[type(request)] = answer.failure.sentence
+            if answer.failure.headline != self._told.get(type(request)):
+                self._told[type(request)] = answer.failure.headline
                 self.failed.emit(answer.failure)
         elif isinstance(request, FrameRequest) and answer.value is not None:
             if request.request_id == self._last_id:

@@ -76,11 +76,10 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
 
 def unexpected(error: BaseException) -> Failure:
     """Tell of an error that is the program's own."""
-    details = "".join(traceback.format_exception(error))
     return Failure(
-        f"something went wrong that should not have ({type(error).__name__}: {error}); save your "
-        f"pose under a new name, and see the log file for details",
-        details,
+        f"unexpected error ({type(error).__name__}: {error})",
+        "save your pose under a new name, and see the log file for details",
+        "".join(traceback.format_exception(error)),
     )
 
 

@@ -26,12 +26,20 @@ class Failure:
 
     Attributes
     ----------
-    sentence : what happened and what to do, fit to be shown as it is
+    headline : what happened, and where
+    next_step : what to do; empty where there is nothing
     details : the traceback
     """
 
-    sentence: str
-    details: str
+    headline: str
+    next_step: str = ""
+    details: str = ""
+
+    @classmethod
+    def of(cls, error: LCollisionError) -> Failure:
+        """Tell of an error that the user can fix."""
+        details = "".join(traceback.format_exception(error))
+        return cls(error.headline, error.next_step, details)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +102,12 @@ def guarded(
         return Response(request_id, cancelled=True)
     except LCollisionError as error:
         _log.info("%s: %s", label, error, exc_info=True)
-        return Response(request_id, failure=Failure(str(error), traceback.format_exc()))
+        return Response(request_id, failure=Failure.of(error))
     except Exception as error:
         _log.exception("%s failed", label)
-        sentence = (
-            f"{label} failed ({type(error).__name__}: {error}); nothing was changed, try again or "
-            f"look into the log"
+        failure = Failure(
+            f"{label} failed ({type(error).__name__}: {error})",
+            "nothing was changed, try again or look into the log",
+            traceback.format_exc(),
         )
-        return Response(request_id, failure=Failure(sentence, traceback.format_exc()))
+        return Response(request_id, failure=failure)

@@ -92,9 +92,10 @@ class AcapCodec:
         given = np.ones(n_vertices) if anchor_weights is None else anchor_weights
         anchor = np.asarray(given, dtype=np.float64)
         if anchor.shape != (n_vertices,) or not (np.isfinite(anchor) & (anchor >= 0.0)).all():
-            raise ShapeError(
-                f"anchor_weights must be ({n_vertices},) numbers of at least 0, "
-                f"got an array of shape {anchor.shape}"
+            raise ShapeError.must_be(
+                "anchor_weights",
+                f"({n_vertices},) numbers of at least 0",
+                f"an array of shape {anchor.shape}",
             )
         self.topology = topology
         self.rest_vertices: FloatArray = rest
@@ -132,7 +133,8 @@ class AcapCodec:
         if len(broken):
             pose, vertex = broken[0]
             raise ShapeError(
-                f"vertex {vertex} of pose {pose} is not finite: {poses[pose, vertex].tolist()}"
+                f"is not finite: {poses[pose, vertex].tolist()}",
+                where=f"vertex {vertex} of pose {pose}",
             )
         features = np.empty((len(poses), self.topology.n_vertices, N_FEATURES))
         n_jumps = np.zeros(len(poses), dtype=np.int64)
@@ -283,8 +285,8 @@ class AcapCodec:
     def _checked(self, array: npt.NDArray[Any], width: int, name: str) -> FloatArray:
         shape = np.shape(array)
         if len(shape) != 3 or shape[1:] != (self.topology.n_vertices, width):
-            raise ShapeError(
-                f"{name} must have shape (B, {self.topology.n_vertices}, {width}), got {shape}"
+            raise ShapeError.must_be(
+                name, f"of shape (B, {self.topology.n_vertices}, {width})", shape
             )
         return np.ascontiguousarray(array, dtype=np.float64)
 

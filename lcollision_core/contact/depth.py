@@ -54,16 +54,15 @@ def penetration_depth(
     first = np.asarray(triangles_a, dtype=np.float64)
     second = np.asarray(triangles_b, dtype=np.float64)
     if first.ndim != 3 or first.shape[1:] != (3, 3) or first.shape != second.shape:
-        raise ShapeError(
-            f"triangles must be two (P, 3, 3) arrays of one length, "
-            f"got {first.shape} and {second.shape}"
+        raise ShapeError.must_be(
+            "triangles", "two (P, 3, 3) arrays of one length", f"{first.shape} and {second.shape}"
         )
     if not tolerance >= 0.0:
-        raise ShapeError(f"the tolerance must be 0 or more, got {tolerance}")
+        raise ShapeError.must_be("the tolerance", "0 or more", tolerance)
     corners = np.stack([first, second], axis=1)
     if not np.isfinite(corners).all():
         pair = int(np.flatnonzero(~np.isfinite(corners).all(axis=(1, 2, 3)))[0])
-        raise ShapeError(f"triangle pair {pair} has a corner that is not finite")
+        raise ShapeError("has a corner that is not finite", where=f"triangle pair {pair}")
     # Work near 1, so that neither products of tiny edges underflow nor huge ones overflow; by a
     # power of two, so that what exactly touches still does.
     origin = corners[:, :1, :1]

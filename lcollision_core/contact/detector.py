@@ -159,23 +159,24 @@ class CollisionDetector:
     ) -> None:
         vertices = np.asarray(reference, dtype=np.float64)
         if vertices.shape != (topology.n_vertices, 3):
-            raise ShapeError(
-                f"the reference must have shape ({topology.n_vertices}, 3), got {vertices.shape}"
+            raise ShapeError.must_be(
+                "the reference", f"of shape ({topology.n_vertices}, 3)", vertices.shape
             )
         if not np.isfinite(vertices).all():
             vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-            raise ShapeError(f"vertex {vertex} of the reference is not finite")
+            raise ShapeError("is not finite", where=f"vertex {vertex} of the reference")
         if not near_exclusion >= 0.0:
-            raise ShapeError(f"the near exclusion must be 0 or more heights, got {near_exclusion}")
+            raise ShapeError.must_be("the near exclusion", "0 or more heights", near_exclusion)
         self.topology = topology
         self.near_exclusion = float(near_exclusion)
         self.height = height(vertices, topology)
         if self.height == 0.0:
-            raise ShapeError("all vertices are in one point; give it a mesh with an extent")
+            raise ShapeError("all vertices are in one point", "give it a mesh with an extent")
         if not 1.0 / MAX_HEIGHT <= self.height <= MAX_HEIGHT:
             raise ShapeError(
                 f"the mesh is {self.height:.1e} high, {1.0 / MAX_HEIGHT:.0e} to {MAX_HEIGHT:.0e} "
-                f"is needed; scale it"
+                "is needed",
+                "scale it",
             )
         self._tree: FaceTree = build_tree(vertices, topology.faces)
         self._near: NearVertices = near_vertices(
@@ -331,7 +332,7 @@ class CollisionDetector:
         array = np.asarray(vertices)
         if array.ndim != len(shape) or array.shape[-2:] != shape[-2:]:
             wanted = ", ".join("B" if size < 0 else str(size) for size in shape)
-            raise ShapeError(f"vertices must have shape ({wanted}), got {array.shape}")
+            raise ShapeError.must_be("vertices", f"of shape ({wanted})", array.shape)
         return array if array.dtype.kind == "f" else array.astype(np.float64)
 
     def _for_each(
@@ -453,7 +454,7 @@ class _Searcher:
             if np.isfinite(position).all()
             else "is not finite"
         )
-        raise ShapeError(f"vertex {vertex}{where} {what}, at {position}; move or repair the mesh")
+        raise ShapeError(f"vertex {vertex}{where} {what}, at {position}", "move or repair the mesh")
 
 
 def _buffer(n_pairs: int) -> Found:

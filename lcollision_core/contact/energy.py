@@ -31,10 +31,8 @@ def domain_energy(
     The targets of L_PD of Tan et al. 2021, section "Collision Predictor Based on Penetration".
     """
     if vertex_energy.ndim != 2 or attention_mask.ndim != 2:
-        raise ShapeError(
-            f"energies must be (B, V) and masks (K, V), "
-            f"got {vertex_energy.shape} and {attention_mask.shape}"
-        )
+        shapes = f"{vertex_energy.shape} and {attention_mask.shape}"
+        raise ShapeError.must_be("energies and masks", "(B, V) and (K, V)", shapes)
     if vertex_energy.shape[1] != attention_mask.shape[1]:
         raise ShapeError(
             f"energies are of {vertex_energy.shape[1]} vertices, masks of {attention_mask.shape[1]}"

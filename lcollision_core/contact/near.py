@@ -54,7 +54,8 @@ def near_vertices(
         if counts.sum() > MAX_NEAR:
             raise ShapeError(
                 f"the near exclusion relates more than {MAX_NEAR} pairs of the "
-                f"{topology.n_vertices} vertices; make it smaller"
+                f"{topology.n_vertices} vertices",
+                "make it smaller",
             )
     return NearVertices(start=np.cumsum(counts), vertex=np.concatenate(reached))
 

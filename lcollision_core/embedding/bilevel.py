@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -102,6 +102,15 @@ class Embedding:
         """(|Z_0|, |Z_1|, ..., |Z_K|)."""
         return tuple(len(part.components) for part in (self.level1, *self.level2))
 
+    def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
+        """Return which codes belong to domains: (D,), true for Z_k and for Z_0's code of each.
+
+        These are the codes that a lock of the domains holds.
+        """
+        chosen = np.zeros(self.n_domains, dtype=np.bool_)
+        chosen[list(domains)] = True
+        return np.concatenate([chosen, np.repeat(chosen, self.group_sizes[1:])])
+
     @property
     def latent_size(self) -> int:
         """D = |Z_all|."""
@@ -143,7 +152,7 @@ class Embedding:
         """
         rows = np.atleast_1d(np.asarray(latent))
         if rows.ndim != 2 or rows.shape[1] != self.latent_size:
-            raise ShapeError(f"latent must have shape (B, {self.latent_size}), got {rows.shape}")
+            raise ShapeError.must_be("latent", f"of shape (B, {self.latent_size})", rows.shape)
         vertices = np.empty((len(rows), self.topology.n_vertices, 3))
 
         def decode_block(start: int) -> None:
@@ -258,9 +267,11 @@ class Embedding:
         try:
             return cls._read(arrays, from_json(_Values, metadata, "embedding"))
         except (LCollisionError, ValueError) as error:
-            raise ModelFileError(
-                f"the model's embedding does not fit together: {error}; train or copy the model "
-                "again"
+            raise ModelFileError.because(
+                "",
+                "the model's embedding does not fit together",
+                error,
+                "train or copy the model again",
             ) from error
 
     @classmethod

@@ -57,8 +57,9 @@ class Checkpoint:
             stored = read_model_file(path)
             if _RUN not in stored or stored[_RUN].metadata.get("key") != key:
                 raise LCollisionError(
-                    f"{path} is the checkpoint of another training run (its poses, options or "
-                    "seed differ); delete it, or choose another checkpoint"
+                    "is the checkpoint of another training run (its poses, options or seed differ)",
+                    "delete it, or choose another checkpoint",
+                    where=path,
                 )
             self._sections = stored
 

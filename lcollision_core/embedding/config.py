@@ -58,12 +58,14 @@ class EmbeddingConfig:
         }
         for name, low in least.items():
             if getattr(self, name) < low:
-                raise LCollisionError(f"{name} must be at least {low}, got {getattr(self, name)}")
+                raise LCollisionError.must_be(name, f"at least {low}", getattr(self, name))
         rates = ("level1_rate", "level2_rate", "convolution_rate")
         for name in (*rates, "locality_weight", "vertex_weight"):
             if not getattr(self, name) >= 0.0:
-                raise LCollisionError(f"{name} must be at least 0, got {getattr(self, name)}")
+                raise LCollisionError.must_be(name, "at least 0", getattr(self, name))
         if not self.window_overlap > 1.0:
-            raise LCollisionError(f"window_overlap must be over 1, got {self.window_overlap}")
+            raise LCollisionError.must_be("window_overlap", "over 1", self.window_overlap)
         if self.held_out_stride == 1:
-            raise LCollisionError("held_out_stride 1 leaves no pose to train on; use 0 or 2 and up")
+            raise LCollisionError(
+                "held_out_stride 1 leaves no pose to train on", "use 0 or 2 and up"
+            )

@@ -108,8 +108,8 @@ class FeatureDecoder:
 
     def _checked(self, latent: npt.NDArray[Any]) -> Float32Array:
         if np.ndim(latent) != 2 or np.shape(latent)[1] != self.latent_size:
-            raise ShapeError(
-                f"latent must have shape (B, {self.latent_size}), got {np.shape(latent)}"
+            raise ShapeError.must_be(
+                "latent", f"of shape (B, {self.latent_size})", np.shape(latent)
             )
         return np.array(latent, dtype=np.float32, order="C")
 

@@ -50,7 +50,7 @@ def attention_mask(
     weights = np.asarray(components, dtype=np.float64)
     n_vertices = topology.n_vertices
     if weights.ndim != 3 or weights.shape[1] != n_vertices or len(weights) == 0:
-        raise ShapeError(f"components must be (K, {n_vertices}, 9), got {weights.shape}")
+        raise ShapeError.must_be("components", f"(K, {n_vertices}, 9)", weights.shape)
     squared = np.einsum("kvj,kvj->kv", weights, weights)
     total = squared.sum(axis=0)
     if not total.max() > 0.0:

@@ -109,13 +109,12 @@ def moving_parts(
     """
     n_vertices = topology.n_vertices
     if np.ndim(features) != 3 or features.shape[1:] != (n_vertices, N_FEATURES):
-        raise ShapeError(
-            f"features must be (N, {n_vertices}, {N_FEATURES}), got {np.shape(features)}"
-        )
+        raise ShapeError.must_be("features", f"(N, {n_vertices}, {N_FEATURES})", np.shape(features))
     if not 1 <= n_parts <= n_vertices:
         raise PoseSetError(
-            f"a mesh of {n_vertices} vertices cannot have {n_parts} domains; ask for 1 to "
-            f"{n_vertices}"
+            f"cannot have {n_parts} domains",
+            f"ask for 1 to {n_vertices}",
+            where=f"a mesh of {n_vertices} vertices",
         )
     areas = vertex_areas(topology, rest_vertices)
     rotations = np.asarray(features[..., :N_ROTATION], dtype=np.float64)

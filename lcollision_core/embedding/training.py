@@ -106,7 +106,7 @@ def train_embedding(
     CancelledError : `cancel` was set; the checkpoint holds the last epoch.
     """
     if len(pose_set) < 2:
-        raise PoseSetError("one pose has nothing to learn from; a pose set needs at least two")
+        raise PoseSetError("one pose has nothing to learn from", "a pose set needs at least two")
     run = _Run(
         pose_set,
         config or EmbeddingConfig(),

@@ -108,13 +108,13 @@ def fit_rigid(
     poses = np.asarray(vertices, dtype=np.float64)
     target = np.asarray(reference, dtype=np.float64)
     if target.ndim != 2 or target.shape[1] != 3 or len(target) == 0:
-        raise ShapeError(f"reference must be a (V, 3) array with V > 0, got {target.shape}")
+        raise ShapeError.must_be("reference", "a (V, 3) array with V > 0", target.shape)
     if poses.shape[-2:] != target.shape:
-        raise ShapeError(f"vertices must be (..., {len(target)}, 3), got {poses.shape}")
+        raise ShapeError.must_be("vertices", f"(..., {len(target)}, 3)", poses.shape)
     share = np.ones(len(target)) if weights is None else np.asarray(weights, dtype=np.float64)
     if share.shape != (len(target),) or not (share >= 0.0).all() or not share.sum() > 0.0:
-        raise ShapeError(
-            f"weights must be ({len(target)},), non-negative and not all zero, got {share.shape}"
+        raise ShapeError.must_be(
+            "weights", f"({len(target)},), non-negative and not all zero", share.shape
         )
     share = share / share.sum()
     pose_centres = share @ poses
@@ -168,7 +168,7 @@ def align_rigid(
     """
     poses = np.asarray(vertices, dtype=np.float64)
     if poses.ndim != 3 or len(poses) == 0:
-        raise ShapeError(f"vertices must be (N, V, 3) with N > 0, got {poses.shape}")
+        raise ShapeError.must_be("vertices", "(N, V, 3) with N > 0", poses.shape)
     target = np.asarray(reference, dtype=np.float64)
     rotations, translations = fit_rigid(poses, target)
     # Below this, motion is rounding, and dividing by it would let rounding choose the weights.

@@ -64,9 +64,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         if sys.platform == "win32":
             unfinished.replace(target)
     except OSError as error:
-        raise MeshFileError(
-            f"{path} cannot be written: {error.strerror or error}; choose another place"
-        ) from error
+        raise MeshFileError.unwritable(path, error, "choose another place") from error
     finally:
         if unfinished is not None:
             with suppress(OSError):
@@ -107,11 +105,13 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
             finally:
                 shutil.rmtree(unfinished, ignore_errors=True)
     except OSError as error:
-        raise MeshFileError(
-            f"the folder {folder} cannot be written to: {error.strerror or error}; name another"
+        raise MeshFileError.because(
+            f"the folder {folder}", "cannot be written to", error, "name another"
         ) from error
     except MeshFileError as error:
-        raise MeshFileError(str(error).replace(str(unfinished), str(target))) from error
+        raise MeshFileError.like(
+            error, error.where.replace(str(unfinished), str(target))
+        ) from error
     finally:
         if is_new:
             with suppress(OSError):  # it is not empty: all is well
@@ -122,7 +122,7 @@ def _move_all(folder: Path, target: Path) -> None:
     names = [file.name for file in folder.iterdir()]
     for name in names:
         if (target / name).is_dir():
-            raise MeshFileError(f"{target / name} cannot be written: it is a folder; move it away")
+            raise MeshFileError.unwritable(target / name, "it is a folder", "move it away")
     try:
         for name in names:
             (folder / name).replace(os.path.realpath(target / name))
@@ -169,9 +169,7 @@ def require_writable(path: str | os.PathLike[str]) -> None:
     """
     folder = _plain_file_in_a_folder(path).parent
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise MeshFileError(
-            f"{path} cannot be written: {folder} is read-only; choose another place"
-        )
+        raise MeshFileError.unwritable(path, f"{folder} is read-only", "choose another place")
 
 
 def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
@@ -181,17 +179,15 @@ def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
     except (FileNotFoundError, NotADirectoryError):
         mode = None
     except OSError as error:
-        raise MeshFileError(
-            f"{path} cannot be written: {error.strerror or error}; choose another name"
-        ) from error
+        raise MeshFileError.unwritable(path, error, "choose another name") from error
     if mode is not None and stat.S_ISDIR(mode):
-        raise MeshFileError(f"{path} cannot be written: it is a folder; add a file name")
+        raise MeshFileError.unwritable(path, "it is a folder", "add a file name")
     # Renaming over a device such as /dev/null would replace it by a plain file.
     if mode is not None and not stat.S_ISREG(mode):
-        raise MeshFileError(f"{path} cannot be written: it is not a plain file; choose another")
+        raise MeshFileError.unwritable(path, "it is not a plain file", "choose another")
     if not target.parent.is_dir():
-        raise MeshFileError(
-            f"{path} cannot be written: there is no folder {target.parent}; create it first"
+        raise MeshFileError.unwritable(
+            path, f"there is no folder {target.parent}", "create it first"
         )
     return target
 

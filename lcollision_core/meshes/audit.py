@@ -64,7 +64,7 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
     """
     points = np.asarray(vertices)
     if points.shape != (topology.n_vertices, 3):
-        raise ShapeError(f"vertices must be ({topology.n_vertices}, 3), got {points.shape}")
+        raise ShapeError.must_be("vertices", f"({topology.n_vertices}, 3)", points.shape)
     watertight = topology.is_watertight
     n_boundary = len(topology.boundary_edges)
     n_non_manifold = len(topology.non_manifold_edges)

@@ -97,8 +97,7 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
         _require_usable(vertices, faces)
         found = Topology(faces, len(vertices))
     except (MeshFileError, PoseSetError) as error:
-        advice = "" if "; " in str(error) else "; export the mesh again"
-        raise MeshFileError(f"{path} cannot be read: {error}{advice}") from error
+        raise MeshFileError.unreadable(path, error, "export the mesh again") from error
     vertices.flags.writeable = False
     if topology is not None and found == topology:
         found = topology
@@ -124,12 +123,13 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
         with open_regular(path) as file:
             if suffix not in READABLE_SUFFIXES:
                 raise MeshFileError(
-                    f"{suffix or 'a name without extension'} is no mesh format known here; "
-                    f"use one of {', '.join(READABLE_SUFFIXES)}"
+                    "is no mesh format known here",
+                    f"use one of {', '.join(READABLE_SUFFIXES)}",
+                    where=suffix or "a name without extension",
                 )
             size = os.fstat(file.fileno()).st_size
             if size == 0:
-                raise MeshFileError("it is empty; export the mesh again")
+                raise MeshFileError("it is empty", "export the mesh again")
             if suffix == ".obj":
                 return obj.read(file)
             if suffix == ".ply":
@@ -140,31 +140,32 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
                 return stl.read(file, size, topology)
             return gltf.read(file, path, topology)
     except FileNotFoundError as error:
-        raise MeshFileError("there is no such file; check the name") from error
+        raise MeshFileError("there is no such file", "check the name") from error
     except PermissionError as error:
-        raise MeshFileError("permission is denied; change the file's permissions") from error
+        raise MeshFileError("permission is denied", "change the file's permissions") from error
     except OSError as error:
         reason = "the name is too long" if error.errno == errno.ENAMETOOLONG else error.strerror
-        raise MeshFileError(f"{reason or error}; check the file") from error
+        raise MeshFileError(str(reason or error), "check the file") from error
     except MemoryError as error:
-        raise MeshFileError("it needs more memory than there is; decimate the mesh") from error
+        raise MeshFileError("it needs more memory than there is", "decimate the mesh") from error
 
 
 def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> None:
     if len(vertices) == 0:
-        raise MeshFileError("it holds no vertices; export the mesh again")
+        raise MeshFileError("it holds no vertices", "export the mesh again")
     if len(faces) == 0:
-        raise MeshFileError("it holds vertices but no faces; export it as a triangle mesh")
+        raise MeshFileError("it holds vertices but no faces", "export it as a triangle mesh")
     for count, what in ((len(faces), "faces"), (len(vertices), "vertices")):
         if count > MAX_FACES:
             raise MeshFileError(
-                f"it holds {count} {what}, at most {MAX_FACES} can be read; decimate the mesh"
+                f"it holds {count} {what}, at most {MAX_FACES} can be read", "decimate the mesh"
             )
     vertex = first_not_finite(vertices)
     if vertex is not None:
         raise MeshFileError(
-            f"vertex {vertex} (from 0) is at {vertices[vertex].tolist()}, which is not finite; "
-            f"export the mesh again"
+            f"is at {vertices[vertex].tolist()}, which is not finite",
+            "export the mesh again",
+            where=f"vertex {vertex} (from 0)",
         )
 
 
@@ -208,19 +209,22 @@ def write_mesh(
     """
     suffix = Path(path).suffix.lower()
     if suffix not in _ENCODERS:
-        raise MeshFileError(
-            f"{path} cannot be written: {suffix or 'a name without extension'} is no mesh format "
-            f"known here; use one of {', '.join(WRITABLE_SUFFIXES)}"
+        raise MeshFileError.unwritable(
+            path,
+            f"{suffix or 'a name without extension'} is no mesh format known here",
+            f"use one of {', '.join(WRITABLE_SUFFIXES)}",
         )
     points = np.asarray(vertices)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-        raise ShapeError(f"vertices must be a (V, 3) array with V > 0, got {points.shape}")
+        raise ShapeError.must_be("vertices", "a (V, 3) array with V > 0", points.shape)
     if points.dtype != np.float32:
         points = points.astype(np.float64)
     points = points.astype(points.dtype.newbyteorder("="), copy=False)
     vertex = first_not_finite(points)
     if vertex is not None:
-        raise ShapeError(f"vertex {vertex} is at {points[vertex].tolist()}, which is not finite")
+        raise ShapeError(
+            f"is at {points[vertex].tolist()}, which is not finite", where=f"vertex {vertex}"
+        )
     topology = Topology(faces, len(points))
     points = as_stored(path, points, topology)
     if suffix == ".glb" and up is not None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.errors import PoseSetError
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 LARGEST_SIZE = 1.25
@@ -43,7 +44,7 @@ def is_torn(lengths: FloatArray, known: FloatArray) -> bool:
     return high > _UNIFORM * low and middle > _TORN
 
 
-def unlike_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, str]:
+def unlike_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, PoseSetError]:
     """Find the poses that are no poses of the body that most of them show.
 
     Parameters
@@ -68,16 +69,16 @@ def unlike_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, st
         scale = scale_of(own, known)
         if scale is None:
             if is_torn(own, known):
-                found[pose] = (
+                found[pose] = PoseSetError(
                     "has other vertices joined than the other poses, as if they came in another "
-                    "order; export it with the set's vertex order"
+                    "order",
+                    "export it with the set's vertex order",
                 )
         elif not 1.0 / LARGEST_SIZE < scale < LARGEST_SIZE:
-            found[pose] = (
-                f"is {scale:.3g} times as large as the other poses; scale it by {1.0 / scale:.3g}"
-                if 0.0 < scale < np.inf
-                else "has no size; remove it"
-            )
+            found[pose] = PoseSetError("has no size", "remove it")
+            if 0.0 < scale < np.inf:
+                what = f"is {scale:.3g} times as large as the other poses"
+                found[pose] = PoseSetError(what, f"scale it by {1.0 / scale:.3g}")
     return found
 
 

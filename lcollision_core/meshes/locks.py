@@ -44,7 +44,9 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
     while (file := _taken(lock, path)) is None:
         if time.monotonic() >= give_up:
             raise MeshFileError(
-                f"{path} is being written by another command; wait for that to end, then try again"
+                "is being written by another command",
+                "wait for that to end, then try again",
+                where=path,
             )
         time.sleep(_SECONDS_BETWEEN_TRIES)
     try:
@@ -100,8 +102,8 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
             require_regular(lock)
         file = lock.open("ab", buffering=0)
     except OSError as error:
-        raise MeshFileError(
-            f"{path} cannot be changed: {error.strerror or error}; choose another place"
+        raise MeshFileError.because(
+            path, "cannot be changed", error, "choose another place"
         ) from error
     try:
         lock_open_file(file)
@@ -112,8 +114,8 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
         pass
     except OSError as error:
         file.close()
-        raise MeshFileError(
-            f"{path} cannot be locked: {error.strerror or error}; copy it to another disk"
+        raise MeshFileError.because(
+            path, "cannot be locked", error, "copy it to another disk"
         ) from error
     file.close()
     return None

@@ -83,13 +83,13 @@ def read_npz(
             }
             return arrays, tuple(entries)
     except FileNotFoundError as error:
-        raise MeshFileError("there is no such file; check the name") from error
+        raise MeshFileError("there is no such file", "check the name") from error
     except OSError as error:
-        raise MeshFileError(f"{error.strerror or error}; check the file") from error
+        raise MeshFileError(error.strerror or str(error), "check the file") from error
     except _DAMAGE as error:
-        raise MeshFileError("it is damaged or no .npz archive; export it again") from error
+        raise MeshFileError("it is damaged or no .npz archive", "export it again") from error
     except MemoryError as error:
-        raise MeshFileError("it needs more memory than there is; keep fewer poses") from error
+        raise MeshFileError("it needs more memory than there is", "keep fewer poses") from error
 
 
 def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> npt.NDArray[Any]:
@@ -100,7 +100,8 @@ def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> n
         if n_items > MAX_ITEMS:
             count = n_items if n_items < 10**15 else "over 10**15"
             raise MeshFileError(
-                f"its array {name!r} holds {count} numbers, at most {MAX_ITEMS} can be read"
+                f"holds {count} numbers, at most {MAX_ITEMS} can be read",
+                where=f"its array {name!r}",
             )
         # Of a size that nothing bears out no memory is taken.
         if n_items * dtype.itemsize > min(info.file_size, _MOST_DEFLATED * info.compress_size):
@@ -125,11 +126,14 @@ def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple
     byte_order, kind, size = (part.decode() for part in descr.groups())
     if kind == "O":
         raise MeshFileError(
-            f"its array {name!r} holds Python objects, which are not loaded because that can "
-            f"run code; save plain numbers"
+            "holds Python objects, which are not loaded because that can run code",
+            "save plain numbers",
+            where=f"its array {name!r}",
         )
     if kind not in _PLAIN_KINDS:
-        raise MeshFileError(f"its array {name!r} is of type {kind + size!r}; save plain numbers")
+        raise MeshFileError(
+            f"is of type {kind + size!r}", "save plain numbers", where=f"its array {name!r}"
+        )
     dtype = np.dtype(f"{byte_order}{kind}{size}")
     if not dtype.itemsize:
         raise ValueError("items without a size")

@@ -72,21 +72,21 @@ class PoseSet:
     def __post_init__(self) -> None:
         shape = self.vertices.shape
         if len(shape) != 3 or shape[1:] != (self.topology.n_vertices, 3) or shape[0] == 0:
-            raise ShapeError(
-                f"vertices must be (N, {self.topology.n_vertices}, 3) with N > 0, got {shape}"
+            raise ShapeError.must_be(
+                "vertices", f"(N, {self.topology.n_vertices}, 3) with N > 0", shape
             )
         if self.vertices.dtype not in (np.float32, np.float64):
-            raise ShapeError(f"vertices must be float32 or float64, got {self.vertices.dtype}")
+            raise ShapeError.must_be("vertices", "float32 or float64", self.vertices.dtype)
         if len(self.names) != shape[0]:
-            raise ShapeError(f"{shape[0]} poses need as many names, got {len(self.names)}")
+            raise ShapeError.must_be("names", f"one for each of {shape[0]} poses", len(self.names))
         if self.up_axis not in (None, 0, 1, 2):
-            raise ShapeError(f"up_axis must be 0, 1, 2 or None, got {self.up_axis}")
+            raise ShapeError.must_be("up_axis", "0, 1, 2 or None", self.up_axis)
         if not 0.0 <= self.near_exclusion < 1.0:
-            raise ShapeError(f"near_exclusion must be in [0, 1), got {self.near_exclusion}")
+            raise ShapeError.must_be("near_exclusion", "in [0, 1)", self.near_exclusion)
         if self.vertex_labels is not None:
             if self.vertex_labels.shape != shape[1:2]:
-                raise ShapeError(
-                    f"vertex_labels must be ({shape[1]},), got {self.vertex_labels.shape}"
+                raise ShapeError.must_be(
+                    "vertex_labels", f"({shape[1]},)", self.vertex_labels.shape
                 )
             _require_labels(self.vertex_labels)
         # A view, so that the caller's own array stays as writable as it was.
@@ -106,9 +106,9 @@ class PoseSet:
         ShapeError : the factor is no number above 0, or a coordinate would overflow.
         """
         if not 0.0 < factor < np.inf:
-            raise ShapeError(f"the scale must be a number above 0, got {factor:g}")
+            raise ShapeError.must_be("the scale", "a number above 0", f"{factor:g}")
         if float(np.abs(self.vertices).max()) > np.finfo(np.float64).max / max(factor, 1.0):
-            raise ShapeError(f"the scale {factor:g} is too large for the coordinates")
+            raise ShapeError("is too large for the coordinates", where=f"the scale {factor:g}")
         return replace(self, vertices=self.vertices.astype(np.float64) * factor)
 
     @property
@@ -143,7 +143,7 @@ def mesh_files(folder: Path) -> tuple[list[Path], list[str]]:
     try:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
-        raise MeshFileError(f"{folder} cannot be listed: {error.strerror or error}") from error
+        raise MeshFileError.because(folder, "cannot be listed", error) from error
     files = [entry for entry in entries if entry.suffix.lower() in READABLE_SUFFIXES]
     others = sorted({entry.name for entry in entries} - {file.name for file in files})
     return sorted(files, key=natural_key), others
@@ -180,14 +180,16 @@ def read_pose_set(
 
     pose_set = collect_poses(Path(path), refuse, progress, cancel).pose_set
     if pose_set is None:
-        raise MeshFileError(f"{path} holds no poses; name another folder or file")
+        raise MeshFileError("holds no poses", "name another folder or file", where=path)
     flat = degenerate_faces(pose_set.topology, pose_set.vertices[0])
     if len(flat):
         face = int(flat[0])
         raise PoseSetError(
-            f"{path} cannot be used: {len(flat)} faces of the reference, pose 0 "
-            f"({pose_set.names[0]}), have no area, the first is face {face} between vertices "
-            f"{pose_set.faces[face].tolist()}; remove them from all poses"
+            f"cannot be used: {len(flat)} faces of the reference, pose 0 ({pose_set.names[0]}), "
+            f"have no area, the first is face {face} between vertices "
+            f"{pose_set.faces[face].tolist()}",
+            "remove them from all poses",
+            where=path,
         )
     return pose_set
 
@@ -225,7 +227,7 @@ def collect_poses(
     try:
         is_folder, exists = path.is_dir(), path.exists()
     except OSError as error:
-        report(MeshFileError(f"{path} cannot be read: {error.strerror or error}; check the name"))
+        report(MeshFileError.unreadable(path, error, "check the name"))
         return Collected(None, 0, same_topology=False)
     if is_folder:
         return _alike(_collect_folder(path, report, progress, cancel), report)
@@ -233,24 +235,25 @@ def collect_poses(
     if exists and suffix == ".npz":
         return _alike(_collect_npz(path, report, progress), report)
     if not exists:
-        defect = f"{path} does not exist; name a folder of meshes or an .npz file"
+        what, next_step = "does not exist", "name a folder of meshes or an .npz file"
     elif suffix in READABLE_SUFFIXES:
-        defect = f"{path} is one mesh, not a pose set; name its folder"
+        what, next_step = "is one mesh, not a pose set", "name its folder"
     else:
-        defect = f"{path} is no pose set; name a folder of meshes or an .npz file"
-    report(MeshFileError(defect))
+        what, next_step = "is no pose set", "name a folder of meshes or an .npz file"
+    report(MeshFileError(what, next_step, where=path))
     return Collected(None, 0, same_topology=False)
 
 
-def _too_far_to_compute(vertices: npt.NDArray[Any]) -> str | None:
+def _too_far_to_compute(where: str, vertices: npt.NDArray[Any]) -> PoseSetError | None:
     """Say which of a pose's (V, 3) vertices is not finite, or too far out to be squared."""
     vertex = first_not_finite(vertices, _LARGEST_COORDINATE)
     if vertex is None:
         return None
-    return (
-        f"vertex {vertex} (from 0) at {vertices[vertex].tolist()}, which is not finite or beyond "
-        f"{_LARGEST_COORDINATE:g}; remove or scale that pose"
+    what = (
+        f"has vertex {vertex} (from 0) at {vertices[vertex].tolist()}, which is not finite or "
+        f"beyond {_LARGEST_COORDINATE:g}"
     )
+    return PoseSetError(what, "remove or scale that pose", where=where)
 
 
 def _alike(collected: Collected, report: Callable[[LCollisionError], None]) -> Collected:
@@ -260,7 +263,7 @@ def _alike(collected: Collected, report: Callable[[LCollisionError], None]) -> C
     if poses is None or not unlike:
         return collected
     for pose, defect in unlike.items():
-        report(PoseSetError(f"pose {poses.names[pose]} of {poses.source} {defect}"))
+        report(PoseSetError.like(defect, f"pose {poses.names[pose]} of {poses.source}"))
     kept = [pose for pose in range(len(poses)) if pose not in unlike]
     names = tuple(poses.names[pose] for pose in kept)
     alike = replace(poses, vertices=poses.vertices[kept], names=names) if kept else None
@@ -303,13 +306,11 @@ def _collect_folder(
     formats = Counter(file.suffix.lower() for file in files)
     if len(formats) != 1:
         held = ", ".join(f"{count} {suffix}" for suffix, count in sorted(formats.items()))
-        report(
-            MeshFileError(
-                f"{path} holds meshes of several formats ({held}); keep one format in a folder"
-                if formats
-                else f"{path} holds no mesh; a pose set is a folder of .obj, .ply, .off or .stl"
-            )
-        )
+        what, next_step = "holds no mesh", "name a folder of .obj, .ply, .off or .stl files"
+        if formats:
+            what = f"holds meshes of several formats ({held})"
+            next_step = "keep one format in a folder"
+        report(MeshFileError(what, next_step, where=path))
         return Collected(None, len(files), same_topology=False)
     notes: Counter[str] = Counter()
     names: list[str] = []
@@ -331,19 +332,18 @@ def _collect_folder(
                     report(too_large)
                     return Collected(None, len(files), same_topology=False)
                 vertices = np.empty((len(files), topology.n_vertices, 3), dtype=np.float64)
-            defect = _disagreement(pose, file.name, mesh.topology, topology)
-            too_far = _too_far_to_compute(mesh.vertices)
-            if defect is None and too_far is not None:
-                report(PoseSetError(f"pose {pose} ({file.name}) has {too_far}"))
-            elif defect is None and mesh.coarseness:
-                report(PoseSetError(f"pose {pose} ({file.name}) is damaged: {mesh.coarseness}"))
-            elif defect is None:
+            where = f"pose {pose} ({file.name})"
+            if (defect := _disagreement(where, mesh.topology, topology)) is not None:
+                same_topology = False
+                report(defect)
+            elif (too_far := _too_far_to_compute(where, mesh.vertices)) is not None:
+                report(too_far)
+            elif mesh.coarseness:
+                report(PoseSetError(f"is damaged: {mesh.coarseness}", where=where))
+            else:
                 vertices[len(names)] = mesh.vertices
                 names.append(file.name)
                 notes.update(mesh.notes)
-            else:
-                same_topology = False
-                report(PoseSetError(defect))
         progress(pose + 1, len(files))
     if topology is None:
         return Collected(None, len(files), same_topology=False)
@@ -361,34 +361,36 @@ def _collect_folder(
     return Collected(pose_set, len(files), same_topology)
 
 
-def _disagreement(pose: int, name: str, found: Topology, expected: Topology) -> str | None:
-    advice = "remove it or export it with the set's topology"
+def _disagreement(where: str, found: Topology, expected: Topology) -> PoseSetError | None:
     if found.n_vertices != expected.n_vertices:
-        return (
-            f"pose {pose} ({name}) has {found.n_vertices} vertices, "
-            f"the set has {expected.n_vertices}; {advice}"
+        what, needed, got = "number of vertices", expected.n_vertices, found.n_vertices
+    elif found.n_faces != expected.n_faces:
+        what, needed, got = "number of faces", expected.n_faces, found.n_faces
+    elif different := np.flatnonzero((found.faces != expected.faces).any(axis=1)).tolist():
+        face = different[0]
+        what, needed, got = (
+            f"face {face}",
+            expected.faces[face].tolist(),
+            found.faces[face].tolist(),
         )
-    if found.n_faces != expected.n_faces:
-        return (
-            f"pose {pose} ({name}) has {found.n_faces} faces, "
-            f"the set has {expected.n_faces}; {advice}"
-        )
-    different = np.flatnonzero((found.faces != expected.faces).any(axis=1))
-    if len(different):
-        face = int(different[0])
-        return (
-            f"pose {pose} ({name}) has {found.faces[face].tolist()} as face {face}, "
-            f"the set has {expected.faces[face].tolist()}; {advice}"
-        )
-    return None
+    else:
+        return None
+    return PoseSetError(
+        f"has another {what} than the set",
+        "remove it or export it with the set's topology",
+        where=where,
+        expected=needed,
+        got=got,
+    )
 
 
 def _too_large(path: Path, n_poses: int, n_vertices: int) -> MeshFileError | None:
     if n_poses * n_vertices * 3 <= MAX_ITEMS:
         return None
     return MeshFileError(
-        f"{path} holds {n_poses} poses of {n_vertices} vertices, more than {MAX_ITEMS} "
-        f"coordinates; keep fewer poses or decimate them"
+        f"holds {n_poses} poses of {n_vertices} vertices, more than {MAX_ITEMS} coordinates",
+        "keep fewer poses or decimate them",
+        where=path,
     )
 
 
@@ -402,17 +404,17 @@ def _collect_npz(
         topology = Topology(faces, vertices.shape[1])
         extras = _extras_of(arrays, vertices.shape)
     except LCollisionError as error:
-        report(MeshFileError(f"{path} cannot be read as a pose set: {error}"))
+        report(MeshFileError.because(path, "cannot be read as a pose set", error))
         return nothing
     names = extras.pop("names") or tuple(f"pose {pose}" for pose in range(len(vertices)))
     usable = np.ones(len(vertices), dtype=np.bool_)
     for pose, mesh in enumerate(vertices):
         where = f"pose {pose} ({names[pose]}) of {path}"
-        defect = _too_far_to_compute(mesh)
+        defect = _too_far_to_compute(where, mesh)
         if defect is not None:
-            report(PoseSetError(f"{where} has {defect}"))
+            report(defect)
         elif mesh.dtype == np.float32 and (coarseness := coarseness_of(mesh, topology)):
-            report(PoseSetError(f"{where} is damaged: {coarseness}"))
+            report(PoseSetError(f"is damaged: {coarseness}", where=where))
         else:
             continue
         usable[pose] = False
@@ -439,9 +441,9 @@ def _meshes_of(
         found.append(arrays[name])
     vertices, faces = found
     if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:
-        raise MeshFileError(f"vertices must be (N, V, 3) with N, V > 0, got {vertices.shape}")
+        raise MeshFileError.must_be("vertices", "(N, V, 3) with N, V > 0", vertices.shape)
     if vertices.dtype.kind != "f" or vertices.dtype.itemsize not in (4, 8):
-        raise MeshFileError(f"vertices must be float32 or float64, got {vertices.dtype}")
+        raise MeshFileError.must_be("vertices", "float32 or float64", vertices.dtype)
     native = np.float32 if vertices.dtype.itemsize == 4 else np.float64
     return np.ascontiguousarray(vertices, dtype=native), faces
 
@@ -450,28 +452,25 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
     def scalar(name: str, kinds: str) -> Any:
         value = arrays[name]
         if value.shape != () or value.dtype.kind not in kinds:
-            raise MeshFileError(f"{name} must be one number, got {value.dtype} {value.shape}")
+            raise MeshFileError.must_be(name, "one number", f"{value.dtype} {value.shape}")
         return value.item()
 
     def strings(name: str, length: int) -> list[str]:
         value = arrays[name]
         if value.shape != (length,) or value.dtype.kind != "U":
-            raise MeshFileError(
-                f"{name} must be ({length},) strings, got {value.dtype} {value.shape}"
+            raise MeshFileError.must_be(
+                name, f"({length},) strings", f"{value.dtype} {value.shape}"
             )
         native = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("="))
         if (native.view(np.uint32) > sys.maxunicode).any():
-            raise MeshFileError(f"{name} holds a character that does not exist")
+            raise MeshFileError("holds a character that does not exist", where=name)
         texts = native.tolist()
         # Half a character, of a file name that was no text, cannot be printed.
         return [text[:_MAX_TEXT_LENGTH].encode(errors="replace").decode() for text in texts]
 
     extras: dict[str, Any] = {"names": None}
     if "format_version" in arrays and scalar("format_version", "iu") > FORMAT_VERSION:
-        raise MeshFileError(
-            f"it has format version {scalar('format_version', 'iu')}, this program reads up to "
-            f"{FORMAT_VERSION}; update the program"
-        )
+        raise MeshFileError.too_new("it", scalar("format_version", "iu"), FORMAT_VERSION)
     if "names" in arrays:
         extras["names"] = tuple(strings("names", shape[0]))
     if "notes" in arrays:
@@ -479,11 +478,11 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
     if "near_exclusion" in arrays:
         extras["near_exclusion"] = float(scalar("near_exclusion", "fiu"))
         if not 0.0 <= extras["near_exclusion"] < 1.0:
-            raise MeshFileError(f"near_exclusion must be in [0, 1), got {extras['near_exclusion']}")
+            raise MeshFileError.must_be("near_exclusion", "in [0, 1)", extras["near_exclusion"])
     if "up_axis" in arrays:
         extras["up_axis"] = scalar("up_axis", "iu")
         if extras["up_axis"] not in (0, 1, 2):
-            raise MeshFileError(f"up_axis must be 0, 1 or 2, got {extras['up_axis']}")
+            raise MeshFileError.must_be("up_axis", "0, 1 or 2", extras["up_axis"])
     if "vertex_labels" in arrays:
         extras["vertex_labels"] = np.array(strings("vertex_labels", shape[1]))
         _require_labels(extras["vertex_labels"])
@@ -494,9 +493,11 @@ def _require_labels(vertex_labels: npt.NDArray[np.str_]) -> None:
     labels = vertex_labels.tolist()
     for label in dict.fromkeys(labels):
         if not label.strip() or not label.isprintable():
-            raise ShapeError(
-                f"vertex_labels must be printable and not blank, got {label[:80]!r} for vertex "
-                f"{labels.index(label)} (from 0); name the body part of every vertex"
+            raise ShapeError.must_be(
+                "vertex_labels",
+                "printable and not blank",
+                f"{label[:80]!r} for vertex {labels.index(label)} (from 0)",
+                "name the body part of every vertex",
             )
 
 
@@ -513,7 +514,7 @@ def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
     MeshFileError : the extension is not .npz or the file cannot be written.
     """
     if Path(path).suffix.lower() != ".npz":
-        raise MeshFileError(f"{path} cannot be written: a pose set is an .npz file; rename it")
+        raise MeshFileError.unwritable(path, "a pose set is an .npz file", "rename it")
     arrays: dict[str, npt.NDArray[Any]] = {
         "format_version": np.array(FORMAT_VERSION),
         "vertices": pose_set.vertices,

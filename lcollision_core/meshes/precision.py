@@ -86,9 +86,8 @@ def as_stored(
     suffix = Path(path).suffix.lower()
     dtype = np.float32 if suffix in SINGLE_PRECISION else np.float64
     if float(np.abs(vertices).max()) > float(np.finfo(dtype).max):
-        raise MeshFileError(
-            f"{path} cannot be written: a coordinate exceeds float32, which {suffix} stores; "
-            f"write .ply or .obj"
+        raise MeshFileError.unwritable(
+            path, f"a coordinate exceeds float32, which {suffix} stores", "write .ply or .obj"
         )
     stored = np.asarray(vertices, dtype) if dtype is np.float32 else np.asarray(vertices)
     # What came rounded is not rounded again.
@@ -96,9 +95,10 @@ def as_stored(
         step, share = rounding_step(vertices, topology, dtype)
         if share > LARGEST_SHARE:
             advice = "write .obj, .ply or .off, or move" if dtype is np.float32 else "move"
-            raise MeshFileError(
-                f"{path} cannot be written: so far from the origin {suffix} rounds coordinates to "
-                f"steps of {step:.2g}, {share:.0%} of a short edge; {advice} the mesh nearer to "
-                f"the origin"
+            raise MeshFileError.unwritable(
+                path,
+                f"so far from the origin {suffix} rounds coordinates to "
+                f"steps of {step:.2g}, {share:.0%} of a short edge",
+                f"{advice} the mesh nearer to the origin",
             )
     return stored

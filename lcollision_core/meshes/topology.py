@@ -33,8 +33,8 @@ class Topology:
     def __init__(self, faces: npt.ArrayLike, n_vertices: int) -> None:
         checked = np.asarray(faces)
         if checked.ndim != 2 or checked.shape[1] != 3 or checked.dtype.kind not in "iu":
-            raise ShapeError(
-                f"faces must be an (F, 3) integer array, got {checked.dtype} {checked.shape}"
+            raise ShapeError.must_be(
+                "faces", "an (F, 3) integer array", f"{checked.dtype} {checked.shape}"
             )
         if len(checked) == 0:
             raise ShapeError("the mesh has no faces")
@@ -42,15 +42,18 @@ class Topology:
         if len(out_of_range):
             face = int(out_of_range[0])
             raise PoseSetError(
-                f"face {face} names vertices {checked[face].tolist()}, "
-                f"but there are {n_vertices} vertices (0 to {n_vertices - 1})"
+                f"names vertices {checked[face].tolist()}, but there are {n_vertices} "
+                f"vertices (0 to {n_vertices - 1})",
+                where=f"face {face}",
             )
         repeated = np.flatnonzero(
             (checked == np.roll(checked, 1, axis=1)).any(axis=1),
         )
         if len(repeated):
             face = int(repeated[0])
-            raise PoseSetError(f"face {face} names a vertex twice: {checked[face].tolist()}")
+            raise PoseSetError(
+                f"names a vertex twice: {checked[face].tolist()}", where=f"face {face}"
+            )
         self.faces: IntArray = np.array(checked, dtype=np.int32, order="C")
         self.faces.flags.writeable = False
         self.n_vertices = int(n_vertices)

@@ -14,7 +14,7 @@ from lcollision_core.meshes.topology import Topology
 def _sides(vertices: npt.NDArray[Any], topology: Topology | None) -> npt.NDArray[np.float64]:
     """Return half of each side of the bounding box: the whole may be beyond the largest number."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) == 0:
-        raise ShapeError(f"vertices must be a (V, 3) array with V > 0, got {vertices.shape}")
+        raise ShapeError.must_be("vertices", "a (V, 3) array with V > 0", vertices.shape)
     points = 0.5 * np.asarray(vertices, dtype=np.float64)
     if topology is not None and len(topology.unused_vertices):
         points = points[topology.used_vertices]

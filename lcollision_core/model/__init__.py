@@ -1,6 +1,7 @@
 """A trained body: one file in, everything that a front end needs out."""
 
 from lcollision_core.model.card import ModelCard
+from lcollision_core.model.encode import encode_mesh, read_model_mesh, with_detail
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.export import (
     EXPORT_SCALES,
@@ -23,7 +24,8 @@ from lcollision_core.model.library import (
     model_destination,
     user_models_folder,
 )
-from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry
+from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry, fingerprint_of_pose
+from lcollision_core.model.naming import unique_names
 from lcollision_core.model.pose_file import (
     MAX_NAME_LENGTH,
     MAX_TAGS,
@@ -33,7 +35,6 @@ from lcollision_core.model.pose_file import (
     name_of_file,
     read_pose_file,
     read_poses,
-    unique_names,
     why_no_name,
     write_poses,
 )
@@ -66,13 +67,16 @@ __all__ = [
     "Symmetry",
     "change_model",
     "checkpoint_path",
+    "encode_mesh",
     "export_frame",
     "export_mesh",
     "find_latent_space",
     "find_model",
+    "fingerprint_of_pose",
     "list_models",
     "model_destination",
     "name_of_file",
+    "read_model_mesh",
     "read_pose_file",
     "read_poses",
     "sample_poses",
@@ -81,5 +85,6 @@ __all__ = [
     "user_models_folder",
     "user_poses_folder",
     "why_no_name",
+    "with_detail",
     "write_poses",
 ]

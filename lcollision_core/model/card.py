@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from lcollision_core.errors import ModelFileError
@@ -15,6 +15,7 @@ _LEAST_HEIGHT = 1e-12
 """Of a body, in whatever unit; its inverse is the largest."""
 
 _MAX_TEXT_LENGTH = 1000
+_CARD = "the model's card"
 _ADVICE = "train or copy the model again"
 
 
@@ -24,9 +25,9 @@ class ModelCard:
 
     Attributes
     ----------
-    height : one height in the data's unit
+    height : the body size, in the data's unit
     up_axis : 0, 1 or 2 for x, y or z
-    near_exclusion : pairs of faces this near along the surface, in heights, are counted apart
+    near_exclusion : pairs of faces this near along the surface, normalised, are counted apart
     domain_names : K different names
     domain_colours : K strings "#rrggbb"
     pose_names : N names of the training poses
@@ -84,23 +85,14 @@ class ModelCard:
             ),
         ):
             if not sound:
-                raise ModelFileError(f"the model's card is damaged: {needed}; {_ADVICE}")
+                raise ModelFileError.because(_CARD, "is damaged", needed, _ADVICE)
 
     def to_metadata(self) -> dict[str, Any]:
         """Return JSON values from which `from_metadata` builds the same card."""
-        ordered = {"domain_order": list(self.domain_order)} if self.domain_order else {}
-        return {
-            "height": self.height,
-            "up_axis": self.up_axis,
-            "near_exclusion": self.near_exclusion,
-            "domain_names": list(self.domain_names),
-            "domain_colours": list(self.domain_colours),
-            "pose_names": list(self.pose_names),
-            "source": self.source,
-            "licence": self.licence,
-            "provenance": dict(self.provenance),
-            **ordered,
-        }
+        values = asdict(self)
+        if not self.domain_order:
+            del values["domain_order"]
+        return values
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> ModelCard:
@@ -113,4 +105,4 @@ class ModelCard:
         try:
             return from_json(cls, metadata, "card")
         except ValueError as error:
-            raise ModelFileError(f"the model's card is damaged: {error}; {_ADVICE}") from error
+            raise ModelFileError.because(_CARD, "is damaged", error, _ADVICE) from error

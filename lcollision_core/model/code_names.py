@@ -1,4 +1,4 @@
-"""What each number of a latent pose does to the body, in words: "left thigh forward", "twist"."""
+"""What each code of a latent pose does to the body, in words: "left thigh forward", "twist"."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+
+from lcollision_core.model.naming import unique_names
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -29,9 +31,9 @@ class CodeEffect:
 
     Attributes
     ----------
-    domain : index from 0 of the domain that the name is of: the code's own in the first group,
-        where each domain has one code, however far it swings what hangs on it; a code of a domain's
-        group is of that domain, unless it hardly moves beside another that it carries along
+    domain : index from 0 of the domain that the name refers to: in the first group, where each
+        domain has one code, that domain, however far it swings what hangs on it; in a domain's
+        group that domain, unless the code mainly moves another
     motion : "up", "down", "forward", "back", "left" or "right" for a shift of that domain; "bend
         up" and so on where it turns, after its far end; "twist" about its long axis; "still" where
         nothing moves
@@ -74,10 +76,8 @@ def code_effects(
     axes = np.stack([up, front, np.cross(up, front)])
     weights = np.asarray(attention_mask, dtype=np.float64) ** 2
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), _TINY)
-    own = np.repeat(np.arange(len(group_sizes)) - 1, group_sizes)
-    one_each = group_sizes[0] == len(weights)
-    if one_each:
-        own[: group_sizes[0]] = np.arange(group_sizes[0])
+    domains = np.arange(len(weights))
+    own = np.concatenate([domains, np.repeat(domains, group_sizes[1:])])
     positions = decode(np.zeros((1, len(high))))[0]
     effects: list[CodeEffect] = []
     for start in range(0, len(high), _CHUNK):
@@ -87,12 +87,7 @@ def code_effects(
         moved = decode(poses) - positions
         effects.extend(
             _effect(
-                motion,
-                positions,
-                weights,
-                axes,
-                int(own[code]),
-                0.0 if one_each and code < group_sizes[0] else _OWN,
+                motion, positions, weights, axes, own[code], _OWN if code >= len(domains) else 0.0
             )
             for code, motion in zip(codes, moved, strict=True)
         )
@@ -117,19 +112,13 @@ def code_names(
         second of two that are alike is "forward 2".
     """
     names: list[str] = []
-    start = 0
     for group, size in enumerate(group_sizes):
-        taken: dict[str, int] = {}
-        for effect in effects[start : start + size]:
-            own = effect.domain == group - 1 or effect.motion == "still"
-            name = effect.motion if own else f"{domain_names[effect.domain]} {effect.motion}"
-            taken[name] = taken.get(name, 0) + 1
-            while taken[name] > 1 and f"{name} {taken[name]}" in taken:
-                taken[name] += 1
-            numbered = name if taken[name] == 1 else f"{name} {taken[name]}"
-            taken.setdefault(numbered, 1)
-            names.append(numbered)
-        start += size
+        names += unique_names(
+            effect.motion
+            if effect.domain == group - 1 or effect.motion == "still"
+            else f"{domain_names[effect.domain]} {effect.motion}"
+            for effect in effects[len(names) : len(names) + size]
+        )
     return tuple(names)
 
 
@@ -138,13 +127,13 @@ def _effect(
     positions: FloatArray,
     weights: FloatArray,
     axes: FloatArray,
-    own: int,
+    own: np.intp,
     least_share: float,
 ) -> CodeEffect:
     motion = weights @ (moved**2).sum(axis=1)
     domain = int(motion.argmax())
-    if own >= 0 and motion[own] >= least_share * motion[domain]:
-        domain = own
+    if motion[own] >= least_share * motion[domain]:
+        domain = int(own)
     share = weights[domain]
     total = float(share @ (moved**2).sum(axis=1))
     if total <= _TINY * float(share @ (positions**2).sum(axis=1)):

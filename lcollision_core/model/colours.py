@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -51,8 +50,10 @@ def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
     -----
     A weight's darkness is drawn as a tint, so that a pale colour must not pass for a neighbour's
     full one: only the hue and chroma of CIELAB count here. Colours swap domains as long as that
-    lessens the sum of overlaps over squared distances.
+    reduces the sum of overlaps over squared distances.
     """
+    from scipy.optimize import quadratic_assignment
+
     n_domains = len(attention_mask)
     chosen = [PALETTE[domain % len(PALETTE)] for domain in range(n_domains)]
     chroma = np.array([cielab(colour)[1:] for colour in chosen])
@@ -61,22 +62,14 @@ def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
     mask = np.asarray(attention_mask, dtype=np.float64)
     overlap = mask @ mask.T
     np.fill_diagonal(overlap, 0.0)
-    order = list(range(n_domains))
-
-    def clash(candidate: list[int]) -> float:
-        return float((overlap * likeness[np.ix_(candidate, candidate)]).sum())
-
-    best = clash(order)
-    improved = True
-    while improved:
-        improved = False
-        for a, b in combinations(range(n_domains), 2):
-            swapped = order.copy()
-            swapped[a], swapped[b] = order[b], order[a]
-            tried = clash(swapped)
-            if tried < best * (1.0 - 1e-9):
-                order, best, improved = swapped, tried, True
-    return tuple(chosen[colour] for colour in order)
+    in_order = np.arange(n_domains)
+    found = quadratic_assignment(
+        overlap,
+        likeness,
+        method="2opt",
+        options={"partial_guess": np.stack([in_order, in_order], axis=1)},
+    )
+    return tuple(chosen[colour] for colour in found.col_ind)
 
 
 def cielab(colour: str, sight: npt.NDArray[np.float64] | None = None) -> npt.NDArray[np.float64]:

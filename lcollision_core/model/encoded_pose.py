@@ -18,7 +18,7 @@ class EncodedPose:
     ----------
     latent : (D,) float64 array
     placement : takes the decoded pose to where the mesh was, and into its unit
-    fit_error_mean, fit_error_max : distance of the decoded vertices from the mesh's, in heights
+    fit_error_mean, fit_error_max : distance of the decoded vertices from the mesh's, normalised
     """
 
     latent: npt.NDArray[np.float64]

@@ -72,15 +72,16 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
             destination = user_models_folder() / f"{path}{MODEL_SUFFIX}"
     if destination.name and checkpoint_path(destination).is_file():
         raise ModelFileError(
-            f"the training of {str(path)!r} is not finished; run its command again, which goes on "
-            f"from {checkpoint_path(destination)}"
+            "is not finished",
+            f"run its command again, which goes on from {checkpoint_path(destination)}",
+            where=f"the training of {str(path)!r}",
         )
     if len(path.parts) == 1:
         names = ", ".join(model.name for model in listed) or "none yet"
         close = get_close_matches(path.name, [model.name for model in listed], 1)
         meant = f" (did you mean {close[0]}?)" if close else ""
         raise ModelFileError(
-            f"there is no model or file {path.name!r}{meant}; the models are: {names}"
+            f"there is no model or file {path.name!r}{meant}", f"the models are: {names}"
         )
     return path
 
@@ -109,19 +110,20 @@ def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ModelFileError(
-                f"{folder} cannot be made: {error.strerror or error}; name a file elsewhere"
+            raise ModelFileError.because(
+                folder, "cannot be made", error, "name a file elsewhere"
             ) from error
         return folder / f"{path}{MODEL_SUFFIX}"
     if path.suffix != MODEL_SUFFIX:
-        raise ModelFileError(
-            f"{path} cannot be written: a model is a {MODEL_SUFFIX} file; rename it, or give a "
-            f"name alone to store it with your models"
+        raise ModelFileError.unwritable(
+            path,
+            f"a model is a {MODEL_SUFFIX} file",
+            "rename it, or give a name alone to store it with your models",
         )
     if not path.parent.is_dir():
-        raise ModelFileError(
-            f"{path} cannot be written: there is no folder {path.parent}; create it first"
+        raise ModelFileError.unwritable(
+            path, f"there is no folder {path.parent}", "create it first"
         )
     if path.is_dir():
-        raise ModelFileError(f"{path} cannot be written: it is a folder; add a file name")
+        raise ModelFileError.unwritable(path, "it is a folder", "add a file name")
     return path

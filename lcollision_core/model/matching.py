@@ -36,19 +36,21 @@ def require_same_faces(topology: Topology, needed: Topology, source: str, model:
     ):
         if found != count:
             raise PoseSetError(
-                f"{source} has {found} {noun}, the model {model!r} has {count}; export it with "
-                f"the model's topology"
+                f"has {found} {noun}, the model {model!r} has {count}",
+                "export it with the model's topology",
+                where=source,
             )
     if topology != needed and not np.array_equal(
-        _sorted_faces(topology.faces), _sorted_faces(needed.faces)
+        sorted_faces(topology.faces), sorted_faces(needed.faces)
     ):
         raise PoseSetError(
-            f"{source} has other faces than the model {model!r}; export it with the model's "
-            f"topology and vertex order"
+            f"has other faces than the model {model!r}",
+            "export it with the model's topology and vertex order",
+            where=source,
         )
 
 
-def _sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+def sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Turn each face until its least vertex comes first, then sort the faces."""
     turned = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
     rows = np.take_along_axis(faces, turned, axis=1)
@@ -79,17 +81,17 @@ def checked_mesh(
     PoseSetError : with its vertices in another order, or too far from the origin for its digits.
     """
     if not 0.0 < scale < np.inf:
-        raise ShapeError(f"the scale must be a number above 0, got {scale:g}")
+        raise ShapeError.must_be("the scale", "a number above 0", f"{scale:g}")
     mesh = np.asarray(vertices, dtype=np.float64)
     if mesh.shape != reference.shape:
-        raise ShapeError(f"a mesh of {model} has shape {reference.shape}, got {mesh.shape}")
+        raise ShapeError.must_be(f"a mesh of {model}", f"of shape {reference.shape}", mesh.shape)
     if not np.isfinite(mesh).all():
         vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
-        raise ShapeError(f"vertex {vertex} (from 0) is not finite")
+        raise ShapeError("is not finite", where=f"vertex {vertex} (from 0)")
     if not can_hold(mesh, topology, np.float64):
         raise PoseSetError(
-            "the mesh lies so far from the origin that its coordinates lose their digits; move it "
-            "nearer to the origin"
+            "the mesh lies so far from the origin that its coordinates lose their digits",
+            "move it nearer to the origin",
         )
     mesh = mesh * scale
     lengths, known = (topology.edge_lengths(one) for one in (mesh, reference))
@@ -103,13 +105,14 @@ def checked_mesh(
             f"which is {height(reference, topology):.3g} tall in its own unit"
         )
         if not 0.0 < size < np.inf:
-            raise PoseSetError(f"{sentence}; export it again")
+            raise PoseSetError(sentence, "export it again")
         factor = likely_factor(1.0 / size) * scale
-        raise WrongScaleError(f"{sentence}; scale it by {factor:.6g}", factor)
+        raise WrongScaleError(sentence, f"scale it by {factor:.6g}", factor=factor)
     if is_torn(lengths, size * known):
         raise PoseSetError(
-            f"the mesh has other vertices joined than the body of {model!r}, as if they came in "
-            f"another order; export it with the model's vertex order"
+            f"the mesh has other vertices joined than the body of {model!r}, as if they "
+            "came in another order",
+            "export it with the model's vertex order",
         )
     return mesh
 

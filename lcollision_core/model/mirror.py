@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import RigidTransform, Topology
+from lcollision_core.model.matching import sorted_faces
 
 if TYPE_CHECKING:
-    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
+    from lcollision_core.resolve import ExactCheck, PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
 
 _TOLERANCE = 1e-3
-"""In heights: how far a vertex may lie from its partner's mirror image."""
+"""Normalised: how far a vertex may lie from its partner's mirror image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class MirrorSource:
     Attributes
     ----------
     latent : (D,) float64 array
-    placement : where the decoded pose belongs, None for the reference's frame
+    placement : where the decoded pose belongs, None for the model's own coordinates
     image : the fingerprint of the mirror image; any other pose has another source
     """
 
@@ -75,12 +75,12 @@ class MirrorSource:
 
 @dataclass(frozen=True, eq=False)
 class MirroredPose:
-    """A pose with left and right exchanged. Lengths are in heights.
+    """A pose with left and right exchanged. Lengths are normalised.
 
     Attributes
     ----------
     latent : (D,) float64 array
-    placement : where the decoded pose belongs, None for the reference's frame
+    placement : where the decoded pose belongs, None for the model's own coordinates
     fit_error_mean, fit_error_max : distance of the decoded vertices from the exact mirror image
     restored : it is the pose that the given one was mirrored from, to the bit
     pairs_before : colliding pairs of faces of the given pose, by the exact check
@@ -107,48 +107,43 @@ class MirroredPose:
         return self.pairs_before == 0 < self.pairs_after
 
 
-def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | None) -> str:
-    """Return 16 hexadecimal digits that tell a pose and its place, to the bit.
+def pose_bytes(latent: npt.NDArray[Any], placement: RigidTransform | None) -> bytes:
+    """Return bytes that are equal for equal poses in equal places, and for no others.
 
     Parameters
     ----------
     latent : (D,) array
-    placement : None for the reference's frame
+    placement : None for the model's own coordinates
     """
-    digest = hashlib.sha256(np.asarray(latent, dtype="<f8").tobytes())
+    arrays: list[npt.ArrayLike] = [latent]
     if placement is not None:
-        for array in (placement.rotation, placement.translation):
-            digest.update(np.asarray(array, dtype="<f8").tobytes())
+        arrays += [placement.rotation, placement.translation]
         if placement.scale != 1.0:
-            digest.update(np.asarray(placement.scale, dtype="<f8").tobytes())
-    return digest.hexdigest()[:16]
+            arrays.append(placement.scale)
+    return b"".join(np.asarray(array, dtype="<f8").tobytes() for array in arrays)
 
 
+def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | None) -> str:
+    """Return 16 hexadecimal digits that tell a pose and its place, to the bit."""
+    return hashlib.sha256(pose_bytes(latent, placement)).hexdigest()[:16]
+
+
+@dataclass(frozen=True, eq=False)
 class PoseMirror:
     """Exchanges left and right of one model's poses; immutable, safe between threads.
 
-    Parameters
+    Attributes
     ----------
     embedding : decodes latent poses, and finds those of meshes
     symmetry : of the mesh, in the data's unit
-    detector : the exact check, in the data's unit
-    height : one height in the data's unit
+    check : the exact check of the model's poses
     resolver : of what collides in the mirror only; None leaves it colliding
     """
 
-    def __init__(
-        self,
-        embedding: Embedding,
-        symmetry: Symmetry,
-        detector: CollisionDetector,
-        height: float,
-        resolver: PoseResolver | None,
-    ) -> None:
-        self._embedding = embedding
-        self._symmetry = symmetry
-        self._detector = detector
-        self._height = height
-        self._resolver = resolver
+    embedding: Embedding
+    symmetry: Symmetry
+    check: ExactCheck
+    resolver: PoseResolver | None
 
     def mirror(
         self,
@@ -167,7 +162,7 @@ class PoseMirror:
         Parameters
         ----------
         latent : (D,) finite array
-        placement : where the decoded pose belongs, None for the reference's frame
+        placement : where the decoded pose belongs, None for the model's own coordinates
         source : what the pose was mirrored from, or None: where it is still that image, what
             comes back is the source, to the bit
         options : of the Resolve; its locked domains keep what they have in the mirror
@@ -178,32 +173,30 @@ class PoseMirror:
         ------
         ShapeError, LCollisionError, CancelledError : as of `PoseModel.resolve`.
         """
-        from lcollision_core.resolve.exact import ExactCheck
-
-        pose = np.array(latent, dtype=np.float64)
-        check = ExactCheck(self._embedding, self._detector, self._height, placement)
+        pose, height = np.array(latent, dtype=np.float64), self.check.height
+        check = replace(self.check, placement=placement)
         decoded = check.decode(pose)[0]
-        pairs_before = len(check.find(decoded).pairs)
-        image = self._symmetry.image(decoded * self._height) / self._height
-        place = None if placement is None else self._symmetry.image_of_placement(placement)
+        pairs_before = len(check.find(check.exported(decoded)).pairs)
+        image = self.symmetry.image(decoded * height) / height
+        place = None if placement is None else self.symmetry.image_of_placement(placement)
         restored = source is not None and source.is_of(pose, placement)
         if source is not None and restored:
             found, place = source.latent, source.placement
         else:
             # In its place: a rigid motion left to the fit would be one more thing to undo, and
-            # the codes hold it all but as well.
-            fit = self._embedding.encode(image[None], cancel=cancel, in_place=True)
+            # the codes hold it nearly as well.
+            fit = self.embedding.encode(image[None], cancel=cancel, in_place=True)
             found = fit.latent[0].astype(np.float64)
-        check = ExactCheck(self._embedding, self._detector, self._height, place)
+        check = replace(check, placement=place)
         mirrored = check.decode(found)[0]
-        pairs_mirrored = pairs_after = len(check.find(mirrored).pairs)
+        pairs_mirrored = pairs_after = len(check.find(check.exported(mirrored)).pairs)
         resolution = None
-        if not restored and pairs_before == 0 < pairs_mirrored and self._resolver is not None:
-            resolution = self._resolver.resolve(found, options, progress, cancel, place)
+        if not restored and pairs_before == 0 < pairs_mirrored and self.resolver is not None:
+            resolution = self.resolver.resolve(found, options, progress, cancel, place)
             if resolution.exactly_free:
                 found, pairs_after = resolution.latent, 0
                 mirrored = check.decode(found)[0]
-        picked = self._embedding.topology.picked
+        picked = self.embedding.topology.picked
         distances = np.linalg.norm((mirrored - image)[picked], axis=1)
         return MirroredPose(
             latent=found,
@@ -248,14 +241,9 @@ def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int)
         partner = np.arange(topology.n_vertices, dtype=np.int32)
         partner[used] = used[nearest]
         is_exchange = distance.max() < tolerance and (nearest[nearest] == everyone).all()
-        if is_exchange and _turned(partner[faces[:, ::-1]]) == _turned(faces):
+        if is_exchange and np.array_equal(
+            sorted_faces(partner[faces[:, ::-1]]), sorted_faces(faces)
+        ):
             partner.flags.writeable = False
             return Symmetry(partner, axis, offset)
     return None
-
-
-def _turned(faces: npt.NDArray[np.int32]) -> set[tuple[int, int, int]]:
-    """Return the faces as a set, each turned until its least vertex comes first."""
-    turns = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
-    rows = np.take_along_axis(faces, turns, axis=1)
-    return {(int(a), int(b), int(c)) for a, b, c in rows}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from lcollision_core.errors import ModelFileError
 MAX_NAME_LENGTH = 60
 
 _MAIN_SHARE = 0.6
-"""Of a domain's weight: a body part with as much names the domain alone."""
+"""Of a domain's weight: a labelled part with as much names the domain alone."""
 _SECOND_SHARE = 0.2
 """Of a domain's weight: a second part with less is not worth naming."""
 _SAME_SHARE = 0.5
@@ -29,7 +29,7 @@ def numbered_names(n_domains: int) -> tuple[str, ...]:
 def names_from_labels(
     attention_mask: npt.NDArray[Any],
     vertex_labels: npt.NDArray[np.str_],
-    heights: npt.NDArray[Any],
+    levels: npt.NDArray[Any],
 ) -> tuple[str, ...]:
     """Name each domain after the body parts that its mask covers.
 
@@ -43,7 +43,7 @@ def names_from_labels(
     ----------
     attention_mask : (K, V) array
     vertex_labels : (V,) strings that are not blank, such as "left forearm"
-    heights : (V,) array, each vertex's coordinate along the up axis, in any unit
+    levels : (V,) array, each vertex's coordinate along the up axis, in any unit
 
     Returns
     -------
@@ -74,7 +74,7 @@ def names_from_labels(
         for first, found in zip(names, ranked, strict=True)
     ]
     mass = np.maximum(attention_mask.sum(axis=1), np.finfo(float).tiny)
-    return _told_apart(names, attention_mask @ heights / mass)
+    return _told_apart(names, attention_mask @ levels / mass)
 
 
 def join_names(first: str, second: str) -> str:
@@ -119,9 +119,29 @@ def checked_name(name: str) -> str:
     stripped = name.strip()
     if not stripped or len(stripped) > MAX_NAME_LENGTH or not stripped.isprintable():
         raise ModelFileError(
-            f"{name[:80]!r} cannot name a domain; use 1 to {MAX_NAME_LENGTH} printable characters"
+            "cannot name a domain",
+            f"use 1 to {MAX_NAME_LENGTH} printable characters",
+            where=f"{name[:80]!r}",
         )
     return stripped
+
+
+def unique_names(names: Iterable[str], max_length: int = 200) -> list[str]:
+    """Return the names, numbered where an earlier one differs by case at most: "a", "A 2".
+
+    Numbered names are at most `max_length` long.
+    """
+    taken: set[str] = set()
+    result = []
+    for name in names:
+        candidate, number = name, 1
+        while candidate.casefold() in taken:
+            number += 1
+            ending = f" {number}"
+            candidate = name[: max_length - len(ending)] + ending
+        taken.add(candidate.casefold())
+        result.append(candidate)
+    return result
 
 
 def _shared(names: Sequence[str]) -> set[str]:
@@ -137,17 +157,4 @@ def _told_apart(names: list[str], levels: npt.NDArray[Any]) -> tuple[str, ...]:
         for rank, domain in enumerate(domains):
             words = places.get(len(domains))
             names[domain] = f"{words[rank]} {shared}" if words else f"{shared} {rank + 1}"
-    return _made_fit(names)
-
-
-def _made_fit(names: Sequence[str]) -> tuple[str, ...]:
-    """Cut names that are too long, and number those that an earlier one is equal to."""
-    fit: list[str] = []
-    for name in names:
-        candidate, number = name[:MAX_NAME_LENGTH].rstrip(), 1
-        while candidate in fit:
-            number += 1
-            ending = f" {number}"
-            candidate = name[: MAX_NAME_LENGTH - len(ending)].rstrip() + ending
-        fit.append(candidate)
-    return tuple(fit)
+    return tuple(unique_names((name[:MAX_NAME_LENGTH].rstrip() for name in names), MAX_NAME_LENGTH))

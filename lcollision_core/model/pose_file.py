@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +16,10 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes import RigidTransform, atomic_write
-from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.library import ListedModel, user_models_folder
-from lcollision_core.model.mirror import MirroredPose, MirrorSource
+from lcollision_core.model.mirror import MirroredPose, MirrorSource, pose_bytes
+from lcollision_core.model.naming import unique_names
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.regular_files import read_regular
 
@@ -48,8 +48,9 @@ class NamedPose:
     name : unlike that of the file's other poses
     latent : (D,) float64 array
     placement : where the decoded pose belongs, for one that came in as a mesh; None leaves it in
-        the reference's frame
-    fit_error_mean, fit_error_max : of one that was fitted to a mesh or a mirror image, in heights
+        the model's coordinates
+    fit_error_mean, fit_error_max : of one that was fitted to a mesh or a mirror image,
+        normalised
     tags : under which it is found in a library
     mirror_of : of a mirror image the pose that it was made from, which mirroring it again, while
         it is unchanged, gives back to the bit
@@ -65,16 +66,7 @@ class NamedPose:
 
     def same_as(self, other: NamedPose) -> bool:
         """Whether both have the same latent and placement, to the bit, whatever their names."""
-        return self.latent.tobytes() == other.latent.tobytes() and _placed_alike(
-            self.placement, other.placement
-        )
-
-    @classmethod
-    def of_mesh(cls, name: str, encoded: EncodedPose) -> NamedPose:
-        """Name an encoded mesh."""
-        return cls(
-            name, encoded.latent, encoded.placement, encoded.fit_error_mean, encoded.fit_error_max
-        )
+        return pose_bytes(self.latent, self.placement) == pose_bytes(other.latent, other.placement)
 
     def mirrored(self, image: MirroredPose) -> NamedPose:
         """Return what mirroring this pose gave, under the same name and tags."""
@@ -126,9 +118,11 @@ class OtherModelError(ModelFileError):
     model : the model that the poses belong to, None where it is not among the listed ones
     """
 
-    def __init__(self, sentence: str, model: ListedModel | None) -> None:
-        super().__init__(sentence)
-        self.model = model
+    def __init__(
+        self, what: str, next_step: str = "", *, where: object, model: ListedModel | None
+    ) -> None:
+        super().__init__(what, next_step, where=where)
+        self.model: Final = model
 
 
 def write_poses(
@@ -156,21 +150,22 @@ def write_poses(
         a pose, or the file cannot be written.
     """
     if Path(path).suffix.lower() != ".json":
-        raise ModelFileError(f"{path} cannot be written: poses are a .json file; rename it")
+        raise ModelFileError.unwritable(path, "poses are a .json file", "rename it")
     name, times = Counter(pose.name for pose in poses).most_common(1)[0] if poses else ("", 0)
     if times > 1:
-        raise ModelFileError(f"{path} cannot be written: {times} poses are called {name!r}")
+        raise ModelFileError.unwritable(path, f"{times} poses are called {name!r}")
     held = [*poses, *([] if working is None else [working])]
     entries = [to_json(pose) for pose in held]
     for pose, entry in zip(held, entries, strict=True):
         try:
             _from_json(entry, model.latent_size)
         except ValueError as error:
-            raise ModelFileError(
-                f"{path} cannot be written: of the pose {pose.name[:80]!r}, {error}; repair that "
-                f"pose"
+            raise ModelFileError.unwritable(
+                path, f"of the pose {pose.name[:80]!r}, {error}", "repair that pose"
             ) from error
-    needs_latest = working is not None or any(pose.tags or _is_scaled(pose) for pose in poses)
+    needs_latest = working is not None or any(
+        pose.tags or (pose.placement is not None and pose.placement.scale != 1.0) for pose in poses
+    )
     document = {
         "format": POSES_FORMAT,
         "format_version": POSES_VERSION if needs_latest else 1,
@@ -181,16 +176,17 @@ def write_poses(
     }
     content = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False).encode()
     if len(content) >= MAX_FILE_BYTES:
-        raise ModelFileError(
-            f"{path} cannot be written: {len(poses)} poses take more than the {MAX_FILE_BYTES} "
-            f"bytes that can be read again; write several files"
+        raise ModelFileError.unwritable(
+            path,
+            f"{len(poses)} poses take more than the {MAX_FILE_BYTES} bytes that can be read again",
+            "write several files",
         )
     try:
         with atomic_write(path) as file:
             file.write(content)
             file.write(b"\n")
     except MeshFileError as error:
-        raise ModelFileError(str(error)) from error
+        raise ModelFileError.like(error) from error
 
 
 def read_poses(path: str | os.PathLike[str], model: PoseModel) -> tuple[NamedPose, ...]:
@@ -215,17 +211,16 @@ def read_pose_file(path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
     try:
         content = read_regular(path, MAX_FILE_BYTES)
     except FileNotFoundError as error:
-        raise ModelFileError(
-            f"{path} cannot be read: there is no such file; name a .json file of poses"
+        raise ModelFileError.unreadable(
+            path, "there is no such file", "name a .json file of poses"
         ) from error
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ModelFileError(f"{path} cannot be read: {reason}; check the file") from error
+        raise ModelFileError.unreadable(path, error, "check the file") from error
     try:
         document = parse_json(content)
     except ValueError as error:
         raise DamagedPosesError(
-            f"{path} is no JSON ({error}); name a file of poses that lcollision wrote"
+            f"is no JSON ({error})", "name a file of poses that lcollision wrote", where=path
         ) from error
     return _parse(document, path, model)
 
@@ -245,40 +240,19 @@ def name_of_file(path: Path) -> str:
     return stem[:MAX_NAME_LENGTH]
 
 
-def unique_names(names: Iterable[str]) -> list[str]:
-    """Return the names, numbered where an earlier one differs by case at most: "a", "A 2".
-
-    Numbered names are at most `MAX_NAME_LENGTH` long.
-    """
-    taken: set[str] = set()
-    result = []
-    for name in names:
-        candidate, number = name, 1
-        while candidate.casefold() in taken:
-            number += 1
-            ending = f" {number}"
-            candidate = name[: MAX_NAME_LENGTH - len(ending)] + ending
-        taken.add(candidate.casefold())
-        result.append(candidate)
-    return result
-
-
 def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
     if not isinstance(document, dict) or document.get("format") != POSES_FORMAT:
         raise DamagedPosesError(
-            f"{path} holds no poses of this program; name a file that lcollision wrote"
+            "holds no poses of this program", "name a file that lcollision wrote", where=path
         )
     version = document.get("format_version")
     if isinstance(version, int) and version > POSES_VERSION:
-        raise ModelFileError(
-            f"{path} has format version {quoted(version)}, this program reads up to "
-            f"{POSES_VERSION}; update the program"
-        )
+        raise ModelFileError.too_new(path, quoted(version), POSES_VERSION)
     owner, entries = document.get("model"), document.get("poses")
     if version not in range(1, POSES_VERSION + 1) or isinstance(version, bool | float):
         version = None
     if version is None or not isinstance(owner, dict) or not isinstance(entries, list):
-        raise DamagedPosesError(f"{path} is damaged: it lacks its version, model or poses")
+        raise DamagedPosesError("is damaged: it lacks its version, model or poses", where=path)
     if owner.get("fingerprint") != model.fingerprint:
         raise _other_model(path, owner, model)
 
@@ -286,13 +260,15 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> Pos
         try:
             return _from_json(entry, model.latent_size)
         except ValueError as error:
-            raise DamagedPosesError(
-                f"{path} is damaged at {place}: {error}; repair or remove that pose"
+            raise DamagedPosesError.because(
+                path, f"is damaged at {place}", error, "repair or remove that pose"
             ) from error
 
     poses = tuple(pose(entry, f"pose {place} (from 0)") for place, entry in enumerate(entries))
     if len({pose.name for pose in poses}) < len(poses):
-        raise DamagedPosesError(f"{path} is damaged: two of its poses share a name; rename one")
+        raise DamagedPosesError(
+            "is damaged: two of its poses share a name", "rename one", where=path
+        )
     working = document.get("working") if version > 1 else None
     return PoseFile(poses, None if working is None else pose(working, "its working pose"))
 
@@ -304,21 +280,20 @@ def _other_model(
     fingerprint, name = (str(owner.get(key))[:MAX_NAME_LENGTH] for key in ("fingerprint", "name"))
     listed = find_latent_space(fingerprint, name)
     if listed is not None:
-        sentence = (
-            f"{path} holds poses of the model {listed.name!r}, not of {model.name!r}; use them "
-            f"with {listed.name!r}"
-        )
+        what = f"holds poses of the model {listed.name!r}, not of {model.name!r}"
+        next_step = f"use them with {listed.name!r}"
     elif name == model.name:
-        sentence = (
-            f"{path} holds poses of another model that is called {name!r} too, which is not among "
-            f"the models here; use them with the model that they were made with"
+        what = (
+            f"holds poses of another model called {name!r} too, which is not among the models here"
         )
+        next_step = "use them with the model that they were made with"
     else:
-        sentence = (
-            f"{path} holds poses of the model {name!r}, not of {model.name!r}, and {name!r} is "
-            f"not among the models here; copy its file to {user_models_folder()}, or name it"
+        what = (
+            f"holds poses of the model {name!r}, not of {model.name!r}, and {name!r} is not among "
+            f"the models here"
         )
-    return OtherModelError(sentence, listed)
+        next_step = f"copy its file to {user_models_folder()}, or name it"
+    return OtherModelError(what, next_step, where=path, model=listed)
 
 
 def to_json(pose: NamedPose) -> dict[str, Any]:
@@ -387,10 +362,6 @@ def _placed_from_json(
     return latent, RigidTransform(rotation, translation, scale)
 
 
-def _is_scaled(pose: NamedPose) -> bool:
-    return pose.placement is not None and pose.placement.scale != 1.0
-
-
 def _tags(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list) or len(value) > MAX_TAGS:
         raise ValueError(f"its tags must be a list of at most {MAX_TAGS} texts")
@@ -400,16 +371,6 @@ def _tags(value: Any) -> tuple[str, ...]:
                 f"each of its tags must be a text of 1 to {MAX_NAME_LENGTH} characters"
             )
     return tuple(dict.fromkeys(value))
-
-
-def _placed_alike(one: RigidTransform | None, other: RigidTransform | None) -> bool:
-    if one is None or other is None:
-        return one is other
-    return (
-        np.array_equal(one.rotation, other.rotation)
-        and np.array_equal(one.translation, other.translation)
-        and one.scale == other.scale
-    )
 
 
 def _object(value: Any, name: str) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """The user's own poses of a model: a file in their data folder, written at every change.
 
 Several programs may have one library open. A change is therefore no new content but a difference,
-which is applied to what the file holds by then, under a lock: nobody's poses are lost, nor does
-taking one's own change back take another's.
+which is applied to what the file holds by then, under a lock: no program's poses are lost, and
+undoing a change leaves those of others.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lcollision_core.errors import MeshFileError, ModelFileError
+from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.meshes import FileStamp, file_stamp, locked, spare_name
+from lcollision_core.model.naming import unique_names
 from lcollision_core.model.pose_file import (
     DamagedPosesError,
     NamedPose,
     OtherModelError,
     read_pose_file,
     to_json,
-    unique_names,
     write_poses,
 )
 from lcollision_core.model.pose_model import PoseModel
@@ -64,11 +64,13 @@ class PoseLibrary:
     ----------
     model : that the poses belong to; a library is found again whatever the model is called
     folder : of all libraries; it is made when there is something to write
-    tell : called with one sentence where the file cannot be read or written; a change that cannot
+    tell : called with the error where the file cannot be read or written; a change that cannot
         be written stays here, and is written with the next one that can
     """
 
-    def __init__(self, model: PoseModel, folder: Path, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, model: PoseModel, folder: Path, tell: Callable[[LCollisionError], None]
+    ) -> None:
         self._model = model
         self._tell = tell
         self._folder = folder
@@ -109,9 +111,9 @@ class PoseLibrary:
             self._unwritten.clear()
         except (ModelFileError, MeshFileError, OSError) as error:
             reason = getattr(error, "strerror", None) or error
+            next_step = "export it to another place before you close the editor"
             self._tell(
-                f"your pose library could not be saved ({reason}); export it to another place "
-                f"before you close the editor"
+                ModelFileError(f"your pose library could not be saved ({reason})", next_step)
             )
         self._poses = _changed(self._in_file, self._unwritten)
 
@@ -125,7 +127,7 @@ class PoseLibrary:
             self._read()
         except (ModelFileError, OSError) as error:
             self._refused = stamp
-            self._tell(f"your pose library could not be read: {error}")
+            self._tell(ModelFileError.because("your pose library", "could not be read", error))
             return False
         self._poses = _changed(self._in_file, self._unwritten)
         return True
@@ -148,10 +150,9 @@ class PoseLibrary:
             if aside.exists():
                 aside = spare_name(aside)
             self.path.rename(aside)
-            self._tell(
-                f"your pose library was damaged and has been set aside as {aside} ({error}); "
-                f"poses that you keep from now on go to a new one"
-            )
+            what = f"was damaged and has been set aside as {aside}: {error.headline}"
+            next_step = "poses that you keep from now on go to a new one"
+            self._tell(ModelFileError(what, next_step, where="your pose library"))
 
 
 def _changed(poses: Sequence[NamedPose], changes: Sequence[LibraryChange]) -> tuple[NamedPose, ...]:

@@ -50,7 +50,7 @@ from lcollision_core.model_file import (
 
 if TYPE_CHECKING:
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
-    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
+    from lcollision_core.resolve import ExactCheck, PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -64,8 +64,8 @@ _LARGEST_CODE = 1e6
 class PoseModel:
     """A body that can take poses: immutable, and safe to share between threads.
 
-    Poses are NumPy arrays in the unit of the data that the model was trained on, in the frame and
-    position of its reference. Build one with `load` or `from_training`.
+    Poses are NumPy arrays in the unit of the data that the model was trained on, in the coordinates
+    of its reference. Build one with `load` or `from_training`.
 
     Parameters
     ----------
@@ -98,8 +98,8 @@ class PoseModel:
         if counts != (embedding.n_domains, len(embedding.training_latent)):
             raise ModelFileError(
                 f"the model names {counts[0]} domains and {counts[1]} poses, but has "
-                f"{embedding.n_domains} and {len(embedding.training_latent)}; train or copy the "
-                f"model again"
+                f"{embedding.n_domains} and {len(embedding.training_latent)}",
+                "train or copy the model again",
             )
         self.name = name
         self.card = card
@@ -129,19 +129,20 @@ class PoseModel:
         missing = [name for name in (EMBEDDING, _CARD) if name not in sections]
         if missing:
             raise ModelFileError(
-                f"{path} is unusable: it lacks its section {missing[0]!r}; train or copy the "
-                f"model again"
+                f"is unusable: it lacks its section {missing[0]!r}",
+                "train or copy the model again",
+                where=path,
             )
         try:
             embedding_section, card_section = sections.pop(EMBEDDING), sections.pop(_CARD)
             embedding = Embedding.from_arrays(embedding_section.arrays, embedding_section.metadata)
             card = ModelCard.from_metadata(card_section.metadata)
             model = cls(path.stem, embedding, card, sections)
-            # What is loaded is sound: the others are used only later, where nobody expects it.
+            # Damage is found now, not when these are used.
             _ = model.predictor_record, model.free_latent
             return model
         except ModelFileError as error:
-            raise ModelFileError(f"{path} is unusable: {error}") from error
+            raise ModelFileError.because(path, "is unusable", error) from error
 
     @classmethod
     def from_training(
@@ -211,8 +212,8 @@ class PoseModel:
 
         Returns
         -------
-        vertices : (V, 3) or (B, V, 3) float64 array, in the data's unit, in the reference's frame
-            and position; a pose gets the same bits alone and in any batch
+        vertices : (V, 3) or (B, V, 3) float64 array, in the data's unit, in the model's
+            coordinates; a pose gets the same bits alone and in any batch
 
         Raises
         ------
@@ -222,6 +223,25 @@ class PoseModel:
         vertices = self.embedding.decode(codes.reshape(-1, self.latent_size), n_threads)
         vertices *= self.card.height
         return vertices[0] if codes.ndim == 1 else vertices
+
+    def exported_vertices(
+        self, latent: npt.ArrayLike, placement: RigidTransform | None = None
+    ) -> npt.NDArray[np.floating]:
+        """Decode a (D,) latent pose to the (V, 3) vertices that it is exported with.
+
+        Parameters
+        ----------
+        placement : where the pose is exported to; None leaves it in the model's coordinates
+        """
+        from lcollision_core.resolve import exported_vertices
+
+        return exported_vertices(self.decode(latent, n_threads=1), placement)
+
+    def exact_check(self, placement: RigidTransform | None = None) -> ExactCheck:
+        """Return what tests poses where they are exported to."""
+        from lcollision_core.resolve import ExactCheck
+
+        return ExactCheck(self.embedding, self.detector, self.height, placement)
 
     def predict(self, latent: npt.ArrayLike) -> Prediction:
         """Predict whether poses collide, and how deeply in which domain, without decoding them.
@@ -245,7 +265,7 @@ class PoseModel:
         cancel: CancelToken | None = None,
         placement: RigidTransform | None = None,
     ) -> ResolveResult:
-        """Find the nearest pose that is exactly free of collisions.
+        """Find the nearest collision-free pose.
 
         Parameters
         ----------
@@ -258,7 +278,7 @@ class PoseModel:
         Raises
         ------
         ShapeError : another shape, a number that is not finite or another number of weights.
-        LCollisionError : a locked domain that there is not.
+        LCollisionError : an unknown locked domain.
         ModelFileError : the model has no predictor, or a damaged one.
         CancelledError : `cancel` was set.
         """
@@ -289,7 +309,7 @@ class PoseModel:
         """
         pose = self._checked(latent)
         if pose.ndim != 1:
-            raise ShapeError(f"one pose is mirrored at a time, got an array of shape {pose.shape}")
+            raise ShapeError("one pose is mirrored at a time", got=f"shape {pose.shape}")
         return self.pose_mirror.mirror(pose, placement, source, options, progress, cancel)
 
     def encode(
@@ -337,10 +357,6 @@ class PoseModel:
         """
         require_same_faces(topology, self.topology, source, self.name)
 
-    def rename_domains(self, names: Mapping[int, str]) -> PoseModel:
-        """Return the same model with some domains called otherwise; see `edit_domains`."""
-        return self.edit_domains(names)
-
     def edit_domains(
         self,
         names: Mapping[int, str] | None = None,
@@ -365,21 +381,23 @@ class PoseModel:
             for domain, value in changes.items():
                 if not 0 <= domain < len(values):
                     raise ModelFileError(
-                        f"{self.name} has no domain {domain + 1}; its domains are 1 to "
-                        f"{len(values)}"
+                        f"has no domain {domain + 1}",
+                        f"its domains are 1 to {len(values)}",
+                        where=self.name,
                     )
                 values[domain] = checked_name(value) if values is renamed else value.lower()
         for name in renamed:
             if renamed.count(name) > 1:
-                raise ModelFileError(f"two domains would be called {name!r}; choose another name")
+                raise ModelFileError(f"two domains would be called {name!r}", "choose another name")
         if order is not None and sorted(order) != list(range(len(renamed))):
             raise ModelFileError(
-                f"{list(order)} is no order of the {len(renamed)} domains of {self.name}; name "
-                f"each once"
+                f"is no order of the {len(renamed)} domains of {self.name}",
+                "name each once",
+                where=list(order),
             )
         for colour in coloured:
             if not re.fullmatch("#[0-9a-f]{6}", colour):
-                raise ModelFileError(f"{colour!r} is no colour; write it as in #0077bb")
+                raise ModelFileError("is no colour", "write it as in #0077bb", where=f"{colour!r}")
         return self.with_card(
             replace(
                 self.card,
@@ -418,16 +436,17 @@ class PoseModel:
         return self._with_section(_PREDICTOR, predictor.to_section())
 
     def with_free_poses(self, latent: npt.ArrayLike) -> PoseModel:
-        """Return the same model with (F, D) poses that were found exactly free, F >= 0."""
+        """Return the same model with (F, D) poses that were found collision-free, F >= 0."""
         codes = np.asarray(latent, dtype=np.float32).reshape(-1, self.latent_size)
         return self._with_section(_FREE_POSES, Section({"latent": codes}))
 
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         codes = np.asarray(latent, dtype=np.float64)
         if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
-            raise ShapeError(
-                f"a latent pose of {self.name} has {self.latent_size} numbers, got an array of "
-                f"shape {codes.shape}"
+            raise ShapeError.must_be(
+                f"a latent pose of {self.name}",
+                f"{self.latent_size} numbers",
+                f"shape {codes.shape}",
             )
         if not np.isfinite(codes).all():
             raise ShapeError("a latent pose has a number that is not finite")
@@ -477,14 +496,15 @@ class PoseModel:
         predictor = self.predictor
         if predictor is None:
             raise ModelFileError(
-                f"the model {self.name!r} has no predictor; run `lcollision label` and then "
-                f"`lcollision train predictor`"
+                "has no predictor",
+                "run `lcollision label` and then `lcollision train predictor`",
+                where=f"the model {self.name!r}",
             )
         return predictor
 
     @cached_property
     def free_latent(self) -> FloatArray:
-        """(F, D) poses that were found exactly free when the predictor was made, read-only.
+        """(F, D) poses that were found collision-free when the predictor was made, read-only.
 
         Raises
         ------
@@ -499,8 +519,8 @@ class PoseModel:
                 section.arrays, "latent", np.float32, (None, self.latent_size), _LARGEST_CODE
             )
         except ValueError as error:
-            raise ModelFileError(
-                f"the model's free poses are damaged: {error}; train the predictor again"
+            raise ModelFileError.because(
+                "the model's free poses", "are damaged", error, "train the predictor again"
             ) from error
         return _read_only(codes.astype(np.float64))
 
@@ -541,11 +561,13 @@ class PoseModel:
         """
         if self.symmetry is None:
             raise LCollisionError(
-                f"poses of {self.name} cannot be mirrored: its first pose is not symmetric, so "
-                f"that left and right are unknown; train a model whose first pose is"
+                "cannot be mirrored: its first pose is not symmetric, so that left and "
+                "right are unknown",
+                "train a model whose first pose is",
+                where=f"poses of {self.name}",
             )
         resolver = self.resolver if self.has_predictor else None
-        return PoseMirror(self.embedding, self.symmetry, self.detector, self.height, resolver)
+        return PoseMirror(self.embedding, self.symmetry, self.exact_check(), resolver)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -620,7 +642,7 @@ class PoseModel:
 
     @property
     def height(self) -> float:
-        """One height, the unit of reports, in the data's unit."""
+        """The body size, by which lengths are normalised, in the data's unit."""
         return self.card.height
 
     @property
@@ -635,7 +657,7 @@ class PoseModel:
 
     @property
     def near_exclusion(self) -> float:
-        """Pairs of faces this near along the surface, in heights, are folds, not collisions."""
+        """Normalised length along the surface within which pairs of faces are folds of the skin."""
         return self.card.near_exclusion
 
     @property
@@ -660,7 +682,7 @@ class PoseModel:
 
     @property
     def metrics(self) -> EmbeddingMetrics | None:
-        """What training measured, lengths in heights."""
+        """What training measured, lengths normalised."""
         return self.embedding.metrics
 
 

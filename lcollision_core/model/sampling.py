@@ -1,4 +1,4 @@
-"""Latent poses by chance, all of them or only those that collide or do not."""
+"""Random latent poses: all of them, or only those that collide or do not."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def sample_poses(
         if n_misses >= _MOST_MISSES:
             kind = "collides" if colliding else "is free"
             raise LCollisionError(
-                f"none of {n_misses} poses in a row {kind}; ask for another kind of pose"
+                f"none of {n_misses} poses in a row {kind}", "ask for another kind of pose"
             )
         progress(n_kept, n_poses)
     return kept

@@ -60,15 +60,15 @@ class PredictorConfig:
     def __post_init__(self) -> None:
         for name, low in (("batch_rows", 2), ("epochs", 1)):
             if getattr(self, name) < low:
-                raise LCollisionError(f"{name} must be at least {low}, got {getattr(self, name)}")
+                raise LCollisionError.must_be(name, f"at least {low}", getattr(self, name))
         if self.batch_rows % 2:
-            raise LCollisionError(f"batch_rows must be even, got {self.batch_rows}")
+            raise LCollisionError.must_be("batch_rows", "even", self.batch_rows)
         for name in ("depth_weight", "rank_weight", "average_passes"):
             if not getattr(self, name) >= 0.0:
-                raise LCollisionError(f"{name} must be at least 0, got {getattr(self, name)}")
+                raise LCollisionError.must_be(name, "at least 0", getattr(self, name))
         for name in ("entropy_weight", "rate"):
             if not getattr(self, name) > 0.0:
-                raise LCollisionError(f"{name} must be over 0, got {getattr(self, name)}")
+                raise LCollisionError.must_be(name, "over 0", getattr(self, name))
 
     def passes(self, n_rows: int) -> int:
         """Return how often `n_rows` training rows are gone through: at most `epochs`.
@@ -88,7 +88,7 @@ class PredictorConfig:
         """
         if loss != "full" and self.preset != "paper":
             raise LCollisionError(
-                f"only the preset paper can be trained with the loss {loss}; add --preset paper"
+                f"only the preset paper can be trained with the loss {loss}", "add --preset paper"
             )
         return replace(
             self,

@@ -127,8 +127,10 @@ class PredictorRecord:
         preset = metadata.get("preset")
         if not isinstance(preset, str) or preset not in PRESETS:
             raise ModelFileError(
-                f"the model's predictor has the preset {quoted(preset)}, this program knows "
-                f"{', '.join(PRESETS)}; update the program or train the predictor again"
+                "the model's predictor has an unknown preset",
+                "update the program or train the predictor again",
+                expected=" or ".join(PRESETS),
+                got=quoted(preset),
             )
         try:
             config = from_json(PredictorConfig, metadata.get("config"), "config")
@@ -167,8 +169,11 @@ class PredictorRecord:
 
 
 def _misfit(error: Exception) -> ModelFileError:
-    return ModelFileError(
-        f"the model's predictor does not fit its latent space: {error}; train the predictor again"
+    return ModelFileError.because(
+        "",
+        "the model's predictor does not fit its latent space",
+        error,
+        "train the predictor again",
     )
 
 
@@ -408,8 +413,8 @@ class CollisionPredictor:
 
     def _require(self, latent: npt.NDArray[Any]) -> None:
         if np.ndim(latent) != 2 or np.shape(latent)[1] != self.latent_size:
-            raise ShapeError(
-                f"latent must have shape (B, {self.latent_size}), got {np.shape(latent)}"
+            raise ShapeError.must_be(
+                "latent", f"of shape (B, {self.latent_size})", np.shape(latent)
             )
         if not np.isfinite(latent).all():
             raise ShapeError("a latent pose has a number that is not finite")
@@ -441,7 +446,7 @@ def evaluate_predictor(
     """
     if not len(rows):
         raise LabelStoreError(
-            "there are no rows to evaluate on; label more with `lcollision label`"
+            "there are no rows to evaluate on", "label more with `lcollision label`"
         )
     probability, predicted = np.empty(len(rows)), np.empty(len(rows))
     for start in range(0, len(rows), _ROWS_A_REPORT):
@@ -479,8 +484,9 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
     n_domains, latent_size = rows.domain_energy.shape[1], rows.latent.shape[1]
     if (n_domains, latent_size) != (embedding.n_domains, embedding.latent_size):
         raise ShapeError(
-            f"the labelled rows have {latent_size} codes and {n_domains} domains, the model has "
-            f"{embedding.latent_size} and {embedding.n_domains}; label samples of this model"
+            f"the labelled rows have {latent_size} codes and {n_domains} domains, the "
+            f"model has {embedding.latent_size} and {embedding.n_domains}",
+            "label samples of this model",
         )
     for start in range(0, len(rows), _ROWS_A_REPORT):
         part = slice(start, start + _ROWS_A_REPORT)
@@ -490,5 +496,7 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
         if not finite.all():
             row = start + int(np.flatnonzero(~finite)[0])
             raise ShapeError(
-                f"row {row} (from 0) has a number that is not finite; label the samples again"
+                "has a number that is not finite",
+                "label the samples again",
+                where=f"row {row} (from 0)",
             )

@@ -1,4 +1,4 @@
-"""The nearest collision-free pose: the paper's problem, then a ladder that ends exactly free."""
+"""The nearest collision-free pose: the paper's problem, then a ladder of exactly checked steps."""
 
 from lcollision_core.resolve.exact import ExactCheck, exported_vertices
 from lcollision_core.resolve.free_poses import find_free_poses

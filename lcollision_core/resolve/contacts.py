@@ -1,7 +1,8 @@
-"""Contacts of a pose as linear constraints on its latent codes."""
+"""Contacts of a pose as linear constraints on its latent codes, and the way out of shallow ones."""
 
 from __future__ import annotations
 
+import daqp
 import numpy as np
 import numpy.typing as npt
 
@@ -11,14 +12,17 @@ from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.depth_slopes import depth_slopes
 from lcollision_core.resolve.exact import ExactCheck
-from lcollision_core.resolve.nearest import nearest_within
 from lcollision_core.resolve.problem import ResolveProblem
 
 MAX_REGIONS = 6
 """The deepest pairs of domains that a pose's contacts are told apart by."""
 
 CLEARANCE = 2e-4
-"""In heights: how far apart what touches is to be put, for what a linear model leaves out."""
+"""In normalised length: how far apart touching surfaces are moved, as the model is linear."""
+
+POLISH_ROUNDS = 6
+_OPTIMAL = 1
+_TOLERANCE = 1e-9
 
 
 class Contacts:
@@ -37,7 +41,7 @@ class Contacts:
     def add(self, latent: FloatArray) -> bool:
         """Add the contacts of a (D,) pose; False where it is free and has none."""
         decoded = self._check.decode(latent)[0]
-        found = self._check.find(decoded)
+        found = self._check.find(self._check.exported(decoded))
         if not found.colliding:
             return False
         depth, slopes = contact_slopes(self._check.embedding, latent, decoded, found)
@@ -46,13 +50,87 @@ class Contacts:
         return True
 
     def drop_refuted(self, free: FloatArray) -> None:
-        """Forget half-spaces that a free pose lies outside of: they were extrapolated too far."""
+        """Forget half-spaces that a free pose lies outside: they were extrapolated too far."""
         kept = self._normals @ free <= self._offsets + CLEARANCE
         self._normals, self._offsets = self._normals[kept], self._offsets[kept]
 
     def nearest(self, centre: FloatArray) -> FloatArray | None:
         """Return the pose nearest to a (D,) pose in all half-spaces, None where there is none."""
         return nearest_within(self._problem, centre, self._normals, self._offsets)
+
+
+def nearest_within(
+    problem: ResolveProblem, centre: FloatArray, normals: FloatArray, offsets: FloatArray
+) -> FloatArray | None:
+    """Minimise d(Z, centre) subject to normals Z <= offsets and the bounds.
+
+    Parameters
+    ----------
+    problem : gives d and the bounds
+    centre : (D,) float64 array within the bounds
+    normals : (C, D) float64 array
+    offsets : (C,) float64 array
+
+    Returns
+    -------
+    latent : (D,) float64 array, or None where the half-spaces have no point in common
+
+    Notes
+    -----
+    Dual active sets: Arnström, Bemporad and Axehill, "A dual active-set solver for embedded
+    quadratic programming using recursive LDL^T updates", 2022.
+    """
+    movable = np.flatnonzero(problem.movable)
+    metric = problem.metric[np.ix_(movable, movable)]
+    # The bounds of the moves come first, then the half-spaces.
+    most = np.concatenate([(problem.high - centre)[movable], offsets - normals @ centre])
+    least = np.concatenate([(problem.low - centre)[movable], np.full(len(normals), -np.inf)])
+    moved, _, status, _ = daqp.solve(
+        metric * (len(metric) / np.trace(metric)),
+        np.zeros(len(movable)),
+        np.ascontiguousarray(normals[:, movable]),
+        most,
+        least,
+        primal_tol=_TOLERANCE,
+    )
+    if status != _OPTIMAL:
+        return None
+    latent = centre.copy()
+    latent[movable] += moved
+    return np.clip(latent, problem.low, problem.high)
+
+
+def polish(check: ExactCheck, problem: ResolveProblem, start: FloatArray) -> FloatArray | None:
+    """Leave shallow contact by a small move.
+
+    Newton's method on the depths of the contacts: each round asks for the smallest move that parts
+    all contacts seen so far. Depths of pairs of faces saturate where bodies are deep within each
+    other, and then point no way out: such poses are given up.
+
+    Parameters
+    ----------
+    check, problem : of the pose
+    start : (D,) float64 array
+
+    Returns
+    -------
+    latent : (D,) float64 array, collision-free, or None
+
+    Raises
+    ------
+    CancelledError : the problem's token was set.
+    """
+    contacts = Contacts(check, problem)
+    latent = start
+    for _ in range(POLISH_ROUNDS):
+        problem.deadline.poll()
+        if not contacts.add(latent):
+            return latent
+        goal = contacts.nearest(start)
+        if goal is None or problem.deadline.expired:
+            return None
+        latent = goal
+    return latent if check.is_free(latent) else None
 
 
 def contact_slopes(
@@ -71,18 +149,17 @@ def contact_slopes(
     ----------
     embedding : decodes
     latent : (D,) float64 array
-    decoded : (V, 3) float64 array, its vertices in heights
+    decoded : (V, 3) float64 array, its vertices in normalised length
     found : its colliding pairs, at least one
 
     Returns
     -------
-    depth : (C,) float64 array > 0, in heights, the deepest first, at most `MAX_REGIONS`
+    depth : (C,) float64 array > 0, normalised, the deepest first, at most `MAX_REGIONS`
     slopes : (C, D) float64 array
 
     Notes
     -----
-    A pair's depth is at most the size of its triangles, so this tells the way out of shallow
-    contact only.
+    A pair's depth is at most the size of its triangles, so this leads out of shallow contact only.
     """
     faces = embedding.topology.faces[found.pairs]
     _, by_corners = depth_slopes(decoded[faces[:, 0]], decoded[faces[:, 1]])
@@ -110,62 +187,43 @@ def pull_to_latent(
     """
     decoder, codec = embedding.decoder, embedding.codec
     codes = latent.astype(np.float32)
-    features = decoder.features(codes[None])
-    at = np.repeat(features, len(by_vertices), axis=0)
+    at = np.repeat(decoder.features(codes[None]), len(by_vertices), axis=0)
     by_features = codec.decode_vjp(at, by_vertices, n_threads=1)
-    by_features *= decoder.scale
-    scaled = by_features.astype(np.float32)
-    result = np.empty((len(by_vertices), len(latent)))
+    scaled = (by_features * decoder.scale).astype(np.float32)
+    slopes = np.zeros((len(by_vertices), len(latent)))
     start = 0
     for group in decoder.groups:
         stop = start + len(group.weights)
-        total = np.empty((len(group.blocks), group.blocks.shape[2]), dtype=np.float32)
-        _weigh(codes[start:stop], group.blocks, total)
-        slope = np.float32(1.0) - np.tanh(total) ** 2
-        part = np.zeros((len(scaled), stop - start))
-        _pull_group(group.blocks, group.support, slope, scaled, part)
-        result[:, start:stop] = part
+        _pull_group(codes[start:stop], group.blocks, group.support, scaled, slopes[:, start:stop])
         start = stop
-    return result
-
-
-@compiled
-def _weigh(
-    codes: npt.NDArray[np.float32],
-    blocks: npt.NDArray[np.float32],
-    total: npt.NDArray[np.float32],
-) -> None:
-    """Write codes @ weights, block by block."""
-    for block in range(len(blocks)):
-        weights, sums = blocks[block], total[block]
-        sums[:] = np.float32(0.0)
-        for k in range(len(codes)):
-            code = codes[k]
-            for i in range(len(sums)):
-                sums[i] += code * weights[k, i]
+    return slopes
 
 
 @compiled
 def _pull_group(
+    codes: npt.NDArray[np.float32],
     blocks: npt.NDArray[np.float32],
     support: npt.NDArray[np.int32],
-    slope: npt.NDArray[np.float32],
     by_output: npt.NDArray[np.float32],
     by_codes: FloatArray,
 ) -> None:
-    """Add the derivative by one group's codes, given the one by its output and its slope there.
+    """Add the derivative by one group's codes, given the one by its scaled output.
 
     Parameters
     ----------
+    codes : (m,) float32 array
     blocks, support : of a `DecoderGroup`
-    slope : (n_blocks, 9 n) float32 array, of tanh
     by_output : (n, V, 9) float32 array
     by_codes : (n, m) float64 array, added to
     """
-    width = slope.shape[1]
-    # A product for each block, small enough for the library to keep to this thread.
+    width = blocks.shape[2]
     weighted = np.zeros((len(by_output), width), dtype=np.float32)
     for block in range(len(blocks)):
+        slope = np.zeros(width, dtype=np.float32)
+        for k in range(len(codes)):
+            slope += codes[k] * blocks[block, k]
+        slope = np.tanh(slope)
+        slope = np.float32(1.0) - slope * slope
         first = block * width // 9
         last = min(first + width // 9, len(support))
         for row in range(len(by_output)):
@@ -173,6 +231,7 @@ def _pull_group(
             for n in range(last - first):
                 given = by_output[row, support[first + n]]
                 for j in range(9):
-                    out[9 * n + j] = given[j] * slope[block, 9 * n + j]
+                    out[9 * n + j] = given[j] * slope[9 * n + j]
             out[9 * (last - first) :] = np.float32(0.0)
+        # A product for each block, small enough for the library to keep to this thread.
         by_codes += np.dot(weighted, blocks[block].T)

@@ -56,8 +56,8 @@ class ExactCheck:
     ----------
     embedding : decodes
     detector : in the data's unit
-    height : one height in the data's unit
-    placement : where a pose is exported to, None for the reference's frame
+    height : the body size, in the data's unit
+    placement : where a pose is exported to, None for the model's own coordinates
     """
 
     embedding: Embedding
@@ -66,22 +66,22 @@ class ExactCheck:
     placement: RigidTransform | None = None
 
     def decode(self, latent: npt.ArrayLike) -> FloatArray:
-        """Decode (B, D) latent poses to (B, V, 3) vertices in heights, in the reference's frame."""
+        """Decode (B, D) latent poses to (B, V, 3) vertices, normalised, in the reference's pose."""
         return self.embedding.decode(np.atleast_2d(np.asarray(latent)), n_threads=1)
 
     def exported(self, decoded: FloatArray) -> npt.NDArray[np.floating]:
-        """Return decoded (..., V, 3) vertices, in heights, as they are exported."""
+        """Return decoded (..., V, 3) vertices, normalised, as they are exported."""
         return exported_vertices(decoded * self.height, self.placement)
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Tell which of (B, D) latent poses are exactly free: (B,) bool."""
+        """Tell which of (B, D) latent poses are collision-free: (B,) bool."""
         exported = self.exported(self.decode(latent))
         if self.placement is None:
             return ~self.detector.are_colliding(exported, workers=1)
         return np.array([self.is_free_mesh(one) for one in exported], dtype=np.bool_)
 
     def is_free(self, latent: npt.ArrayLike) -> bool:
-        """Tell whether one (D,) latent pose is exactly free."""
+        """Tell whether one (D,) latent pose is collision-free."""
         return bool(self.are_free(latent)[0])
 
     def is_free_mesh(self, exported: npt.NDArray[np.floating]) -> bool:
@@ -91,12 +91,12 @@ class ExactCheck:
             self.detector.are_colliding(form[None], workers=1, unit=self._unit)[0] for form in forms
         )
 
-    def find(self, decoded: FloatArray) -> SelfCollisions:
-        """Find all colliding pairs of one pose's decoded (V, 3) vertices.
+    def find(self, exported: npt.NDArray[np.floating]) -> SelfCollisions:
+        """Find all colliding pairs of (V, 3) vertices where they are exported to.
 
         Those in float64 where it collides in that, else those in float32.
         """
-        for form in in_each_format(self.exported(decoded), self.detector.topology):
+        for form in in_each_format(exported, self.detector.topology):
             found = self.detector.detect(form, unit=self._unit)
             if found.colliding:
                 break

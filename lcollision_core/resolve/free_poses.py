@@ -1,4 +1,4 @@
-"""Find poses that are exactly free, for Resolve to walk back to."""
+"""Find collision-free poses, for Resolve to fall back to."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def find_free_poses(
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> FloatArray:
-    """Find latent poses that are exactly free: the mean pose, training poses, then samples.
+    """Find collision-free latent poses: the mean pose, training poses, then samples.
 
     Parameters
     ----------
     embedding : decodes
     detector : the exact check, in the data's unit
-    height : one height in the data's unit
+    height : the body size, in the data's unit
     seed : of the samples
     progress : called with (poses checked, poses to check)
     cancel : polled every few poses

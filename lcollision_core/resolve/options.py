@@ -22,7 +22,7 @@ class Solver(StrEnum):
 
 
 class Metric(StrEnum):
-    """What "as close as possible" means: to the eye, or in the codes as in the paper."""
+    """What is kept small: the displacement of the vertices, or of the codes as in the paper."""
 
     EYE = "eye"
     LATENT = "latent"
@@ -31,7 +31,7 @@ class Metric(StrEnum):
 class Step(StrEnum):
     """The step of the ladder that a result comes from.
 
-    Each is followed by shortening: see `shorten`.
+    After each the pose is pulled back towards the target: see `pull_back`.
     """
 
     UNCHANGED = "unchanged"
@@ -39,8 +39,8 @@ class Step(StrEnum):
     SOLVER = "solver"
     MARGIN = "margin"
     POLISH = "polish"
-    START = "start"
-    WALK_BACK = "walk-back"
+    RESTART = "start"
+    FALL_BACK = "walk-back"
     NONE = "none"
 
 
@@ -57,12 +57,12 @@ class ResolveOptions:
         with the further margins of the ladder tried beside it
     locked_domains : indices from 0 of domains that keep their codes: Z_k, and the one code of
         Z_0 whose component the domain is. Neighbours may still carry a locked domain along.
-    group_weights : 1 + K numbers > 0 for (Z_0, Z_1, ..., Z_K), how dear a move of each group is
-        beyond what the metric says; by default all 1
+    group_weights : 1 + K numbers > 0 for (Z_0, Z_1, ..., Z_K), by which the cost of moving each
+        group is multiplied; by default all 1
     time_budget : seconds after which the ladder goes straight to its last step; None for no limit.
         With one, results depend on the machine's speed.
     verify : check exactly and climb the ladder; False stops at the solver's answer
-    seed : >= 0, of the other starts
+    seed : >= 0, of the restarts
 
     Raises
     ------
@@ -83,17 +83,18 @@ class ResolveOptions:
         for name, kind in (("solver", Solver), ("metric", Metric)):
             if getattr(self, name) not in set(kind):
                 raise LCollisionError(
-                    f"there is no {name} {getattr(self, name)!r}; choose one of {', '.join(kind)}"
+                    f"there is no {name} {getattr(self, name)!r}",
+                    f"choose one of {', '.join(kind)}",
                 )
         if not 0.0 < self.threshold < 1.0:
-            raise LCollisionError(
-                f"the threshold must be a probability between 0 and 1, got {self.threshold:g}"
+            raise LCollisionError.must_be(
+                "the threshold", "a probability between 0 and 1", f"{self.threshold:g}"
             )
         if self.margin is not None and not 0.0 <= self.margin < math.inf:
-            raise LCollisionError(f"the margin must be 0 or more, got {self.margin:g}")
+            raise LCollisionError.must_be("the margin", "0 or more", f"{self.margin:g}")
         if self.time_budget is not None and not self.time_budget > 0.0:
-            raise LCollisionError(
-                f"the time budget must be more than 0 seconds, got {self.time_budget:g}"
+            raise LCollisionError.must_be(
+                "the time budget", "more than 0 seconds", f"{self.time_budget:g}"
             )
         if self.group_weights is not None and not all(
             0.0 < weight < math.inf for weight in self.group_weights
@@ -108,7 +109,7 @@ class ResolveOptions:
 
 @dataclass(frozen=True, eq=False)
 class ResolveResult:
-    """Where Resolve ended. Lengths are in heights, energies in squared heights.
+    """Where Resolve ended. Lengths are normalised, energies in squared normalised length.
 
     Three facts are kept apart: that the solver converged, that the predictor calls the pose free,
     and that it is free by the exact check.
@@ -116,25 +117,28 @@ class ResolveResult:
     Attributes
     ----------
     latent : (D,) float64 array, read-only
+    vertices : (V, 3) array, read-only, in the data's unit: what the exact check saw, and what is to
+        be written; float32 in the model's coordinates, or float64 where the pose is placed
     solver_status : what the solver of the paper's problem said at its least margin, "not run"
         where none ran
     converged : that it ended by its own tolerances
     predicted_free : the collision probability of `latent` is at most the threshold
     exactly_free : by the exact check of the vertices rounded to float32; None without `verify`
-    step : of the ladder, the one that freed the pose
+    step : of the ladder, the one that resolved the collisions
     energy_before, energy_after : exact penetration energy; None without `verify`
     pairs_before, pairs_after : exact number of colliding pairs; None without `verify`
     latent_distance : ||Z - Z*|| / ||Z*||, or ||Z - Z*|| where Z* is the zero pose; 0 for a pose
         that did not move
     vertex_distance_mean, vertex_distance_max : from the decoded pose as it was
     iterations : of the solver at its least margin, for those of NLopt its evaluations; further
-        margins and starts do not count
+        margins and restarts do not count
     evaluations : poses at which the predictor was asked
     seconds : spent
     note : a sentence for the user, None where there is nothing to say
     """
 
     latent: npt.NDArray[np.float64]
+    vertices: npt.NDArray[np.floating]
     solver_status: str
     converged: bool
     predicted_free: bool

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.resolve.metric import LatentMetric
 
 
 class CollisionModel(Protocol):
@@ -22,7 +21,7 @@ class CollisionModel(Protocol):
 
 
 @dataclass
-class Watch:
+class Deadline:
     """Clock and cancel token of one solve, asked at every evaluation.
 
     Attributes
@@ -61,30 +60,29 @@ class ResolveProblem:
     Attributes
     ----------
     target : (D,) float64 array Z*
-    metric : d
+    metric : (D, D) float64 array G of d(Z, Z') = (Z - Z')^T G (Z - Z')
     code_weights : (D,) float64 array > 0, of the solvers' own distance
     low, high : (D,) float64 arrays; equal where a code is locked
     limit : the threshold's logit
     model : of the constraint
-    watch : asked before each evaluation
+    deadline : asked before each evaluation
     evaluations : poses that the model was asked about so far
 
     Notes
     -----
     The solvers keep the plain distance of the codes small, times the user's weights, whatever
-    `metric` is: where moves that the eye does not see are cheap they find the model's blind spots,
-    poses that it calls free and that are not. What they find is then shortened in `metric` against
-    the exact check.
+    `metric` is: where moves that hardly displace a vertex are cheap, they find poses that the model
+    wrongly calls free. What they find is then pulled back in `metric` against the exact check.
     """
 
     target: FloatArray
-    metric: LatentMetric
+    metric: FloatArray
     code_weights: FloatArray
     low: FloatArray
     high: FloatArray
     limit: float
     model: CollisionModel
-    watch: Watch = field(default_factory=Watch)
+    deadline: Deadline = field(default_factory=Deadline)
     evaluations: int = 0
 
     @property
@@ -95,7 +93,9 @@ class ResolveProblem:
 
     def distance(self, latent: FloatArray) -> FloatArray:
         """Measure d of (..., D) poses from Z*: (...)."""
-        return self.metric.squared(latent - self.target)
+        moved = latent - self.target
+        squared: FloatArray = np.einsum("...i,ij,...j->...", moved, self.metric, moved)
+        return squared
 
     def search_distance(self, latent: FloatArray) -> FloatArray:
         """Measure the solvers' squared distance of (..., D) poses from Z*: (...)."""
@@ -107,9 +107,9 @@ class ResolveProblem:
 
         Raises
         ------
-        CancelledError : the watch's token was set.
+        CancelledError : the token was set.
         """
-        self.watch.poll()
+        self.deadline.poll()
         self.evaluations += len(latent)
         logit, gradient = self.model.logit_and_gradient(latent)
         return logit - self.limit, np.where(self.movable, gradient, 0.0)

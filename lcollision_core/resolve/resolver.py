@@ -1,9 +1,10 @@
-"""Resolve: the nearest pose that is free of collisions, proved exactly."""
+"""Resolve: the nearest pose that is free of collisions by the exact check."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise, repeat
 from threading import Lock
@@ -19,23 +20,23 @@ from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.exact import ExactCheck
 from lcollision_core.resolve.ladder import Ladder
-from lcollision_core.resolve.metric import LatentMetric
+from lcollision_core.resolve.metric import displacement_metric
 from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult
-from lcollision_core.resolve.problem import CollisionModel, ResolveProblem, Watch
+from lcollision_core.resolve.problem import CollisionModel, Deadline, ResolveProblem
 from lcollision_core.resolve.threads import single_torch_thread
 
 
 class PoseResolver:
-    """Moves poses of one model free of self-collisions; immutable, safe between threads.
+    """Resolves the self-collisions of one model's poses; immutable, safe between threads.
 
     Parameters
     ----------
     embedding : decodes latent poses
     predictor : says how a latent pose collides, smoothly: a `CollisionPredictor`
     detector : the exact check, in the data's unit
-    height : one height in the data's unit
-    free_latents : (F, D) array of poses known to be exactly free: see `find_free_poses`. With
-        none, a pose that the other steps do not free stays colliding.
+    height : the body size, in the data's unit
+    free_latents : (F, D) array of poses known to be collision-free: see `find_free_poses`. Without
+        any, a pose that the other steps do not resolve stays colliding.
     bounds : (low, high), two (D,) arrays: the latent box in which to look
     """
 
@@ -50,8 +51,7 @@ class PoseResolver:
     ) -> None:
         self._embedding = embedding
         self._predictor = predictor
-        self._detector = detector
-        self._height = height
+        self._check = ExactCheck(embedding, detector, height)
         size = embedding.latent_size
         self._free_latents: FloatArray = np.array(free_latents, np.float64).reshape(-1, size)
         self._low, self._high = (np.array(bound, np.float64) for bound in bounds)
@@ -65,7 +65,7 @@ class PoseResolver:
         placement: RigidTransform | None = None,
         near: npt.ArrayLike | None = None,
     ) -> ResolveResult:
-        """Find the nearest pose that is exactly free.
+        """Find the nearest collision-free pose.
 
         Parameters
         ----------
@@ -78,31 +78,28 @@ class PoseResolver:
 
         Returns
         -------
-        result : ResolveResult; a pose that is exactly free comes back unchanged, and what cannot
-            be done (all domains locked, no free pose known) is said in its note
+        result : ResolveResult; a collision-free pose comes back unchanged, and what cannot be done
+            (all domains locked, no free pose known) is said in its note
 
         Raises
         ------
         ShapeError : another shape, a number that is not finite or another number of weights.
-        LCollisionError : a locked domain that there is not.
+        LCollisionError : an unknown locked domain.
         CancelledError : `cancel` was set.
         """
         chosen = options or ResolveOptions()
         target = self._checked(latent)
-        problem = self._problem(target, chosen, cancel)
-        check = ExactCheck(self._embedding, self._detector, self._height, placement)
-        correction = None if near is None else self._checked(near)
         outside = int(np.count_nonzero((target < self._low) | (target > self._high)))
         remark = (
             f"{outside} of {len(target)} sliders {'is' if outside == 1 else 'are'} outside the "
             f"trained range"
         )
         ladder = Ladder(
-            problem,
-            check,
+            self._problem(target, chosen, cancel),
+            replace(self._check, placement=placement),
             chosen,
             self._free_latents,
-            correction,
+            None if near is None else self._checked(near),
             progress,
             remark if outside else None,
         )
@@ -150,7 +147,7 @@ class PoseResolver:
         rows = [self._checked(row) for row in np.atleast_2d(np.asarray(latents, np.float64))]
         placed = [None] * len(rows) if placements is None else placements
         # Built once, before several threads would each begin to.
-        _ = self._eye, self._embedding.codec, self._embedding.decoder
+        _ = self._displacement_metric, self._embedding.codec, self._embedding.decoder
         known = done or {}
         results: dict[int, ResolveResult] = {}
         guard = Lock()
@@ -187,62 +184,48 @@ class PoseResolver:
     ) -> bool:
         if cancel is not None:
             cancel.raise_if_cancelled()
-        check = ExactCheck(self._embedding, self._detector, self._height, placement)
-        return not check.is_free(latent)
+        return not replace(self._check, placement=placement).is_free(latent)
 
     @cached_property
-    def _eye(self) -> LatentMetric:
-        return LatentMetric.eye(self._embedding)
-
-    @cached_property
-    def _plain(self) -> LatentMetric:
-        return LatentMetric.latent(self._embedding.latent_size)
-
-    @cached_property
-    def _group_of_code(self) -> npt.NDArray[np.int64]:
-        sizes = self._embedding.group_sizes
-        return np.repeat(np.arange(len(sizes)), sizes)
+    def _displacement_metric(self) -> FloatArray:
+        return displacement_metric(self._embedding)
 
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         target: FloatArray = np.array(latent, dtype=np.float64)
         size = self._embedding.latent_size
         if target.shape != (size,):
-            raise ShapeError(f"a latent pose has {size} numbers, got shape {target.shape}")
+            raise ShapeError.must_be("a latent pose", f"{size} numbers", f"shape {target.shape}")
         if not np.isfinite(target).all():
-            raise ShapeError("a latent pose has a number that is not finite; repair the pose")
+            raise ShapeError("a latent pose has a number that is not finite", "repair the pose")
         return target
 
     def _problem(
         self, target: FloatArray, options: ResolveOptions, cancel: CancelToken | None
     ) -> ResolveProblem:
-        metric = self._eye if options.metric == Metric.EYE else self._plain
-        code_weights = np.ones(len(target))
-        if options.group_weights is not None:
-            n_groups = len(self._embedding.group_sizes)
-            if len(options.group_weights) != n_groups:
-                raise ShapeError(
-                    f"{n_groups} group weights are needed, got {len(options.group_weights)}"
-                )
-            code_weights = np.array(options.group_weights, np.float64)[self._group_of_code]
-            metric = metric.weighted(code_weights)
+        is_displacement = options.metric == Metric.EYE
+        metric = self._displacement_metric if is_displacement else np.eye(len(target))
+        sizes = self._embedding.group_sizes
+        weights = options.group_weights or (1.0,) * len(sizes)
+        if len(weights) != len(sizes):
+            raise ShapeError.must_be("group weights", f"{len(sizes)} numbers", len(weights))
+        code_weights = np.repeat(weights, sizes)
+        root = np.sqrt(code_weights)
         low, high = np.minimum(self._low, target), np.maximum(self._high, target)
         for domain in sorted(options.locked_domains):
             if not 0 <= domain < self._embedding.n_domains:
                 raise LCollisionError(
-                    f"there is no domain {domain + 1} to lock; the model has "
-                    f"{self._embedding.n_domains}"
+                    f"there is no domain {domain + 1} to lock",
+                    f"the model has {self._embedding.n_domains}",
                 )
-            locked = self._group_of_code == domain + 1
-            locked[domain] = True
-            low[locked] = high[locked] = target[locked]
-        watch = Watch(options.time_budget, cancel)
+        locked = self._embedding.codes_of(options.locked_domains)
+        low[locked] = high[locked] = target[locked]
         return ResolveProblem(
             target,
-            metric,
+            metric * np.outer(root, root),
             code_weights,
             low,
             high,
             options.threshold_logit,
             self._predictor,
-            watch,
+            Deadline(options.time_budget, cancel),
         )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.options import ResolveResult
-
-_FRAMES_AT_ONCE = 16
 
 
 def largest_correction_change(
@@ -26,17 +25,16 @@ def largest_correction_change(
 
     Returns
     -------
-    change : the largest of all frames of the mean distance over vertices, in heights, between the
-        displacement of a frame by its correction and that of the frame before; 0 for one frame
+    change : the largest of all frames of the mean distance over vertices, in normalised length,
+        between the displacement of a frame by its correction and that of the frame before; 0 for
+        one frame
     """
-    corrected = np.array([result.latent for result in results])
-    before = np.zeros((0, embedding.topology.n_vertices, 3))
-    largest = 0.0
-    for start in range(0, len(latents), _FRAMES_AT_ONCE):
-        rows = slice(start, start + _FRAMES_AT_ONCE)
-        moved = embedding.decode(corrected[rows]) - embedding.decode(latents[rows])
-        changes = np.diff(np.concatenate([before, moved]), axis=0)
-        if len(changes):
-            largest = max(largest, float(np.linalg.norm(changes, axis=2).mean(axis=1).max()))
-        before = moved[-1:]
-    return largest
+    displacements = (
+        np.subtract(*embedding.decode(np.stack([result.latent, latent])))
+        for latent, result in zip(latents, results, strict=True)
+    )
+    changes = (
+        float(np.linalg.norm(after - before, axis=1).mean())
+        for before, after in pairwise(displacements)
+    )
+    return max(changes, default=0.0)

@@ -1,4 +1,4 @@
-"""Sequential quadratic programming for one constraint, many margins and starts side by side.
+"""Sequential quadratic programming for one constraint, many margins and starts in one batch.
 
 With one linearised constraint the quadratic program has nearly a closed form, so an iteration
 costs little more than the model's gradients, and those of several problems come as one batch.
@@ -14,7 +14,7 @@ from lcollision_core.resolve.problem import FEASIBLE, ResolveProblem, SolverOutc
 
 _SETTLED = 0.02
 """A row has converged when its step is this share of its distance from Z*; the exact check and
-shortening follow, so more digits would be lost."""
+pulling back follow, so more digits would be lost."""
 
 _PATIENCE = 20
 _SHORTEST = 0.1
@@ -37,12 +37,12 @@ class SqpBatch:
 
     Raises
     ------
-    CancelledError : the problem's watch said so.
+    CancelledError : the problem's token was set.
     """
 
     def __init__(self, problem: ResolveProblem, starts: FloatArray, margins: FloatArray) -> None:
         n_rows = len(starts)
-        # What holds to the tolerance then holds in truth.
+        # What holds to the tolerance then holds exactly.
         self._problem, self._margins = problem, margins + FEASIBLE
         self._here = np.clip(starts, problem.low, problem.high)
         excess, self._slope = problem.excess(self._here)
@@ -70,13 +70,13 @@ class SqpBatch:
 
         Raises
         ------
-        CancelledError : the problem's watch said so.
+        CancelledError : the problem's token was set.
         """
         for _ in range(n_iterations):
             for row in np.flatnonzero(self._running & self._fresh).tolist():
                 self._aim(row)
             active = np.flatnonzero(self._running)
-            if len(active) == 0 or self._problem.watch.expired:
+            if len(active) == 0 or self._problem.deadline.expired:
                 break
             trials = self._here[active] + self._length[active, None] * self._step[active]
             excess, slopes = self._problem.excess(trials)

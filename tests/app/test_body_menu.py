@@ -32,7 +32,7 @@ def test_a_part_is_locked_reset_and_found_from_the_body(qtbot: QtBot, window: Ma
     document, scene = window.document, window.viewport.scene
     assert scene is not None
     name = heading(document.model.domain_names[1])
-    document.set_latent(np.full(document.model.latent_size, 0.1), "Test")
+    document.blend_towards(np.full(document.model.latent_size, 0.1), 1.0)
     rest(qtbot, window)
     menu = opened(qtbot, window, 1)
     assert scene.outline.is_shown

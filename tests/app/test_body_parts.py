@@ -183,7 +183,7 @@ def test_another_model_that_comes_in_takes_the_dialog_of_this_one_away(own: Main
 
 def test_what_another_command_wrote_meanwhile_stays(qtbot: QtBot, own: MainWindow) -> None:
     document, file = own.document, Path(own.document.model_file)
-    change_model(file, lambda model: model.rename_domains({1: "told elsewhere"}))
+    change_model(file, lambda model: model.edit_domains({1: "told elsewhere"}))
     with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
         document.edit_parts(PartEdits({0: "knee"}, {}))
     assert PoseModel.load(file).domain_names == ("knee", "told elsewhere")
@@ -250,7 +250,7 @@ def test_the_menu_of_a_body_part(qtbot: QtBot, window: MainWindow, where: str) -
     part = header if where == "header" else window.collision.prediction.rows[1]
     name = heading(document.model.domain_names[1])
     latent = np.full(document.model.latent_size, 0.2)
-    document.set_latent(latent, "Test")
+    document.blend_towards(latent, 1.0)
     choose(menu_at(part), f"Reset {name}")
     assert not document.latent[codes].any()
     assert document.latent[1] == 0.0

@@ -57,7 +57,7 @@ def test_the_result_of_resolve_scrolls_into_sight(
 ) -> None:
     card = window.collision.resolve
     window.resize(1280, 560)
-    window.document.set_latent(colliding, "Test")
+    window.document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     assert scrolled(window).verticalScrollBar().value() == 0
     resolve(qtbot, window)
@@ -125,7 +125,7 @@ def test_the_estimate_steps_back_once_the_check_has_spoken(
     monkeypatch.setattr(FrameEvaluator, "_predict", lambda *_: told)
     said = "Probably colliding" if collides == right else "Probably clear"
     alarm = getattr(current_theme(), "colliding" if collides == right else "free")
-    document.set_latent(colliding if collides else np.zeros_like(colliding) + 1e-3, "Test")
+    document.blend_towards(colliding if collides else np.zeros_like(colliding) + 1e-3, 1.0)
     qtbot.waitUntil(
         lambda: card.verdict.text() == said and ink(card.verdict) == alarm, timeout=PATIENCE
     )
@@ -148,7 +148,7 @@ def test_the_headline_stays_in_sight_below_which_the_panel_scrolls(
 ) -> None:
     headline = window.collision.exact
     window.resize(1280, 560)
-    window.document.set_latent(colliding, "Test")
+    window.document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     resolve(qtbot, window)
     qtbot.waitUntil(lambda: scrolled(window).verticalScrollBar().value() > 0, timeout=PATIENCE)
@@ -162,7 +162,7 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
     document, card = window.document, window.collision.exact
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     told, height = texts(card), card.height()
     places = [child.geometry() for child in card.findChildren(QLabel)]
@@ -183,7 +183,7 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     assert not card.is_of_the_pose_before
     assert "of the pose before" not in texts(card)
     # From one verdict to the other nothing moves either.
-    document.set_latent(np.zeros_like(colliding), "Test")
+    document.blend_towards(np.zeros_like(colliding), 1.0)
     rest(qtbot, window)
     assert card.verdict.text() == "No collisions (checked)"
     assert card.height() == height
@@ -206,7 +206,7 @@ def test_a_free_pose_reads_as_success_whatever_was_predicted(
 ) -> None:
     document, card = window.document, window.collision.resolve
     facts = (card.exactly_free, card.converged, card.predicted_free)
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     found = resolve(qtbot, window)
     for changes, signs, words in (
@@ -257,7 +257,7 @@ def test_the_ghost_goes_and_comes_back_with_the_result_it_belongs_to(
         rest(qtbot, window)
         return card.outcome.isVisible(), scene.ghost_shown
 
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     resolve(qtbot, window)
     assert seen() == (True, True)
@@ -277,11 +277,11 @@ def test_the_ghost_goes_and_comes_back_with_the_result_it_belongs_to(
 def test_a_result_says_of_what_the_body_has_moved_its_shares(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
-    window.document.set_latent(colliding, "Test")
+    window.document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     resolve(qtbot, window)
     (moved,) = (text for text in texts(window.collision.resolve) if "at most" in text)
-    assert re.fullmatch(r"[\d.]+ % of the height,\nat most [\d.]+ %", moved)
+    assert re.fullmatch(r"[\d.]+ % of the body size,\nat most [\d.]+ %", moved)
     window.resizeDocks([window.docks["collision"]], [1], Qt.Orientation.Horizontal)
     qtbot.wait(100)
     assert has_room(window)

@@ -36,6 +36,7 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import PoseModel
 from tests.app.support import Lcollision
+from tests.app.views import on_screen
 from tests.app.windows import (
     PATIENCE,
     answer,
@@ -182,7 +183,7 @@ def share_of_height(window: MainWindow) -> float:
     """Return how much of the view's height the pose on the screen takes."""
     canvas = window.viewport.canvas
     assert canvas is not None
-    places = [canvas.place_of(vertex).y() for vertex in shown(window)]
+    places = [on_screen(canvas, vertex).y() for vertex in shown(window)]
     assert 0.0 < min(places) < max(places) < canvas.height()
     return (max(places) - min(places)) / canvas.height()
 
@@ -586,7 +587,9 @@ def test_the_built_in_body_from_colliding_to_free(
     assert document.outcome.exactly_free
     assert not document.exact.colliding
     assert document.ghost is not None
-    window.show_failure(Failure("bent.obj has 3 vertices; import a mesh of this model", "details"))
+    window.show_failure(
+        Failure("bent.obj has 3 vertices", "import a mesh of this model", "details")
+    )
     (dialog,) = window.findChildren(FailureDialog)
     qtbot.waitUntil(dialog.isVisible)
     take_picture(window, f"{theme.name}-error")

@@ -39,6 +39,7 @@ from app.work.preparing import REASON
 from app.work.threads import Failure
 from lcollision_core.meshes import read_mesh, write_mesh
 from lcollision_core.model import EncodedPose, PoseModel, read_poses, sample_poses
+from tests.app.views import on_screen
 from tests.app.windows import (
     PATIENCE,
     answer,
@@ -123,7 +124,7 @@ def test_prediction_and_exact_check_follow_the_pose(
 ) -> None:
     document, model = window.document, window.document.model
     for latent in (colliding, np.zeros_like(colliding)):
-        document.set_latent(latent, "Test")
+        document.blend_towards(latent, 1.0)
         rest(qtbot, window)
         card = window.collision.prediction
         predicted = model.predict(latent[None])
@@ -173,9 +174,10 @@ def test_hovering_a_row_lights_its_domain_and_the_mesh_lights_its_row(
     front = [
         vertex
         for vertex in np.flatnonzero(leading == 1)
-        if canvas.pick_vertex(canvas.place_of(scene.surface.vertices[vertex]), scene.body) == vertex
+        if canvas.pick_vertex(on_screen(canvas, scene.surface.vertices[vertex]), scene.body)
+        == vertex
     ]
-    place = canvas.place_of(scene.surface.vertices[front[len(front) // 2]]).toPoint()
+    place = on_screen(canvas, scene.surface.vertices[front[len(front) // 2]]).toPoint()
     with qtbot.waitSignal(window.viewport.domain_hovered) as told:
         QTest.mouseMove(canvas, place)
     lit = [header.is_lit for header in (group.header for group in window.sliders.groups)]
@@ -188,7 +190,7 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document, card = window.document, window.collision.resolve
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     before = shown(window)
     assert document.model.detector.detect(before).colliding
@@ -242,7 +244,7 @@ def test_nothing_on_the_screen_speaks_of_the_mathematics(
 ) -> None:
     document = window.document
     # Further than the sliders go: Resolve remarks on that.
-    document.set_latent(1.5 * colliding, "Test")
+    document.blend_towards(1.5 * colliding, 1.0)
     rest(qtbot, window)
     for shading in Shading:
         window.viewport.set_shading(shading)
@@ -263,7 +265,7 @@ def test_cancelled_in_the_middle_resolve_leaves_everything_as_it_was(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document, card = window.document, window.collision.resolve
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     before = shown(window)
     QTest.mouseClick(card.button, Qt.MouseButton.LeftButton)
@@ -285,7 +287,7 @@ def test_an_edit_cancels_resolve(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document = window.document
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     window.actions_by_key["resolve"].trigger()
     assert document.solving
@@ -301,7 +303,7 @@ def test_the_window_closes_in_the_middle_of_resolve(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document = window.document
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     window.actions_by_key["resolve"].trigger()
     assert document.solving
@@ -323,7 +325,7 @@ def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_p
     assert document.placement is not None
     back = document.placement.apply(shown(window).astype(np.float64))
     assert np.abs(back - vertices).max() < 2e-3 * model.height
-    assert "of the height" in window.statusBar().currentMessage()
+    assert "of the body size" in window.statusBar().currentMessage()
 
 
 @pytest.mark.parametrize(
@@ -368,7 +370,7 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
     document, model = window.document, window.document.model
-    document.set_latent(0.5 * model.latent_space.minimum, "Test")
+    document.blend_towards(0.5 * model.latent_space.minimum, 1.0)
     rest(qtbot, window)
     on_screen = shown(window)
     path = tmp_path / f"pose{suffix}"
@@ -550,7 +552,7 @@ def test_closing_writes_what_waits_to_be_exported(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64], tmp_path: Path
 ) -> None:
     document = window.document
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     window.actions_by_key["resolve"].trigger()
     document.export_mesh(tmp_path / "no such folder" / "pose.obj")
@@ -600,7 +602,7 @@ def test_a_window_that_closes_is_gone_before_its_work_has_ended(
 ) -> None:
     close, seen = window.document.close, []
     window.docks["sliders"].setFloating(True)
-    window.show_failure(Failure("the disk is full; make room", "details"))
+    window.show_failure(Failure("the disk is full", "make room", "details"))
 
     def look() -> bool:
         seen.extend(w for w in QApplication.topLevelWidgets() if w.isVisible())
@@ -620,7 +622,7 @@ def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -
 
 
 def test_a_failure_is_told_once_while_its_dialog_is_open(window: MainWindow) -> None:
-    failure = Failure("the disk is full; make room", "details")
+    failure = Failure("the disk is full", "make room", "details")
     for _ in range(3):
         window.show_failure(failure)
     (dialog,) = failures(window)

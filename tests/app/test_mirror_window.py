@@ -64,7 +64,7 @@ def test_mirroring_twice_is_the_pose_again_also_after_save_and_reopen(
 ) -> None:
     document = window.document
     pose = body.latent_space.sample(1, np.random.default_rng(0))[0]
-    document.set_latent(pose, "Test")
+    document.blend_towards(pose, 1.0)
     rest(qtbot, window)
     take_picture(window, "mirror_before")
     before = shown(window).astype(float)
@@ -102,7 +102,7 @@ def test_a_free_pose_that_would_collide_is_resolved_or_it_is_said(
 ) -> None:
     document = window.document
     pose = body.latent_space.sample(2, np.random.default_rng(0))[FREE_THAT_COLLIDES_MIRRORED]
-    document.set_latent(pose, "Test")
+    document.blend_towards(pose, 1.0)
     rest(qtbot, window)
     assert document.exact is not None
     assert not document.exact.colliding

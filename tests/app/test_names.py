@@ -119,7 +119,7 @@ def test_the_window_shows_names_in_one_line(
     qtbot.waitUntil(lambda: window.windowTitle().startswith(SHOWN), timeout=PATIENCE)
     window.document.message.emit(f"Saved {TWO_LINES}")
     assert window.statusBar().currentMessage() == f"Saved {SHOWN}"
-    dialog = FailureDialog(Failure(f"{TWO_LINES} is damaged; copy it again", ""), window)
+    dialog = FailureDialog(Failure(f"{TWO_LINES} is damaged", "copy it again"), window)
     assert f"{SHOWN} is damaged" in [label.text() for label in dialog.findChildren(QLabel)]
 
 

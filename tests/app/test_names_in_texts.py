@@ -30,7 +30,7 @@ HOSTILE = ("arms &hands & more", "<b>bold</b><img src=x>")
 @pytest.fixture
 def hostile(qtbot: QtBot, editor_model: PoseModel, tmp_path: Path) -> Iterator[MainWindow]:
     """Return a window whose body parts, pose and steps of undo have hostile names."""
-    document = PoseDocument(editor_model.rename_domains(dict(enumerate(HOSTILE))))
+    document = PoseDocument(editor_model.edit_domains(dict(enumerate(HOSTILE))))
     window = open_window(qtbot, document, settings_in(tmp_path))
     for name in HOSTILE:
         document.add_pose_to_library(name)
@@ -104,7 +104,7 @@ def test_dialogs_show_a_name_to_the_letter(hostile: MainWindow) -> None:
     # Only the label of a field makes shortcuts of "&".
     assert name in looked[0][0]
     assert name.replace("&", "&&") in looked[1][0]
-    dialog = FailureDialog(Failure(f"{name} cannot be read; {name}", ""), hostile)
+    dialog = FailureDialog(Failure(f"{name} cannot be read", name), hostile)
     assert dialog.what.textFormat() is dialog.advice.textFormat() is Qt.TextFormat.PlainText
     dialog.deleteLater()
 
@@ -125,7 +125,7 @@ def test_the_keyboard_stays_where_resolve_was_asked_for(
     qtbot: QtBot, window: MainWindow, editor_model: PoseModel, how: str
 ) -> None:
     card, slider = window.collision.resolve, window.sliders.row_of(0).slider
-    window.document.set_latent(sample_poses(editor_model, 1, 0, colliding=True)[0], "Test")
+    window.document.blend_towards(sample_poses(editor_model, 1, 0, colliding=True)[0], 1.0)
     rest(qtbot, window)
     asking = slider if how == "shortcut" else card.button
     asking.setFocus()

@@ -254,7 +254,7 @@ def test_what_can_be_typed_is_near_the_sliders_range(qtbot: QtBot, window: MainW
     # What comes from a file may be further away: it is shown as it is, and stays so.
     pose = document.latent.copy()
     pose[1] = high + 10.0 * beyond + 1e-5
-    document.set_latent(pose, "Test")
+    document.blend_towards(pose, 1.0)
     rest(qtbot, window)
     assert row.field.value() == pytest.approx(pose[1], abs=1e-3)
     row.field.setFocus()
@@ -273,7 +273,7 @@ def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
     qtbot: QtBot, editor_model: PoseModel, tmp_path: Path
 ) -> None:
     long, endless = "right arm", "arm and " * 7 + "arm"
-    document = PoseDocument(editor_model.rename_domains({1: long}))
+    document = PoseDocument(editor_model.edit_domains({1: long}))
     window = open_window(qtbot, document, settings_in(tmp_path))
 
     def labels() -> list[QLabel]:
@@ -285,7 +285,7 @@ def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
     for label in labels():
         assert label.width() >= label.fontMetrics().horizontalAdvance(label.text())
         assert label.toolTip() == ""
-    window.document.set_model(editor_model.rename_domains({0: long, 1: endless}))
+    window.document.set_model(editor_model.edit_domains({0: long, 1: endless}))
     rest(qtbot, window)
     told = {label.text(): label.toolTip() for label in labels()}
     assert told[heading(endless)] == heading(endless)

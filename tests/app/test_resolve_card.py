@@ -16,7 +16,7 @@ from app.wording import seconds_text
 from app.work import jobs
 from app.work.jobs import Resolved
 from lcollision_core.jobs import CancelToken, Progress
-from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.model import NamedPose, PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult, Step
 from tests.app.windows import PATIENCE, rest
 
@@ -44,7 +44,7 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document, card = window.document, window.collision.resolve
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     for domain in (0, 1):
         assert "All body parts are locked: unlock one to resolve" not in texts(card)
         document.set_locked(domain, True)
@@ -59,7 +59,7 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
     assert "No search was needed" not in texts(card)
     assert card.converged.sign == "info"
     # A free pose needs none, locked or not.
-    document.set_latent(np.zeros_like(colliding), "Test")
+    document.load_pose(NamedPose("mean", np.zeros_like(colliding)))
     assert resolve(qtbot, window).exactly_free
     assert "No search was needed" in texts(card)
     assert LOCKED not in texts(card)
@@ -71,11 +71,11 @@ def test_a_search_that_had_no_time_is_not_called_needless(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document, card = window.document, window.collision.resolve
-    document.set_latent(colliding, "Test")
+    document.blend_towards(colliding, 1.0)
     outcome = resolve(qtbot, window)
     for free in (True, False):
         rushed = replace(
-            outcome, solver_status="not run", step=Step.WALK_BACK, exactly_free=free, note=None
+            outcome, solver_status="not run", step=Step.FALL_BACK, exactly_free=free, note=None
         )
         document._amend(replace(document._state, outcome=rushed))
         assert "No search: the time limit came first" in texts(card)
@@ -100,7 +100,7 @@ def test_the_time_told_is_what_was_waited_as_well(
         return prepared
 
     card = window.collision.resolve
-    window.document.set_latent(colliding, "Test")
+    window.document.blend_towards(colliding, 1.0)
     resolve(qtbot, window)
     assert not any("of preparation" in text for text in texts(card))
     window.document.undo()

@@ -120,9 +120,7 @@ def test_dialogs_fit_800_by_600(
     elif kind == "about":
         dialog = AboutDialog(["a model", "of long " * 8 + "origin"], small)
     elif kind == "no":
-        dialog = FailureDialog(
-            Failure("no such file; " + "look elsewhere " * 40, "x\n" * 99), small
-        )
+        dialog = FailureDialog(Failure("no such file", "look elsewhere " * 40, "x\n" * 99), small)
         dialog.show()
         dialog.unfold.click()
     else:

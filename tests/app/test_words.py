@@ -28,7 +28,7 @@ def test_the_window_uses_standard_words(qtbot: QtBot, window: MainWindow) -> Non
     document = window.document
     form = resolve_form(window.settings, window)
     qtbot.addWidget(form)
-    document.set_latent(sample_poses(document.model, 1, 0, colliding=True)[0], "Test")
+    document.blend_towards(sample_poses(document.model, 1, 0, colliding=True)[0], 1.0)
     rest(qtbot, window)
     said: set[str] = set()
     for shading in Shading:

@@ -11,6 +11,7 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
+from app.view.canvas import Canvas
 from app.view.viewport import Viewport
 
 SIDE = 420
@@ -67,10 +68,19 @@ def changed(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> npt.
     return np.abs(after - before).sum(axis=2) > 24
 
 
+def on_screen(canvas: Canvas, point: npt.NDArray[np.floating]) -> QPointF:
+    """Return where a (3,) point of the scene is seen in the widget, in pixels of the window."""
+    renderer, ratio = canvas.renderer, canvas.devicePixelRatioF()
+    renderer.SetWorldPoint(*point.tolist(), 1.0)
+    renderer.WorldToDisplay()
+    x, y, _ = renderer.GetDisplayPoint()
+    return QPointF(x / ratio, canvas.height() - 1 - y / ratio)
+
+
 def place_of(viewport: Viewport, vertex: int) -> QPoint:
     assert viewport.canvas is not None
     assert viewport.scene is not None
-    return viewport.canvas.place_of(viewport.scene.surface.vertices[vertex]).toPoint()
+    return on_screen(viewport.canvas, viewport.scene.surface.vertices[vertex]).toPoint()
 
 
 def seen_vertex(viewport: Viewport, domain: int) -> int:

@@ -18,7 +18,7 @@ from PySide6.QtWidgets import (
 from app.view.icons import pixmap
 from app.view.theme import NORMAL, WIDE, current_theme
 from app.window.panels.widgets import labelled
-from app.wording import one_line, split_sentence
+from app.wording import one_line, with_capital
 from app.work.log import log_file
 from app.work.threads import Failure
 
@@ -28,7 +28,7 @@ class FailureDialog(QDialog):
 
     Parameters
     ----------
-    failure : its sentence may say what to do behind its last semicolon; kept as an attribute
+    failure : kept as an attribute
     parent : the window that it belongs to
     """
 
@@ -37,14 +37,16 @@ class FailureDialog(QDialog):
         self.setWindowTitle("Couldn't do that")
         self.setMinimumWidth(480)
         self.failure = failure
-        what, advice = split_sentence(one_line(failure.sentence))
+        what, advice = map(with_capital, map(one_line, (failure.headline, failure.next_step)))
+        if advice and not advice.endswith((".", "?", "!")):
+            advice += "."
         sign = QLabel()
         sign.setPixmap(pixmap("warning", current_theme().colliding, 36, self.devicePixelRatioF()))
         self.what = labelled(what, "verdict")
         self.what.setWordWrap(True)
         self.advice = labelled(advice or "Nothing was changed.")
         self.advice.setWordWrap(True)
-        self.details = QPlainTextEdit(failure.details or failure.sentence)
+        self.details = QPlainTextEdit(failure.details or failure.headline)
         self.details.setReadOnly(True)
         self.details.setMinimumHeight(200)
         self.details.hide()

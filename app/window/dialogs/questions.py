@@ -17,7 +17,7 @@ from PySide6.QtWidgets import (
 
 from app.view.icons import pixmap
 from app.view.theme import WIDE, current_theme
-from app.wording import menu_text, one_line
+from app.wording import menu_text, one_line, with_capital
 
 if TYPE_CHECKING:
     from app.editing.recovery import LostPose
@@ -119,9 +119,9 @@ def ask_about_scale(parent: QWidget, found: WrongScale) -> bool:
     """Offer to import a mesh that is in another unit; whether it is to be scaled."""
     box = _box(parent, "Another unit")
     box.setText(f"“{found.path.name}” seems to be in another unit.")
-    sentence = found.sentence[:1].upper() + found.sentence[1:]
     box.setInformativeText(
-        f"{sentence}. Scaled by {found.factor:.6g} it fits; exported, it has its own size again."
+        f"{with_capital(found.what)}. Scaled by {found.factor:.6g} it fits; exported, it has its "
+        f"own size again."
     )
     scale = box.addButton("Scale and import", QMessageBox.ButtonRole.AcceptRole)
     cancel = box.addButton("Cancel", QMessageBox.ButtonRole.RejectRole)

@@ -102,7 +102,7 @@ class ExactCard(Card):
             )
             self.details.setToolTip(
                 "How deep all crossing triangles lie in each other, taken together, in per cent "
-                "of the height"
+                "of the body size"
             )
         else:
             self.verdict.setText("No collisions (checked)")

@@ -290,7 +290,7 @@ class ResolveCard(Card):
                 f"{overlap_text(result.energy_before)} → {overlap_text(result.energy_after)}"
             )
         mean, largest = result.vertex_distance_mean, result.vertex_distance_max
-        moved = f"{height_text(mean)} of the height,\nat most {height_text(largest)}"
+        moved = f"{height_text(mean)} of the body size,\nat most {height_text(largest)}"
         self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
         self._moved.setToolTip("Mean and maximum over the mesh")
         self._took.setText(_times(result.seconds, self._document.outcome_seconds))

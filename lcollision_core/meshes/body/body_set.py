@@ -110,7 +110,7 @@ def make_body(
     count = DEFAULT_VERTICES[kind] if n_vertices is None else n_vertices
     if not MIN_VERTICES <= count <= MAX_VERTICES:
         raise ShapeError(
-            f"the built-in body can have {MIN_VERTICES} to {MAX_VERTICES} vertices, got {count}"
+            f"the built-in body can have {MIN_VERTICES} to {MAX_VERTICES} vertices", got=count
         )
     template = cached_template(count)
     skin = Skin(template)

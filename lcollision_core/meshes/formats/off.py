@@ -53,8 +53,8 @@ def read(file: BinaryIO) -> Polygons:
     ends = np.flatnonzero(np.frombuffer(data, dtype=np.uint8) == ord("\n")) + 1
     if len(ends) < n_vertices + n_faces:
         raise MeshFileError(
-            f"it announces {n_vertices} vertices and {n_faces} faces but has only {len(ends)} "
-            f"lines for them; it is truncated"
+            f"it is truncated: it announces {n_vertices} vertices and {n_faces} faces but has only "
+            f"{len(ends)} lines for them"
         )
     middle, end = (int(ends[n - 1]) if n else 0 for n in (n_vertices, n_vertices + n_faces))
     return Polygons(points(data[:middle], "vertex"), *_faces(data[middle:end]))
@@ -80,8 +80,8 @@ def _faces(text: bytes) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     if len(missing):
         face = missing[0]
         raise MeshFileError(
-            f"face {face} (from 0) announces {announced[face]:g} corners but has "
-            f"{n_words[face] - 1}"
+            f"announces {announced[face]:g} corners but has {n_words[face] - 1}",
+            where=f"face {face} (from 0)",
         )
     sizes = announced.astype(np.int64)
     place = np.arange(len(values)) - np.repeat(starts, n_words)

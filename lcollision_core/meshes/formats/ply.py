@@ -37,7 +37,7 @@ class _Property(NamedTuple):
 
 class _Element(NamedTuple):
     name: str
-    count: int
+    n_rows: int
     properties: list[_Property]
 
 
@@ -121,15 +121,15 @@ def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
             case ["comment" | "obj_info", *_]:
                 continue
             case _ if not line:
-                raise MeshFileError("its header has no end; it is truncated")
+                raise MeshFileError("its header has no end, it is truncated")
             case _:
                 raise MeshFileError(
                     f"its header has a line that is not understood: {' '.join(words)[:60]!r}"
                 )
     else:
-        raise MeshFileError("its header has no end; it is damaged")
+        raise MeshFileError("its header has no end")
     if not has_format:
-        raise MeshFileError("its header names no format; it is damaged")
+        raise MeshFileError("its header names no format")
     _require_mesh(elements)
     return byte_order, elements
 
@@ -139,8 +139,8 @@ def _require_mesh(elements: list[_Element]) -> None:
     for wanted in ("vertex", "face"):
         if names.count(wanted) != 1:
             raise MeshFileError(
-                f"its header names {names.count(wanted)} elements {wanted!r}, one is needed; "
-                f"export it as a triangle mesh"
+                f"its header names {names.count(wanted)} elements {wanted!r}, one is needed",
+                "export it as a triangle mesh",
             )
     for element in elements:
         properties = [item.name for item in element.properties]
@@ -148,18 +148,18 @@ def _require_mesh(elements: list[_Element]) -> None:
             raise MeshFileError(f"its header names a property of {element.name!r} twice")
     vertex = {item.name: item for item in elements[names.index("vertex")].properties}
     if not all(axis in vertex and vertex[axis].count_dtype is None for axis in "xyz"):
-        raise MeshFileError("its vertices have no x, y and z; export the mesh again")
+        raise MeshFileError("its vertices have no x, y and z", "export the mesh again")
     face = {item.name: item for item in elements[names.index("face")].properties}
     corners = next((face[name] for name in _CORNER_NAMES if name in face), None)
     if corners is None or corners.count_dtype is None or corners.dtype.startswith("f"):
-        raise MeshFileError("its faces have no list vertex_indices; export the mesh again")
+        raise MeshFileError("its faces have no list vertex_indices", "export the mesh again")
 
 
 def _truncated(element: _Element, row: int | None = None) -> MeshFileError:
     where = "" if row is None else f" at {element.name} {row} (from 0)"
     return MeshFileError(
-        f"it announces {element.count} of element {element.name!r} but ends before{where}; "
-        f"it is truncated"
+        f"it is truncated: it announces {element.n_rows} of element {element.name!r} but ends "
+        f"before{where}"
     )
 
 
@@ -173,7 +173,7 @@ class _Body:
 
     def read(self, element: _Element) -> dict[str, _Column]:
         """Read the next element's rows."""
-        if element.count == 0 or not element.properties:
+        if element.n_rows == 0 or not element.properties:
             return {item.name: (np.empty(0), np.empty(0, np.int64)) for item in element.properties}
         columns = self._read_table(element)
         return self._read_ragged(element) if columns is None else columns
@@ -194,7 +194,7 @@ class _Body:
             if not (0 <= length <= len(self._data) and length % 1 == 0):
                 return None
             fields.append((item.name, dtype, (int(length),)))
-        table = self._rows(fields, element.count)
+        table = self._rows(fields, element.n_rows)
         if table is None:
             if all(item.count_dtype is None for item in element.properties):
                 raise _truncated(element)
@@ -229,7 +229,7 @@ class _Body:
         ]
         sizes: list[list[int]] = [[] for _ in dtypes]
         pieces: list[list[bytes]] = [[] for _ in dtypes]
-        for row in range(element.count):
+        for row in range(element.n_rows):
             for index, (dtype, count) in enumerate(zip(dtypes, counts, strict=True)):
                 length = 1
                 if count is not None:
@@ -238,7 +238,8 @@ class _Body:
                     (announced,) = count.unpack_from(data, offset)
                     if not (0 <= announced <= len(data) and announced % 1 == 0):
                         raise MeshFileError(
-                            f"{element.name} {row} (from 0) announces a list of {announced:g} items"
+                            f"announces a list of {announced:g} items",
+                            where=f"{element.name} {row} (from 0)",
                         )
                     length = int(announced)
                     offset += count.size

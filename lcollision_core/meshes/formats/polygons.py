@@ -116,7 +116,9 @@ def triangulate(polygons: Polygons) -> tuple[npt.NDArray[np.int64], tuple[str, .
     too_small = np.flatnonzero(sizes < 3)
     if len(too_small):
         face = int(too_small[0])
-        raise MeshFileError(f"face {face} (from 0) has {sizes[face]} corners, three are needed")
+        raise MeshFileError(
+            f"has {sizes[face]} corners, three are needed", where=f"face {face} (from 0)"
+        )
     quads = int((sizes == 4).sum())
     larger = int((sizes > 4).sum())
     if not quads and not larger:
@@ -143,10 +145,10 @@ def triangulate(polygons: Polygons) -> tuple[npt.NDArray[np.int64], tuple[str, .
 def require_plausible_count(count: int, what: str) -> None:
     """Raise `MeshFileError` when a file announces fewer than none, or more than `MAX_FACES`."""
     if count < 0:
-        raise MeshFileError(f"it announces {count} {what}; the file is damaged")
+        raise MeshFileError(f"it is damaged: it announces {count} {what}")
     if count > MAX_FACES:
         raise MeshFileError(
-            f"it holds {count} {what}, at most {MAX_FACES} can be read; decimate the mesh"
+            f"it holds {count} {what}, at most {MAX_FACES} can be read", "decimate the mesh"
         )
 
 
@@ -156,7 +158,7 @@ def read_rest(file: BinaryIO) -> bytes:
     size = file.seek(0, os.SEEK_END) - start
     if size > MAX_FILE_BYTES:
         raise MeshFileError(
-            f"it is larger than {MAX_FILE_BYTES >> 20} MiB; decimate the mesh or split the file"
+            f"it is larger than {MAX_FILE_BYTES >> 20} MiB", "decimate the mesh or split the file"
         )
     file.seek(start)
     return file.read(size)

@@ -63,11 +63,13 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
         corners = _text_corners(read_rest(file))
     elif n_triangles >= 0:
         raise MeshFileError(
-            f"it announces {n_triangles} triangles, which take {expected} bytes, but has {size}; "
-            f"it is truncated, or no STL file"
+            f"it is truncated or not an STL file: it announces {n_triangles} triangles, which take "
+            f"{expected} bytes, but has {size}"
         )
     else:
-        raise MeshFileError(f"it has {size} bytes, too few for an STL file; export the mesh again")
+        raise MeshFileError(
+            f"it has {size} bytes, too few for an STL file", "export the mesh again"
+        )
     points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0, as which corner is kept is chance
     is_single = not (is_text and expected != size)
     ordered = with_order_of(points, topology, _REORDERED, is_single)
@@ -81,8 +83,8 @@ def _text_corners(data: bytes) -> npt.NDArray[np.float64]:
     rows = _CORNER.findall(data)
     if len(rows) != 3 * n_facets or not has_end:
         raise MeshFileError(
-            f"it has {n_facets} complete triangles and {len(rows)} corners, and "
-            f"{'an' if has_end else 'no'} end line; it is truncated or damaged"
+            f"it is truncated or damaged: it has {n_facets} complete triangles, {len(rows)} "
+            f"corners and {'an' if has_end else 'no'} end line"
         )
     del data
     corners, sizes = number_rows(b"\n".join([*rows, b""]), "corner")

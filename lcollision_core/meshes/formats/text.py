@@ -64,6 +64,7 @@ def number_rows(
     MeshFileError : a word is no number.
     """
     # What stands nowhere else marks the ends of lines.
+    values: npt.NDArray[Any]
     if dtype is not np.float64 and text and not text.translate(None, b" \n0123456789"):
         values = np.fromstring(text.replace(b"\n", b" -1 "), dtype=np.int64, sep=" ")
         is_end = values < 0
@@ -83,8 +84,9 @@ def number_rows(
                 found.append(float(word))
             except ValueError as error:
                 raise MeshFileError(
-                    f"{name} {row} (from 0) holds {word[:30]!r}, which is no number; export the "
-                    f"mesh again"
+                    f"holds {word[:30]!r}, which is no number",
+                    "export the mesh again",
+                    where=f"{name} {row} (from 0)",
                 ) from error
     return np.array(found, dtype=np.float64), np.array(sizes, dtype=np.int64)
 
@@ -102,10 +104,12 @@ def points(text: bytes, name: str) -> npt.NDArray[np.float64]:
     short = np.flatnonzero(sizes < 3)
     if len(short):
         raise MeshFileError(
-            f"{name} {short[0]} (from 0) has {sizes[short[0]]} coordinates, three are needed"
+            f"has {sizes[short[0]]} coordinates, three are needed",
+            where=f"{name} {short[0]} (from 0)",
         )
     starts = np.cumsum(sizes) - sizes
-    return values[starts[:, None] + np.arange(3)]
+    coordinates: npt.NDArray[np.float64] = values[starts[:, None] + np.arange(3)]
+    return coordinates.astype(np.float64, copy=False)
 
 
 def vertex_numbers(
@@ -127,7 +131,8 @@ def vertex_numbers(
     if len(bad):
         row = int(np.searchsorted(np.cumsum(sizes), bad[0], side="right"))
         raise MeshFileError(
-            f"{name} {row} (from 0) has a corner that is no vertex number: {values[bad[0]]:g}"
+            f"has a corner that is no vertex number: {values[bad[0]]:g}",
+            where=f"{name} {row} (from 0)",
         )
     return values.astype(np.int64)
 

@@ -122,12 +122,12 @@ def contact_field(
     ShapeError : there are not two reaches, or the order or `apart` has another size.
     """
     if len(reach) != len(REACHES):
-        raise ShapeError(f"the field has {len(REACHES)} reaches, got {len(reach)}")
+        raise ShapeError(f"the field has {len(REACHES)} reaches", got=len(reach))
     n_points, n_ordered = places.shape[2], len(order)
     if n_ordered != -(-n_points // BLOCK) * BLOCK or apart.shape != (n_points, n_ordered):
         raise ShapeError(
-            f"{n_points} points are ordered in blocks of {BLOCK}, got an order of {n_ordered} and "
-            f"pairs of shape {tuple(apart.shape)}"
+            f"{n_points} points are ordered in blocks of {BLOCK}",
+            got=f"an order of {n_ordered} and pairs of shape {tuple(apart.shape)}",
         )
     if frame.device.type == "cpu":
         sums: torch.Tensor = _ContactField.apply(frame, places, order, apart, reach)  # type: ignore[no-untyped-call]

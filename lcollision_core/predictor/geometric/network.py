@@ -146,7 +146,7 @@ class GeometricNetwork(PredictorNetwork):
         """
         if not config.by_domain:
             raise LCollisionError(
-                "only the preset paper has a network without domains; add --preset paper"
+                "only the preset paper has a network without domains", "add --preset paper"
             )
         if rows is None:
             return cls(embedding, seed, np.empty((0, N_MEMBERS), dtype=np.int64))

@@ -172,7 +172,7 @@ class TrainingLoop:
             self._losses.append(processes.sum_of(loss))
             if not math.isfinite(self._losses[-1]):
                 raise LCollisionError(
-                    f"the training diverged in step {step} of {self._total}; lower the rate"
+                    f"the training diverged in step {step} of {self._total}", "lower the rate"
                 )
             self._after_step(step, network, optimiser, checkpoint, processes)
         return network

@@ -72,8 +72,8 @@ class Processes:
         dist.all_reduce(largest, dist.ReduceOp.MAX)
         if int(largest[0]) != -int(largest[1]):
             raise LCollisionError(
-                "the processes do not see the same checkpoint; put it into a folder that all "
-                "machines share, or delete it"
+                "the processes do not see the same checkpoint",
+                "put it into a folder that all machines share, or delete it",
             )
 
     def wait(self) -> None:
@@ -95,9 +95,11 @@ def joined_processes(device: str) -> Iterator[Processes]:
     LCollisionError : there is no such device.
     """
     if device not in ("auto", "cpu", "cuda"):
-        raise LCollisionError(f"there is no device {device!r}; use auto, cpu or cuda")
+        raise LCollisionError(f"there is no device {device!r}", "use auto, cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
-        raise LCollisionError("this machine has no CUDA device that torch can use; use auto or cpu")
+        raise LCollisionError(
+            "this machine has no CUDA device that torch can use", "use auto or cpu"
+        )
     kind = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
     chosen = torch.device(kind, local_rank % torch.cuda.device_count() if kind == "cuda" else 0)

@@ -78,12 +78,13 @@ def train_predictor(
     n_training, n_colliding = len(colliding), int(colliding.sum())
     if not 0 < n_colliding < n_training or not len(split.held_out):
         raise LabelStoreError(
-            f"{n_colliding} of the {n_training} rows to train on collide and "
-            f"{len(split.held_out)} are held out; training needs some of each: label more samples"
+            f"{n_colliding} of the {n_training} rows to train on collide and {len(split.held_out)} "
+            "are held out",
+            "training needs some of each: label more samples",
         )
     scale = float(energy[colliding].mean())
     if not scale > 0.0:
-        raise LabelStoreError("no colliding row has any depth to learn; label more samples")
+        raise LabelStoreError("no colliding row has any depth to learn", "label more samples")
     facts = TrainingFacts(
         rows=len(rows),
         training_rows=n_training,

@@ -197,7 +197,7 @@ def test_a_damaged_library_is_told_of(qtbot: QtBot, document: PoseDocument) -> N
     document._library.path.write_text("[1, 2")
     with qtbot.waitSignal(document.failed) as told:
         document.set_model(document.model)
-    assert "set aside as" in told.args[0].sentence
+    assert "set aside as" in told.args[0].headline
     assert document.poses == ()
 
 
@@ -210,7 +210,7 @@ def test_a_pose_of_a_library_that_cannot_be_written_is_still_to_be_saved(
     other.set_code(0, 0.5)
     with qtbot.waitSignal(other.failed) as told:
         other.add_pose_to_library("A")
-    assert "could not be saved" in told.args[0].sentence
+    assert "could not be saved" in told.args[0].headline
     assert names(other) == ["A"]
     assert other.modified
     blocked.unlink()
@@ -314,7 +314,7 @@ def test_a_file_of_another_model_offers_that_model(
         document.open_poses(path)
     (found,) = told.args
     assert (found.path, found.model.name) == (path, "snake")
-    assert snake.fingerprint not in found.sentence
+    assert snake.fingerprint not in f"{found.failure.headline} {found.failure.next_step}"
     assert document.latent is before
     with qtbot.waitSignal(document.opened):
         document.open_poses(path, found.model.path)

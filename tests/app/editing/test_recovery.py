@@ -27,14 +27,14 @@ application = QGuiApplication(sys.argv)
 document = PoseDocument()
 autosave = Autosave(document, Path(sys.argv[2]), seconds=0.1)
 autosave.written.connect(lambda: print("written", flush=True))
-autosave.failed.connect(lambda failure: print(failure.sentence, flush=True))
+autosave.failed.connect(lambda failure: print(failure.headline, flush=True))
 
 def edit():
     document.add_pose_to_library("kick")
     document.set_code(2, 0.625)
     document.set_locked(1, True)
 
-document.failed.connect(lambda failure: print(failure.sentence, flush=True))
+document.failed.connect(lambda failure: print(failure.headline, flush=True))
 QTimer.singleShot(60_000, application.quit)
 document.model_changed.connect(edit)
 document.open_model(sys.argv[1])
@@ -244,4 +244,4 @@ def test_a_failing_disk_is_told_of_once(
     with qtbot.waitSignal(autosave.written):
         document.set_code(0, 0.6)
     assert len(failures) == 1
-    assert "save them to a file" in failures[0].sentence
+    assert "save them to a file" in failures[0].next_step

@@ -23,6 +23,7 @@ from lcollision_core.model import NamedPose
 from tests.app.views import (
     SIDE,
     changed,
+    on_screen,
     pixels,
     place_of,
     rest,
@@ -50,7 +51,7 @@ def test_each_camera_shows_the_whole_body(viewport: Viewport) -> None:
     positions = set()
     for name in CAMERAS:
         viewport.set_camera(name, glide=False)
-        places = [viewport.canvas.place_of(vertex) for vertex in viewport.scene.surface.vertices]
+        places = [on_screen(viewport.canvas, vertex) for vertex in viewport.scene.surface.vertices]
         across = np.array([(place.x(), place.y()) for place in places])
         assert across.min() > 0
         assert across.max() < SIDE

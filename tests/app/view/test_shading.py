@@ -99,7 +99,7 @@ def test_movement_is_drawn_up_to_the_largest_which_the_legend_names(shader: Shad
     colours = shader.colours(Shading.MOVEMENT, movement=moved)
     assert (colours == scale[[0, 63, 255, 127]]).all()
     legend = shader.legend(Shading.MOVEMENT, movement=moved)
-    assert legend.note == "in % of the height"
+    assert legend.note == "in % of the body size"
     assert legend.ticks == ((0.0, "0"), (0.5, "0.2"), (1.0, "0.4"))
     still = np.zeros(4)
     assert (shader.colours(Shading.MOVEMENT, movement=still) == rgb(shader.skin)).all()

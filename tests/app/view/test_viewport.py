@@ -97,7 +97,7 @@ def test_where_no_model_could_be_opened_the_page_stands_still_and_offers_another
     qtbot.waitUntil(lambda: document.has_model, timeout=20_000)
     rest(qtbot, shown)
     assert not page.turns
-    document.failed.emit(Failure("later; no matter", ""))
+    document.failed.emit(Failure("later", "no matter"))
     assert shown.is_ready
     assert not page.isVisible()
     qtbot.waitUntil(lambda: not document.busy, timeout=60_000)
@@ -113,7 +113,7 @@ def test_a_pose_is_drawn_in_place(
     surface = viewport.scene.surface
     arrays = surface.vertices, surface.normals, surface.colours
     before = pixels(viewport)
-    document.set_latent(colliding, "Jump")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     frame = document.frame
     assert frame is not None
@@ -149,7 +149,7 @@ def test_a_highlight_outlines_its_domain_and_leaves_all_colours_as_they_are(
     colliding: npt.NDArray[np.float64],
     shading: Shading,
 ) -> None:
-    document.set_latent(colliding, "Jump")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     qtbot.waitUntil(lambda: document.exact is not None)
     viewport.set_shading(shading)
@@ -192,7 +192,7 @@ def test_an_outline_follows_the_pose_and_the_camera_in_one_width(
         return changed(*pictures)
 
     straight = outlined()
-    document.set_latent(colliding, "Jump")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     bent = outlined()
     viewport.set_camera("Back", glide=False)
@@ -210,7 +210,7 @@ def test_an_outline_follows_the_pose_and_the_camera_in_one_width(
 def test_each_shading_looks_different_and_explains_itself(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
 ) -> None:
-    document.set_latent(colliding, "Jump")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     qtbot.waitUntil(lambda: document.exact is not None)
     seen = []
@@ -286,7 +286,7 @@ def test_the_legend_lies_beneath_the_mesh_and_holds_still_while_a_pose_changes(
         assert blocks[-1].bottom() <= legend.height()
         assert max(block.right() for block in blocks) <= width
         for latent in (colliding, np.zeros_like(colliding)):
-            document.set_latent(latent, "Jump")
+            document.blend_towards(latent, 1.0)
             rest(qtbot, viewport)
             assert (legend.geometry(), canvas.geometry()) == geometries
             qtbot.waitUntil(lambda: document.exact is not None)
@@ -299,7 +299,7 @@ def test_what_resolve_has_moved_is_drawn_and_explained(
     scene = viewport.scene
     assert scene is not None
     viewport.set_shading(Shading.MOVEMENT)
-    document.set_latent(colliding, "Jump")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     assert viewport.legend.note == "shown after Resolve"
     plain = scene.surface.colours.copy()
@@ -333,7 +333,7 @@ def test_intersecting_faces_are_red_while_the_truth_is_known(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
 ) -> None:
     viewport.set_shading(Shading.EXACT)
-    document.set_latent(colliding, "Jump")
+    document.blend_towards(colliding, 1.0)
     qtbot.waitUntil(lambda: document.exact is not None)
     rest(qtbot, viewport)
     exact, scene = document.exact, viewport.scene
@@ -360,7 +360,7 @@ def test_intersecting_faces_are_red_while_the_truth_is_known(
 def test_resolve_transitions_to_the_new_pose_and_leaves_a_ghost(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
 ) -> None:
-    document.set_latent(colliding, "Jump")
+    document.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     scene = viewport.scene
     assert scene is not None
@@ -493,7 +493,8 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
     assert "turn.webp" in viewport.pictures.busy
     qtbot.waitUntil(lambda: not film.is_running, timeout=20_000)
     (failure,) = told
-    assert "turn.webp could not be made; try" in failure.sentence
+    assert "turn.webp could not be made" in failure.headline
+    assert failure.next_step.startswith("try")
     assert type(error).__name__ in failure.details
     assert viewport.pictures.busy == ""
     assert list(tmp_path.iterdir()) == []

@@ -57,7 +57,7 @@ def test_the_log_holds_what_nobody_caught_and_what_qt_says(logging_into: Path) -
     assert "a timer of another thread" in text
     assert "ZeroDivisionError" in text
     (failure,) = told
-    assert "missing bone" in failure.sentence
+    assert "missing bone" in failure.headline
     assert "Traceback" in failure.details
     assert len(log._QT_LEVELS) == len(QtMsgType)
 

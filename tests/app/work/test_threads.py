@@ -225,7 +225,7 @@ def test_a_solve_that_fails_leaves_the_editor_usable(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     latent = sample_poses(document.model, 1, 0, colliding=True)[0]
-    document.set_latent(latent, "Jump")
+    document.blend_towards(latent, 1.0)
     failures: list[Failure] = []
     document.failed.connect(failures.append)
     with monkeypatch.context() as broken:
@@ -234,7 +234,7 @@ def test_a_solve_that_fails_leaves_the_editor_usable(
             document.resolve()
     assert finished.args == [None]
     qtbot.waitUntil(lambda: bool(failures))
-    assert "ZeroDivisionError" in failures[0].sentence
+    assert "ZeroDivisionError" in failures[0].headline
     assert not document.solving
     assert document.latent.tobytes() == latent.tobytes()
     with qtbot.waitSignal(document.solve_finished, timeout=20_000):
@@ -264,7 +264,7 @@ def test_a_live_worker_that_fails_tells_once_and_goes_on(
     document.set_code(0, 0.4)
     settle(qtbot, document)
     assert len(failures) == 1
-    assert "MemoryError" in failures[0].sentence
+    assert "MemoryError" in failures[0].headline
     assert document.frame is not None
     assert document.frame.latent[0] == 0.4
 

@@ -12,12 +12,11 @@ from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve import ResolveOptions, Solver
-from lcollision_core.resolve.metric import LatentMetric
-from lcollision_core.resolve.nearest import nearest_within
+from lcollision_core.resolve.contacts import nearest_within
 from lcollision_core.resolve.nlopt_solvers import solve_nlopt
-from lcollision_core.resolve.problem import ResolveProblem, SolverOutcome, Watch
+from lcollision_core.resolve.problem import Deadline, ResolveProblem, SolverOutcome
 from lcollision_core.resolve.sqp import SqpBatch
-from tests.core.resolve_toys import Ball, HalfSpace, toy_problem
+from tests.core.resolve.toys import Ball, HalfSpace, toy_problem
 
 TARGET = np.array([1.0, 2.0, -1.0, 0.5])
 NORMAL = np.array([1.0, 1.0, 0.0, -2.0])
@@ -132,7 +131,7 @@ def test_cancel_stops_before_the_next_evaluation(solver: Solver, at_call: int) -
             # Curved, so that no solver is there after one step.
             return 81.0 - (latent**2).sum(axis=1), -2.0 * latent
 
-    problem = toy_problem(Cancelling(), TARGET, watch=Watch(cancel=token))
+    problem = toy_problem(Cancelling(), TARGET, deadline=Deadline(cancel=token))
     with pytest.raises(CancelledError):
         solve(solver, problem)
     assert calls == at_call
@@ -141,7 +140,7 @@ def test_cancel_stops_before_the_next_evaluation(solver: Solver, at_call: int) -
 @pytest.mark.parametrize("solver", Solver)
 def test_no_time_still_returns_a_pose(solver: Solver) -> None:
     half_space = HalfSpace(NORMAL, 0.5)
-    outcome = solve(solver, toy_problem(half_space, TARGET, watch=Watch(budget=0.0)))
+    outcome = solve(solver, toy_problem(half_space, TARGET, deadline=Deadline(budget=0.0)))
     assert half_space.n_calls == 1
     assert outcome.status == ("stopped" if solver == Solver.SQP else "out of time")
     assert not outcome.converged
@@ -259,7 +258,7 @@ def test_nearest_within_half_spaces_agrees_with_a_general_solver() -> None:
         size = 6
         root = generator.normal(size=(size, size))
         problem = toy_problem(HalfSpace(np.ones(size), 0.0), generator.normal(size=size))
-        problem.metric = LatentMetric(root @ root.T + 0.1 * np.eye(size))
+        problem.metric = root @ root.T + 0.1 * np.eye(size)
         problem.low, problem.high = problem.target - 0.06, problem.target + 0.06
         normals = generator.normal(size=(3, size))
         inside = problem.target + generator.uniform(-0.05, 0.05, size)

@@ -33,14 +33,13 @@ def turned(points: FloatArray, axis: int, angle: float, about: FloatArray) -> Fl
     return (points - about) @ rotation.T + about
 
 
-def effect_of(move: Callable[[FloatArray, float], FloatArray], high: float = 1.0) -> CodeEffect:
-    """Return the effect of a code that moves the body, the first of one group."""
+def effect_of(domain: int, move: Callable[[FloatArray, float], FloatArray]) -> CodeEffect:
+    """Return the effect of a domain's code of the whole body, which moves the body."""
 
     def decode(latent: FloatArray) -> FloatArray:
-        return np.stack([move(BODY, float(row[0])) for row in latent])
+        return np.stack([move(BODY, float(row[domain])) for row in latent])
 
-    (effect,) = code_effects(decode, np.array([high]), MASK, (1,), UP, FRONT)
-    return effect
+    return code_effects(decode, np.ones(2), MASK, (2, 0, 0), UP, FRONT)[domain]
 
 
 def moving(domain: int, change: Callable[[FloatArray, float], FloatArray]) -> CodeEffect:
@@ -51,7 +50,7 @@ def moving(domain: int, change: Callable[[FloatArray, float], FloatArray]) -> Co
         posed[part] = change(body[part], share)
         return posed
 
-    return effect_of(move)
+    return effect_of(domain, move)
 
 
 @pytest.mark.parametrize(
@@ -84,19 +83,19 @@ def test_a_turn_about_the_long_axis_is_a_twist_and_another_a_bend() -> None:
 
 
 def test_what_does_nothing_is_still() -> None:
-    assert effect_of(lambda body, _: body).motion == "still"
+    assert effect_of(0, lambda body, _: body).motion == "still"
 
 
 def test_a_domains_own_code_moves_it_unless_it_carries_another_along() -> None:
     def decode(latent: FloatArray) -> FloatArray:
         bodies = np.repeat(BODY[None], len(latent), axis=0)
-        for body, (_, own, carrying) in zip(bodies, latent, strict=True):
+        for body, (_, _, own, carrying) in zip(bodies, latent, strict=True):
             body[len(ARM) :] += [0, 0, 0.6 * own + 0.1 * carrying]
             body[: len(ARM)] += [0, own + carrying, 0]
         return bodies
 
-    found = code_effects(decode, np.ones(3), MASK, (1, 0, 2), UP, FRONT)
-    assert found[1:] == (CodeEffect(1, "up"), CodeEffect(0, "back"))
+    found = code_effects(decode, np.ones(4), MASK, (2, 0, 2), UP, FRONT)
+    assert found[2:] == (CodeEffect(1, "up"), CodeEffect(0, "back"))
 
 
 def test_a_domains_code_of_the_whole_body_is_named_after_it_however_it_swings_others() -> None:
@@ -130,7 +129,7 @@ def test_a_models_names_are_measured_once_and_follow_its_parts(
         assert len(set(names[group.codes])) == group.codes.stop - group.codes.start
     monkeypatch.setattr(PoseModel, "decode", lambda *_: pytest.fail("measured again"))
     first, second = tube_model.domain_names
-    renamed = tube_model.rename_domains({0: "knee", 1: "hip"})
+    renamed = tube_model.edit_domains({0: "knee", 1: "hip"})
     expected = [name.replace(first, "knee").replace(second, "hip") for name in names]
     assert list(renamed.code_names) == expected
 

@@ -52,7 +52,7 @@ def _commands(*words: str) -> set[str]:
 
 
 def test_readme_and_help_name_the_same_commands() -> None:
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    readme = (Path(__file__).parents[3] / "README.md").read_text()
     rows = re.findall(r"^\| (`lcollision.*?) \| ", readme, re.MULTILINE)
     named = {name for row in rows for name in re.findall(r"`lcollision ([a-z]+)", row)}
     assert named == _commands()

@@ -68,7 +68,7 @@ def trained(model: Path, store: Path) -> Path:
     assert result.stdout == ""
     said = _without_progress(result.stderr)
     assert said.startswith(f"lcollision: wrote {path}: ")
-    assert f" of {3 * N_ROWS // 10} unseen samples right" in said
+    assert f" on {3 * N_ROWS // 10} unseen samples" in said
     assert not path.with_name("trained.safetensors.checkpoint").exists()
     return path
 
@@ -171,7 +171,7 @@ def test_all_rows_of_another_store_count(
     assert later["false_negative_rate"] == missed.mean() > report["false_negative_rate"]
     text = lcollision("evaluate", trained, other, "--rows", 200).stdout
     assert text.startswith("trained, preset paper: ")
-    assert " of 200 unseen samples right" in text
+    assert " on 200 unseen samples" in text
     share = 100.0 * rows.colliding[:200].mean()
     sizes = "|Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion"
     assert f"\n  {sizes}; {share:.1f} % of these 200 samples collide\n" in text
@@ -351,7 +351,7 @@ def test_what_cannot_be_trained_or_evaluated_is_refused(
     assert loaded.predictor is not None
     changed.with_predictor(loaded.predictor).save(nearer)
     assert "near exclusion of 0.0, not" in _refusal(lcollision, "evaluate", nearer, store)
-    assert measured_model_sentence(changed).endswith("for 2 parts, near exclusion 0.2 heights")
+    assert measured_model_sentence(changed).endswith("for 2 domains, near exclusion 0.2")
     assert not output.exists()
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.resolve.metric import LatentMetric
-from lcollision_core.resolve.problem import CollisionModel, ResolveProblem, Watch
+from lcollision_core.resolve.problem import CollisionModel, Deadline, ResolveProblem
 
 
 @dataclass(eq=False)
@@ -53,18 +52,18 @@ def toy_problem(
     model: CollisionModel,
     target: FloatArray,
     reach: float = 10.0,
-    watch: Watch | None = None,
+    deadline: Deadline | None = None,
     code_weights: FloatArray | None = None,
 ) -> ResolveProblem:
     """Make the problem with the plain distance, within `reach` of 0."""
     size = len(target)
     return ResolveProblem(
         target=target,
-        metric=LatentMetric.latent(size),
+        metric=np.eye(size),
         code_weights=np.ones(size) if code_weights is None else code_weights,
         low=np.full(size, -reach),
         high=np.full(size, reach),
         limit=0.0,
         model=model,
-        watch=watch or Watch(),
+        deadline=deadline or Deadline(),
     )

@@ -79,7 +79,7 @@ def test_no_poses_are_a_file_too(model: PoseModel, tmp_path: Path) -> None:
 
 
 def test_poses_of_a_renamed_model_are_still_its_own(model: PoseModel, path: Path) -> None:
-    assert len(read_poses(path, model.rename_domains({0: "tail"}))) == 3
+    assert len(read_poses(path, model.edit_domains({0: "tail"}))) == 3
 
 
 def test_poses_of_another_model_are_refused(model: PoseModel, path: Path) -> None:

@@ -184,7 +184,7 @@ def test_a_model_renamed_while_another_is_trained_to_its_file_stays(
     train = training.train_embedding
 
     def rename_then_train(*arguments: Any, **options: Any) -> Any:
-        change_model(tube, lambda model: model.rename_domains({0: "neck"}))
+        change_model(tube, lambda model: model.edit_domains({0: "neck"}))
         return train(*arguments, **options)
 
     monkeypatch.setattr(training, "train_embedding", rename_then_train)
@@ -327,7 +327,7 @@ def test_a_mesh_comes_back_to_its_place(lcollision: Lcollision, tube: Path, tmp_
     poses, folder = tmp_path / "poses.json", tmp_path / "back"
     result = lcollision("encode", tube, *meshes, "-o", poses)
     assert result.exit_code == 0
-    assert "mesh 1: fit error of 0.000 % of the height" in result.stdout
+    assert "mesh 1: fit error of 0.000 % of the body size" in result.stdout
     encoded = read_poses(poses, model)
     assert [pose.name for pose in encoded] == ["mesh 0", "mesh 1"]
     for pose, wanted in zip(encoded, latent, strict=True):

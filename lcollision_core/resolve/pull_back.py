@@ -1,8 +1,9 @@
-"""Pull a free pose back towards the one that was asked for, as far as it stays exactly free."""
+"""Between a collision-free pose and the target: pull back to it, or fall back from it."""
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.contacts import Contacts
@@ -14,6 +15,12 @@ SLIDES = 5
 _SLIDE_HALVINGS = 1
 _SETTLED = 0.01
 """Share of the distance that a further slide must promise."""
+
+FALL_BACKS = 6
+"""Known free poses that are tried, the nearest ones: the segment to the nearest of all often is
+not the one that becomes free soonest."""
+
+FALL_BACK_HALVINGS = 8
 
 
 def bisect(
@@ -36,10 +43,10 @@ def bisect(
 
     Raises
     ------
-    CancelledError : the problem's watch said so.
+    CancelledError : the problem's token was set.
     """
     for _ in range(n):
-        problem.watch.poll()
+        problem.deadline.poll()
         middle = 0.5 * (free + colliding)
         if check.is_free(middle):
             free = middle
@@ -48,8 +55,8 @@ def bisect(
     return free, colliding
 
 
-def shorten(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
-    """Move a free pose as near to Z* as it stays exactly free.
+def pull_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
+    """Move a free pose as near to Z* as it stays collision-free.
 
     First straight towards Z* by bisection. Where that is stopped, the contacts become linear
     constraints, and the nearest pose that they allow is the next goal: the pose slides along what
@@ -58,23 +65,52 @@ def shorten(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> Flo
     Parameters
     ----------
     check, problem : of the pose
-    free : (D,) float64 array, exactly free
+    free : (D,) float64 array, collision-free
 
     Returns
     -------
-    latent : (D,) float64 array, exactly free, no farther from Z* than `free`
+    latent : (D,) float64 array, collision-free, no farther from Z* than `free`
 
     Raises
     ------
-    CancelledError : the problem's watch said so.
+    CancelledError : the problem's token was set.
     """
     free, colliding = bisect(check, problem, free, problem.target, FIRST_HALVINGS)
     slid = _slide(check, problem, free, colliding)
     if slid is free:
-        free, _ = bisect(check, problem, free, colliding, FURTHER_HALVINGS)
-    else:
-        free = slid
-    return _put_domains_back(check, problem, free)
+        slid, _ = bisect(check, problem, free, colliding, FURTHER_HALVINGS)
+    return _put_domains_back(check, problem, slid)
+
+
+def fall_back(
+    check: ExactCheck, problem: ResolveProblem, free_latents: FloatArray
+) -> FloatArray | None:
+    """Bisect the segments from Z* to known free poses, and take the end that is nearest to Z*.
+
+    Locked codes stay, so that a known free pose may collide for want of them; such are left out.
+
+    Parameters
+    ----------
+    check, problem : of the pose
+    free_latents : (F, D) float64 array
+
+    Returns
+    -------
+    latent : (D,) float64 array, collision-free, or None where all known poses collide
+
+    Raises
+    ------
+    CancelledError : the problem's token was set.
+    """
+    ends = np.where(problem.movable, free_latents, problem.target)
+    reached: list[FloatArray] = []
+    for end in ends[np.argsort(problem.distance(ends), kind="stable")]:
+        problem.deadline.poll()
+        if len(reached) == FALL_BACKS or (reached and problem.deadline.expired):
+            break
+        if check.is_free(end):
+            reached.append(bisect(check, problem, end, problem.target, FALL_BACK_HALVINGS)[0])
+    return min(reached, key=problem.distance, default=None)
 
 
 def _slide(
@@ -82,8 +118,8 @@ def _slide(
 ) -> FloatArray:
     contacts = Contacts(check, problem)
     for _ in range(SLIDES):
-        problem.watch.poll()
-        if problem.watch.expired or not contacts.add(colliding):
+        problem.deadline.poll()
+        if problem.deadline.expired or not contacts.add(colliding):
             break
         contacts.drop_refuted(free)
         goal = contacts.nearest(problem.target)
@@ -101,25 +137,20 @@ def _slide(
 
 def _put_domains_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
     """Try for each group of codes, the farthest moved first, whether it may return to Z*."""
-    sizes = check.embedding.group_sizes
-    stops = np.cumsum(sizes)
-    groups = [slice(stop - size, stop) for size, stop in zip(sizes, stops, strict=True)]
-    for group in sorted(groups, key=lambda one: -_gain(problem, free, one)):
-        problem.watch.poll()
-        if problem.watch.expired:
+
+    def put_back(codes: npt.NDArray[np.intp]) -> FloatArray:
+        latent = free.copy()
+        latent[codes] = problem.target[codes]
+        return latent
+
+    groups = np.split(np.arange(len(free)), np.cumsum(check.embedding.group_sizes)[:-1])
+    for codes in sorted(groups, key=lambda codes: float(problem.distance(put_back(codes)))):
+        problem.deadline.poll()
+        if problem.deadline.expired:
             break
         # Where the metric ties groups to each other, putting one back alone may add to it.
-        if _gain(problem, free, group) <= _SETTLED * problem.distance(free):
-            continue
-        put_back = free.copy()
-        put_back[group] = problem.target[group]
-        if check.is_free(put_back):
-            free = put_back
+        tried = put_back(codes)
+        gain = problem.distance(free) - problem.distance(tried)
+        if gain > _SETTLED * problem.distance(free) and check.is_free(tried):
+            free = tried
     return free
-
-
-def _gain(problem: ResolveProblem, latent: FloatArray, group: slice) -> float:
-    """Return by how much the squared distance falls if a group of codes returns to Z*."""
-    put_back = latent.copy()
-    put_back[group] = problem.target[group]
-    return float(problem.distance(latent) - problem.distance(put_back))

@@ -238,7 +238,7 @@ def test_loading_and_decoding_need_no_torch_and_no_front_end(path: Path) -> None
 
 
 def test_renaming_is_kept_and_leaves_the_latent_space_alone(model: PoseModel, path: Path) -> None:
-    renamed = PoseModel.load(path).rename_domains({1: "  Schwanz ☃ "})
+    renamed = PoseModel.load(path).edit_domains({1: "  Schwanz ☃ "})
     renamed.save(path)
     loaded = PoseModel.load(path)
     assert loaded.domain_names == (model.domain_names[0], "Schwanz ☃")
@@ -250,18 +250,18 @@ def test_renaming_is_kept_and_leaves_the_latent_space_alone(model: PoseModel, pa
 @pytest.mark.parametrize("name", ["", "  ", "a\nb", "x" * 61, "\x07"])
 def test_names_that_cannot_be_shown_are_refused(model: PoseModel, name: str) -> None:
     with pytest.raises(ModelFileError, match="cannot name a domain"):
-        model.rename_domains({0: name})
+        model.edit_domains({0: name})
 
 
 def test_taken_names_and_missing_domains_are_refused(model: PoseModel) -> None:
     first, second = model.domain_names
     with pytest.raises(ModelFileError, match="two domains would be called"):
-        model.rename_domains({0: second})
-    assert model.rename_domains({0: first}).domain_names == (first, second)
-    assert model.rename_domains({0: second, 1: first}).domain_names == (second, first)
+        model.edit_domains({0: second})
+    assert model.edit_domains({0: first}).domain_names == (first, second)
+    assert model.edit_domains({0: second, 1: first}).domain_names == (second, first)
     for domain in (-1, 2):
         with pytest.raises(ModelFileError, match="domains are 1 to 2"):
-            model.rename_domains({domain: "tail"})
+            model.edit_domains({domain: "tail"})
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.01, 0.75, 1.5, 3.28, 100.0, 1e150])
@@ -297,7 +297,7 @@ def test_another_order_of_vertices_is_refused(model: PoseModel) -> None:
 def test_sections_of_later_programs_survive_a_renaming(path: Path) -> None:
     later = Section({"bones": np.arange(4, dtype=np.int32)}, {"kind": "later"})
     write_model_file(path, read_model_file(path) | {"skeleton": later})
-    PoseModel.load(path).rename_domains({0: "tail"}).save(path)
+    PoseModel.load(path).edit_domains({0: "tail"}).save(path)
     kept = read_model_file(path)["skeleton"]
     assert kept.metadata == later.metadata
     assert np.array_equal(kept.arrays["bones"], later.arrays["bones"])
@@ -407,6 +407,6 @@ def test_models_of_programs_with_other_training_options_still_load(path: Path) -
     sections["embedding"] = Section(embedding.arrays, metadata)
     write_model_file(path, sections)
     before = PoseModel.load(path)
-    before.rename_domains({0: "tail"}).save(path)
+    before.edit_domains({0: "tail"}).save(path)
     assert read_model_file(path)["embedding"].metadata["config"] == config
     assert PoseModel.load(path).fingerprint == before.fingerprint

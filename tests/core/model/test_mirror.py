@@ -20,7 +20,7 @@ from lcollision_core.model import (
     write_poses,
 )
 from lcollision_core.model.mirror import find_symmetry
-from lcollision_core.resolve import ResolveOptions, exported_vertices
+from lcollision_core.resolve import ResolveOptions
 from tests.core.shapes import random_rotation
 
 OCTAHEDRON = np.array(
@@ -172,7 +172,7 @@ def test_a_free_pose_that_collides_mirrored_is_resolved(
     assert not resolved.lost_freedom
     assert resolved.resolution is not None
     np.testing.assert_array_equal(resolved.latent, resolved.resolution.latent)
-    vertices = exported_vertices(body.decode(resolved.latent))
+    vertices = body.exported_vertices(resolved.latent)
     assert not body.detector.detect(vertices).colliding
     symmetry = body.symmetry
     assert symmetry is not None

@@ -15,7 +15,6 @@ from lcollision_core.model import (
     export_frame,
     export_mesh,
 )
-from lcollision_core.resolve import exported_vertices
 
 X, Y, Z = np.eye(3)
 
@@ -43,7 +42,7 @@ def test_a_file_stands_upright_and_faces_the_front_of_its_program(
         ExportAxes.MAYA: (Y, Z),
         ExportAxes.UNREAL: (Z, X),
     }[axes]
-    vertices = exported_vertices(body.decode(body.training_latent[0]))
+    vertices = body.exported_vertices(body.training_latent[0])
     path = tmp_path / f"body{suffix}"
     written = export_mesh(path, body, vertices, frame=export_frame(body, axes, path))
     read = read_mesh(path, topology=body.topology).vertices
@@ -63,7 +62,7 @@ def test_a_file_stands_upright_and_faces_the_front_of_its_program(
 
 def test_turn_and_scale_are_exact(body: PoseModel, tmp_path: Path) -> None:
     path = tmp_path / "body.obj"
-    vertices = exported_vertices(body.decode(body.training_latent[3]))
+    vertices = body.exported_vertices(body.training_latent[3])
     frame = export_frame(body, "maya", path)
     export_mesh(path, body, vertices, frame=frame)
     read = read_mesh(path).vertices
@@ -77,7 +76,7 @@ def test_turn_and_scale_are_exact(body: PoseModel, tmp_path: Path) -> None:
 def test_what_is_checked_is_what_is_written(body: PoseModel, tmp_path: Path, suffix: str) -> None:
     rng = np.random.default_rng(2)
     for latent in body.latent_space.sample(8, rng):
-        vertices = exported_vertices(body.decode(latent))
+        vertices = body.exported_vertices(latent)
         path = tmp_path / f"pose{suffix}"
         frame = export_frame(body, "unreal", path)
         written = export_mesh(path, body, vertices, frame=frame)
@@ -90,7 +89,7 @@ def test_what_is_checked_is_what_is_written(body: PoseModel, tmp_path: Path, suf
 
 
 def test_a_scale_of_its_own_and_glb_that_has_its_own_axes(body: PoseModel, tmp_path: Path) -> None:
-    vertices = exported_vertices(body.decode(body.training_latent[0]))
+    vertices = body.exported_vertices(body.training_latent[0])
     path = tmp_path / "body.ply"
     export_mesh(path, body, vertices, frame=export_frame(body, "model", path, scale=1000.0))
     np.testing.assert_array_equal(read_mesh(path).vertices, vertices.astype(float) * 1000.0)
@@ -102,7 +101,7 @@ def test_a_scale_of_its_own_and_glb_that_has_its_own_axes(body: PoseModel, tmp_p
 
 def test_a_placed_mesh_is_turned_like_all_others(body: PoseModel, tmp_path: Path) -> None:
     placement = RigidTransform(np.eye(3), np.array([0.0, 0.0, 2.0]))
-    vertices = exported_vertices(body.decode(body.training_latent[0]), placement)
+    vertices = body.exported_vertices(body.training_latent[0], placement)
     path = tmp_path / "body.obj"
     frame = export_frame(body, "y-up", path)
     written = export_mesh(path, body, vertices, placement, frame)

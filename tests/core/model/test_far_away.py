@@ -122,7 +122,7 @@ def test_a_far_mesh_is_fitted_checked_and_given_back_as_a_near_one(
         assert len(np.unique(exported, axis=0)) == tube_model.n_vertices
         back = far.placement.inverse().apply(exported)  # type: ignore[union-attr]
         assert back == pytest.approx(decoded * tube_model.height, abs=1e-5 + 1e-15 * distance)
-        expected, found = near.find(decoded), far.find(decoded)
+        expected, found = (one.find(one.exported(decoded)) for one in (near, far))
         assert len(found.pairs) == pytest.approx(len(expected.pairs), rel=0.2)
         assert far.is_free(latent) == (len(found.pairs) == 0) == near.is_free(latent)
         fit = tube_model.encode(exported)
@@ -175,7 +175,7 @@ def test_a_mesh_in_another_unit_comes_back_in_its_own(
     assert fit.placement.scale == pytest.approx(factor)
     check = ExactCheck(tube_model.embedding, tube_model.detector, tube_model.height, fit.placement)
     expected = tube_model.detector.detect(tube_model.decode(fit.latent))
-    found = check.find(check.decode(fit.latent)[0])
+    found = check.find(check.exported(check.decode(fit.latent)[0]))
     assert len(found.pairs) == pytest.approx(len(expected.pairs), rel=0.2)
     assert found.energy == pytest.approx(expected.energy, rel=1e-3)
 

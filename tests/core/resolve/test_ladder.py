@@ -25,15 +25,14 @@ from lcollision_core.resolve import (
     ResolveResult,
     Solver,
     Step,
-    exported_vertices,
     find_free_poses,
     largest_correction_change,
 )
 from lcollision_core.resolve.exact import ExactCheck
 from lcollision_core.resolve.problem import CollisionModel
-from lcollision_core.resolve.shorten import bisect
+from lcollision_core.resolve.pull_back import bisect
 from tests.core.brute_force import all_pairs
-from tests.core.resolve_toys import Ball, toy_problem
+from tests.core.resolve.toys import Ball, toy_problem
 from tests.core.shapes import random_rotation
 
 MEAN_ALONE = 1
@@ -100,12 +99,15 @@ def facts(result: ResolveResult) -> dict:
     """Return all that does not depend on the clock."""
     values = asdict(result)
     del values["seconds"]
-    return values | {"latent": result.latent.tobytes()}
+    arrays = {name: values[name].tobytes() for name in ("latent", "vertices")}
+    return values | arrays
 
 
 def assert_free_by_brute_force(model: PoseModel, result: ResolveResult) -> None:
     assert result.exactly_free
-    vertices = model.decode(result.latent).astype(np.float32).astype(np.float64)
+    assert np.array_equal(result.vertices, model.exported_vertices(result.latent))
+    assert result.vertices.dtype == np.float32
+    vertices = result.vertices.astype(np.float64)
     found = all_pairs(vertices, model.faces, DEPTH_TOLERANCE * model.height)
     assert len(found.pairs) == 0
     assert (result.pairs_after, result.energy_after) == (0, 0.0)
@@ -168,7 +170,7 @@ def test_another_start(tube_model: PoseModel, deep: FloatArray) -> None:
     predictor.reach = 0.7 * float(np.linalg.norm(deep))
     resolver = resolver_of(tube_model, predictor, np.zeros((MEAN_ALONE, 8)))
     result = resolver.resolve(deep)
-    assert result.step == Step.START
+    assert result.step == Step.RESTART
     assert_free_by_brute_force(tube_model, result)
 
 
@@ -180,7 +182,7 @@ def test_polishing_shallow_contact(tube_model: PoseModel, shallow: FloatArray) -
     assert_free_by_brute_force(tube_model, result)
 
 
-def test_the_walk_back(
+def test_falling_back_to_a_known_free_pose(
     tube_model: PoseModel, check: ExactCheck, deep: FloatArray, free_latents: FloatArray
 ) -> None:
     # Halfway to these it still collides, so that it is no start.
@@ -188,11 +190,11 @@ def test_the_walk_back(
     assert halfway.any()
     far = free_latents[halfway]
     result = resolver_of(tube_model, useless(deep), far).resolve(deep)
-    assert result.step == Step.WALK_BACK
+    assert result.step == Step.FALL_BACK
     assert not result.predicted_free
     assert_free_by_brute_force(tube_model, result)
     assert_measured(tube_model, deep, result)
-    # Shortened: nearer than any of the poses that it could walk to.
+    # Pulled back: nearer than any of the poses that it could fall back to.
     ways = np.linalg.norm(far - deep, axis=1) / np.linalg.norm(deep)
     assert result.latent_distance < ways.min()
 
@@ -204,7 +206,7 @@ def test_no_way_out_is_a_statement(tube_model: PoseModel, deep: FloatArray) -> N
     assert result.pairs_after == result.pairs_before > 0
     assert result.latent.tobytes() == deep.tobytes()
     assert result.note == (
-        "no free pose of the model is known to walk back to, so the pose still collides"
+        "the model has no known collision-free pose to fall back to, so the pose still collides"
     )
 
 
@@ -242,14 +244,14 @@ def test_the_neighbours_correction_comes_first(
     resolver = resolver_of(tube_model, useless(deep), free_latents)
     alone = resolver.resolve(deep)
     result = resolver.resolve(deep, near=1.1 * (alone.latent - deep))
-    assert result.step in {Step.NEIGHBOUR, Step.WALK_BACK}
+    assert result.step in {Step.NEIGHBOUR, Step.FALL_BACK}
     assert_free_by_brute_force(tube_model, result)
     to_mean = resolver.resolve(deep, near=-deep)
     assert to_mean.step == Step.NEIGHBOUR
     assert_free_by_brute_force(tube_model, to_mean)
 
 
-def test_shortening_beats_bisection(
+def test_pulling_back_beats_bisection(
     tube_model: PoseModel, check: ExactCheck, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     """Without a predictor's help, against the segment to the mean: the baseline of no learning."""
@@ -363,13 +365,13 @@ def test_threshold_and_margin_move_the_constraint(
         assert np.linalg.norm(result.latent) == pytest.approx(size * (0.5 + logit / 100), rel=1e-3)
 
 
-def test_no_time_goes_straight_to_the_walk_back(
+def test_no_time_goes_straight_to_falling_back(
     tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     latent = colliding[0]
     resolver = resolver_of(tube_model, around_the_mean(latent, 0.3), free_latents)
     result = resolver.resolve(latent, ResolveOptions(time_budget=1e-9))
-    assert result.step == Step.WALK_BACK
+    assert result.step == Step.FALL_BACK
     assert_free_by_brute_force(tube_model, result)
 
 
@@ -381,9 +383,9 @@ def test_a_pose_that_came_as_a_mesh_is_checked_where_it_lies(
     for latent in colliding[:4]:
         resolver = resolver_of(tube_model, around_the_mean(latent, 0.5), free_latents)
         result = resolver.resolve(latent, placement=placement)
-        placed = exported_vertices(tube_model.decode(result.latent), placement)
         tolerance = DEPTH_TOLERANCE * tube_model.height
-        assert len(all_pairs(placed.astype(np.float64), tube_model.faces, tolerance).pairs) == 0
+        assert len(all_pairs(result.vertices, tube_model.faces, tolerance).pairs) == 0
+        assert result.vertices.dtype == np.float64
         assert result.exactly_free
 
 
@@ -550,8 +552,9 @@ def test_a_result_is_read_only_and_progress_ends_full(
     assert reports[-1][0] == reports[-1][1] > 0
     assert list(reports) == sorted(reports)
     assert len({total for _, total in reports}) == 1
-    with pytest.raises(ValueError, match="read-only"):
-        result.latent[0] = 1.0
+    for array in (result.latent, result.vertices):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
     with pytest.raises(ShapeError):
         resolver.resolve_many(np.zeros((2, 9)))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.errors import LCollisionError
 from lcollision_core.model import (
     LibraryChange,
     NamedPose,
@@ -20,7 +21,7 @@ from lcollision_core.model import (
 
 
 @pytest.fixture
-def told() -> list[str]:
+def told() -> list[LCollisionError]:
     return []
 
 
@@ -43,7 +44,7 @@ def names(library: PoseLibrary) -> list[str]:
 
 
 def test_a_change_is_in_the_file_at_once_and_its_inverse_takes_it_back(
-    model: PoseModel, tmp_path: Path, told: list[str]
+    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
     library = PoseLibrary(model, tmp_path / "poses", told.append)
     assert library.poses == ()
@@ -68,7 +69,7 @@ def test_a_change_is_in_the_file_at_once_and_its_inverse_takes_it_back(
 
 
 def test_a_library_belongs_to_the_latent_space_whatever_the_model_is_called(
-    model: PoseModel, tmp_path: Path, told: list[str], monkeypatch: pytest.MonkeyPatch
+    model: PoseModel, tmp_path: Path, told: list[LCollisionError], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add(PoseLibrary(model, tmp_path, told.append), pose(model, "a"))
     renamed = PoseModel("snake / 2", model.embedding, model.card)
@@ -81,7 +82,7 @@ def test_a_library_belongs_to_the_latent_space_whatever_the_model_is_called(
 
 
 def test_two_editors_at_once_lose_nothing(
-    model: PoseModel, tmp_path: Path, told: list[str]
+    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
     one = PoseLibrary(model, tmp_path, told.append)
     add(one, pose(model, "a", 1.0), pose(model, "b", 2.0))
@@ -115,7 +116,7 @@ def test_two_editors_at_once_lose_nothing(
 
 
 def test_editors_that_know_the_model_by_other_names_begin_one_library(
-    model: PoseModel, tmp_path: Path, told: list[str]
+    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
     copied = PoseModel("copy", model.embedding, model.card)
     one, two, watching = (PoseLibrary(m, tmp_path, told.append) for m in (model, copied, copied))
@@ -129,7 +130,7 @@ def test_editors_that_know_the_model_by_other_names_begin_one_library(
 
 @pytest.mark.parametrize("damage", ["half", "garbage", "other model"])
 def test_a_damaged_library_is_told_of_and_set_aside(
-    model: PoseModel, tmp_path: Path, told: list[str], damage: str
+    model: PoseModel, tmp_path: Path, told: list[LCollisionError], damage: str
 ) -> None:
     library = PoseLibrary(model, tmp_path, told.append)
     add(library, pose(model, "a"))
@@ -142,7 +143,7 @@ def test_a_damaged_library_is_told_of_and_set_aside(
         assert opened.poses == ()
         aside = tmp_path / f"{library.path.stem} damaged{number}.json"
         assert aside.read_text() == content
-        assert f"was damaged and has been set aside as {aside}" in told[-1]
+        assert f"was damaged and has been set aside as {aside}" in str(told[-1])
         add(opened, pose(model, "b"))
         assert names(PoseLibrary(model, tmp_path, told.append)) == ["b"]
     # One that knows what was there before the damage writes that again.
@@ -153,26 +154,26 @@ def test_a_damaged_library_is_told_of_and_set_aside(
 
 
 def test_a_library_of_a_later_version_is_neither_read_nor_touched(
-    model: PoseModel, tmp_path: Path, told: list[str]
+    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
     library = PoseLibrary(model, tmp_path, told.append)
     add(library, pose(model, "a"))
     later = json.dumps(json.loads(library.path.read_text()) | {"format_version": 99})
     library.path.write_text(later)
     opened = PoseLibrary(model, tmp_path, told.append)
-    assert "could not be read" in told[-1]
+    assert "could not be read" in str(told[-1])
     assert not opened.refresh()
     add(opened, pose(model, "b"))
-    assert "could not be saved" in told[-1]
-    assert "[Errno" not in told[-1]
-    assert "update the program" in told[-1]
+    assert "could not be saved" in str(told[-1])
+    assert "[Errno" not in str(told[-1])
+    assert "update the program" in str(told[-1])
     assert names(opened) == ["b"]
     assert library.path.read_text() == later
     assert len(told) == 2
 
 
 def test_what_cannot_be_written_is_kept_until_it_can(
-    model: PoseModel, tmp_path: Path, told: list[str]
+    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
     folder = tmp_path / "poses"
     folder.write_text("a file, where the folder should be")

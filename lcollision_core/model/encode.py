@@ -1,0 +1,74 @@
+"""Mesh files as latent poses, and what encoding loses of them."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes import Mesh, read_mesh
+from lcollision_core.model.pose_file import NamedPose, name_of_file
+from lcollision_core.model.pose_model import PoseModel
+
+if TYPE_CHECKING:
+    from lcollision_core.resolve import ResolveResult
+
+
+def read_model_mesh(path: str | os.PathLike[str], model: PoseModel) -> Mesh:
+    """Read a mesh file and refuse it where its topology is not the model's.
+
+    Raises
+    ------
+    MeshFileError : the file cannot be read.
+    PoseSetError : another topology.
+    """
+    mesh = read_mesh(path, topology=model.topology)
+    model.require_topology(mesh.topology, str(path))
+    return mesh
+
+
+def encode_mesh(
+    mesh: Mesh, model: PoseModel, scale: float = 1.0, cancel: CancelToken | None = None
+) -> NamedPose:
+    """Find the latent pose nearest to a mesh, and name it after the mesh's file.
+
+    Parameters
+    ----------
+    mesh : of the model's topology, by `read_model_mesh`
+    model, scale, cancel : see `PoseModel.encode`, which raises the same errors
+    """
+    encoded = model.encode(mesh.vertices, cancel, scale)
+    return NamedPose(
+        name_of_file(mesh.source),
+        encoded.latent,
+        encoded.placement,
+        encoded.fit_error_mean,
+        encoded.fit_error_max,
+    )
+
+
+def with_detail(
+    model: PoseModel, mesh: npt.NDArray[np.float64], pose: NamedPose, result: ResolveResult
+) -> npt.NDArray[np.float64] | None:
+    """Move a mesh as Resolve moved the pose that it was encoded as, so that its detail stays.
+
+    Parameters
+    ----------
+    model : of the pose
+    mesh : (V, 3) float64 array, the vertices that were encoded
+    pose : as which they were encoded
+    result : of its Resolve
+
+    Returns
+    -------
+    vertices : (V, 3) float64 array that the exact check found free; None where the moved mesh
+        would collide
+    """
+    # Where the pose did not move, the mesh stays as it is to the bit.
+    moved: npt.NDArray[np.float64] = mesh + (
+        result.vertices - model.exported_vertices(pose.latent, pose.placement)
+    )
+    return moved if model.exact_check(pose.placement).is_free_mesh(moved) else None
