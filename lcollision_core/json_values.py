@@ -36,7 +36,7 @@ def parse_json(content: bytes) -> Any:
 
     Raises
     ------
-    ValueError : it is no JSON, is nested too deeply, or its values would take more memory than
+    ValueError : it is not JSON, is nested too deeply, or its values would take more memory than
         `MAX_MEMORY`.
     """
     if sum(content.count(mark) * each for mark, each in _BYTES_EACH.items()) > MAX_MEMORY:
@@ -136,4 +136,4 @@ def _refuse(value: Any, hint: Any, name: str) -> NoReturn:
 
 
 def _refuse_constant(word: str) -> NoReturn:
-    raise ValueError(f"{word} is no JSON number")
+    raise ValueError(f"{word} is not a JSON number")

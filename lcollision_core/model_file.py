@@ -128,7 +128,7 @@ def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Sectio
         )
     except (TypeError, ValueError) as error:
         raise ModelFileError.unwritable(
-            path, f"its metadata is no JSON ({error})", "keep plain values there"
+            path, f"its metadata is not JSON ({error})", "keep plain values there"
         ) from error
     document = _canonical_json(
         {
@@ -158,7 +158,7 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
 
     Raises
     ------
-    ModelFileError : the file is missing, empty, truncated, damaged, no model of this program, of
+    ModelFileError : the file is missing, empty, truncated, damaged, not an LCollision model, of
         a later version, or larger than `MAX_FILE_BYTES`.
     """
     try:
@@ -181,7 +181,7 @@ def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
 
     Raises
     ------
-    ModelFileError : the file cannot be read, or is no model of this program and version.
+    ModelFileError : the file cannot be read, is not an LCollision model, or of another version.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -266,7 +266,7 @@ class _Header:
 
 def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _Header:
     foreign = ModelFileError(
-        "is no model of this program", "name a file that `lcollision train` wrote", where=path
+        "is not an LCollision model", "name a file that `lcollision train` wrote", where=path
     )
     length = int.from_bytes(file.read(8), "little")
     if size < 8 or length > MAX_HEADER_BYTES:

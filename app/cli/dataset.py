@@ -45,7 +45,7 @@ def check(
         inspection = inspect_pose_set(path, progress)
     poses = inspection.pose_set
     if poses is None or inspection.audit is None:
-        raise MeshFileError(inspection.problems[0])
+        raise inspection.defects[0]
     for remark in poses.notes:
         note(f"{path}: {remark}")
     exclusion = poses.near_exclusion if near_exclusion is None else near_exclusion

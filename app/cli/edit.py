@@ -37,7 +37,7 @@ def edit(
     if file is not None and not file.is_file():
         raise LCollisionError(
             "is not there",
-            "name a file of poses, a mesh or a model, or none to begin anew",
+            "name a file of poses, a mesh or a model, or none to start a new pose",
             where=file,
         )
     raise typer.Exit(open_editor(file, model_name))

@@ -125,7 +125,7 @@ def output_named(name: str) -> Output:
     if not must_be_folder and has_known_suffix(path):
         raise LCollisionError.unwritable(
             path,
-            f"{suffix} is no format known here",
+            f"{suffix} is not a known format",
             f"use one of {', '.join(WRITABLE_SUFFIXES)}, .json or a folder",
         )
     require_writable(path)

@@ -88,7 +88,7 @@ class UnfinishedPoses:
 
     def damaged(self) -> LCollisionError:
         """Return the error for a file whose facts are not those that were kept."""
-        return LCollisionError("is damaged", "delete it to begin anew", where=self.path)
+        return LCollisionError("is damaged", "delete it to start again", where=self.path)
 
     def _go_on(self) -> None:
         from lcollision_core.model import read_poses

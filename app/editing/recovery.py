@@ -72,7 +72,7 @@ class Session:
     def held(cls, folder: Path) -> Session | None:
         """Take a session over, or return None where a living process holds it.
 
-        Nor is one taken whose lock is no plain file: Qt would wait for a pipe for ever.
+        Nor is one taken whose lock is not a plain file: Qt would wait for a pipe for ever.
         """
         try:
             require_regular(folder / _LOCK)

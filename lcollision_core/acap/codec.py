@@ -80,10 +80,8 @@ class AcapCodec:
     ) -> None:
         n_vertices = topology.n_vertices
         if np.shape(rest_vertices) != (n_vertices, 3):
-            raise ShapeError(
-                f"the reference has shape {np.shape(rest_vertices)}, but the topology needs "
-                f"({n_vertices}, 3)"
-            )
+            shape = np.shape(rest_vertices)
+            raise ShapeError.must_be("the reference", f"of shape ({n_vertices}, 3)", shape)
         rest = np.array(rest_vertices, dtype=np.float64)
         if not np.isfinite(rest).all():
             raise ShapeError("the reference has a vertex that is not finite")
@@ -92,11 +90,8 @@ class AcapCodec:
         given = np.ones(n_vertices) if anchor_weights is None else anchor_weights
         anchor = np.asarray(given, dtype=np.float64)
         if anchor.shape != (n_vertices,) or not (np.isfinite(anchor) & (anchor >= 0.0)).all():
-            raise ShapeError.must_be(
-                "anchor_weights",
-                f"({n_vertices},) numbers of at least 0",
-                f"an array of shape {anchor.shape}",
-            )
+            needed = f"({n_vertices},) numbers of at least 0"
+            raise ShapeError.must_be("anchor_weights", needed, f"shape {anchor.shape}")
         self.topology = topology
         self.rest_vertices: FloatArray = rest
         weights = cotangent_weights(topology, rest, WEIGHT_FLOOR)
@@ -285,9 +280,8 @@ class AcapCodec:
     def _checked(self, array: npt.NDArray[Any], width: int, name: str) -> FloatArray:
         shape = np.shape(array)
         if len(shape) != 3 or shape[1:] != (self.topology.n_vertices, width):
-            raise ShapeError.must_be(
-                name, f"of shape (B, {self.topology.n_vertices}, {width})", shape
-            )
+            needed = f"of shape (B, {self.topology.n_vertices}, {width})"
+            raise ShapeError.must_be(name, needed, shape)
         return np.ascontiguousarray(array, dtype=np.float64)
 
 

@@ -173,11 +173,8 @@ class CollisionDetector:
         if self.height == 0.0:
             raise ShapeError("all vertices are in one point", "give it a mesh with an extent")
         if not 1.0 / MAX_HEIGHT <= self.height <= MAX_HEIGHT:
-            raise ShapeError(
-                f"the mesh is {self.height:.1e} high, {1.0 / MAX_HEIGHT:.0e} to {MAX_HEIGHT:.0e} "
-                "is needed",
-                "scale it",
-            )
+            needed = f"{1.0 / MAX_HEIGHT:.0e} to {MAX_HEIGHT:.0e}"
+            raise ShapeError.must_be("the mesh's height", needed, f"{self.height:.1e}", "scale it")
         self._tree: FaceTree = build_tree(vertices, topology.faces)
         self._near: NearVertices = near_vertices(
             topology, vertices, self.near_exclusion * self.height

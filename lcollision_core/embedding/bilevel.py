@@ -267,11 +267,9 @@ class Embedding:
         try:
             return cls._read(arrays, from_json(_Values, metadata, "embedding"))
         except (LCollisionError, ValueError) as error:
+            advice = "train or copy the model again"
             raise ModelFileError.because(
-                "",
-                "the model's embedding does not fit together",
-                error,
-                "train or copy the model again",
+                "the model's embedding", "does not fit together", error, advice
             ) from error
 
     @classmethod

@@ -137,14 +137,23 @@ class PoseSetInspection:
     n_found : the poses that are there, usable or not
     same_topology : whether all readable poses share their vertex count and faces
     audit : the state of the reference, pose 0; None without poses
-    problems : a sentence for each defect, those of the reference among them
+    defects : of the set and its poses, in the order in which they were found
     """
 
     pose_set: PoseSet | None
     n_found: int
     same_topology: bool
     audit: MeshAudit | None
-    problems: tuple[str, ...]
+    defects: tuple[LCollisionError, ...]
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """A sentence for each defect, those of the reference among them."""
+        found = [str(defect) for defect in self.defects]
+        if self.pose_set is not None and self.audit is not None:
+            name = self.pose_set.names[0]
+            found += [f"pose 0 ({name}): {problem}" for problem in self.audit.problems]
+        return tuple(found)
 
 
 def inspect_pose_set(
@@ -170,12 +179,8 @@ def inspect_pose_set(
     """
     defects: list[LCollisionError] = []
     collected = collect_poses(Path(path), defects.append, progress, cancel)
-    audit = None
-    problems = [str(defect) for defect in defects]
     pose_set = collected.pose_set
-    if pose_set is not None:
-        audit = audit_mesh(pose_set.topology, pose_set.vertices[0])
-        problems += [f"pose 0 ({pose_set.names[0]}): {problem}" for problem in audit.problems]
+    audit = None if pose_set is None else audit_mesh(pose_set.topology, pose_set.vertices[0])
     return PoseSetInspection(
-        pose_set, collected.n_found, collected.same_topology, audit, tuple(problems)
+        pose_set, collected.n_found, collected.same_topology, audit, tuple(defects)
     )

@@ -123,7 +123,7 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
         with open_regular(path) as file:
             if suffix not in READABLE_SUFFIXES:
                 raise MeshFileError(
-                    "is no mesh format known here",
+                    "is not a known mesh format",
                     f"use one of {', '.join(READABLE_SUFFIXES)}",
                     where=suffix or "a name without extension",
                 )
@@ -211,7 +211,7 @@ def write_mesh(
     if suffix not in _ENCODERS:
         raise MeshFileError.unwritable(
             path,
-            f"{suffix or 'a name without extension'} is no mesh format known here",
+            f"{suffix or 'a name without extension'} is not a known mesh format",
             f"use one of {', '.join(WRITABLE_SUFFIXES)}",
         )
     points = np.asarray(vertices)

@@ -239,7 +239,7 @@ def collect_poses(
     elif suffix in READABLE_SUFFIXES:
         what, next_step = "is one mesh, not a pose set", "name its folder"
     else:
-        what, next_step = "is no pose set", "name a folder of meshes or an .npz file"
+        what, next_step = "is not a pose set", "name a folder of meshes or an .npz file"
     report(MeshFileError(what, next_step, where=path))
     return Collected(None, 0, same_topology=False)
 

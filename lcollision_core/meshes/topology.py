@@ -42,9 +42,9 @@ class Topology:
         if len(out_of_range):
             face = int(out_of_range[0])
             raise PoseSetError(
-                f"names vertices {checked[face].tolist()}, but there are {n_vertices} "
-                f"vertices (0 to {n_vertices - 1})",
+                f"names vertices {checked[face].tolist()}",
                 where=f"face {face}",
+                expected=f"0 to {n_vertices - 1}",
             )
         repeated = np.flatnonzero(
             (checked == np.roll(checked, 1, axis=1)).any(axis=1),

@@ -220,7 +220,7 @@ def read_pose_file(path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
         document = parse_json(content)
     except ValueError as error:
         raise DamagedPosesError(
-            f"is no JSON ({error})", "name a file of poses that lcollision wrote", where=path
+            f"is not JSON ({error})", "name a file of poses that lcollision wrote", where=path
         ) from error
     return _parse(document, path, model)
 
@@ -243,7 +243,7 @@ def name_of_file(path: Path) -> str:
 def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
     if not isinstance(document, dict) or document.get("format") != POSES_FORMAT:
         raise DamagedPosesError(
-            "holds no poses of this program", "name a file that lcollision wrote", where=path
+            "is not an LCollision pose file", "name a file that lcollision wrote", where=path
         )
     version = document.get("format_version")
     if isinstance(version, int) and version > POSES_VERSION:
@@ -355,7 +355,7 @@ def _placed_from_json(
     translation = _numbers(held.get("translation"), (3,), "translation", _LARGEST_PLACE)
     turned = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
-        raise ValueError("its rotation is no rotation matrix")
+        raise ValueError("its rotation is not a rotation matrix")
     scale = float(_numbers(held.get("scale", 1.0), (), "scale", 1.0 / _LEAST_SCALE))
     if not _LEAST_SCALE <= scale <= 1.0 / _LEAST_SCALE:
         raise ValueError(f"its scale must be {_LEAST_SCALE:g} to {1.0 / _LEAST_SCALE:g}")

@@ -129,9 +129,7 @@ class PoseModel:
         missing = [name for name in (EMBEDDING, _CARD) if name not in sections]
         if missing:
             raise ModelFileError(
-                f"is unusable: it lacks its section {missing[0]!r}",
-                "train or copy the model again",
-                where=path,
+                f"lacks its section {missing[0]!r}", "train or copy the model again", where=path
             )
         try:
             embedding_section, card_section = sections.pop(EMBEDDING), sections.pop(_CARD)
@@ -391,13 +389,15 @@ class PoseModel:
                 raise ModelFileError(f"two domains would be called {name!r}", "choose another name")
         if order is not None and sorted(order) != list(range(len(renamed))):
             raise ModelFileError(
-                f"is no order of the {len(renamed)} domains of {self.name}",
+                f"is not an order of the {len(renamed)} domains of {self.name}",
                 "name each once",
                 where=list(order),
             )
         for colour in coloured:
             if not re.fullmatch("#[0-9a-f]{6}", colour):
-                raise ModelFileError("is no colour", "write it as in #0077bb", where=f"{colour!r}")
+                raise ModelFileError(
+                    "is not a colour", "write it as in #0077bb", where=f"{colour!r}"
+                )
         return self.with_card(
             replace(
                 self.card,

@@ -169,12 +169,8 @@ class PredictorRecord:
 
 
 def _misfit(error: Exception) -> ModelFileError:
-    return ModelFileError.because(
-        "",
-        "the model's predictor does not fit its latent space",
-        error,
-        "train the predictor again",
-    )
+    what, next_step = "does not fit its latent space", "train the predictor again"
+    return ModelFileError.because("the model's predictor", what, error, next_step)
 
 
 class CollisionPredictor:

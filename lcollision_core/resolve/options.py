@@ -83,7 +83,7 @@ class ResolveOptions:
         for name, kind in (("solver", Solver), ("metric", Metric)):
             if getattr(self, name) not in set(kind):
                 raise LCollisionError(
-                    f"there is no {name} {getattr(self, name)!r}",
+                    f"unknown {name} {getattr(self, name)!r}",
                     f"choose one of {', '.join(kind)}",
                 )
         if not 0.0 < self.threshold < 1.0:

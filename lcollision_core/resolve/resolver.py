@@ -214,7 +214,7 @@ class PoseResolver:
         for domain in sorted(options.locked_domains):
             if not 0 <= domain < self._embedding.n_domains:
                 raise LCollisionError(
-                    f"there is no domain {domain + 1} to lock",
+                    f"unknown domain {domain + 1} to lock",
                     f"the model has {self._embedding.n_domains}",
                 )
         locked = self._embedding.codes_of(options.locked_domains)

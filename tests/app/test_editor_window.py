@@ -404,7 +404,7 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
 @pytest.mark.parametrize(
     ("action", "name", "sentence"),
     [
-        ("export", "b.fbx", ".fbx is no mesh format known here"),
+        ("export", "b.fbx", ".fbx is not a known mesh format"),
         ("turntable", "b.mp4", "b.mp4 can't be written as a turntable"),
     ],
 )

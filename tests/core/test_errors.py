@@ -54,7 +54,7 @@ SENTENCES = [
     ),
     (CancelledError("cancelled on request"), "cancelled on request"),
     (LabelStoreError("has no rows", where="store", got=0), "store has no rows, got 0"),
-    (DamagedPosesError("is no JSON", where="p.json"), "p.json is no JSON"),
+    (DamagedPosesError("is not JSON", where="p.json"), "p.json is not JSON"),
     (
         OtherModelError("holds poses of another model", where="p.json", model=None),
         "p.json holds poses of another model",

@@ -72,7 +72,7 @@ def test_json_that_would_fill_the_memory_is_refused(
     path.write_bytes(content)
 
     def read() -> None:
-        with pytest.raises(LCollisionError, match=r"poses\.json is no JSON \(") as caught:
+        with pytest.raises(LCollisionError, match=r"poses\.json is not JSON \(") as caught:
             read_poses(path, tube_model)
         assert len(str(caught.value)) < 400
 

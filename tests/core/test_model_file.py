@@ -186,7 +186,7 @@ def test_the_safetensors_of_another_program_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.safetensors"
     for metadata in (None, {"format": "pt"}):
         path.write_bytes(save({"weight": np.zeros(3, np.float32)}, metadata=metadata))
-        with pytest.raises(ModelFileError, match="no model of this program"):
+        with pytest.raises(ModelFileError, match="not an LCollision model"):
             read_model_file(path)
 
 

@@ -109,9 +109,8 @@ def make_body(
     """
     count = DEFAULT_VERTICES[kind] if n_vertices is None else n_vertices
     if not MIN_VERTICES <= count <= MAX_VERTICES:
-        raise ShapeError(
-            f"the built-in body can have {MIN_VERTICES} to {MAX_VERTICES} vertices", got=count
-        )
+        needed = f"{MIN_VERTICES} to {MAX_VERTICES}"
+        raise ShapeError.must_be("the built-in body's number of vertices", needed, count)
     template = cached_template(count)
     skin = Skin(template)
     names, figures = figures_of(kind, template.skeleton, seed)

@@ -122,7 +122,7 @@ def contact_field(
     ShapeError : there are not two reaches, or the order or `apart` has another size.
     """
     if len(reach) != len(REACHES):
-        raise ShapeError(f"the field has {len(REACHES)} reaches", got=len(reach))
+        raise ShapeError.must_be("reach", f"{len(REACHES)} numbers", len(reach))
     n_points, n_ordered = places.shape[2], len(order)
     if n_ordered != -(-n_points // BLOCK) * BLOCK or apart.shape != (n_points, n_ordered):
         raise ShapeError(

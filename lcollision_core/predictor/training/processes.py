@@ -95,7 +95,7 @@ def joined_processes(device: str) -> Iterator[Processes]:
     LCollisionError : there is no such device.
     """
     if device not in ("auto", "cpu", "cuda"):
-        raise LCollisionError(f"there is no device {device!r}", "use auto, cpu or cuda")
+        raise LCollisionError(f"unknown device {device!r}", "use auto, cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise LCollisionError(
             "this machine has no CUDA device that torch can use", "use auto or cpu"

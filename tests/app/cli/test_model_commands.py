@@ -359,7 +359,7 @@ def test_form_of_the_output_decides_what_decode_writes(
     assert sorted(path.name for path in existing.iterdir()) == ["sample 1.obj", "sample 2.obj"]
     for output, sentence in (
         (tmp_path / "both.obj", "2 poses; name a folder"),
-        (tmp_path / "both.xyz", ".xyz is no format"),
+        (tmp_path / "both.xyz", ".xyz is not a known format"),
         (tmp_path / ("x" * 300), "File name too long"),
         (tmp_path / "none" / "folder", "there is no folder"),
         (one / "folder", "there is no folder"),
@@ -406,14 +406,14 @@ def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(
     before = sorted(work.iterdir())
     output = work / "out"
     refusals = [
-        (("info", other_model), "no model of this program"),
+        (("info", other_model), "not an LCollision model"),
         (("info", tube, "--figure", work / "m.jpg"), "must be a .png file"),
         (("info", tube, "--figure", work / "none" / "m.png"), "no folder"),
         (("encode", tube, mesh, foreign, "-o", poses), "foreign.obj has 415 faces"),
         (("encode", tube, work / "none.obj", "-o", poses), "none.obj"),
         (("encode", tube, mesh, larger, "-o", poses), "larger.obj cannot be encoded"),
         (("encode", tube, mesh, "-o", work / "poses.obj"), "must be a .json file"),
-        (("encode", other_model, mesh, "-o", poses), "no model of this program"),
+        (("encode", other_model, mesh, "-o", poses), "not an LCollision model"),
         (("decode", tube, poses, "-o", output), "no such file"),
         (("decode", tube, mesh, "-o", output), "no JSON"),
         (("sample", tube, "-n", 1, "-o", work / "poses"), "must be a .json file"),

@@ -387,7 +387,7 @@ def test_a_sequence_reports_its_largest_change(
     [
         (("--threshold", "0"), "the threshold must be a probability between 0 and 1, got 0"),
         (("--threshold", "1.5"), "the threshold must be a probability between 0 and 1, got 1.5"),
-        (("--solver", "magic"), "there is no solver 'magic'; choose one of sqp, auglag"),
+        (("--solver", "magic"), "unknown solver 'magic'; choose one of sqp, auglag"),
         (("--metric", "near"), "there is no metric 'near'; choose one of eye, latent"),
         (("--margin", "-2"), "the margin must be 0 or more, got -2"),
         (("--lock", "tail"), "has no domain 'tail'; its domains are"),
@@ -434,7 +434,7 @@ def test_bad_inputs_are_one_sentence_each_and_the_rest_is_done(
     assert wrote == f"lcollision: wrote 5 poses to {out}"
     for path, sentence in zip(inputs[:-1], sentences, strict=True):
         assert str(path) in sentence
-    assert "is no JSON" in sentences[0]
+    assert "is not JSON" in sentences[0]
     assert "which is not" in sentences[1]
     assert "has no poses in it" in sentences[3]
     assert len(read_poses(out, model)) == 5
@@ -449,9 +449,9 @@ def test_an_output_that_cannot_be_is_refused_first(
     (tmp_path / "free").write_text("mine")
     for out, sentence in (
         (tmp_path / "no" / "free.json", "there is no folder"),
-        (tmp_path / "free.docx", ".docx is no format known here"),
-        (tmp_path / "free.fbx", ".fbx is no format known here"),
-        (tmp_path / "free.txt", ".txt is no format known here"),
+        (tmp_path / "free.docx", ".docx is not a known format"),
+        (tmp_path / "free.fbx", ".fbx is not a known format"),
+        (tmp_path / "free.txt", ".txt is not a known format"),
         (tmp_path / ("x" * 300 + ".json"), "File name too long"),
         (tmp_path / ("x" * 300), "File name too long"),
         (f"{tmp_path / 'free'}/", "cannot be made: it is a file; name another"),

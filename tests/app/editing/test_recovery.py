@@ -188,7 +188,7 @@ def test_sessions_of_living_editors_are_left_alone(tmp_path: Path) -> None:
 def test_a_session_without_a_pose_is_cleared_away(tmp_path: Path) -> None:
     session = Session.new(tmp_path)
     session.release()
-    (session.folder / "session.json").write_text("{ this is no JSON")
+    (session.folder / "session.json").write_text("{ this is not JSON")
     assert find_lost_poses(tmp_path) == []
     assert list(tmp_path.iterdir()) == []
 

@@ -62,8 +62,8 @@ def test_unwritable_places_are_refused(tmp_path: Path) -> None:
     for path, message in (
         (tmp_path / "none" / "m.obj", "there is no folder"),
         (tmp_path / "folder.obj", "is a folder"),
-        (tmp_path / "m.fbx", r"\.fbx is no mesh format"),
-        (tmp_path / "m.gltf", r"\.gltf is no mesh format"),
+        (tmp_path / "m.fbx", r"\.fbx is not a known mesh format"),
+        (tmp_path / "m.gltf", r"\.gltf is not a known mesh format"),
         (tmp_path / "m", "without extension"),
         (tmp_path / ("x" * 300 + ".obj"), "too long"),
     ):

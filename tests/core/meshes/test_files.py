@@ -398,7 +398,11 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.ply", HEADER.format(3, 1) + "0 0 0\n1 0 0\n0 1 0\n-3 0 1 2", "face 0 .* announces"),
         ("a.ply", HEADER.format(3, 1) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 1.5", "face 0 .*: 1.5"),
         ("a.ply", HEADER.format(3, 1) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 inf", "face 0 .*: inf"),
-        ("a.ply", HEADER.format(3, 1) + "0 0 0\n1 0 0\n0 x 0\n3 0 1 2", "b'x', which is no number"),
+        (
+            "a.ply",
+            HEADER.format(3, 1) + "0 0 0\n1 0 0\n0 x 0\n3 0 1 2",
+            "b'x', which is not a number",
+        ),
         ("a.ply", HEADER.format(3, 1) + "0 0 0\n1 0 0\n0 inf 0\n3 0 1 2", "vertex 2 .* not finite"),
         ("a.ply", HEADER.format(3, 1).replace("float z", "float w"), "no x, y and z"),
         ("a.ply", HEADER.format(3, 1).replace("element face", "element tri"), "0 elements 'face'"),
@@ -416,7 +420,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.gltf", "{", "no readable glTF"),
         ("a.gltf", '{"meshes": []}', "holds 0 meshes"),
         ("a.gltf", '{"accessors": [{"count": 900000000}]}', "holds 300000000 faces"),
-        ("a.fbx", "x", r"\.fbx is no mesh format"),
+        ("a.fbx", "x", r"\.fbx is not a known mesh format"),
         ("a", "x", "without extension"),
     ],
 )

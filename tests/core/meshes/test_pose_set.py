@@ -228,7 +228,7 @@ def test_folders_that_are_no_pose_set(tmp_path: Path) -> None:
     with pytest.raises(MeshFileError, match="name too long"):
         read_pose_set(tmp_path / ("x" * 300))
     (tmp_path / "x.txt").write_text("x")
-    with pytest.raises(MeshFileError, match="is no pose set"):
+    with pytest.raises(MeshFileError, match="is not a pose set"):
         read_pose_set(tmp_path / "x.txt")
     assert inspect_pose_set(tmp_path / "none").problems != ()
 

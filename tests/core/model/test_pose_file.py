@@ -163,9 +163,9 @@ def _broken(document: Any) -> list[tuple[str, Any]]:
         return with_first(placement={"rotation": rotation, "translation": [0, 0, 0]})
 
     return [
-        ("no poses of this program", []),
-        ("no poses of this program", {"poses": []}),
-        ("no poses of this program", {**document, "format": "other"}),
+        ("not an LCollision pose file", []),
+        ("not an LCollision pose file", {"poses": []}),
+        ("not an LCollision pose file", {**document, "format": "other"}),
         ("update the program", {**document, "format_version": POSES_VERSION + 1}),
         ("damaged", {**document, "format_version": 0}),
         ("damaged", {**document, "format_version": "1"}),

@@ -224,7 +224,7 @@ def test_sqp_run_in_pieces_is_the_same_run() -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"solver": "simplex"}, "there is no solver 'simplex'; choose one of sqp, auglag"),
+        ({"solver": "simplex"}, "unknown solver 'simplex'; choose one of sqp, auglag"),
         ({"metric": "taxicab"}, "there is no metric 'taxicab'; choose one of eye, latent"),
         ({"threshold": 0.0}, "between 0 and 1, got 0"),
         ({"threshold": 1.0}, "between 0 and 1, got 1"),
