@@ -108,7 +108,7 @@ def test_another_unit_is_named_and_helps(
         command, *rest = arguments
         result = lcollision(command, model_file, tmp_path / "in", *rest)
         assert result.exit_code == 2
-        assert f"scale it by {1 / factor:.6g} with --scale {1 / factor:.6g}" in result.stderr
+        assert f"; scale it with --scale {1 / factor:.6g}" in result.stderr
     assert not out.exists()
     scaled = ["--scale", 1 / factor]
     assert lcollision("encode", model_file, tmp_path / "in", "-o", poses, *scaled).exit_code == 0
