@@ -124,9 +124,7 @@ def score_baseline(model: PoseModel, poses: CollidingPoses) -> ResolveScore:
     """
     if len(model.free_latent) == 0:
         raise LCollisionError(
-            "knows no free pose to bisect to",
-            "train its predictor again",
-            where=f"the model {model.name!r}",
+            f"the model {model.name!r} knows no free pose to bisect to", "train its predictor again"
         )
     seconds, latents = [], []
     for target in poses.latents:

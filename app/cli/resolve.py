@@ -229,9 +229,8 @@ def _domain(model: PoseModel, name: str) -> int:
     if name.isdecimal() and 1 <= int(name) <= len(names):
         return int(name) - 1
     raise LCollisionError(
-        f"has no domain {name!r}",
+        f"{model.name} has no domain {name!r}",
         f"its domains are {', '.join(model.domain_names)}, or 1 to {len(names)}",
-        where=model.name,
     )
 
 

@@ -136,9 +136,8 @@ class FileActions(QObject):
         file = Path(document.model_file)
         if is_bundled(document.model_file):
             raise LCollisionError(
-                "comes with the program and stays as it is",
+                f"{document.model.name} comes with the program and stays as it is",
                 f"copy {file}, open the copy and turn that",
-                where=document.model.name,
             )
         if not self.may_lose_changes():
             return

@@ -112,9 +112,8 @@ def moving_parts(
         raise ShapeError.must_be("features", f"(N, {n_vertices}, {N_FEATURES})", np.shape(features))
     if not 1 <= n_parts <= n_vertices:
         raise PoseSetError(
-            f"cannot have {n_parts} domains",
+            f"a mesh of {n_vertices} vertices cannot have {n_parts} domains",
             f"ask for 1 to {n_vertices}",
-            where=f"a mesh of {n_vertices} vertices",
         )
     areas = vertex_areas(topology, rest_vertices)
     rotations = np.asarray(features[..., :N_ROTATION], dtype=np.float64)

@@ -123,9 +123,8 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
         with open_regular(path) as file:
             if suffix not in READABLE_SUFFIXES:
                 raise MeshFileError(
-                    "is not a known mesh format",
+                    f"{suffix or 'a name without extension'} is not a known mesh format",
                     f"use one of {', '.join(READABLE_SUFFIXES)}",
-                    where=suffix or "a name without extension",
                 )
             size = os.fstat(file.fileno()).st_size
             if size == 0:
@@ -163,9 +162,8 @@ def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int
     vertex = first_not_finite(vertices)
     if vertex is not None:
         raise MeshFileError(
-            f"is at {vertices[vertex].tolist()}, which is not finite",
+            f"vertex {vertex} (from 0) is at {vertices[vertex].tolist()}, which is not finite",
             "export the mesh again",
-            where=f"vertex {vertex} (from 0)",
         )
 
 

@@ -119,9 +119,8 @@ def checked_name(name: str) -> str:
     stripped = name.strip()
     if not stripped or len(stripped) > MAX_NAME_LENGTH or not stripped.isprintable():
         raise ModelFileError(
-            "cannot name a domain",
+            f"{name[:80]!r} cannot name a domain",
             f"use 1 to {MAX_NAME_LENGTH} printable characters",
-            where=f"{name[:80]!r}",
         )
     return stripped
 

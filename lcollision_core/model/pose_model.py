@@ -379,9 +379,8 @@ class PoseModel:
             for domain, value in changes.items():
                 if not 0 <= domain < len(values):
                     raise ModelFileError(
-                        f"has no domain {domain + 1}",
+                        f"{self.name} has no domain {domain + 1}",
                         f"its domains are 1 to {len(values)}",
-                        where=self.name,
                     )
                 values[domain] = checked_name(value) if values is renamed else value.lower()
         for name in renamed:
@@ -389,9 +388,8 @@ class PoseModel:
                 raise ModelFileError(f"two domains would be called {name!r}", "choose another name")
         if order is not None and sorted(order) != list(range(len(renamed))):
             raise ModelFileError(
-                f"is not an order of the {len(renamed)} domains of {self.name}",
+                f"{list(order)} is not an order of the {len(renamed)} domains of {self.name}",
                 "name each once",
-                where=list(order),
             )
         for colour in coloured:
             if not re.fullmatch("#[0-9a-f]{6}", colour):
@@ -496,9 +494,8 @@ class PoseModel:
         predictor = self.predictor
         if predictor is None:
             raise ModelFileError(
-                "has no predictor",
+                f"the model {self.name!r} has no predictor",
                 "run `lcollision label` and then `lcollision train predictor`",
-                where=f"the model {self.name!r}",
             )
         return predictor
 

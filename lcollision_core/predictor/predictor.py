@@ -492,7 +492,5 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
         if not finite.all():
             row = start + int(np.flatnonzero(~finite)[0])
             raise ShapeError(
-                "has a number that is not finite",
-                "label the samples again",
-                where=f"row {row} (from 0)",
+                f"row {row} (from 0) has a number that is not finite", "label the samples again"
             )
