@@ -128,7 +128,7 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
                 )
             size = os.fstat(file.fileno()).st_size
             if size == 0:
-                raise MeshFileError("it is empty", "export the mesh again")
+                raise MeshFileError("it is empty")
             if suffix == ".obj":
                 return obj.read(file)
             if suffix == ".ply":
@@ -151,7 +151,7 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
 
 def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> None:
     if len(vertices) == 0:
-        raise MeshFileError("it holds no vertices", "export the mesh again")
+        raise MeshFileError("it holds no vertices")
     if len(faces) == 0:
         raise MeshFileError("it holds vertices but no faces", "export it as a triangle mesh")
     for count, what in ((len(faces), "faces"), (len(vertices), "vertices")):
@@ -162,8 +162,7 @@ def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int
     vertex = first_not_finite(vertices)
     if vertex is not None:
         raise MeshFileError(
-            f"vertex {vertex} (from 0) is at {vertices[vertex].tolist()}, which is not finite",
-            "export the mesh again",
+            f"vertex {vertex} (from 0) is at {vertices[vertex].tolist()}, which is not finite"
         )
 
 

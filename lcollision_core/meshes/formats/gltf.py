@@ -75,9 +75,7 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
         raise
     # On a damaged file trimesh raises whatever its line at hand raises; nothing of ours runs here.
     except Exception as error:
-        raise MeshFileError(
-            "it is a damaged or unsupported glTF file", "export it again"
-        ) from error
+        raise MeshFileError("it is a damaged or unsupported glTF file") from error
     if len(meshes) != 1 or not isinstance(meshes[0][1], trimesh.Trimesh):
         raise MeshFileError(f"it shows {len(meshes)} meshes, one of triangles is needed")
     transform, mesh = meshes[0]
@@ -104,7 +102,7 @@ def _require_one_mesh(data: bytes) -> None:
         length = int.from_bytes(data[12:16], "little")
         text = data[20 : 20 + length]
         if len(text) < max(length, 1):
-            raise MeshFileError("it is a truncated GLB file", "export it again")
+            raise MeshFileError("it is a truncated GLB file")
     try:
         scene = parse_json(text)
         counts = [int(accessor.get("count", 0)) for accessor in scene.get("accessors", [])]
@@ -116,7 +114,7 @@ def _require_one_mesh(data: bytes) -> None:
         TypeError,
         KeyError,
     ) as error:
-        raise MeshFileError("it holds no readable glTF description", "export it again") from error
+        raise MeshFileError("it holds no readable glTF description") from error
     for count in counts:
         # An accessor of indices counts corners, three a face.
         require_plausible_count(-(-count // 3), "faces")

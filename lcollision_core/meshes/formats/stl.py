@@ -67,9 +67,7 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
             f"{expected} bytes, but has {size}"
         )
     else:
-        raise MeshFileError(
-            f"it has {size} bytes, too few for an STL file", "export the mesh again"
-        )
+        raise MeshFileError(f"it has {size} bytes, too few for an STL file")
     points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0, as which corner is kept is chance
     is_single = not (is_text and expected != size)
     ordered = with_order_of(points, topology, _REORDERED, is_single)
