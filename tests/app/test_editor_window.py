@@ -335,7 +335,7 @@ def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_p
         ("other.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "3 vertices"),
         ("empty.ply", "", "empty"),
         ("notes.txt", "hello", "TXT isn't supported"),
-        ("poses.json", "[1, 2", "no JSON"),
+        ("poses.json", "[1, 2", "not JSON"),
         ("model.safetensors", "garbage", "model.safetensors"),
     ],
 )

@@ -121,9 +121,9 @@ def test_tensors_decode_as_arrays(
 
 def test_other_shapes_are_refused(codec: AcapCodec, features: FloatArray) -> None:
     n_vertices = codec.topology.n_vertices
-    with pytest.raises(ShapeError, match="features must have shape"):
+    with pytest.raises(ShapeError, match="features must be of shape"):
         codec.decode_torch(torch.zeros(n_vertices - 1, 9))
-    with pytest.raises(ShapeError, match="tangents must have shape"):
+    with pytest.raises(ShapeError, match="tangents must be of shape"):
         codec.decode_jvp(features[0], np.zeros((2, n_vertices, 3)))
     with pytest.raises(ShapeError, match="3 poses but by_vertices 2"):
         codec.decode_vjp(features, np.zeros((2, n_vertices, 3)))

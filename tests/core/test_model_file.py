@@ -109,7 +109,7 @@ def test_every_truncation_is_refused(path: Path) -> None:
     content = path.read_bytes()
     for length in range(len(content)):
         path.write_bytes(content[:length])
-        with pytest.raises(ModelFileError, match=r"truncated|empty|no model"):
+        with pytest.raises(ModelFileError, match=r"truncated|empty|not an LCollision model"):
             read_model_file(path)
 
 

@@ -415,7 +415,7 @@ def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(
         (("encode", tube, mesh, "-o", work / "poses.obj"), "must be a .json file"),
         (("encode", other_model, mesh, "-o", poses), "not an LCollision model"),
         (("decode", tube, poses, "-o", output), "no such file"),
-        (("decode", tube, mesh, "-o", output), "no JSON"),
+        (("decode", tube, mesh, "-o", output), "not JSON"),
         (("sample", tube, "-n", 1, "-o", work / "poses"), "must be a .json file"),
         (("train", "embedding", work / "none.npz", "-o", work / "m.safetensors"), "none.npz"),
         (("train", "embedding", dataset, "-o", work / "m.obj"), "a model is a .safetensors file"),

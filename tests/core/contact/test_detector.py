@@ -157,7 +157,7 @@ def test_an_absurdly_large_pose_is_refused_rather_than_called_free(factor: float
 def test_a_unit_beyond_arithmetic_is_refused_rather_than_called_free(factor: float) -> None:
     mesh = figure_eight(0.2, 0.15)
     vertices = mesh.vertices / np.abs(mesh.vertices).max() * factor
-    with pytest.raises(ShapeError, match=r"(high|one point).*(scale it|extent)$"):
+    with pytest.raises(ShapeError, match=r"(height|one point).*(scale it|extent)$"):
         CollisionDetector(mesh.topology, vertices)
 
 

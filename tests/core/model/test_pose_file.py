@@ -248,9 +248,9 @@ def test_other_files_are_refused(model: PoseModel, tmp_path: Path) -> None:
         ("none.json", "no such file"),
         (".", "not a plain file"),
         ("pipe.json", "not a plain file"),
-        ("empty.json", "no JSON"),
-        ("binary.json", "no JSON"),
-        ("deep.json", "no JSON"),
+        ("empty.json", "not JSON"),
+        ("binary.json", "not JSON"),
+        ("deep.json", "not JSON"),
     ):
         with pytest.raises(ModelFileError, match=sentence):
             read_poses(tmp_path / name, model)

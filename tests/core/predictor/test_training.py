@@ -469,7 +469,7 @@ def test_rows_that_cannot_teach_are_refused(tube_model: PoseModel, rows: LabelRo
         train_predictor(none, embedding, config())
     with pytest.raises(LabelStoreError, match="0 are held out"):
         train_predictor(rows.head(6), embedding, config())
-    with pytest.raises(LCollisionError, match="no device 'abacus'"):
+    with pytest.raises(LCollisionError, match="unknown device 'abacus'"):
         train_predictor(rows, embedding, PAPER, device="abacus")
 
 

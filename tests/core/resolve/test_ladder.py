@@ -530,7 +530,7 @@ def test_cancelling_a_sequence_stops_its_first_check(
         (
             np.zeros(8),
             ResolveOptions(locked_domains=frozenset({2})),
-            "no domain 3 to lock; the model has 2",
+            "unknown domain 3 to lock; the model has 2",
         ),
         (np.zeros(8), ResolveOptions(group_weights=(1.0, 1.0)), "3 group weights are needed, got"),
     ],

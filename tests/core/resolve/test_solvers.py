@@ -225,7 +225,7 @@ def test_sqp_run_in_pieces_is_the_same_run() -> None:
     ("change", "sentence"),
     [
         ({"solver": "simplex"}, "unknown solver 'simplex'; choose one of sqp, auglag"),
-        ({"metric": "taxicab"}, "there is no metric 'taxicab'; choose one of eye, latent"),
+        ({"metric": "taxicab"}, "unknown metric 'taxicab'; choose one of eye, latent"),
         ({"threshold": 0.0}, "between 0 and 1, got 0"),
         ({"threshold": 1.0}, "between 0 and 1, got 1"),
         ({"threshold": float("nan")}, "between 0 and 1, got nan"),

@@ -107,7 +107,7 @@ def test_every_authored_pose_stands_on_the_floor(poses: BodySet) -> None:
 
 @pytest.mark.parametrize("n_vertices", [0, 499, 12001])
 def test_vertex_count_out_of_range_is_refused(n_vertices: int) -> None:
-    with pytest.raises(ShapeError, match=f"500 to 12000 vertices, got {n_vertices}"):
+    with pytest.raises(ShapeError, match=f"vertices must be 500 to 12000, got {n_vertices}"):
         make_body("body", n_vertices)
 
 
