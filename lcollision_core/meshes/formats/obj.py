@@ -47,7 +47,7 @@ def read(file: BinaryIO) -> Polygons:
     """
     data = read_rest(file)
     if b"\0" in data:
-        raise MeshFileError("it is not a text file, so no OBJ", "export the mesh again")
+        raise MeshFileError("it is not a text file, so not an OBJ file")
     if len(data) > _SHORTEST_LINE * MAX_FACES:
         require_plausible_count(data.count(b"\nf"), "faces")
         require_plausible_count(data.count(b"\nv "), "vertices")

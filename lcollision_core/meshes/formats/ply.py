@@ -148,11 +148,11 @@ def _require_mesh(elements: list[_Element]) -> None:
             raise MeshFileError(f"its header names a property of {element.name!r} twice")
     vertex = {item.name: item for item in elements[names.index("vertex")].properties}
     if not all(axis in vertex and vertex[axis].count_dtype is None for axis in "xyz"):
-        raise MeshFileError("its vertices have no x, y and z", "export the mesh again")
+        raise MeshFileError("its vertices have no x, y and z")
     face = {item.name: item for item in elements[names.index("face")].properties}
     corners = next((face[name] for name in _CORNER_NAMES if name in face), None)
     if corners is None or corners.count_dtype is None or corners.dtype.startswith("f"):
-        raise MeshFileError("its faces have no list vertex_indices", "export the mesh again")
+        raise MeshFileError("its faces have no list vertex_indices")
 
 
 def _truncated(element: _Element, row: int | None = None) -> MeshFileError:

@@ -84,8 +84,7 @@ def number_rows(
                 found.append(float(word))
             except ValueError as error:
                 raise MeshFileError(
-                    f"holds {word[:30]!r}, which is no number",
-                    "export the mesh again",
+                    f"holds {word[:30]!r}, which is not a number",
                     where=f"{name} {row} (from 0)",
                 ) from error
     return np.array(found, dtype=np.float64), np.array(sizes, dtype=np.int64)
@@ -131,7 +130,7 @@ def vertex_numbers(
     if len(bad):
         row = int(np.searchsorted(np.cumsum(sizes), bad[0], side="right"))
         raise MeshFileError(
-            f"has a corner that is no vertex number: {values[bad[0]]:g}",
+            f"has a corner that is not a vertex number: {values[bad[0]]:g}",
             where=f"{name} {row} (from 0)",
         )
     return values.astype(np.int64)

@@ -365,26 +365,26 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.obj", TRIANGLE + "f 1 2 3\nf 1 2\n", "face 1 .* has 2 corners"),
         ("a.obj", TRIANGLE + "f\n", "face 0 .* has 0 corners"),
         ("a.obj", TRIANGLE + "f 1 2 3\nf 1 2 2\n", "face 1 names a vertex twice"),
-        ("a.obj", TRIANGLE + "f 1 2 3\nf 1 x 3\n", "face 1 .* b'x', which is no number"),
-        ("a.obj", TRIANGLE + "f 1 2 /3\n", "face 0 .* b'/3', which is no number"),
-        ("a.obj", TRIANGLE + "f 1 2 99999999999999999999\n", "face 0 .* no vertex number"),
-        ("a.obj", TRIANGLE + "f 1/1 2/2 99999999999999999999/3\n", "face 0 .* no vertex number"),
+        ("a.obj", TRIANGLE + "f 1 2 3\nf 1 x 3\n", "face 1 .* b'x', which is not a number"),
+        ("a.obj", TRIANGLE + "f 1 2 /3\n", "face 0 .* b'/3', which is not a number"),
+        ("a.obj", TRIANGLE + "f 1 2 99999999999999999999\n", "face 0 .* not a vertex number"),
+        ("a.obj", TRIANGLE + "f 1/1 2/2 99999999999999999999/3\n", "face 0 .* not a vertex number"),
         ("a.obj", TRIANGLE + "v 1 nan 2\nf 1 2 3\n", "vertex 3 .* not finite"),
         ("a.obj", TRIANGLE + "v 1 2 1e999\nf 1 2 3\n", "vertex 3 .* not finite"),
         ("a.obj", TRIANGLE + "v 1 2\nf 1 2 3\n", "vertex 3 .* has 2 coordinates"),
-        ("a.obj", TRIANGLE + "v 1 2 y\nf 1 2 3\n", "vertex 3 .* no number"),
+        ("a.obj", TRIANGLE + "v 1 2 y\nf 1 2 3\n", "vertex 3 .* not a number"),
         ("a.obj", TRIANGLE + "\0", "not a text file"),
         ("a.off", "OFX\n", "does not start with OFF"),
         ("a.off", "OFF\n", "counts .* missing"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n", "truncated"),
         ("a.off", "OFF\n-3 1 0\n0 0 0\n", "damaged"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0\n0 1 0\n3 0 1 2\n", "vertex 1 .* 2 coordinates"),
-        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 x\n0 1 0\n3 0 1 2\n", "no number"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 x\n0 1 0\n3 0 1 2\n", "not a number"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", "face 0 .* 3 corners but has 2"),
         (
             "a.off",
             "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 z\n",
-            "face 0 .* b'z', which is no number",
+            "face 0 .* b'z', which is not a number",
         ),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", "face 0 names vertices"),
         ("a.off", "OFF\n1 50000000 0\n0 0 0\n", "holds 50000000 faces"),
@@ -546,5 +546,7 @@ def test_lines_of_numbers_are_read_alike_at_once_and_word_by_word(
 
 @pytest.mark.parametrize("word", [b"x", b"1.2.3", b"1e", b"1-2", b"+", b"1,5", b"0x1", b"a"])
 def test_a_word_that_is_no_number_is_named(word: bytes) -> None:
-    with pytest.raises(MeshFileError, match=r"vertex 1 \(from 0\) holds b'.*', which is no number"):
+    with pytest.raises(
+        MeshFileError, match=r"vertex 1 \(from 0\) holds b'.*', which is not a number"
+    ):
         points(b"0 0 0\n0 " + word + b" 0\n", "vertex")

@@ -207,7 +207,9 @@ def test_a_section_that_does_not_fit_is_refused(
 ) -> None:
     section = predictor.to_section()
     unknown = Section(section.arrays, {**section.metadata, "preset": "oracle"})
-    with pytest.raises(ModelFileError, match="unknown preset, expected default or paper, got 'oracle'"):
+    with pytest.raises(
+        ModelFileError, match="unknown preset, expected default or paper, got 'oracle'"
+    ):
         CollisionPredictor.from_section(unknown, tube_model.embedding)
     name = min(section.arrays)
     short = {**section.arrays, name: section.arrays[name][..., :1]}

@@ -524,7 +524,7 @@ def test_cancelling_a_sequence_stops_its_first_check(
 @pytest.mark.parametrize(
     ("latent", "options", "sentence"),
     [
-        (np.zeros(7), ResolveOptions(), r"has 8 numbers, got shape \(7,\)"),
+        (np.zeros(7), ResolveOptions(), r"must be 8 numbers, got shape \(7,\)"),
         (np.full(8, np.nan), ResolveOptions(), "not finite"),
         (np.full(8, np.inf), ResolveOptions(), "not finite"),
         (
@@ -532,7 +532,11 @@ def test_cancelling_a_sequence_stops_its_first_check(
             ResolveOptions(locked_domains=frozenset({2})),
             "unknown domain 3 to lock; the model has 2",
         ),
-        (np.zeros(8), ResolveOptions(group_weights=(1.0, 1.0)), "3 group weights are needed, got"),
+        (
+            np.zeros(8),
+            ResolveOptions(group_weights=(1.0, 1.0)),
+            "group weights must be 3 numbers, got 2",
+        ),
     ],
 )
 def test_bad_requests_are_refused(
