@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
+from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.inputs import expanded
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
@@ -27,7 +27,7 @@ def check(
             help="OBJ, PLY, OFF, STL or GLB files, or folders of them.",
         ),
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+    as_json: JsonOption = False,
     near_exclusion: Annotated[
         float,
         typer.Option(

@@ -9,12 +9,14 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import typer
 
 from app.wording import one_line
 from lcollision_core.jobs import Progress, no_progress
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 
 SECONDS_BETWEEN_LINES = 30.0
 """Of progress, where it goes to a file or a pipe."""
@@ -156,17 +158,3 @@ def _bar(task: str, *amounts: str) -> Iterator[ShowStatus]:
             )
 
         yield show
-
-
-def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], left: set[str]) -> None:
-    """Print a table; the columns of these headings are aligned to the left, others to the right."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None)
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading in left else "right")
-    for row in rows:
-        table.add_row(*row)
-    # In a pipe rich would fold the table to 80 columns.
-    Console(width=None if sys.stdout.isatty() else 140).print(table)

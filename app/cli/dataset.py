@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
+from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.inputs import up_sentence
 from app.wording import counted
 
@@ -20,7 +20,7 @@ def check(
         Path,
         typer.Argument(metavar="PATH", readable=False, help="A folder of meshes or an .npz file."),
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+    as_json: JsonOption = False,
     near_exclusion: Annotated[
         float | None,
         typer.Option(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.console import print_json, progress_bar, tell
+from app.cli.console import JsonOption, print_json, progress_bar, tell
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from app.wording import counted
@@ -38,7 +38,7 @@ def evaluate(
             "higher one gives fewer false positives and more false negatives.",
         ),
     ] = 0.5,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Score a model's predictor against exact labels.
 

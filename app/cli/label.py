@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar, status_bar, tell
+from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, status_bar, tell
 from app.cli.evaluate import require_store_of
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
@@ -50,7 +50,7 @@ def label(
         typer.Option(metavar="ADDRESS", help="Label on the workers of this Dask scheduler."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal rows.")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Draw poses from the model's latent box and find their exact collisions.
 

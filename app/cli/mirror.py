@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
+from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.poses import PosesOutput
@@ -25,7 +25,7 @@ def mirror(
         Path, typer.Argument(metavar="POSES", readable=False, help="A .json file of poses.")
     ],
     output: PosesOutput,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Exchange left and right of poses, and mirror where they belong.
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, tell
+from app.cli.console import ExitStatus, JsonOption, note, print_json, tell
 from app.cli.inputs import Axis
 from app.cli.results import require_output
 from app.wording import counted
@@ -25,7 +25,7 @@ ModelArgument = Annotated[
 
 
 def models(
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """List the bundled models and your own, with their metrics."""
     from lcollision_core.model import PoseModel, list_models, user_models_folder
@@ -64,7 +64,7 @@ def _origin(bundled: bool) -> str:
 
 def info(
     model_name: ModelArgument,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+    as_json: JsonOption = False,
     figure: Annotated[
         Path | None,
         typer.Option(metavar="MASKS.png", help="Draw the domains, darker where they own more."),

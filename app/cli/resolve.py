@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, note, print_json, progress_bar, tell
+from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.inputs import ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -107,7 +107,7 @@ def resolve(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the solver's starts.")] = 0,
     mesh_format: FormatOption = "obj",
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Move poses to the nearest ones that are free of self-collisions.
 
