@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import QByteArray, QRectF, QSize, Qt
-from PySide6.QtGui import QIcon, QPainter, QPixmap, QPixmapCache
+from PySide6.QtCore import QByteArray, QObject, QRectF, QSize, Qt
+from PySide6.QtGui import QAction, QIcon, QPainter, QPixmap, QPixmapCache
 from PySide6.QtSvg import QSvgRenderer
+from PySide6.QtWidgets import QAbstractButton
 
 from app.view.theme import current_theme, mixed
 from lcollision_core.bundled import bundled_file
@@ -33,6 +34,26 @@ def icon(name: str, colour: str | None = None) -> QIcon:
         for sharpness in _SHARPNESSES:
             drawn.addPixmap(pixmap(name, ink, ICON_SIZE, sharpness), mode)
     return drawn
+
+
+def give_icon(holder: QAction | QAbstractButton, name: str, ink: str = "text") -> None:
+    """Give an action or a button an icon that follows the theme; see `redraw_icons`.
+
+    Parameters
+    ----------
+    name : of the file, without its extension
+    ink : which colour of the theme
+    """
+    holder.setProperty("drawing", f"{name} {ink}")
+    holder.setIcon(icon(name, getattr(current_theme(), ink)))
+
+
+def redraw_icons(root: QObject) -> None:
+    """Draw the icons of everything below an object in the theme that has come."""
+    for holder in root.findChildren(QObject):
+        drawing = holder.property("drawing")
+        if isinstance(drawing, str) and isinstance(holder, QAction | QAbstractButton):
+            give_icon(holder, *drawing.split())
 
 
 def pixmap(name: str, colour: str, size: int, sharpness: float = 1.0) -> QPixmap:

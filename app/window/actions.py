@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from PySide6.QtCore import QObject
-from PySide6.QtGui import QAction, QKeySequence
+from PySide6.QtGui import QAction, QActionGroup, QKeySequence
+from PySide6.QtWidgets import QMenu, QWidget
 
 from app.view.camera import CAMERAS
-from app.view.icons import icon
+from app.view.icons import give_icon
 from app.view.shading import Shading
 
 
@@ -177,6 +180,36 @@ def make_action(spec: ActionSpec, parent: QObject) -> QAction:
     return action
 
 
+def make_choices(
+    specs: Mapping[Any, ActionSpec],
+    chosen: Any,
+    slot: Callable[[QAction], None],
+    parent: QObject,
+) -> list[QAction]:
+    """Make actions of which one is chosen; each carries its key as data.
+
+    Parameters
+    ----------
+    specs : by key
+    chosen : key of the one that is on at first
+    slot : called with the action that the user chooses
+    """
+    group = QActionGroup(parent)
+    for key, spec in specs.items():
+        action = group.addAction(make_action(spec, parent))
+        action.setData(key)
+        action.setChecked(key == chosen)
+    group.triggered.connect(slot)
+    return group.actions()
+
+
+def make_menu(title: str, actions: Iterable[QAction], parent: QWidget) -> QMenu:
+    """Make a menu of actions."""
+    menu = QMenu(title, parent)
+    menu.addActions(list(actions))
+    return menu
+
+
 def equip_action(action: QAction, spec: ActionSpec) -> None:
     """Give an action, perhaps one of Qt's own, what its line says."""
     action.setText(spec.text)
@@ -187,7 +220,7 @@ def equip_action(action: QAction, spec: ActionSpec) -> None:
     # In a menu an icon would stand where the tick is.
     action.setIconVisibleInMenu(not spec.checkable)
     if spec.icon:
-        action.setIcon(icon(spec.icon))
+        give_icon(action, spec.icon)
 
 
 def explain_action(action: QAction, tip: str) -> None:

@@ -19,7 +19,7 @@ from app.window.dialogs.questions import (
     ask_about_scale,
     ask_to_switch,
 )
-from app.window.panels.widgets import plain_tip
+from app.window.widgets import plain_tip
 from app.wording import menu_text
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
@@ -70,10 +70,12 @@ class FileActions(QObject):
     window : that dialogs belong to
     document : opened into and saved from
     settings : remembers the last folder, the recent files and the model
+    viewport : of which pictures are saved
     attempt : does something and shows what a user can fix of what goes wrong
 
     Attributes
     ----------
+    acts : callables by the actions' keys
     recent_menu, models_menu : list what can be opened by a click
     """
 
@@ -82,6 +84,7 @@ class FileActions(QObject):
         window: QWidget,
         document: PoseDocument,
         settings: Settings,
+        viewport: Viewport,
         attempt: Callable[[Callable[[], object]], object],
     ) -> None:
         super().__init__(window)
@@ -89,6 +92,19 @@ class FileActions(QObject):
         self._window = window
         self._document = document
         self._settings = settings
+        self._viewport = viewport
+        self.acts: dict[str, Callable[[], object]] = {
+            "new": self._new_pose,
+            "open": lambda: self._ask_and_open("Open", "poses", "meshes", "models"),
+            "open_model": lambda: self._ask_and_open("Open a model", "models"),
+            "save": self.save,
+            "save_as": self._save_as,
+            "import": lambda: self._ask_and_open("Import mesh", "meshes"),
+            "export": self._export,
+            "upright": self.turn_upright,
+            "screenshot": self._screenshot,
+            "turntable": self._turntable,
+        }
         self.recent_menu = self._listing("Open &recent", self._fill_recent)
         self._fill_recent()
         self.models_menu = self._listing("Mode&ls", self._fill_models)
@@ -104,21 +120,8 @@ class FileActions(QObject):
         self._dropped: tuple[Path, int] | None = None
         self._told = ""
 
-    def open(self) -> None:
-        """Ask for any file that can be opened, and open it."""
-        path = self.ask_open("Open", "poses", "meshes", "models")
-        if path is not None:
-            self.open_path(path)
-
-    def open_model(self) -> None:
-        """Ask for a model, and open it."""
-        path = self.ask_open("Open a model", "models")
-        if path is not None:
-            self.open_path(path)
-
-    def import_mesh(self) -> None:
-        """Ask for a mesh, and make it the pose."""
-        path = self.ask_open("Import mesh", "meshes")
+    def _ask_and_open(self, title: str, *kinds: str) -> None:
+        path = self.ask_open(title, *kinds)
         if path is not None:
             self.open_path(path)
 
@@ -192,8 +195,7 @@ class FileActions(QObject):
         if len(paths) > 1:
             self._dropped = (path, len(paths))
 
-    def new_pose(self) -> None:
-        """Start anew, once unsaved changes are settled."""
+    def _new_pose(self) -> None:
         if self.may_lose_changes():
             self._document.new_pose()
 
@@ -206,25 +208,22 @@ class FileActions(QObject):
         """
         document = self._document
         if document.file is None:
-            return self.save_as()
+            return self._save_as()
         if document.file_is_another_s:
             answer = ask_about_another_s(self._window, document.file.name)
-            if answer is not Choice.SAVE:
-                return answer is Choice.DISCARD and self.save_as()
+            if answer is not Choice.DISCARD:
+                return answer is Choice.SAVE and self._save_as()
         document.save()
         return True
 
-    def save_as(self) -> bool:
-        """Ask for a file, and save there; returns whether it was saved."""
+    def _save_as(self) -> bool:
         path = self.ask_save("Save poses", self._name, {"Poses": POSES_SUFFIX}, self._document.file)
         if path is None:
             return False
         self._document.save(path)
         return True
 
-    def export(self) -> None:
-        """Ask for axes, scale and file, and write the mesh on the screen."""
-
+    def _export(self) -> None:
         def write() -> None:
             path = self.ask_save("Export mesh", self._name, _EXPORTS)
             if path is not None:
@@ -235,14 +234,12 @@ class FileActions(QObject):
         form = export_form(self._settings, self._window, model.up_axis, model.front)
         self._after(form, write)
 
-    def screenshot(self, viewport: Viewport) -> None:
-        """Ask for size and file, and save a picture of the viewport."""
-
+    def _screenshot(self) -> None:
         def shoot() -> None:
             path = self.ask_save("Save screenshot", self._name, {"PNG": ".png"})
             if path is not None:
                 settings = self._settings
-                viewport.screenshot(
+                self._viewport.screenshot(
                     path,
                     settings["screenshot_width"],
                     settings["screenshot_height"],
@@ -252,8 +249,7 @@ class FileActions(QObject):
 
         self._after(screenshot_form(self._settings, self._window), shoot)
 
-    def turntable(self, viewport: Viewport) -> None:
-        """Ask for format, size, rate, background and file, and save a film of one turn."""
+    def _turntable(self) -> None:
         from app.view.turntable import TurntableStyle
 
         def shoot() -> None:
@@ -271,7 +267,7 @@ class FileActions(QObject):
                     settings["turntable_background"],
                     settings["turntable_colour"],
                 )
-                viewport.turntable(path, style)
+                self._viewport.turntable(path, style)
 
         self._after(turntable_form(self._settings, self._window), shoot)
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QEvent, QSize, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import (
     QAction,
-    QActionGroup,
     QCloseEvent,
     QDragEnterEvent,
     QDropEvent,
@@ -18,47 +17,30 @@ from PySide6.QtGui import (
     QResizeEvent,
     QShowEvent,
 )
-from PySide6.QtWidgets import (
-    QApplication,
-    QDialog,
-    QMainWindow,
-    QMenu,
-    QWidget,
-)
+from PySide6.QtWidgets import QApplication, QDialog, QMainWindow, QWidget
 
 from app.editing.settings import Settings
-from app.view.icons import icon, program_icon
-from app.view.shading import Shading
+from app.view.icons import program_icon, redraw_icons
 from app.view.theme import apply_theme, wanted_theme
 from app.view.viewport import Viewport
-from app.window.action_handlers import ActionHandlers
-from app.window.actions import (
-    ACTIONS,
-    CAMERA_ACTIONS,
-    DOCKS,
-    SHADINGS,
-    THEMES,
-    ActionSpec,
-    equip_action,
-    explain_action,
-    make_action,
-)
-from app.window.body_menu import BodyMenu
-from app.window.dialogs.body_parts import BodyPartsDialog
-from app.window.dialogs.failure import FailureDialog
+from app.window import actions
+from app.window.actions import ACTIONS, DOCKS, THEMES
+from app.window.body_menus import BodyMenus
+from app.window.dialogs.failure import FailureDialog, open_log_file
+from app.window.dialogs.help import show_about, show_shortcuts
+from app.window.edit_actions import EditActions
 from app.window.file_actions import FileActions
 from app.window.library_actions import LibraryActions
-from app.window.menus import fill_menus, make_bar, refresh_bar
+from app.window.menus import fill_menus, make_bar
 from app.window.panels.collision import CollisionPanel
 from app.window.panels.dock import Panel
 from app.window.panels.library import LibraryPanel
-from app.window.panels.part_menu import PartMenus
 from app.window.panels.randomise import RandomiseCard
 from app.window.panels.sliders import SlidersPanel
-from app.window.panels.widgets import silent
 from app.window.shortcuts import WindowShortcuts
 from app.window.status_bar import StatusBar
-from app.wording import menu_text, one_line
+from app.window.view_actions import ViewActions
+from app.wording import one_line
 from app.work.preparing import Preparing
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
@@ -116,61 +98,69 @@ class MainWindow(QMainWindow):
             self.setCorner(corner, Qt.DockWidgetArea.LeftDockWidgetArea)
         self.setCorner(Qt.Corner.TopRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
 
-        self.files = FileActions(self, document, settings, self.attempt)
         self.viewport = Viewport(document)
         self.viewport.setMinimumSize(160, 120)
         self.setCentralWidget(self.viewport)
-        self.actions_by_key = {key: self._action(key, spec) for key, spec in ACTIONS.items()}
-        self._shadings = self._choices(
-            SHADINGS, Shading[settings["shading"].upper()], self._on_shading_chosen
-        )
-        self._themes = self._choices(THEMES, settings["theme"], self._on_theme_chosen)
-        self._cameras = {name: make_action(spec, self) for name, spec in CAMERA_ACTIONS.items()}
-        for name, action in self._cameras.items():
-            action.setData(name)
-            action.triggered.connect(self._on_camera_chosen)
-
-        act = self.actions_by_key
+        self.actions_by_key = act = {key: self._action(key) for key in ACTIONS}
         self.sliders = SlidersPanel(document)
         self.randomise = RandomiseCard(act["randomise"], settings["randomise_amount"])
         self.sliders.add_card(self.randomise)
-        self.collision = CollisionPanel(document, act["resolve"])
+        self.collision = CollisionPanel(document, act["resolve"], act["resolve_options"])
         self.library = LibraryPanel(document, act["keep"], act["update"], act["add"])
-        self.library_actions = LibraryActions(self, document, self.library, self.files, act)
         self.docks = {
             "sliders": self._dock("sliders", "Sliders", self.sliders),
             "collision": self._dock("collision", "Collisions", self.collision),
             "library": self._dock("library", "Poses", self.library),
         }
-        self._camera_menu = self._submenu("&Camera view", self._cameras.values())
-        self._body_menu = BodyMenu(self, self._shadings.values(), self._camera_menu)
-        self._theme_menu = self._submenu("&Theme", self._themes.values())
+        self.files = FileActions(self, document, settings, self.viewport, self.attempt)
+        self._edits = EditActions(
+            self, document, settings, self.sliders, self.randomise, self.viewport.pictures, act
+        )
+        library_actions = LibraryActions(self, document, self.library, self.files, act)
+        views = ViewActions(self, document, settings, self.viewport, act["ghost"])
+        themes = actions.make_choices(THEMES, settings["theme"], self._on_theme_chosen, self)
         self.menus = fill_menus(
             self,
             act,
             {
-                "shading": self._shadings.values(),
+                "shading": views.shadings,
                 "docks": [dock.toggleViewAction() for dock in self.docks.values()],
             },
             {
                 "recent": self.files.recent_menu,
                 "models": self.files.models_menu,
-                "cameras": self._camera_menu,
-                "themes": self._theme_menu,
+                "cameras": views.camera_menu,
+                "themes": actions.make_menu("&Theme", themes, self),
             },
         )
-        self._bar = make_bar(act, self._shadings.values(), self._camera_menu)
-        self.addToolBar(self._bar)
-        self._handlers = ActionHandlers(self)
-        self.part_menus = PartMenus(self)
+        self.addToolBar(make_bar(act, views.shadings, views.camera_menu))
+        self._acts: dict[str, Callable[[], object]] = {
+            "quit": self.close,
+            "full_screen": self._toggle_full_screen,
+            "reset_layout": self.reset_layout,
+            "shortcuts": lambda: show_shortcuts(self.menus, self),
+            "log": open_log_file,
+            "about": lambda: show_about(document.model if document.has_model else None, self),
+            **self.files.acts,
+            **self._edits.acts,
+            **library_actions.acts,
+            **views.acts,
+        }
+        self._body_menus = BodyMenus(
+            self,
+            document,
+            self.viewport,
+            self.sliders,
+            act,
+            (views.shading_menu, views.camera_menu),
+            self._edits.edit_parts,
+            self.attempt,
+        )
         WindowShortcuts(self)
         self._status = StatusBar()
         self.setStatusBar(self._status)
         self._preparing = Preparing(self)
         self._connect()
-        self.viewport.set_shading(Shading[settings["shading"].upper()])
-        document.show_ghost(settings["show_ghost"])
-        act["ghost"].setChecked(settings["show_ghost"])
         self._restore()
         self._on_model()
 
@@ -216,47 +206,9 @@ class MainWindow(QMainWindow):
         assert isinstance(application, QApplication)
         self.settings["theme"] = choice
         apply_theme(application, wanted_theme(choice))
-        for key, spec in ACTIONS.items():
-            if spec.icon:
-                self.actions_by_key[key].setIcon(icon(spec.icon))
-        for name, action in self._cameras.items():
-            action.setIcon(icon(CAMERA_ACTIONS[name].icon))
-        refresh_bar(self._bar)
+        redraw_icons(self)
         self.collision.refresh_icons()
-        self.randomise.refresh_icons()
         self.library.redraw()
-
-    def show_in_sliders(self, domain: int) -> None:
-        """Open a body part's sliders and bring them into sight."""
-        self.docks["sliders"].show()
-        self.docks["sliders"].raise_()
-        self.sliders.show_domain(domain)
-
-    def edit_parts(self, domain: int | None = None, what: str = "") -> None:
-        """Show the dialog of the body parts.
-
-        Parameters
-        ----------
-        domain : the one to begin with, None for the first
-        what : "name" or "colour" of it to change at once, "" for neither
-        """
-        from app.work.jobs import is_bundled
-        from lcollision_core.model import list_models
-
-        document = self.document
-        taken = [model.name for model in list_models()]
-        dialog = BodyPartsDialog(document.model, is_bundled(document.model_file), taken, self)
-        dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
-        dialog.edited.connect(document.edit_parts)
-        # Of another model these are other parts.
-        document.model_changed.connect(dialog.reject)
-        dialog.open()
-        if domain is not None:
-            dialog.choose(domain)
-        if what == "name":
-            dialog.edit_name()
-        elif what == "colour":
-            dialog.choose_colour()
 
     def reset_layout(self) -> None:
         """Put all panels back to their places."""
@@ -341,35 +293,15 @@ class MainWindow(QMainWindow):
 
     # Building.
 
-    def _action(self, key: str, spec: ActionSpec) -> QAction:
-        action = make_action(spec, self)
+    def _action(self, key: str) -> QAction:
+        action = actions.make_action(ACTIONS[key], self)
         action.setObjectName(key)
         action.triggered.connect(self._on_action)
         return action
 
-    def _choices(
-        self, specs: Mapping[Any, ActionSpec], chosen: Any, slot: Callable[[], None]
-    ) -> dict[Any, QAction]:
-        """Make actions of which one is on; each carries its key as data."""
-        group = QActionGroup(self)
-        actions = {}
-        for key, spec in specs.items():
-            action = make_action(spec, self)
-            action.setData(key)
-            action.setChecked(key == chosen)
-            action.triggered.connect(slot)
-            group.addAction(action)
-            actions[key] = action
-        return actions
-
-    def _submenu(self, title: str, actions: Iterable[QAction]) -> QMenu:
-        menu = QMenu(title, self)
-        menu.addActions(list(actions))
-        return menu
-
     def _dock(self, key: str, title: str, content: QWidget) -> Panel:
         dock = Panel(key, title, content, self)
-        equip_action(dock.toggleViewAction(), DOCKS[key])
+        actions.equip_action(dock.toggleViewAction(), DOCKS[key])
         self.addDockWidget(_AREAS[key], dock)
         return dock
 
@@ -378,22 +310,16 @@ class MainWindow(QMainWindow):
         for panel in (self.sliders, self.collision):
             panel.domain_hovered.connect(self.viewport.highlight_domain)
         for rows in (self.sliders, self.collision.prediction):
-            rows.menu_wanted.connect(self.part_menus.show_menu)
+            rows.menu_wanted.connect(self._body_menus.open_on_part)
         self.viewport.domain_hovered.connect(self.sliders.light_domain)
         self.viewport.domain_hovered.connect(self.collision.prediction.light_domain)
-        self.viewport.shading_changed.connect(self._on_shading)
-        self.viewport.menu_wanted.connect(self._body_menu.open)
-        self.collision.resolve.options_wanted.connect(self._handlers.choose_resolve_options)
+        self.viewport.waiting.open_wanted.connect(self.actions_by_key["open_model"].trigger)
         self.randomise.wanted.connect(document.randomise)
         self.randomise.refused.connect(self._status.tell)
         document.model_changed.connect(self._on_model)
         document.frame_changed.connect(self._on_frame)
         document.file_changed.connect(self._update_title)
         document.modified_changed.connect(self._update_title)
-        document.locks_changed.connect(self._update_actions)
-        document.ghost_changed.connect(self._on_ghost)
-        document.solve_started.connect(self._update_actions)
-        document.solve_finished.connect(self._update_actions)
         document.busy_changed.connect(self._on_busy)
         self.viewport.pictures.busy_changed.connect(self._on_busy)
         # What was told of the pose before is past.
@@ -402,8 +328,6 @@ class MainWindow(QMainWindow):
         document.failed.connect(self.show_failure)
         self._preparing.begun.connect(self._status.explain)
         self._preparing.begun.connect(self.viewport.waiting.explain)
-        stack = document.undo_stack
-        stack.indexChanged.connect(self._update_actions)
         QGuiApplication.styleHints().colorSchemeChanged.connect(self._on_system_theme)
 
     def _restore(self) -> None:
@@ -443,11 +367,12 @@ class MainWindow(QMainWindow):
         has_model = self.document.has_model
         for dock in self.docks.values():
             dock.widget().setEnabled(has_model)
+        for key in self.files.acts:
+            self.actions_by_key[key].setEnabled(has_model or key == "open_model")
         if has_model:
             model = self.document.model
             self._status.show_facts(f"{model.name} · {model.n_vertices} vertices")
         self._update_title()
-        self._update_actions()
 
     @Slot()
     def _on_frame(self) -> None:
@@ -470,56 +395,8 @@ class MainWindow(QMainWindow):
         self.setWindowModified(document.modified)
 
     @Slot()
-    def _update_actions(self) -> None:
-        document, stack = self.document, self.document.undo_stack
-        has_model = document.has_model
-        allowed = {
-            "undo": stack.canUndo(),
-            "redo": stack.canRedo(),
-            "mirror": document.can_mirror,
-            "unlock": bool(document.locked_domains),
-            "resolve": document.can_resolve and not (document.solving or document.incoming),
-            "resolve_options": document.can_resolve,
-            "cancel": bool(self._busy),
-        }
-        waits = f"{document.incoming}: it replaces this pose"
-        tip = waits if document.incoming else ACTIONS["resolve"].tip
-        explain_action(self.actions_by_key["resolve"], tip)
-        always = ("open_model", "quit", "reset_layout", "full_screen", "shortcuts", "log", "about")
-        for key, action in self.actions_by_key.items():
-            if key not in self.library_actions.acts:
-                action.setEnabled(key in always or (has_model and allowed.get(key, True)))
-        for key, name, text in (
-            ("undo", "Undo", stack.undoText()),
-            ("redo", "Redo", stack.redoText()),
-        ):
-            self.actions_by_key[key].setText(
-                f"&{name} {menu_text(text[:1].lower() + text[1:])}".rstrip()
-            )
-        for action in (*self._shadings.values(), *self._cameras.values()):
-            action.setEnabled(has_model)
-        self._shadings[Shading.PREDICTED].setEnabled(document.can_resolve)
-
-    @Slot(object)
-    def _on_shading(self, shading: Shading) -> None:
-        self._shadings[shading].setChecked(True)
-        self.settings["shading"] = shading.name.lower()
-
-    @Slot()
-    def _on_ghost(self) -> None:
-        with silent(self.actions_by_key["ghost"]):
-            self.actions_by_key["ghost"].setChecked(self.document.ghost_shown)
-        self.settings["show_ghost"] = self.document.ghost_shown
-
-    @property
-    def _busy(self) -> str:
-        """What is being done that can be cancelled, or "" where there is nothing."""
-        return self.document.busy or self.viewport.pictures.busy
-
-    @Slot()
     def _on_busy(self) -> None:
-        self._status.show_busy(self._busy)
-        self._update_actions()
+        self._status.show_busy(self.document.busy or self.viewport.pictures.busy)
 
     @Slot()
     def _on_system_theme(self) -> None:
@@ -530,21 +407,14 @@ class MainWindow(QMainWindow):
     def _on_action(self) -> None:
         action = self.sender()
         if isinstance(action, QAction):
-            self.attempt(self._handlers.acts[action.objectName()])
+            self.attempt(self._acts[action.objectName()])
 
-    @Slot()
-    def _on_shading_chosen(self) -> None:
-        self.viewport.set_shading(self._sender_data())
+    @Slot(QAction)
+    def _on_theme_chosen(self, action: QAction) -> None:
+        self.set_theme(action.data())
 
-    @Slot()
-    def _on_theme_chosen(self) -> None:
-        self.set_theme(self._sender_data())
-
-    @Slot()
-    def _on_camera_chosen(self) -> None:
-        self.viewport.set_camera(self._sender_data())
-
-    def _sender_data(self) -> Any:
-        action = self.sender()
-        assert isinstance(action, QAction)
-        return action.data()
+    def _toggle_full_screen(self) -> None:
+        if self.isFullScreen():
+            self.showNormal()
+        else:
+            self.showFullScreen()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QMainWindow, QMenu, QSizePolicy, QToolBar, QToolButton, QWidget
 
-from app.view.icons import ICON_SIZE, icon
+from app.view.icons import ICON_SIZE, give_icon
 
 SEPARATOR = ""
 
@@ -43,7 +43,6 @@ _BAR = (
     *("open", "save", SEPARATOR, "undo", "redo", SEPARATOR),
     *("reset", "randomise", "mirror"),
 )
-_BAR_END = ("ghost", "cameras", "screenshot")
 
 
 def fill_menus(
@@ -66,24 +65,20 @@ def fill_menus(
     """
     menus = {}
     for title, keys in MENUS.items():
-        menu = window.menuBar().addMenu(title)
+        menu = menus[title] = window.menuBar().addMenu(title)
         menu.setToolTipsVisible(True)
         for key in keys:
             if key == SEPARATOR:
                 menu.addSeparator()
             elif key in submenus:
                 menu.addMenu(submenus[key])
-            elif key in groups:
-                for action in groups[key]:
-                    menu.addAction(action)
             else:
-                menu.addAction(actions[key])
-        menus[title] = menu
+                menu.addActions(list(groups.get(key) or [actions[key]]))
     return menus
 
 
 def make_bar(
-    actions: Mapping[str, QAction], shadings: Iterable[QAction], cameras: QMenu
+    actions: Mapping[str, QAction], shadings: Sequence[QAction], cameras: QMenu
 ) -> QToolBar:
     """Make the tool bar: files and edits, the shadings in the middle, the camera at the end."""
     bar = QToolBar("Tool bar")
@@ -97,42 +92,31 @@ def make_bar(
         else:
             bar.addAction(actions[key])
     bar.addWidget(_spring())
-    shown = list(shadings)
-    for place, action in enumerate(shown):
+    ends = {shadings[0]: "first", shadings[-1]: "last"}
+    for action in shadings:
         button = QToolButton()
         button.setObjectName("segment")
-        ends = {0: "first", len(shown) - 1: "last"}
-        button.setProperty("place", ends.get(place, "middle"))
+        button.setProperty("place", ends.get(action, "middle"))
         button.setDefaultAction(action)
-        button.setFocusPolicy(Qt.FocusPolicy.TabFocus)
         bar.addWidget(button)
     bar.addWidget(_spring())
-    for key in _BAR_END:
-        if key == "cameras":
-            button = QToolButton()
-            button.setMenu(cameras)
-            button.setIcon(icon("camera"))
-            button.setObjectName("cameras")
-            button.setToolTip("Camera view")
-            button.setAccessibleName("Camera view")
-            button.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
-            bar.addWidget(button)
-        else:
-            bar.addAction(actions[key])
+    bar.addAction(actions["ghost"])
+    camera = QToolButton()
+    camera.setMenu(cameras)
+    give_icon(camera, "camera")
+    camera.setObjectName("cameras")
+    camera.setToolTip("Camera view")
+    camera.setAccessibleName("Camera view")
+    camera.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
+    bar.addWidget(camera)
+    bar.addAction(actions["screenshot"])
     for button in bar.findChildren(QToolButton):
         button.setFocusPolicy(Qt.FocusPolicy.TabFocus)
-    refresh_bar(bar)
+        if button.objectName() == "qt_toolbar_ext_button":
+            # Qt's own button for what a narrow bar has no space for has a black arrow in any theme.
+            give_icon(button, "more")
+            button.setToolTip("More actions")
     return bar
-
-
-def refresh_bar(bar: QToolBar) -> None:
-    """Draw in the theme that has come what is no action's: the cameras, and the way to the rest."""
-    # Qt's own button for what a narrow bar has no room for; its arrow is black in both themes.
-    for name, drawing in (("cameras", "camera"), ("qt_toolbar_ext_button", "more")):
-        button = bar.findChild(QToolButton, name)
-        if isinstance(button, QToolButton):
-            button.setIcon(icon(drawing))
-            button.setToolTip(button.toolTip() or "More actions")
 
 
 def _spring() -> QWidget:

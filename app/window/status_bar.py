@@ -6,7 +6,7 @@ from PySide6.QtCore import Slot
 from PySide6.QtWidgets import QProgressBar, QStatusBar
 
 from app.view.theme import NORMAL
-from app.window.panels.widgets import labelled
+from app.window.widgets import labelled
 from app.wording import one_line
 
 _MESSAGE_MILLISECONDS = 8000

@@ -32,8 +32,8 @@ from app.editing.document import PoseDocument
 from app.view.shading import Shading
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
-from app.window.panels.widgets import HANDLE
 from app.window.status_bar import StatusBar
+from app.window.widgets import HANDLE
 from app.work import jobs
 from app.work.preparing import REASON
 from app.work.threads import Failure

@@ -15,7 +15,7 @@ from app.editing.settings import SETTINGS, Settings
 from app.view.theme import current_theme
 from app.window.dialogs.forms import Form, resolve_form, screenshot_form, turntable_form
 from app.window.main_window import MainWindow
-from app.window.panels.number_box import QuietIntegerBox, QuietSpinBox
+from app.window.number_box import QuietIntegerBox, QuietSpinBox
 from tests.app.windows import settings_in
 
 LEFT = Qt.MouseButton.LeftButton

@@ -21,7 +21,7 @@ from app.editing.settings import Settings
 from app.view.theme import apply_theme, wanted_theme
 from app.window.main_window import MainWindow
 from app.window.panels.code_slider import CodeRow
-from app.window.panels.widgets import HANDLE
+from app.window.widgets import HANDLE
 
 SHOTS = Path(__file__).parents[2] / "out" / "screenshots"
 """Where tests leave pictures of the window, for people to look at."""

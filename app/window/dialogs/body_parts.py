@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE
-from app.window.panels.widgets import labelled
+from app.window.widgets import labelled
 from app.work.jobs import PartEdits
 from lcollision_core.errors import ModelFileError
 

@@ -17,7 +17,7 @@ from PySide6.QtWidgets import (
 
 from app.view.icons import pixmap
 from app.view.theme import NORMAL, WIDE, current_theme
-from app.window.panels.widgets import labelled
+from app.window.widgets import labelled
 from app.wording import one_line, with_capital
 from app.work.log import log_file
 from app.work.threads import Failure

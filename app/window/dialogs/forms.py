@@ -21,8 +21,8 @@ from PySide6.QtWidgets import (
 
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
-from app.window.panels.number_box import QuietIntegerBox, QuietSpinBox
-from app.window.panels.widgets import labelled
+from app.window.number_box import QuietIntegerBox, QuietSpinBox
+from app.window.widgets import labelled
 
 if TYPE_CHECKING:
     import numpy as np

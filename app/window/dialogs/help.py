@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QAction, QKeySequence
 from PySide6.QtWidgets import (
     QDialog,
     QDialogButtonBox,
-    QGridLayout,
-    QHBoxLayout,
+    QFormLayout,
     QLabel,
+    QMenu,
+    QMessageBox,
     QVBoxLayout,
     QWidget,
 )
@@ -20,54 +22,61 @@ from PySide6.QtWidgets import (
 from app.view.icons import program_icon
 from app.view.theme import CLOSE, NORMAL, WIDE
 from app.window.actions import ACTIONS
-from app.window.panels.widgets import labelled, scrolling
+from app.window.dialogs.questions import message_box
+from app.window.widgets import labelled, scrolling
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PoseModel
 
 _TITLE_BAR = 60
 """Of a dialog and what the desktop keeps for itself, in device-independent pixels."""
 
+_ABOUT = """\
+Version {version}, Apache-2.0 licence
 
-class AboutDialog(QDialog):
-    """Name, version, licence and origin of the program and of the model."""
+A pose editor that detects self-collisions and resolves them. After “LCollision: Fast Generation \
+of Collision-Free Human Poses using Learned Non-Penetration Constraints” by Tan, Pan and Manocha, \
+AAAI 2021.
+"""
+_ABOUT_MODEL = """
+{model.name}: {model.n_vertices} vertices, {n_parts} body parts, {model.latent_size} sliders, \
+trained on {model.card.source}, licence {model.card.licence}.
+"""
 
-    def __init__(self, model_lines: Sequence[str], parent: QWidget | None = None) -> None:
-        super().__init__(parent)
-        self.setWindowTitle("About LCollision")
-        picture = QLabel()
-        picture.setPixmap(program_icon().pixmap(72, 72))
-        picture.setAlignment(Qt.AlignmentFlag.AlignTop)
-        words = QVBoxLayout()
-        words.setSpacing(CLOSE)
-        words.addWidget(labelled("LCollision", "headline"))
-        words.addWidget(labelled(f"Version {_version()}, Apache-2.0 licence", "caption"))
-        text = QLabel(
-            "A pose editor that detects self-collisions and resolves them. After "
-            "“LCollision: Fast Generation of Collision-Free Human Poses using Learned "
-            "Non-Penetration Constraints” by Tan, Pan and Manocha, AAAI 2021."
-        )
-        text.setWordWrap(True)
-        text.setMinimumWidth(360)
-        words.addWidget(text)
-        if model_lines:
-            words.addSpacing(CLOSE)
-            words.addWidget(labelled("Model", "title"))
-            for line in model_lines:
-                words.addWidget(labelled(line, "caption"))
-        top = QHBoxLayout()
-        top.setSpacing(WIDE + 4)
-        top.addWidget(picture)
-        top.addLayout(words, 1)
-        _finish(self, top)
+
+def show_about(model: PoseModel | None, parent: QWidget) -> None:
+    """Show name, version, licence and origin of the program and of the model."""
+    box = message_box(parent, "About LCollision", "LCollision", _ABOUT.format(version=_version()))
+    if model is not None:
+        text = _ABOUT_MODEL.format(model=model, n_parts=len(model.domain_names))
+        box.setInformativeText(box.informativeText() + text)
+    box.setIconPixmap(program_icon().pixmap(72, 72))
+    box.setStandardButtons(QMessageBox.StandardButton.Close)
+    box.open()
+
+
+def show_shortcuts(menus: Mapping[str, QMenu], parent: QWidget) -> None:
+    """Show the shortcuts of the menus' actions, and what mouse and keys do elsewhere."""
+    listed = [(title.replace("&", ""), _with_shortcuts(menu)) for title, menu in menus.items()]
+    dialog = ShortcutsDialog(listed, parent)
+    dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+    dialog.open()
 
 
 class ShortcutsDialog(QDialog):
-    """All actions with their shortcuts, and what mouse and keys do elsewhere."""
+    """All actions with their shortcuts, and what mouse and keys do elsewhere.
+
+    Parameters
+    ----------
+    menus : titles and actions
+    """
 
     _ELSEWHERE = (
         ("Drag in the view", "rotate the camera"),
         ("Middle-drag or Shift-drag", "move the camera"),
         ("Wheel or pinch in the view", "come nearer, go away, at the pointer"),
         ("Right-drag in the view", "zoom"),
-        ("Right-click in the view", "menu of the part under the pointer"),
+        ("Right-click in the view", "menu of the body part under the pointer"),
         ("Arrow keys on a slider", "a hundredth of its range"),
         ("Page keys on a slider", "a tenth of its range"),
         ("Home, End on a slider", "lowest and highest value"),
@@ -81,36 +90,45 @@ class ShortcutsDialog(QDialog):
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle("Keyboard and mouse")
-        room = self.screen().availableSize()
-        self.resize(560, min(620, room.height() - _TITLE_BAR))
+        self.resize(560, min(620, self.screen().availableSize().height() - _TITLE_BAR))
         page = QWidget()
-        grid = QGridLayout(page)
-        grid.setContentsMargins(0, 0, NORMAL, 0)
-        grid.setHorizontalSpacing(WIDE * 2)
-        grid.setVerticalSpacing(CLOSE - 2)
-        line = 0
+        form = QFormLayout(page)
+        form.setContentsMargins(0, 0, NORMAL, 0)
+        form.setHorizontalSpacing(WIDE * 2)
+        form.setVerticalSpacing(CLOSE - 2)
+        native = QKeySequence.SequenceFormat.NativeText
         for title, actions in menus:
-            grid.addWidget(labelled(title, "title"), line, 0, 1, 2)
-            line += 1
+            form.addRow(labelled(title, "title"))
             for action in actions:
-                native = QKeySequence.SequenceFormat.NativeText
                 keys = " or ".join(key.toString(native) for key in action.shortcuts())
                 # Undo names its step in the menu only.
                 spec = ACTIONS.get(action.objectName())
                 text = spec.text if spec is not None else action.text()
                 name = text.replace("&", "").removesuffix("…")
-                grid.addWidget(QLabel(name), line, 0)
-                grid.addWidget(labelled(keys, "caption"), line, 1)
-                line += 1
-            grid.setRowMinimumHeight(line, NORMAL)
-            line += 1
-        grid.addWidget(labelled("Elsewhere", "title"), line, 0, 1, 2)
+                form.addRow(QLabel(name), labelled(keys, "caption"))
+            form.addRow(labelled(""))
+        form.addRow(labelled("Elsewhere", "title"))
         for name, effect in self._ELSEWHERE:
-            line += 1
-            grid.addWidget(QLabel(name), line, 0)
-            grid.addWidget(labelled(effect, "caption"), line, 1)
-        grid.setColumnStretch(1, 1)
-        _finish(self, scrolling(page))
+            form.addRow(QLabel(name), labelled(effect, "caption"))
+        column = QVBoxLayout(self)
+        column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
+        column.setSpacing(WIDE)
+        column.addWidget(scrolling(page))
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
+        buttons.rejected.connect(self.reject)
+        column.addWidget(buttons)
+
+
+def _with_shortcuts(menu: QMenu) -> list[QAction]:
+    """Return the actions of a menu and its submenus that have a shortcut."""
+    found = []
+    for action in menu.actions():
+        submenu = action.menu()
+        if isinstance(submenu, QMenu):
+            found.extend(_with_shortcuts(submenu))
+        elif not action.shortcut().isEmpty():
+            found.append(action)
+    return found
 
 
 def _version() -> str:
@@ -118,16 +136,3 @@ def _version() -> str:
         return version("lcollision")
     except PackageNotFoundError:
         return "of a checkout"
-
-
-def _finish(dialog: QDialog, content: QWidget | QHBoxLayout) -> None:
-    column = QVBoxLayout(dialog)
-    column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
-    column.setSpacing(WIDE)
-    if isinstance(content, QWidget):
-        column.addWidget(content)
-    else:
-        column.addLayout(content)
-    buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
-    buttons.rejected.connect(dialog.reject)
-    column.addWidget(buttons)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QDialog, QInputDialog, QLabel, QLineEdit, QVBoxLayout, QWidget
 
-from app.window.panels.widgets import labelled
+from app.window.widgets import labelled
 from app.wording import heading, menu_text
 
 _WIDTH = 400

@@ -7,8 +7,8 @@ from PySide6.QtGui import QKeyEvent, QMouseEvent
 from PySide6.QtWidgets import QHBoxLayout, QWidget
 
 from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT
-from app.window.panels.number_box import QuietSpinBox
-from app.window.panels.widgets import (
+from app.window.number_box import QuietSpinBox
+from app.window.widgets import (
     NAME_SHARE,
     ElidedLabel,
     HoverRow,

@@ -12,7 +12,7 @@ from app.view.theme import CLOSE, NORMAL, TIGHT
 from app.window.panels.exact import ExactCard
 from app.window.panels.prediction import PredictionCard
 from app.window.panels.resolve import ResolveCard
-from app.window.panels.widgets import scrolling
+from app.window.widgets import scrolling
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -31,18 +31,20 @@ class CollisionPanel(QWidget):
     Parameters
     ----------
     document : followed and changed
-    resolve_action : what the button of Resolve triggers
+    resolve_action, options_action : what the buttons of Resolve trigger
     """
 
     domain_hovered = Signal(object)
 
-    def __init__(self, document: PoseDocument, resolve_action: QAction) -> None:
+    def __init__(
+        self, document: PoseDocument, resolve_action: QAction, options_action: QAction
+    ) -> None:
         super().__init__()
         self._document = document
         self.setMinimumWidth(_MIN_WIDTH)
         self.exact = ExactCard(document)
         self.prediction = PredictionCard(document)
-        self.resolve = ResolveCard(document, resolve_action)
+        self.resolve = ResolveCard(document, resolve_action, options_action)
         page = QWidget()
         cards = QVBoxLayout(page)
         cards.setContentsMargins(NORMAL, 0, NORMAL, CLOSE)

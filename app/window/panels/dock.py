@@ -57,6 +57,14 @@ class Panel(QDockWidget):
         self.move(place)
 
 
+def bring_up(content: QWidget) -> None:
+    """Show the panel that holds a widget, in front of those that share its place."""
+    dock = content.parentWidget()
+    if dock is not None:
+        dock.show()
+        dock.raise_()
+
+
 def beside(panel: QRect, window: QRect, body: QRect, room: QRect) -> QPoint:
     """Find where a panel hides neither its window nor the body in it.
 

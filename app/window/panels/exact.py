@@ -8,7 +8,7 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel
 
 from app.view.icons import pixmap
 from app.view.theme import CLOSE, current_theme
-from app.window.panels.widgets import Card, ElidedLabel, labelled, show_verdict, title_row
+from app.window.widgets import Card, ElidedLabel, labelled, show_verdict, title_row
 from app.wording import counted, overlap_text
 
 if TYPE_CHECKING:

@@ -23,9 +23,10 @@ from app.editing.commands import Source
 from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
 from app.window.panels.action_button import ActionButton
+from app.window.panels.dock import bring_up
 from app.window.panels.pose_grid import THUMBNAIL, PoseGrid
 from app.window.panels.thumbnail import draw_pose
-from app.window.panels.widgets import ElidedLabel, Slider, labelled, plain_tip, silent
+from app.window.widgets import ElidedLabel, Slider, labelled, plain_tip, silent
 from app.wording import menu_text, one_line
 
 if TYPE_CHECKING:
@@ -232,6 +233,7 @@ class LibraryPanel(QWidget):
 
     def find_pose(self) -> None:
         """Let the user type what a pose is called."""
+        bring_up(self)
         self.search.setFocus(Qt.FocusReason.ShortcutFocusReason)
         self.search.selectAll()
 

@@ -14,7 +14,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import CLOSE, TIGHT
-from app.window.panels.widgets import labelled
+from app.window.widgets import labelled
 
 THUMBNAIL = 88
 """Side of a picture, in device-independent pixels."""

@@ -12,7 +12,7 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy, QToolButton, QVB
 from app.view.icons import icon
 from app.view.shading import FULL_PREDICTED
 from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme
-from app.window.panels.widgets import (
+from app.window.widgets import (
     NAME_SHARE,
     Card,
     ElidedLabel,

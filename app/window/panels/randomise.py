@@ -6,10 +6,10 @@ from PySide6.QtCore import Qt, Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QHBoxLayout, QPushButton
 
-from app.view.icons import icon
+from app.view.icons import give_icon
 from app.view.theme import CLOSE
-from app.window.panels.number_box import QuietIntegerBox
-from app.window.panels.widgets import Card, Slider, labelled
+from app.window.number_box import QuietIntegerBox
+from app.window.widgets import Card, Slider, labelled
 
 _LARGEST_SEED = 999_999
 _SEED_WIDTH = 76
@@ -51,6 +51,7 @@ class RandomiseCard(Card):
         self.seed.setToolTip("The same seed gives the same random pose; it counts up by itself")
         self.button = QPushButton("Randomise")
         self.button.setToolTip(action.toolTip())
+        give_icon(self.button, "random")
         for widgets in (
             (labelled("Amount", "caption"), self.amount, self._percent),
             (labelled("Seed", "caption"), self.seed, self.button),
@@ -64,11 +65,6 @@ class RandomiseCard(Card):
         self.button.clicked.connect(action.trigger)
         self.seed.refused.connect(self.refused)
         self._on_amount(self.amount.value())
-        self.refresh_icons()
-
-    def refresh_icons(self) -> None:
-        """Draw the die in the theme that has come."""
-        self.button.setIcon(icon("random"))
 
     def draw(self) -> None:
         """Ask for the next random pose."""

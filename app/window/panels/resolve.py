@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Qt, Signal, Slot
+from PySide6.QtCore import Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import (
     QApplication,
@@ -21,7 +21,7 @@ from PySide6.QtWidgets import (
 
 from app.view.icons import icon, pixmap
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
-from app.window.panels.widgets import Card, ElidedLabel, labelled, show_verdict
+from app.window.widgets import Card, ElidedLabel, labelled, show_verdict
 from app.wording import heading, height_text, overlap_text, seconds_text
 
 if TYPE_CHECKING:
@@ -93,19 +93,15 @@ class Fact(QWidget):
 class ResolveCard(Card):
     """The lower end of the right panel.
 
-    Signals
-    -------
-    options_wanted : the user wants to choose how Resolve works
-
     Parameters
     ----------
     document : resolved and cancelled through it
-    resolve_action : what the button triggers, with its shortcut
+    resolve_action, options_action : what the buttons trigger
     """
 
-    options_wanted = Signal()
-
-    def __init__(self, document: PoseDocument, resolve_action: QAction) -> None:
+    def __init__(
+        self, document: PoseDocument, resolve_action: QAction, options_action: QAction
+    ) -> None:
         super().__init__()
         self._document = document
         self._action = resolve_action
@@ -146,7 +142,7 @@ class ResolveCard(Card):
         self.column.addWidget(self.outcome)
         self.button.clicked.connect(resolve_action.trigger)
         self.cancel.clicked.connect(document.cancel_resolve)
-        self.options.clicked.connect(self.options_wanted)
+        self.options.clicked.connect(options_action.trigger)
         resolve_action.changed.connect(self._on_action)
         document.solve_started.connect(self._on_started)
         document.solve_progressed.connect(self._on_progressed)

@@ -12,7 +12,8 @@ from PySide6.QtWidgets import QAbstractButton, QLineEdit, QVBoxLayout, QWidget
 from app.view.icons import pixmap
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
 from app.window.panels.code_slider import CodeRow, tab_order
-from app.window.panels.widgets import fill_with, labelled, longest_name, plain_tip, scrolling
+from app.window.panels.dock import bring_up
+from app.window.widgets import fill_with, labelled, longest_name, plain_tip, scrolling
 from app.wording import heading
 
 if TYPE_CHECKING:
@@ -298,8 +299,15 @@ class SlidersPanel(QWidget):
         for group in self.groups:
             group.header.set_lit(domain is not None and group.header.domain == domain)
 
+    def find_slider(self) -> None:
+        """Let the user type part of a slider's name."""
+        bring_up(self)
+        self.filter.setFocus(Qt.FocusReason.ShortcutFocusReason)
+        self.filter.selectAll()
+
     def show_domain(self, domain: int) -> None:
         """Open the sliders of a domain, and scroll to them."""
+        bring_up(self)
         self.filter.clear()
         group = self.groups[1 + domain]
         group.set_open(True)
@@ -310,12 +318,10 @@ class SlidersPanel(QWidget):
 
     def row_of(self, code: int) -> CodeRow:
         """Open the group of a code and return its row."""
-        for group in self.groups:
-            group.set_open(True)
-            for row in group.rows:
-                if row.code == code:
-                    return row
-        raise IndexError(code)
+        groups = self.document.model.latent_space.groups
+        place = next(k for k, group in enumerate(groups) if code < group.codes.stop)
+        self.groups[place].set_open(True)
+        return next(row for row in self.groups[place].rows if row.code == code)
 
     def begin_drag(self) -> None:
         """Make what follows one step of undo, named after the slider that is dragged."""

@@ -6,7 +6,7 @@ from PySide6.QtCore import QEvent, QPoint, Qt, Signal
 from PySide6.QtGui import QKeyEvent, QKeySequence, QValidator, QWheelEvent
 from PySide6.QtWidgets import QAbstractSpinBox, QDoubleSpinBox, QSpinBox, QToolTip
 
-from app.window.panels.widgets import wheel_if_focused
+from app.window.widgets import wheel_if_focused
 
 _TOLD_MILLISECONDS = 8000
 

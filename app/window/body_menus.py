@@ -1,0 +1,123 @@
+"""What a click with the right button offers: on the body or beside it, on a slider, on a row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, QPoint, Qt, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QMenu, QWidget
+
+from app.wording import heading, menu_text
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.view.viewport import Viewport
+    from app.window.panels.sliders import SlidersPanel
+
+
+class BodyMenus(QObject):
+    """Opens the menus of body parts and sliders.
+
+    Parameters
+    ----------
+    window : that the menus belong to
+    document : changed
+    viewport : outlines the body part whose menu is open
+    sliders : show a body part's sliders, and take typed values
+    actions : the window's, by key
+    view_menus : what the menu of the body shows beneath: ways to colour it, camera views
+    edit_parts : opens the dialog of the body parts, of one part and what of it is to be changed
+    attempt : does something and shows what a user can fix of what goes wrong
+    """
+
+    def __init__(
+        self,
+        window: QWidget,
+        document: PoseDocument,
+        viewport: Viewport,
+        sliders: SlidersPanel,
+        actions: Mapping[str, QAction],
+        view_menus: Iterable[QMenu],
+        edit_parts: Callable[[int, str], None],
+        attempt: Callable[[Callable[[], object]], object],
+    ) -> None:
+        super().__init__(window)
+        self._window, self._document = window, document
+        self._viewport, self._sliders, self._actions = viewport, sliders, actions
+        self._view_menus = tuple(view_menus)
+        self._edit_parts, self._attempt = edit_parts, attempt
+        viewport.menu_wanted.connect(self.open_on_body)
+
+    @Slot(object, QPoint)
+    def open_on_body(self, domain: int | None, place: QPoint) -> None:
+        """Open the menu of the part under the pointer, which stays outlined meanwhile.
+
+        Parameters
+        ----------
+        domain : index from 0, None beside the body
+        place : on the screen
+        """
+        actions = self._actions
+        menu = self._new_menu() if domain is None else self.part_menu(domain, None)
+        if domain is not None:
+            menu.addSeparator()
+            self._viewport.highlight_domain(domain)
+            menu.aboutToHide.connect(partial(self._viewport.highlight_domain, None))
+        for held in self._view_menus:
+            menu.addMenu(held)
+        menu.addActions([actions["reset_camera"], actions["ghost"]])
+        menu.addSeparator()
+        menu.addActions([actions[key] for key in ("resolve", "reset", "undo")])
+        menu.popup(place)
+
+    @Slot(object, object, QPoint)
+    def open_on_part(self, domain: int | None, code: int | None, place: QPoint) -> None:
+        """Open the menu of a code, or of a domain; neither is the whole body's."""
+        self.part_menu(domain, code).popup(place)
+
+    def part_menu(self, domain: int | None, code: int | None) -> QMenu:
+        """Make a menu that deletes itself when it is closed.
+
+        Parameters
+        ----------
+        domain : index from 0, None for the whole body
+        code : index from 0 in the latent, None for the part alone
+        """
+        document, actions = self._document, self._actions
+        menu = self._new_menu()
+        if code is not None:
+            row = self._sliders.row_of(code)
+            reset = self._add(menu, "&Reset", document.reset_code, code)
+            reset.setEnabled(bool(document.latent[code] != 0.0))
+            self._add(menu, "&Type a value…", row.edit_number)
+            menu.addSeparator()
+        if domain is not None:
+            name = menu_text(heading(document.model.domain_names[domain]))
+            locked = domain in document.locked_domains
+            lock = self._add(menu, f"&Lock {name}", document.set_locked, domain, not locked)
+            lock.setCheckable(True)
+            lock.setChecked(locked)
+            self._add(menu, f"R&eset {name}", document.reset_domain, domain).setEnabled(not locked)
+            if code is None:
+                self._add(menu, "&Show in sliders", self._sliders.show_domain, domain)
+            menu.addSeparator()
+            self._add(menu, f"Re&name {name}…", self._edit_parts, domain, "name")
+            self._add(menu, f"&Colour of {name}…", self._edit_parts, domain, "colour")
+        menu.addAction(actions["parts"])
+        menu.addSeparator()
+        menu.addActions([actions["unlock"], actions["mirror"]])
+        return menu
+
+    def _new_menu(self) -> QMenu:
+        menu = QMenu(self._window)
+        menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        menu.setToolTipsVisible(True)
+        return menu
+
+    def _add(self, menu: QMenu, text: str, act: Callable[..., object], *values: object) -> QAction:
+        action = menu.addAction(text)
+        action.triggered.connect(lambda: self._attempt(partial(act, *values)))
+        return action

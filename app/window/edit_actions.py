@@ -1,0 +1,152 @@
+"""What the menus Edit and Pose do, and when each can be chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, Qt, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QWidget
+
+from app.window.actions import ACTIONS, explain_action
+from app.window.dialogs.body_parts import BodyPartsDialog
+from app.window.dialogs.forms import resolve_form
+from app.wording import menu_text
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.editing.settings import Settings
+    from app.view.pictures import Pictures
+    from app.window.panels.randomise import RandomiseCard
+    from app.window.panels.sliders import SlidersPanel
+
+
+class EditActions(QObject):
+    """Changes the pose and the body parts of its model.
+
+    Parameters
+    ----------
+    window : that dialogs belong to
+    document : changed
+    settings : how Resolve works
+    sliders, randomise : where the user finds a slider, and chooses a random pose
+    pictures : cancelled with the document's work
+    actions : by key; their texts and whether they can be chosen follow the document
+
+    Attributes
+    ----------
+    acts : callables by the actions' keys; each may raise `LCollisionError`
+    """
+
+    def __init__(
+        self,
+        window: QWidget,
+        document: PoseDocument,
+        settings: Settings,
+        sliders: SlidersPanel,
+        randomise: RandomiseCard,
+        pictures: Pictures,
+        actions: Mapping[str, QAction],
+    ) -> None:
+        super().__init__(window)
+        self._window, self._document, self._settings = window, document, settings
+        self._pictures, self._actions = pictures, actions
+        self.acts: dict[str, Callable[[], object]] = {
+            "undo": document.undo,
+            "redo": document.redo,
+            "reset": document.reset_all,
+            "randomise": randomise.draw,
+            "mirror": document.mirror,
+            "filter": sliders.find_slider,
+            "unlock": self._unlock,
+            "parts": self.edit_parts,
+            "resolve": self._resolve,
+            "cancel": self._cancel,
+            "resolve_options": self._choose_resolve_options,
+        }
+        for changed in (
+            document.model_changed,
+            document.locks_changed,
+            document.solve_started,
+            document.solve_finished,
+            document.busy_changed,
+            pictures.busy_changed,
+            document.undo_stack.indexChanged,
+        ):
+            changed.connect(self._update_actions)
+        self._update_actions()
+
+    def edit_parts(self, domain: int | None = None, what: str = "") -> None:
+        """Show the dialog of the body parts.
+
+        Parameters
+        ----------
+        domain : the one to begin with, None for the first
+        what : "name" or "colour" of it to change at once, "" for neither
+        """
+        from app.work.jobs import is_bundled
+        from lcollision_core.model import list_models
+
+        document = self._document
+        taken = [model.name for model in list_models()]
+        dialog = BodyPartsDialog(
+            document.model, is_bundled(document.model_file), taken, self._window
+        )
+        dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        dialog.edited.connect(document.edit_parts)
+        # Another model has other parts.
+        document.model_changed.connect(dialog.reject)
+        dialog.open()
+        if domain is not None:
+            dialog.choose(domain)
+        if what == "name":
+            dialog.edit_name()
+        elif what == "colour":
+            dialog.choose_colour()
+
+    def _choose_resolve_options(self) -> None:
+        form = resolve_form(self._settings, self._window)
+        form.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        form.open()
+
+    def _unlock(self) -> None:
+        for domain in self._document.locked_domains:
+            self._document.set_locked(domain, False)
+
+    def _resolve(self) -> None:
+        from lcollision_core.resolve import ResolveOptions
+
+        settings = self._settings
+        self._document.resolve(
+            ResolveOptions(
+                metric=settings["resolve_metric"],
+                threshold=settings["resolve_threshold"],
+                time_budget=settings["resolve_time_budget"],
+            )
+        )
+
+    def _cancel(self) -> None:
+        self._document.cancel_all()
+        self._pictures.cancel()
+
+    @Slot()
+    def _update_actions(self) -> None:
+        document, stack = self._document, self._document.undo_stack
+        allowed = {
+            "undo": stack.canUndo(),
+            "redo": stack.canRedo(),
+            "mirror": document.can_mirror,
+            "unlock": bool(document.locked_domains),
+            "resolve": document.can_resolve and not (document.solving or document.incoming),
+            "resolve_options": document.can_resolve,
+            "cancel": bool(document.busy or self._pictures.busy),
+        }
+        for key in self.acts:
+            self._actions[key].setEnabled(document.has_model and allowed.get(key, True))
+        waits = f"{document.incoming}: it replaces this pose"
+        tip = waits if document.incoming else ACTIONS["resolve"].tip
+        explain_action(self._actions["resolve"], tip)
+        for key, step in (("undo", stack.undoText()), ("redo", stack.redoText())):
+            text = f"{ACTIONS[key].text} {menu_text(step[:1].lower() + step[1:])}"
+            self._actions[key].setText(text.rstrip())

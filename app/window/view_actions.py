@@ -1,0 +1,94 @@
+"""What the menu View does to the picture: ways to colour the body, camera views, the ghost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QWidget
+
+from app.view.camera import CAMERAS
+from app.view.shading import Shading
+from app.window.actions import CAMERA_ACTIONS, SHADINGS, make_choices, make_menu
+from app.window.widgets import silent
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.editing.settings import Settings
+    from app.view.viewport import Viewport
+
+
+class ViewActions(QObject):
+    """Chooses how the body is looked at.
+
+    Parameters
+    ----------
+    window : that the actions belong to
+    document : shows or hides its ghost
+    settings : remember the shading and whether there is a ghost
+    viewport : coloured and turned
+    ghost : the action that shows the ghost
+
+    Attributes
+    ----------
+    acts : callables by the actions' keys
+    shadings, cameras : actions, in order
+    camera_menu, shading_menu : of them
+    """
+
+    def __init__(
+        self,
+        window: QWidget,
+        document: PoseDocument,
+        settings: Settings,
+        viewport: Viewport,
+        ghost: QAction,
+    ) -> None:
+        super().__init__(window)
+        self._document, self._settings = document, settings
+        self._viewport, self._ghost = viewport, ghost
+        self.acts: dict[str, Callable[[], object]] = {
+            "ghost": lambda: document.show_ghost(ghost.isChecked()),
+            "reset_camera": lambda: viewport.set_camera(CAMERAS[0]),
+        }
+        shading = Shading[settings["shading"].upper()]
+        self.shadings = make_choices(SHADINGS, shading, self._on_shading_chosen, window)
+        self.cameras = make_choices(CAMERA_ACTIONS, None, self._on_camera_chosen, window)
+        self.shading_menu = make_menu("C&olour by", self.shadings, window)
+        self.camera_menu = make_menu("&Camera view", self.cameras, window)
+        viewport.shading_changed.connect(self._on_shading)
+        document.model_changed.connect(self._update_actions)
+        document.ghost_changed.connect(self._on_ghost)
+        viewport.set_shading(shading)
+        document.show_ghost(settings["show_ghost"])
+        ghost.setChecked(settings["show_ghost"])
+        self._update_actions()
+
+    @Slot()
+    def _update_actions(self) -> None:
+        document = self._document
+        for action in (*self.shadings, *self.cameras):
+            needed = action.data() is not Shading.PREDICTED or document.can_resolve
+            action.setEnabled(document.has_model and needed)
+
+    @Slot()
+    def _on_ghost(self) -> None:
+        with silent(self._ghost):
+            self._ghost.setChecked(self._document.ghost_shown)
+        self._settings["show_ghost"] = self._document.ghost_shown
+
+    @Slot(object)
+    def _on_shading(self, shading: Shading) -> None:
+        for action in self.shadings:
+            action.setChecked(action.data() is shading)
+        self._settings["shading"] = shading.name.lower()
+
+    @Slot(QAction)
+    def _on_shading_chosen(self, action: QAction) -> None:
+        self._viewport.set_shading(action.data())
+
+    @Slot(QAction)
+    def _on_camera_chosen(self, action: QAction) -> None:
+        self._viewport.set_camera(action.data())
