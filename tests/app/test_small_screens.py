@@ -14,6 +14,7 @@ from PySide6.QtWidgets import (
     QDialog,
     QDockWidget,
     QScrollArea,
+    QToolBar,
     QToolButton,
     QWidget,
 )
@@ -50,7 +51,7 @@ def test_everything_is_reached_at_800_by_600(qtbot: QtBot, small: MainWindow) ->
         assert lies_in(dock, small)
         for button in dock.findChildren(QToolButton):
             assert not button.isVisible() or lies_in(button, small) or _scrolls(button)
-    for button in small._bar.findChildren(QToolButton):
+    for button in small.findChild(QToolBar).findChildren(QToolButton):
         assert not button.isVisible() or lies_in(button, small)
     # What does not fit is in an area that scrolls there.
     card = small.collision.resolve
@@ -86,7 +87,7 @@ def _scrolls(widget: QWidget) -> bool:
 def test_what_a_narrow_tool_bar_leaves_out_is_behind_its_arrow(
     qtbot: QtBot, small: MainWindow
 ) -> None:
-    bar = small._bar
+    bar = small.findChild(QToolBar)
     for dock in small.docks.values():
         dock.hide()
     more = bar.findChild(QToolButton, "qt_toolbar_ext_button")

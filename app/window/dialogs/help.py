@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
 from app.view.icons import program_icon
 from app.view.theme import CLOSE, NORMAL, WIDE
 from app.window.actions import ACTIONS
-from app.window.dialogs.questions import message_box
+from app.window.dialogs.questions import message_box, widen
 from app.window.widgets import labelled, scrolling
 
 if TYPE_CHECKING:
@@ -52,6 +52,8 @@ def show_about(model: PoseModel | None, parent: QWidget) -> None:
         box.setInformativeText(box.informativeText() + text)
     box.setIconPixmap(program_icon().pixmap(72, 72))
     box.setStandardButtons(QMessageBox.StandardButton.Close)
+    box.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+    widen(box)
     box.open()
 
 

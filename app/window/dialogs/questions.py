@@ -101,18 +101,22 @@ def ask_about_scale(parent: QWidget, found: WrongScale) -> bool:
 
 
 def message_box(parent: QWidget, title: str, text: str, note: str) -> QMessageBox:
-    """Return a message whose names are shown to the letter, as wide as the other dialogs."""
+    """Return a message that shows names to the letter; see `widen`."""
     box = QMessageBox(parent)
     box.setWindowTitle(title)
     box.setTextFormat(Qt.TextFormat.PlainText)
     box.setText(one_line(text))
     box.setInformativeText(note)
+    return box
+
+
+def widen(box: QMessageBox) -> None:
+    """Make a message, with its texts and buttons, as wide as the other dialogs."""
     layout = box.layout()
     if isinstance(layout, QGridLayout):
         layout.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
         # A message box takes no minimum width of its own.
         layout.addItem(QSpacerItem(_WIDTH, 0), layout.rowCount(), 0, 1, layout.columnCount())
-    return box
 
 
 def _ask(
@@ -133,6 +137,9 @@ def _ask(
                 box.setDefaultButton(button)
             if choice is Choice.CANCEL:
                 box.setEscapeButton(button)
+    widen(box)
     box.exec()
     box.deleteLater()
-    return Choice(box.buttonRole(box.clickedButton()))
+    clicked = box.clickedButton()
+    # None where the window closed without asking.
+    return Choice(box.buttonRole(clicked)) if clicked is not None else Choice.CANCEL
