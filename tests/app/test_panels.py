@@ -217,6 +217,8 @@ def test_a_slider_is_found_by_what_its_row_and_undo_call_it(window: MainWindow) 
     assert heading(own) in [label.text() for label in row.findChildren(QLabel)]
     QTest.keyClick(row.slider, Qt.Key.Key_Right)
     assert document.undo_stack.undoText() == f"Move {name}"
+    for held in panel.groups:
+        held.set_open(True)
     whole, parts = space.groups[0].codes, range(space.groups[1].codes.start, space.size)
     for words, codes in (
         (f"{group.name} motion 3", [code]),
