@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csgraph, csr_matrix
+from scipy.sparse import csgraph
 
 from lcollision_core.compiled import compiled
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
 
 _TURN = 2.0 * math.pi
 _AXIS_DEFINED_ABOVE = 1e-7
@@ -17,6 +18,7 @@ _AXIS_DEFINED_ABOVE = 1e-7
 # steeply as its surface can bear, 60 degrees were too few to pass the full turn.
 _AXIS_TRUSTED_ABOVE = 0.7
 _N_LANDMARKS = 8
+_DONE = -1.0
 
 
 def component_roots(topology: Topology, rest_vertices: FloatArray) -> IntArray:
@@ -35,19 +37,13 @@ def component_roots(topology: Topology, rest_vertices: FloatArray) -> IntArray:
     -------
     roots : (n_components,) int32 array, ordered by the component's number
     """
-    i, j = topology.edges.T
-    lengths = topology.edge_lengths(rest_vertices)
-    # csgraph takes an entry of 0 for no edge.
-    lengths = np.maximum(lengths, 1e-12 * max(float(lengths.max()), 1e-300))
-    graph = csr_matrix((lengths, (i, j)), shape=(topology.n_vertices, topology.n_vertices))
+    graph = length_graph(topology.edges, rest_vertices)
     count, component = topology.vertex_components
     order = np.argsort(component, kind="stable")
     starts = np.searchsorted(component[order], np.arange(count))
 
     def distances_from(landmarks: npt.NDArray[np.signedinteger]) -> FloatArray:
-        found: FloatArray = csgraph.dijkstra(
-            graph, directed=False, indices=landmarks, min_only=True
-        )
+        found: FloatArray = csgraph.dijkstra(graph, indices=landmarks, min_only=True)
         return found
 
     nearest = distances_from(order[starts])
@@ -59,43 +55,6 @@ def component_roots(topology: Topology, rest_vertices: FloatArray) -> IntArray:
         nearest = np.minimum(nearest, distance)
     ranked = order[np.lexsort((farthest[order], component[order]))]
     return ranked[starts].astype(np.int32)
-
-
-@compiled
-def _push(heap_key: FloatArray, heap_edge: IntArray, size: int, key: float, edge: int) -> int:
-    at = size
-    while at > 0:
-        above = (at - 1) >> 1
-        if heap_key[above] <= key:
-            break
-        heap_key[at] = heap_key[above]
-        heap_edge[at] = heap_edge[above]
-        at = above
-    heap_key[at] = key
-    heap_edge[at] = edge
-    return size + 1
-
-
-@compiled
-def _pop(heap_key: FloatArray, heap_edge: IntArray, size: int) -> int:
-    """Drop the least entry (which the caller has read at index 0); return the new size."""
-    size -= 1
-    key, edge = heap_key[size], heap_edge[size]
-    at = 0
-    while True:
-        child = 2 * at + 1
-        if child >= size:
-            break
-        if child + 1 < size and heap_key[child + 1] < heap_key[child]:
-            child += 1
-        if key <= heap_key[child]:
-            break
-        heap_key[at] = heap_key[child]
-        heap_edge[at] = heap_edge[child]
-        at = child
-    heap_key[at] = key
-    heap_edge[at] = edge
-    return size
 
 
 @compiled
@@ -117,43 +76,30 @@ def spanning_order(
     order, parent : (V,) int32 arrays, overwritten: every vertex after its parent; a root is its
         own parent
     """
-    n_vertices = len(quaternions)
-    source = np.empty(len(ring), dtype=np.int32)
-    heap_key = np.empty(len(ring) + 1)
-    heap_edge = np.empty(len(ring) + 1, dtype=np.int32)
-    best = np.full(n_vertices, 2.0)
-    done = np.zeros(n_vertices, dtype=np.bool_)
+    best = np.full(len(quaternions), 2.0)
     count = 0
     for root in roots:
-        size = 0
-        vertex = root
-        parent[root] = root
-        while True:
-            done[vertex] = True
+        queue = [(0.0, root, root)]
+        while len(queue) > 0:
+            _, vertex, source = heapq.heappop(queue)
+            if best[vertex] == _DONE:
+                continue
+            best[vertex] = _DONE
+            parent[vertex] = source
             order[count] = vertex
             count += 1
             q = quaternions[vertex]
             for k in range(ring_start[vertex], ring_start[vertex + 1]):
                 other = ring[k]
-                if done[other]:
-                    continue
                 o = quaternions[other]
                 # Falls with the cosine of half the relative angle, whichever sign q has.
                 key = 1.0 - abs(q[0] * o[0] + q[1] * o[1] + q[2] * o[2] + q[3] * o[3])
-                # A pose out of all measure gives NaN, and is still to be walked to its end.
+                # Huge coordinates give NaN, and their vertices must be visited too.
                 if not key <= 1.0:
                     key = 1.0
                 if key < best[other]:
                     best[other] = key
-                    source[k] = vertex
-                    size = _push(heap_key, heap_edge, size, key, k)
-            while size > 0 and done[ring[heap_edge[0]]]:
-                size = _pop(heap_key, heap_edge, size)
-            if size == 0:
-                break
-            vertex = ring[heap_edge[0]]
-            parent[vertex] = source[heap_edge[0]]
-            size = _pop(heap_key, heap_edge, size)
+                    heapq.heappush(queue, (key, other, vertex))
 
 
 @compiled
@@ -203,33 +149,13 @@ def _hand_down(
 
 
 @compiled
-def _count_jumps(logs: FloatArray, ring_start: IntArray, ring: IntArray) -> int:
-    """Count the edges whose angles differ by more than pi once their axes point the same way."""
-    n_jumps = 0
-    for vertex in range(len(logs)):
-        for k in range(ring_start[vertex], ring_start[vertex + 1]):
-            other = ring[k]
-            if other < vertex:
-                continue
-            here, there, along = 0.0, 0.0, 0.0
-            for a in range(3):
-                here += logs[vertex, a] * logs[vertex, a]
-                there += logs[other, a] * logs[other, a]
-                along += logs[vertex, a] * logs[other, a]
-            signed = math.sqrt(there) if along >= 0.0 else -math.sqrt(there)
-            if abs(math.sqrt(here) - signed) > math.pi:
-                n_jumps += 1
-    return n_jumps
-
-
-@compiled
 def consistent_logarithms(
     quaternions: FloatArray,
     ring_start: IntArray,
     ring: IntArray,
     roots: IntArray,
     logs: FloatArray,
-) -> int:
+) -> None:
     """Choose each vertex's rotation vector to agree with its parent's in the spanning tree.
 
     The root has three choices (its short way round, and a full turn more or less); the one with
@@ -241,10 +167,6 @@ def consistent_logarithms(
     ring_start, ring : the one-rings in CSR form
     roots : (n_components,) int32 array
     logs : (V, 3) float64 array, overwritten with theta * axis in radians
-
-    Returns
-    -------
-    n_jumps : edges whose angles still differ by more than pi, their axes pointing the same way
     """
     n_vertices = len(quaternions)
     order = np.empty(n_vertices, dtype=np.int32)
@@ -284,4 +206,3 @@ def consistent_logarithms(
                 for k in range(begin, end):
                     logs[order[k]] = trial[order[k]]
         begin = end
-    return _count_jumps(logs, ring_start, ring)

@@ -12,8 +12,6 @@ from lcollision_core.meshes.topology import FloatArray
 N_FEATURES = 9
 N_ROTATION = 3
 _SERIES_BELOW = 1e-2
-IDENTITY_FEATURE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
-"""(log R, S_xx, S_xy, S_xz, S_yy, S_yz, S_zz) of a vertex that does not deform."""
 
 
 @compiled
@@ -64,12 +62,13 @@ def _stretch_product(r: FloatArray, s: FloatArray, product: FloatArray) -> None:
 
 
 @compiled
-def gradients_from_features(features: FloatArray, gradients: FloatArray) -> None:
-    """Write T_i = exp(log R_i) S_i; features (V, 9), gradients (V, 3, 3)."""
+def gradients_from_features(features: FloatArray, gradients: FloatArray) -> FloatArray:
+    """Write T_i = exp(log R_i) S_i, (V, 3, 3), of (V, 9) features, and return them."""
     rotation = np.empty((3, 3))
     for i in range(len(features)):
         exponential(features[i, 0], features[i, 1], features[i, 2], rotation)
         _stretch_product(rotation, features[i, 3:], gradients[i])
+    return gradients
 
 
 @compiled
@@ -110,14 +109,14 @@ def push_forward(features: FloatArray, tangents: FloatArray, gradients: FloatArr
 
 
 @compiled
-def pull_back(features: FloatArray, by_gradient: FloatArray, by_feature: FloatArray) -> None:
+def pull_back(features: FloatArray, grad_gradient: FloatArray, grad_features: FloatArray) -> None:
     """Write a loss's derivative by the features, given the one by T: `push_forward` transposed.
 
     Parameters
     ----------
     features : (V, 9) float64 array
-    by_gradient : (V, 3, 3) float64 array
-    by_feature : (V, 9) float64 array, overwritten
+    grad_gradient : (V, 3, 3) float64 array
+    grad_features : (V, 9) float64 array, overwritten
     """
     rotation = np.empty((3, 3))
     turned = np.empty((3, 3))
@@ -127,7 +126,7 @@ def pull_back(features: FloatArray, by_gradient: FloatArray, by_feature: FloatAr
         exponential(x, y, z, rotation)
         _, b, c = exponential_coefficients(x * x + y * y + z * z)
         _stretch_product(rotation, features[i, 3:], turned)
-        g = by_gradient[i]
+        g = grad_gradient[i]
         p0, p1, p2 = 0.0, 0.0, 0.0
         for k in range(3):
             p0 += turned[1, k] * g[2, k] - turned[2, k] * g[1, k]
@@ -135,9 +134,9 @@ def pull_back(features: FloatArray, by_gradient: FloatArray, by_feature: FloatAr
             p2 += turned[0, k] * g[1, k] - turned[1, k] * g[0, k]
         # The transposed left Jacobian is the left Jacobian of -a.
         k0, k1, k2 = y * p2 - z * p1, z * p0 - x * p2, x * p1 - y * p0
-        by_feature[i, 0] = p0 - b * k0 + c * (y * k2 - z * k1)
-        by_feature[i, 1] = p1 - b * k1 + c * (z * k0 - x * k2)
-        by_feature[i, 2] = p2 - b * k2 + c * (x * k1 - y * k0)
+        grad_features[i, 0] = p0 - b * k0 + c * (y * k2 - z * k1)
+        grad_features[i, 1] = p1 - b * k1 + c * (z * k0 - x * k2)
+        grad_features[i, 2] = p2 - b * k2 + c * (x * k1 - y * k0)
         for a in range(3):
             for column in range(3):
                 h[a, column] = (
@@ -145,9 +144,9 @@ def pull_back(features: FloatArray, by_gradient: FloatArray, by_feature: FloatAr
                     + rotation[1, a] * g[1, column]
                     + rotation[2, a] * g[2, column]
                 )
-        by_feature[i, 3] = h[0, 0]
-        by_feature[i, 4] = h[0, 1] + h[1, 0]
-        by_feature[i, 5] = h[0, 2] + h[2, 0]
-        by_feature[i, 6] = h[1, 1]
-        by_feature[i, 7] = h[1, 2] + h[2, 1]
-        by_feature[i, 8] = h[2, 2]
+        grad_features[i, 3] = h[0, 0]
+        grad_features[i, 4] = h[0, 1] + h[1, 0]
+        grad_features[i, 5] = h[0, 2] + h[2, 0]
+        grad_features[i, 6] = h[1, 1]
+        grad_features[i, 7] = h[1, 2] + h[2, 1]
+        grad_features[i, 8] = h[2, 2]

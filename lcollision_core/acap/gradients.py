@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from lcollision_core.compiled import compiled
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, edge_graph
 
 NORMAL_LENGTH = 0.3
 _LOST_DIRECTION = 1e-10
 
 
-@dataclass(frozen=True)
-class RingFit:
+class RingFit(NamedTuple):
     """The least-squares fit of every one-ring, solved once for the reference.
 
     Attributes
     ----------
+    faces : (F, 3) int32 array
     ring_start, ring : (V + 1,) and (2E,) int32 arrays, the one-rings in CSR form
     ring_solution : (2E, 3) float64 array g_ij: T_i is the sum of (p'_i - p'_j) g_ij^T and the
         two parts below
@@ -28,22 +28,12 @@ class RingFit:
         neighbours nor a normal see (all of them at a vertex in no face), 0 elsewhere
     """
 
+    faces: IntArray
     ring_start: IntArray
     ring: IntArray
     ring_solution: FloatArray
     normal_solution: FloatArray
     kept_identity: FloatArray
-
-    @property
-    def arrays(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
-        """What `deformation_gradients` takes, in its order."""
-        return (
-            self.ring_start,
-            self.ring,
-            self.ring_solution,
-            self.normal_solution,
-            self.kept_identity,
-        )
 
 
 @compiled
@@ -106,21 +96,14 @@ def fit_rings(
     -------
     fit : RingFit; a flat, thin or empty one-ring gets the identity where it says nothing
     """
-    n_vertices = topology.n_vertices
-    adjacency = topology.adjacency
-    start = adjacency.indptr.astype(np.int32)
-    ring = adjacency.indices.astype(np.int32)
-    owner = np.repeat(np.arange(n_vertices), np.diff(start))
-    low, high = np.minimum(owner, ring), np.maximum(owner, ring)
-    keys = topology.edges[:, 0].astype(np.int64) * n_vertices + topology.edges[:, 1]
-    ring_edge = np.searchsorted(keys, low.astype(np.int64) * n_vertices + high)
-
-    weight = edge_weights[ring_edge]
+    graph = edge_graph(topology.edges, topology.n_vertices, edge_weights)
+    start, ring, weight = graph.indptr, graph.indices, graph.data
+    n_neighbours = np.diff(start)
+    owner = np.repeat(np.arange(topology.n_vertices), n_neighbours)
     spoke = rest_vertices[owner] - rest_vertices[ring]
-    normals = np.empty((n_vertices, 3))
+    normals = np.empty_like(rest_vertices)
     scaled_normals(rest_vertices, topology.faces, start, ring, normals)
-    degree = np.maximum(np.diff(start), 1)
-    mean_weight = np.bincount(owner, weight, minlength=n_vertices) / degree
+    mean_weight = np.bincount(owner, weight, topology.n_vertices) / np.maximum(n_neighbours, 1)
     row_weight = normal_weight * mean_weight
 
     gram = np.einsum("v,va,vb->vab", row_weight, normals, normals)
@@ -131,6 +114,7 @@ def fit_rings(
     inverse = np.einsum("vab,vb,vcb->vac", axes, inverse_values, axes)
     kept = np.einsum("vab,vb,vcb->vac", axes, np.where(seen, 0.0, 1.0), axes)
     return RingFit(
+        faces=topology.faces,
         ring_start=start,
         ring=ring,
         ring_solution=np.einsum("rab,rb,r->ra", inverse[owner], spoke, weight),
@@ -140,34 +124,20 @@ def fit_rings(
 
 
 @compiled
-def deformation_gradients(
-    vertices: FloatArray,
-    faces: IntArray,
-    ring_start: IntArray,
-    ring: IntArray,
-    ring_solution: FloatArray,
-    normal_solution: FloatArray,
-    kept_identity: FloatArray,
-    gradients: FloatArray,
-) -> None:
-    """Write T_i of every vertex of one pose.
-
-    Parameters
-    ----------
-    vertices : (V, 3) float64 array, the pose p'
-    faces : (F, 3) int32 array
-    ring_start, ring, ring_solution, normal_solution, kept_identity : as in `RingFit`
-    gradients : (V, 3, 3) float64 array, overwritten
-    """
+def deformation_gradients(vertices: FloatArray, fit: RingFit, gradients: FloatArray) -> FloatArray:
+    """Write T_i, (V, 3, 3), of every vertex of one pose (V, 3), and return them."""
     normals = np.empty((len(vertices), 3))
-    scaled_normals(vertices, faces, ring_start, ring, normals)
+    scaled_normals(vertices, fit.faces, fit.ring_start, fit.ring, normals)
     for i in range(len(vertices)):
         for a in range(3):
             for b in range(3):
-                gradients[i, a, b] = kept_identity[i, a, b] + normals[i, a] * normal_solution[i, b]
-        for k in range(ring_start[i], ring_start[i + 1]):
-            j = ring[k]
+                gradients[i, a, b] = (
+                    fit.kept_identity[i, a, b] + normals[i, a] * fit.normal_solution[i, b]
+                )
+        for k in range(fit.ring_start[i], fit.ring_start[i + 1]):
+            j = fit.ring[k]
             for a in range(3):
                 difference = vertices[i, a] - vertices[j, a]
                 for b in range(3):
-                    gradients[i, a, b] += difference * ring_solution[k, b]
+                    gradients[i, a, b] += difference * fit.ring_solution[k, b]
+    return gradients

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.acap.features import N_FEATURES, N_ROTATION
-
-if TYPE_CHECKING:
-    import torch
-
-    Features = TypeVar("Features", npt.NDArray[Any], torch.Tensor)
-else:
-    Features = TypeVar("Features")
+from lcollision_core.meshes.topology import FloatArray
 
 SCALED_BOUND = 0.95
-"""Training features fill [-0.95, 0.95] (Gao et al. 2019), inside the reach of tanh."""
+"""Training features fill [-0.95, 0.95] (Gao et al. 2019), inside the range of tanh."""
 
 
 _LARGEST_FEATURE, _LARGEST_SCALE = 100.0, 1e18
-"""Radians, or a stretch, beyond all that training meets; numbers that hardly differ have large
-scales."""
+"""Radians, or a stretch, beyond what any training set holds; the scales of numbers that hardly
+differ are large."""
 
 
 @dataclass(frozen=True)
@@ -69,26 +63,23 @@ class FeatureScaling:
             centres_and_scales += [0.5 * (low + high), scale]
         return cls(*centres_and_scales)
 
-    def apply(self, features: Features) -> Features:
-        """Scale (..., 9) features, array or tensor; dtype and device are kept."""
-        centre, scale = self._per_number(features)
-        scaled: Features = (features - centre) * scale
+    @property
+    def scale(self) -> FloatArray:
+        """The scales of a feature's numbers, (9,)."""
+        return _per_number(self.rotation_scale, self.stretch_scale)
+
+    def apply(self, features: npt.NDArray[Any]) -> FloatArray:
+        """Scale (..., 9) features."""
+        centre = _per_number(self.rotation_centre, self.stretch_centre)
+        scaled: FloatArray = (features - centre) * self.scale
         return scaled
 
-    def invert(self, scaled: Features) -> Features:
-        """Take scaled (..., 9) features, array or tensor, back to radians and stretches."""
-        centre, scale = self._per_number(scaled)
-        features: Features = scaled / scale + centre
+    def invert(self, scaled: npt.NDArray[Any]) -> FloatArray:
+        """Take scaled (..., 9) features back to radians and stretches."""
+        centre = _per_number(self.rotation_centre, self.stretch_centre)
+        features: FloatArray = scaled / self.scale + centre
         return features
 
-    def _per_number(self, like: Features) -> tuple[Features, Features]:
-        n_stretch = N_FEATURES - N_ROTATION
-        rows = [
-            [self.rotation_centre] * N_ROTATION + [self.stretch_centre] * n_stretch,
-            [self.rotation_scale] * N_ROTATION + [self.stretch_scale] * n_stretch,
-        ]
-        if isinstance(like, np.ndarray):
-            table: Any = np.array(rows, dtype=like.dtype)
-        else:
-            table = like.new_tensor(rows)
-        return cast("tuple[Features, Features]", (table[0], table[1]))
+
+def _per_number(rotation: float, stretch: float) -> FloatArray:
+    return np.repeat([rotation, stretch], [N_ROTATION, N_FEATURES - N_ROTATION])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
 
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -28,20 +29,18 @@ def cotangent_weights(topology: Topology, rest_vertices: FloatArray, floor: floa
     A triangle of no area would give infinite cotangents: the sine of an angle counts as at
     least 1e-6 of the product of the two sides, and the cotangent of such a sliver as 0.
     """
-    faces = topology.faces
-    keys = topology.edges[:, 0].astype(np.int64) * topology.n_vertices + topology.edges[:, 1]
-    weights = np.zeros(len(keys))
-    for corner in range(3):
-        apex, start, end = faces[:, corner], faces[:, (corner + 1) % 3], faces[:, (corner + 2) % 3]
-        side_a = rest_vertices[start] - rest_vertices[apex]
-        side_b = rest_vertices[end] - rest_vertices[apex]
-        sine = np.linalg.norm(np.cross(side_a, side_b), axis=1)
-        cosine = np.einsum("fa,fa->f", side_a, side_b)
-        product = np.linalg.norm(side_a, axis=1) * np.linalg.norm(side_b, axis=1)
-        sound = sine > _DEGENERATE_SINE * product
-        cotangent = np.where(sound, cosine / np.where(sound, sine, 1.0), 0.0)
-        low, high = np.minimum(start, end), np.maximum(start, end)
-        edge = np.searchsorted(keys, low.astype(np.int64) * topology.n_vertices + high)
-        np.add.at(weights, edge, 0.5 * cotangent)
-    clamped: FloatArray = np.maximum(weights, floor)
-    return clamped
+    apex, start, end = np.stack([np.roll(topology.faces, -shift, axis=1) for shift in range(3)])
+    side_a = rest_vertices[start] - rest_vertices[apex]
+    side_b = rest_vertices[end] - rest_vertices[apex]
+    sine = np.linalg.norm(np.cross(side_a, side_b), axis=2)
+    cosine = (side_a * side_b).sum(axis=2)
+    product = np.linalg.norm(side_a, axis=2) * np.linalg.norm(side_b, axis=2)
+    sound = sine > _DEGENERATE_SINE * product
+    cotangent = np.where(sound, cosine / np.where(sound, sine, 1.0), 0.0)
+    # Duplicates are summed, and the entries sorted as the edges are.
+    sums = sparse.csr_matrix(
+        (cotangent.ravel(), (np.minimum(start, end).ravel(), np.maximum(start, end).ravel())),
+        shape=(topology.n_vertices, topology.n_vertices),
+    )
+    weights: FloatArray = np.maximum(0.5 * sums.data, floor)
+    return weights

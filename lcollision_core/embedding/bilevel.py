@@ -214,7 +214,7 @@ class Embedding:
             weights[self.topology.picked] = self.alignment_weights[self.topology.picked]
             rotations, translations = fit_rigid(vertices, self.rest_vertices, weights)
             aligned = vertices @ np.swapaxes(rotations, 1, 2) + translations[:, None]
-        guess = self.guess(self.codec.encode(aligned).features)
+        guess = self.guess(self.codec.encode(aligned))
         return fit_latent(
             self.decoder,
             self.codec,

@@ -16,6 +16,8 @@ import torch
 from scipy import sparse
 from torch.autograd.function import once_differentiable
 
+from lcollision_core.acap.codec import AcapCodec
+
 
 class _RingMean(torch.autograd.Function):
     """A constant sparse matrix times a dense one; torch's own warns and differs by thread count."""
@@ -89,3 +91,26 @@ class TiedAutoencoder(torch.nn.Module):
     def forward(self, features: torch.Tensor, ring_features: torch.Tensor) -> torch.Tensor:
         """Encode and decode."""
         return self.decode(self.encode(features, ring_features))
+
+
+class _Decode(torch.autograd.Function):
+    """`AcapCodec.decode`, in float64 on the CPU, where the factor lies."""
+
+    @staticmethod
+    def forward(ctx: Any, features: torch.Tensor, codec: AcapCodec) -> torch.Tensor:
+        ctx.codec = codec
+        ctx.save_for_backward(features)
+        return torch.from_numpy(codec.decode(features.detach().numpy())).to(features)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_vertices: torch.Tensor) -> tuple[torch.Tensor, None]:
+        (features,) = ctx.saved_tensors
+        grad_features = ctx.codec.decode_vjp(features.detach().numpy(), grad_vertices.numpy())
+        return torch.from_numpy(grad_features).to(features), None
+
+
+def decode_features(features: torch.Tensor, codec: AcapCodec) -> torch.Tensor:
+    """Rebuild the (B, V, 3) poses of (B, V, 9) unscaled features, with first derivatives."""
+    vertices: torch.Tensor = _Decode.apply(features, codec)  # type: ignore[no-untyped-call]
+    return vertices

@@ -22,7 +22,7 @@ from lcollision_core.embedding.checkpoint import Checkpoint
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.decoder import Float32Array
 from lcollision_core.embedding.masks import attention_mask, keep_one_patch
-from lcollision_core.embedding.network import TiedAutoencoder, ring_mean
+from lcollision_core.embedding.network import TiedAutoencoder, decode_features, ring_mean
 from lcollision_core.embedding.seeding import (
     initial_components,
     locality_weights,
@@ -188,7 +188,7 @@ class BilevelTrainer:
                 ):
                     rebuilt = rebuilt.index_add(1, index, network(values[batch], around[batch]))
                 feature_loss = ((rebuilt - wanted[batch]) ** 2).sum() / (len(batch) * n_vertices)
-                decoded = self._codec.decode_torch(offset + scale * rebuilt)
+                decoded = decode_features(offset + scale * rebuilt, self._codec)
                 squared = ((decoded - targets[batch]) ** 2).sum(dim=2)
                 (feature_loss + config.vertex_weight * squared.mean()).backward()
                 optimiser.step()

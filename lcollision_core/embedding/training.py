@@ -147,7 +147,7 @@ class _Run:
         self._codec = AcapCodec(pose_set.topology, vertices[0], self._alignment_weights)
         self._vertices = np.repeat(self._codec.rest_vertices[None], len(vertices), axis=0)
         self._vertices[:, self._picked] = alignment.vertices
-        self._features = self._codec.encode(self._vertices).features
+        self._features = self._codec.encode(self._vertices)
         self._config, self._cancel, self._seed = config, cancel, seed
         self._progress = progress
         poses = np.arange(len(vertices))

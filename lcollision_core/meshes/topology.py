@@ -15,6 +15,27 @@ from lcollision_core.errors import PoseSetError, ShapeError
 IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
 
+_LEAST_LENGTH = 1e-12
+"""Of an edge in a graph of lengths."""
+
+
+def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> sparse.csr_matrix:
+    """Return the symmetric (V, V) matrix of (E,) weights of (E, 2) edges, in sorted CSR form."""
+    i, j = edges.T
+    matrix = sparse.coo_matrix(
+        (np.tile(weights, 2), (np.concatenate([i, j]), np.concatenate([j, i]))),
+        shape=(n_vertices, n_vertices),
+    ).tocsr()
+    matrix.sort_indices()
+    return matrix
+
+
+def length_graph(edges: IntArray, vertices: FloatArray) -> sparse.csr_matrix:
+    """Return the symmetric (V, V) matrix of the lengths of (E, 2) edges on (V, 3) vertices."""
+    lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    # csgraph takes a stored 0 for no edge.
+    return edge_graph(edges, len(vertices), np.maximum(lengths, _LEAST_LENGTH))
+
 
 class Topology:
     """An immutable triangle connectivity and what follows from it alone.
@@ -135,14 +156,7 @@ class Topology:
     @cached_property
     def adjacency(self) -> sparse.csr_matrix:
         """(V, V) symmetric 0/1 matrix, CSR with sorted indices: the one-rings."""
-        i, j = self.edges.T
-        ones = np.ones(2 * len(i), dtype=np.float64)
-        matrix = sparse.coo_matrix(
-            (ones, (np.concatenate([i, j]), np.concatenate([j, i]))),
-            shape=(self.n_vertices, self.n_vertices),
-        ).tocsr()
-        matrix.sort_indices()
-        return matrix
+        return edge_graph(self.edges, self.n_vertices, np.ones(len(self.edges)))
 
     @cached_property
     def vertex_components(self) -> tuple[int, IntArray]:
