@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NoReturn
@@ -22,7 +21,7 @@ from lcollision_core.contact.kernels import (
 from lcollision_core.contact.near import near_vertices
 from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.errors import ShapeError
-from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.units import height
 
@@ -342,28 +341,14 @@ class CollisionDetector:
     ) -> None:
         n_threads = available_cores() if workers is None else workers
         size = max(1, min(_POSES_A_TASK, n_poses // (_TASKS_A_THREAD * max(1, n_threads))))
-        starts = range(0, n_poses, size)
 
-        def work(start: int) -> int:
-            if cancel is not None:
-                cancel.raise_if_cancelled()
-            stop = min(start + size, n_poses)
+        def work(start: int, stop: int) -> None:
             with self._searcher() as searcher:
                 for pose in range(start, stop):
                     search(searcher, pose)
-            return stop
 
-        if min(n_threads, len(starts)) <= 1:
-            # Starting a thread takes a third of the time that a pose of 2000 vertices does.
-            for stop in map(work, starts):
-                progress(stop, n_poses)
-            return
-        pool = ThreadPoolExecutor(n_threads, thread_name_prefix="contact")
-        try:
-            for stop in pool.map(work, starts):
-                progress(stop, n_poses)
-        finally:
-            pool.shutdown(cancel_futures=True)
+        # Starting a thread takes a third of the time that a pose of 2000 vertices does.
+        for_blocks(work, n_poses, size, n_threads, progress, cancel)
 
     @contextmanager
     def _searcher(self) -> Iterator[_Searcher]:

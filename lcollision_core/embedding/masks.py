@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csgraph
-from scipy.spatial import cKDTree
 
-from lcollision_core.embedding.seeding import bridged_edges, edge_graph
+from lcollision_core.embedding.seeding import bridged_edges
 from lcollision_core.errors import ShapeError
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, edge_graph, length_graph
 
 LEAST_SHARE = 1e-3
 """Smaller shares of a vertex are given to its other domains, so that masks have an edge."""
@@ -118,19 +117,11 @@ def _nearest_owned(
     owned: npt.NDArray[np.bool_], topology: Topology, rest_vertices: FloatArray
 ) -> npt.NDArray[np.intp]:
     """Return for each vertex that is not owned the nearest one that is."""
-    lengths = topology.edge_lengths(rest_vertices)
-    # A stored 0 would be no edge at all.
-    graph = edge_graph(topology.edges, topology.n_vertices, np.maximum(lengths, 1e-12))
-    distance, _, source = csgraph.dijkstra(
+    graph = length_graph(bridged_edges(topology, rest_vertices), rest_vertices)
+    _, _, source = csgraph.dijkstra(
         graph, indices=np.flatnonzero(owned), min_only=True, return_predecessors=True
     )
-    lost = np.flatnonzero(~owned)
-    nearest = np.asarray(source)[lost].astype(np.intp)
-    cut_off = ~np.isfinite(distance[lost])
-    if cut_off.any():
-        holders = np.flatnonzero(owned)
-        _, index = cKDTree(rest_vertices[holders]).query(rest_vertices[lost[cut_off]])
-        nearest[cut_off] = holders[index]
+    nearest: npt.NDArray[np.intp] = np.asarray(source)[~owned].astype(np.intp)
     return nearest
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from lcollision_core.acap.bridges import component_bridges
 from lcollision_core.acap.features import N_FEATURES, N_ROTATION
 from lcollision_core.errors import PoseSetError, ShapeError
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
 
 POSITION_WEIGHT = 1.0
 """Radians of relative rotation that weigh as much as one height of distance."""
@@ -58,19 +58,6 @@ def vertex_areas(topology: Topology, rest_vertices: FloatArray) -> FloatArray:
     areas = np.bincount(topology.faces.ravel(), np.repeat(thirds, 3), minlength=topology.n_vertices)
     floored: FloatArray = np.maximum(areas, _LEAST_AREA_SHARE * areas.sum() + np.finfo(float).tiny)
     return floored
-
-
-def edge_graph(
-    edges: IntArray, n_vertices: int, weights: npt.NDArray[np.float64]
-) -> sparse.csr_matrix:
-    """Return the symmetric (V, V) matrix with a weight per undirected edge."""
-    i, j = edges.T
-    matrix = sparse.coo_matrix(
-        (np.tile(weights, 2), (np.concatenate([i, j]), np.concatenate([j, i]))),
-        shape=(n_vertices, n_vertices),
-    ).tocsr()
-    matrix.sort_indices()
-    return matrix
 
 
 def moving_parts(
@@ -186,9 +173,7 @@ def part_distances(part: IntArray, topology: Topology, rest_vertices: FloatArray
         distance
     """
     edges = bridged_edges(topology, rest_vertices)
-    lengths = np.linalg.norm(rest_vertices[edges[:, 0]] - rest_vertices[edges[:, 1]], axis=1)
-    # A stored 0 would be no edge at all.
-    graph = edge_graph(edges, topology.n_vertices, np.maximum(lengths, 1e-12))
+    graph = length_graph(edges, rest_vertices)
     start = int(np.argmax(csgraph.dijkstra(graph, indices=0)))
     largest = float(csgraph.dijkstra(graph, indices=start).max())
     distances = np.empty((int(part.max()) + 1, topology.n_vertices))

@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy import sparse
 
+from lcollision_core.acap.codec import AcapCodec
 from lcollision_core.acap.scaling import FeatureScaling
 from lcollision_core.embedding.autoencoders import (
     AutoencoderWeights,
@@ -18,7 +19,7 @@ from lcollision_core.embedding.autoencoders import (
 )
 from lcollision_core.embedding.decoder import DecoderGroup, FeatureDecoder
 from lcollision_core.embedding.masks import LEAST_SHARE, attention_mask, judge_masks, keep_one_patch
-from lcollision_core.embedding.network import TiedAutoencoder, ring_mean
+from lcollision_core.embedding.network import TiedAutoencoder, decode_features, ring_mean
 from lcollision_core.embedding.seeding import (
     bridged_edges,
     locality_weights,
@@ -31,7 +32,7 @@ from lcollision_core.embedding.seeding import (
 )
 from lcollision_core.errors import PoseSetError, ShapeError
 from lcollision_core.meshes import Topology
-from tests.core.shapes import Mesh, join
+from tests.core.shapes import Mesh, join, sphere
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -263,6 +264,30 @@ def test_gradients_of_the_network_match_finite_differences() -> None:
                 flat[index] = kept
             slope = (slopes[0] - slopes[1]) / (2 * step)
             assert float(gradient[index]) == pytest.approx(slope, rel=1e-6, abs=1e-8)
+
+
+def test_gradient_through_decoding_is_the_central_difference() -> None:
+    mesh = sphere(n=10)
+    codec = AcapCodec(mesh.topology, mesh.vertices, np.ones(len(mesh.vertices)))
+    rng = np.random.default_rng(2)
+    features = codec.encode(mesh.vertices[None]) + 0.3 * rng.normal(size=(3, len(mesh.vertices), 9))
+    target = torch.from_numpy(rng.normal(size=(3, len(mesh.vertices), 3)))
+    tangent = rng.normal(size=features.shape)
+
+    def loss(fields: torch.Tensor) -> torch.Tensor:
+        return ((decode_features(fields, codec) - target) ** 2).sum()
+
+    for dtype, tolerance in ((torch.float64, 1e-6), (torch.float32, 1e-4)):
+        variable = torch.tensor(features, dtype=dtype, requires_grad=True)
+        assert decode_features(variable, codec).dtype == dtype
+        loss(variable).backward()
+        assert variable.grad is not None
+        along = float((variable.grad * torch.from_numpy(tangent)).sum())
+        ahead, behind = (
+            float(loss(torch.from_numpy(features + sign * 1e-5 * tangent))) for sign in (1, -1)
+        )
+        assert along == pytest.approx((ahead - behind) / 2e-5, rel=tolerance)
+        assert abs(along) > 1.0
 
 
 def test_scaling_a_code_changes_nothing() -> None:

@@ -8,14 +8,11 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from lcollision_core.embedding import Embedding
-from lcollision_core.embedding.seeding import edge_graph
 from lcollision_core.meshes.normals import vertex_normals
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, length_graph
 
 N_POINTS = 240
 """Of a mesh that has as many vertices; see the table in docs/experiments.md."""
-
-_LEAST_LENGTH = 1e-9
 
 
 def body_points(embedding: Embedding, n_points: int = N_POINTS) -> npt.NDArray[np.int64]:
@@ -108,10 +105,7 @@ def with_tighter_blocks(
 
 def skin_graph(embedding: Embedding) -> sparse.csr_matrix:
     """Return the (V, V) lengths of the reference's edges, in heights."""
-    rest, topology = embedding.rest_vertices, embedding.topology
-    # SciPy would drop edges of length 0.
-    lengths = np.maximum(topology.edge_lengths(rest), _LEAST_LENGTH)
-    return edge_graph(topology.edges, len(rest), lengths)
+    return length_graph(embedding.topology.edges, embedding.rest_vertices)
 
 
 def skin_distances(

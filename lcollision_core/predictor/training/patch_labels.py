@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
-from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.labels import LabelRows
 from lcollision_core.predictor.geometric.folds import FoldDetector
 from lcollision_core.predictor.network import SkinCells
@@ -75,19 +73,14 @@ class PatchLabeller:
         roots = np.zeros((len(index), len(self._unit)), dtype=np.float16)
         places = np.flatnonzero(self._rows.colliding[index])
 
-        def label(start: int) -> int:
-            if cancel is not None:
-                cancel.raise_if_cancelled()
-            block = places[start : start + _ROWS_A_BLOCK]
+        def label(start: int, stop: int) -> None:
+            block = places[start:stop]
             latent = self._rows.latent[index[block]]
             poses = self._embedding.decode(latent, n_threads=1).astype(np.float32)
             for row, vertices in zip(block, poses, strict=True):
                 roots[row] = self._roots_of(vertices)
-            return start + len(block)
 
-        with ThreadPoolExecutor(available_cores()) as pool:
-            for done in pool.map(label, range(0, len(places), _ROWS_A_BLOCK)):
-                progress(done, len(places))
+        for_blocks(label, len(places), _ROWS_A_BLOCK, progress=progress, cancel=cancel)
         return roots
 
     def _roots_of(self, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:

@@ -1,15 +1,13 @@
-"""Derivatives of decoding, against central differences, and decoding as a torch function."""
+"""Derivatives of decoding, against central differences, and the scaling of features."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-import torch
 
 from lcollision_core.acap.codec import AcapCodec
 from lcollision_core.acap.scaling import FeatureScaling
-from lcollision_core.acap.torch_decode import decode_torch
 from lcollision_core.errors import ShapeError
 from tests.core.shapes import join, sphere
 
@@ -51,40 +49,6 @@ def test_forward_derivative_is_the_central_difference(
         assert np.abs(moved).max() > 0.1
 
 
-def test_torch_gradient_is_the_central_difference(codec: AcapCodec, features: FloatArray) -> None:
-    rng = np.random.default_rng(2)
-    target = rng.normal(size=(3, codec.topology.n_vertices, 3))
-    tangent = rng.normal(size=features.shape)
-
-    def loss(fields: torch.Tensor) -> torch.Tensor:
-        return ((decode_torch(codec, fields) - torch.from_numpy(target)) ** 2).sum()
-
-    variable = torch.from_numpy(features.copy()).requires_grad_()
-    loss(variable).backward()
-    assert variable.grad is not None
-    along = float((variable.grad * torch.from_numpy(tangent)).sum())
-    ahead, behind = (
-        float(loss(torch.from_numpy(features + sign * STEP * tangent))) for sign in (1, -1)
-    )
-    assert along == pytest.approx((ahead - behind) / (2 * STEP), rel=1e-6)
-    assert abs(along) > 1.0
-
-
-def test_every_entry_of_the_gradient_is_right(codec: AcapCodec, features: FloatArray) -> None:
-    variable = torch.from_numpy(features[:1].copy()).requires_grad_()
-    pull = torch.from_numpy(np.random.default_rng(3).normal(size=(codec.topology.n_vertices, 3)))
-    (decode_torch(codec, variable)[0] * pull).sum().backward()
-    assert variable.grad is not None
-    # Vertices 0 (rotation zero) and 1, and one of the smaller sphere.
-    for vertex in (0, 1, 50):
-        tangents = np.zeros((9, *features.shape[1:]))
-        tangents[np.arange(9), vertex, np.arange(9)] = 1.0
-        steps = [codec.decode(features[0] + sign * STEP * tangents) for sign in (1, -1)]
-        expected = ((steps[0] - steps[1]) / (2 * STEP) * pull.numpy()).sum(axis=(1, 2))
-        assert variable.grad[0, vertex].numpy() == pytest.approx(expected, abs=1e-8)
-        assert np.abs(expected).min() > 1e-6
-
-
 def test_backward_is_the_transpose_of_forward(codec: AcapCodec, features: FloatArray) -> None:
     rng = np.random.default_rng(4)
     n_poses = 20
@@ -101,32 +65,12 @@ def test_backward_is_the_transpose_of_forward(codec: AcapCodec, features: FloatA
         assert np.array_equal(codec.decode_vjp(fields[one], pulls[one])[0], pulled[pose])
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 0.0)])
-def test_tensors_decode_as_arrays(
-    codec: AcapCodec, features: FloatArray, dtype: torch.dtype, tolerance: float
-) -> None:
-    expected = codec.decode(features)
-    tensor = torch.from_numpy(features).to(dtype)
-    decoded = codec.decode_torch(tensor)
-    assert decoded.dtype == dtype
-    assert decoded.numpy() == pytest.approx(expected, abs=tolerance)
-    assert torch.equal(codec.decode_torch(tensor[1]), decoded[1])
-    assert torch.equal(codec.decode_torch(tensor[:, None]), decoded[:, None])
-    single = tensor.clone().requires_grad_()
-    codec.decode_torch(single).sum().backward()
-    assert single.grad is not None
-    assert single.grad.dtype == dtype
-    assert bool(single.grad.isfinite().all())
-
-
 def test_other_shapes_are_refused(codec: AcapCodec, features: FloatArray) -> None:
     n_vertices = codec.topology.n_vertices
     with pytest.raises(ShapeError, match="features must be of shape"):
-        codec.decode_torch(torch.zeros(n_vertices - 1, 9))
+        codec.decode(np.zeros((1, n_vertices - 1, 9)))
     with pytest.raises(ShapeError, match="tangents must be of shape"):
         codec.decode_jvp(features[0], np.zeros((2, n_vertices, 3)))
-    with pytest.raises(ShapeError, match="3 poses but by_vertices 2"):
-        codec.decode_vjp(features, np.zeros((2, n_vertices, 3)))
 
 
 def test_scaling_takes_a_set_to_its_bounds_and_back(features: FloatArray) -> None:
@@ -136,10 +80,6 @@ def test_scaling_takes_a_set_to_its_bounds_and_back(features: FloatArray) -> Non
         assert numbers.min() == pytest.approx(-0.95, abs=1e-12)
         assert numbers.max() == pytest.approx(0.95, abs=1e-12)
     assert scaling.invert(scaled) == pytest.approx(features, abs=1e-12)
-    tensor = torch.from_numpy(features).float()
-    assert scaling.apply(tensor).dtype == torch.float32
-    assert scaling.apply(tensor).numpy() == pytest.approx(scaled, abs=1e-5)
-    assert scaling.invert(scaling.apply(tensor)).numpy() == pytest.approx(features, abs=1e-5)
 
 
 def test_scaling_of_a_still_set_only_shifts() -> None:
