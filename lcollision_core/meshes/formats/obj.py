@@ -53,7 +53,7 @@ def read(file: BinaryIO) -> Polygons:
         require_plausible_count(data.count(b"\nv "), "vertices")
     data = plain_lines(data)
     if b"\\" in data:
-        data = data.replace(b"\\\n", b" ")
+        data = data.replace(b"\\\n", b" ") + b"\n"
     if data.startswith(b" ") or b"\n " in data:
         data = re.sub(rb"(?m)^ +", b"", data)
     text = np.frombuffer(bytearray(data), dtype=np.uint8)
@@ -75,7 +75,7 @@ def _faces(
     """Return sizes and corners of `f` lines, before each of which `n_before` vertices stand."""
     if b"/" in text:
         text = re.sub(rb"(?<=[0-9])/[^\s]*", b"", text)
-    values, sizes = number_rows(text, "face")
+    values, sizes = number_rows(text, "face", whole=True)
     named = vertex_numbers(values, sizes)
     owner = np.repeat(np.arange(len(sizes)), sizes)
     zero = np.flatnonzero(named == 0)

@@ -72,7 +72,7 @@ def _read_head(text: bytes) -> tuple[int, int, int]:
 
 
 def _faces(text: bytes) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    values, n_words = number_rows(text, "face")
+    values, n_words = number_rows(text, "face", whole=True)
     starts = np.cumsum(n_words) - n_words
     announced = values[starts]
     is_count = (announced >= 0) & (announced == np.floor(announced))

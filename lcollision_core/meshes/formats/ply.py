@@ -65,7 +65,7 @@ def read(file: BinaryIO) -> Polygons:
     data = read_rest(file)
     if byte_order is None:
         # As text, a body is read as if it were binary and all of it double precision.
-        data = number_rows(plain_lines(data), "row", np.float64)[0].tobytes()
+        data = number_rows(plain_lines(data), "row")[0].tobytes()
         elements = [
             element._replace(properties=[_as_double(item) for item in element.properties])
             for element in elements

@@ -44,7 +44,7 @@ def plain_lines(data: bytes) -> bytes:
 
 
 def number_rows(
-    text: bytes, name: str, dtype: type[np.generic] | None = None
+    text: bytes, name: str, *, whole: bool = False
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
     """Parse lines of blank-separated decimals.
 
@@ -52,11 +52,11 @@ def number_rows(
     ----------
     text : lines that end in a newline
     name : what a line is called in the message, such as "vertex"
-    dtype : of the values; by default int64 where all are digits, else float64
+    whole : read text of digits alone as int64, where numbers beyond become its largest
 
     Returns
     -------
-    values : all numbers; whole ones beyond int64 become its largest
+    values : all numbers, float64 but for that
     sizes : how many there are in each line
 
     Raises
@@ -65,7 +65,7 @@ def number_rows(
     """
     # What stands nowhere else marks the ends of lines.
     values: npt.NDArray[Any]
-    if dtype is not np.float64 and text and not text.translate(None, b" \n0123456789"):
+    if whole and text and not text.translate(None, b" \n0123456789"):
         values = np.fromstring(text.replace(b"\n", b" -1 "), dtype=np.int64, sep=" ")
         is_end = values < 0
     elif (parsed := _plain_decimals(text.replace(b"\n", b" nan "))) is not None:
@@ -108,7 +108,7 @@ def points(text: bytes, name: str) -> npt.NDArray[np.float64]:
         )
     starts = np.cumsum(sizes) - sizes
     coordinates: npt.NDArray[np.float64] = values[starts[:, None] + np.arange(3)]
-    return coordinates.astype(np.float64, copy=False)
+    return coordinates
 
 
 def vertex_numbers(
