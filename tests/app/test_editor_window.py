@@ -37,6 +37,7 @@ from app.window.widgets import HANDLE
 from app.work import jobs
 from app.work.preparing import REASON
 from app.work.threads import Failure
+from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes import read_mesh, write_mesh
 from lcollision_core.model import EncodedPose, PoseModel, read_poses, sample_poses
 from tests.app.views import on_screen
@@ -619,6 +620,16 @@ def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -
     assert window.close()
     assert not asked.isActive()
     assert not is_open(window)
+
+
+def test_a_failure_says_what_happened_and_below_it_what_to_do(window: MainWindow) -> None:
+    error = MeshFileError("was truncated", "copy it again", where="a; b.obj", expected=9, got=4)
+    window.show_failure(Failure.of(error))
+    window.show_failure(Failure("nothing to do"))
+    first, second = failures(window)
+    assert first.what.text() == "a; b.obj was truncated, expected 9, got 4"
+    assert first.advice.text() == "Copy it again."
+    assert (second.what.text(), second.advice.text()) == ("Nothing to do", "Nothing was changed.")
 
 
 def test_a_failure_is_told_once_while_its_dialog_is_open(window: MainWindow) -> None:
