@@ -7,12 +7,10 @@ from collections.abc import Generator, Sequence
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from lcollision_core.errors import LCollisionError, MissingExtraError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels.labeller import Labeller, LabelRows
-from lcollision_core.labels.local import ChunkTask, CountRows, label_chunk
+from lcollision_core.labels.local import CountRows
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -26,11 +24,11 @@ _CHUNKS_AHEAD = 2
 def label_on_cluster(
     labeller: Labeller,
     seed: int,
-    tasks: Sequence[ChunkTask],
+    chunks: Sequence[range],
     scheduler: str,
     count: CountRows,
     cancel: CancelToken,
-) -> Generator[tuple[ChunkTask, LabelRows], None, None]:
+) -> Generator[tuple[range, LabelRows], None, None]:
     """Label chunks on the workers of a Dask scheduler.
 
     The workers need this program in the same version. Those that leave are replaced by others,
@@ -40,14 +38,14 @@ def label_on_cluster(
     ----------
     labeller : of the model; it is sent to every worker once
     seed : of the samples
-    tasks : what to label
+    chunks : the rows to label
     scheduler : its address
     count : called after each chunk
     cancel : polled while waiting
 
     Yields
     ------
-    each task with its rows, as they come
+    each of `chunks` with its labels, as they come
 
     Raises
     ------
@@ -72,14 +70,14 @@ def label_on_cluster(
     with client:
         _require_workers(client, scheduler)
         shared = client.scatter(labeller, broadcast=True, hash=False)
-        remaining = deque(tasks)
-        in_hand: dict[Any, ChunkTask] = {}
+        remaining = deque(chunks)
+        in_hand: dict[Any, range] = {}
         while remaining or in_hand:
             # Workers come and go; with none, a chunk waits for the next.
             n_threads = max(sum(client.nthreads().values()), 1)
             while remaining and len(in_hand) < _CHUNKS_AHEAD * n_threads:
-                task = remaining.popleft()
-                in_hand[client.submit(label_on_worker, shared, seed, task, pure=False)] = task
+                chunk = remaining.popleft()
+                in_hand[client.submit(label_on_worker, shared, seed, chunk, pure=False)] = chunk
             cancel.raise_if_cancelled()
             try:
                 with client.as_current():
@@ -89,10 +87,10 @@ def label_on_cluster(
             except TimeoutError:
                 continue
             for future in finished:
-                task = in_hand.pop(future)
-                rows = _result(future, scheduler)
-                count(len(rows), int(np.count_nonzero(rows.colliding)))
-                yield task, rows
+                chunk = in_hand.pop(future)
+                labelled = _result(future, scheduler)
+                count(labelled)
+                yield chunk, labelled
 
 
 def program_version() -> str:
@@ -100,11 +98,11 @@ def program_version() -> str:
     return version("lcollision")
 
 
-def label_on_worker(labeller: Labeller, seed: int, task: ChunkTask) -> tuple[str, str, LabelRows]:
-    """Label one chunk; returns the worker, its version of this program, and the rows."""
+def label_on_worker(labeller: Labeller, seed: int, rows: range) -> tuple[str, str, LabelRows]:
+    """Label one chunk; returns the worker, its version of this program, and the labels."""
     from distributed import get_worker
 
-    return get_worker().address, program_version(), label_chunk(labeller, seed, task)
+    return get_worker().address, program_version(), labeller.label_rows(seed, rows)
 
 
 def _require_workers(client: Client, scheduler: str) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.json_values import from_json
+from lcollision_core.labels.box import LatentBox
 from lcollision_core.labels.labeller import Labeller
 
 
@@ -70,12 +68,7 @@ class StoreIdentity:
             box_high=tuple(labeller.box.high.tolist()),
         )
 
-    @classmethod
-    def from_metadata(cls, metadata: Mapping[str, Any]) -> StoreIdentity:
-        """Rebuild an identity from JSON values; ValueError if it cannot."""
-        return from_json(cls, metadata, "labels")
-
     @property
-    def latent_size(self) -> int:
-        """D."""
-        return len(self.box_low)
+    def box(self) -> LatentBox:
+        """The box that the samples fill."""
+        return LatentBox(np.array(self.box_low), np.array(self.box_high))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -12,7 +12,13 @@ import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding import Embedding
-from lcollision_core.labels.box import LatentBox
+from lcollision_core.labels.box import ROWS_A_BLOCK, LatentBox
+
+
+def blocks_of(rows: range) -> Iterator[range]:
+    """Cut rows, from a multiple of `ROWS_A_BLOCK` on, into those that one thread labels at once."""
+    for first in range(rows.start, rows.stop, ROWS_A_BLOCK):
+        yield range(first, min(first + ROWS_A_BLOCK, rows.stop))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +48,8 @@ class LabelRows:
         """(B,) whether each pose intersects itself, by the strict pair rule."""
         return self.n_pairs > 0
 
-    def head(self, n_rows: int) -> LabelRows:
-        """Return the first `n_rows` rows, views of these."""
-        return LabelRows(*(getattr(self, field.name)[:n_rows] for field in fields(self)))
-
-    def taken(self, index: npt.NDArray[Any]) -> LabelRows:
-        """Return copies of the rows chosen by an index or a boolean array."""
+    def taken(self, index: npt.NDArray[Any] | slice) -> LabelRows:
+        """Return the rows chosen by an index, a boolean array or, as views, by a slice."""
         return LabelRows(*(getattr(self, field.name)[index] for field in fields(self)))
 
     @classmethod
@@ -99,9 +101,19 @@ class Labeller:
         """Build what labelling needs, once, before several threads would each begin to."""
         _ = self.box, self.detector, self.embedding.codec, self.embedding.decoder
 
-    def label_block(self, seed: int, block: int) -> LabelRows:
-        """Draw and label block `block` of the box's samples: see `LatentBox.draw`."""
-        return self.label(self.box.draw(seed, block))
+    def label_rows(self, seed: int, rows: range) -> LabelRows:
+        """Draw samples of the box and label them, on the calling thread alone.
+
+        Parameters
+        ----------
+        seed : of the samples
+        rows : their indices, at least one, from a multiple of `ROWS_A_BLOCK` on
+        """
+        drawn = (
+            self.box.draw(seed, block.start // ROWS_A_BLOCK)[: len(block)]
+            for block in blocks_of(rows)
+        )
+        return LabelRows.joined([self.label(latent) for latent in drawn])
 
     def label(self, latent: npt.NDArray[Any]) -> LabelRows:
         """Label latent poses exactly, on the calling thread alone.

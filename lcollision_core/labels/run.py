@@ -8,14 +8,15 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 
+import numpy as np
+
 from lcollision_core.errors import LabelStoreError
 from lcollision_core.jobs import CancelToken, available_cores
 from lcollision_core.labels.cluster import label_on_cluster
 from lcollision_core.labels.identity import StoreIdentity
-from lcollision_core.labels.labeller import Labeller
-from lcollision_core.labels.layout import ROWS_A_CHUNK
-from lcollision_core.labels.local import ChunkTask, label_locally
-from lcollision_core.labels.store import LabelStore
+from lcollision_core.labels.labeller import Labeller, LabelRows
+from lcollision_core.labels.local import label_locally
+from lcollision_core.labels.store import LabelStore, chunks_of
 
 
 @dataclass(frozen=True)
@@ -26,15 +27,26 @@ class LabelStatus:
     ----------
     done, total : rows, those of earlier runs among them
     n_colliding : of the rows done
-    rows_per_second : of this run, None before its first rows
-    seconds_left : at that rate, None before its first rows
+    labelled : rows of this run
+    seconds : since it began to label
     """
 
     done: int
     total: int
     n_colliding: int
-    rows_per_second: float | None
-    seconds_left: float | None
+    labelled: int = 0
+    seconds: float = 0.0
+
+    @property
+    def rows_per_second(self) -> float | None:
+        """Of this run, None before its first rows."""
+        return self.labelled / max(self.seconds, 1e-9) if self.labelled else None
+
+    @property
+    def seconds_left(self) -> float | None:
+        """At that rate, None before this run's first rows."""
+        rate = self.rows_per_second
+        return None if rate is None else (self.total - self.done) / rate
 
     @property
     def colliding_share(self) -> float | None:
@@ -59,12 +71,12 @@ def label_poses(
     scheduler: str | None = None,
     progress: StatusCallback = no_status,
     cancel: CancelToken | None = None,
-) -> LabelStore:
+) -> LabelStatus:
     """Bring a store to at least `n_rows` labelled samples of a model's latent box.
 
-    Goes on where an earlier run ended, however that ended; rows that were cut off or damaged are
-    labelled again, those beyond `n_rows` too. Sample i of (model, seed) has the same labels to the
-    last bit on any number of workers and on a cluster.
+    Goes on where an earlier run ended, however that ended; rows that are damaged, or missing before
+    later ones, are labelled again. Sample i of (model, seed) has the same labels to the last bit on
+    any number of workers and on a cluster, so that several runs may label into one store.
 
     Parameters
     ----------
@@ -79,12 +91,11 @@ def label_poses(
 
     Returns
     -------
-    store : LabelStore, of at least `n_rows` rows
+    status : at the end, when all rows of the store are done
 
     Raises
     ------
-    LabelStoreError : the store belongs to another model or seed, is damaged, or cannot be written,
-        or another run is labelling into it.
+    LabelStoreError : the store belongs to another model or seed, is damaged, or cannot be written.
     MissingExtraError : `scheduler` without Dask installed.
     LCollisionError : no scheduler or worker answers at the address, or a worker has another
         version of the program.
@@ -95,50 +106,39 @@ def label_poses(
             f"a store needs at least 1 row and a seed of 0 or more, got {n_rows} and {seed}"
         )
     token = cancel or CancelToken()
-    identity = StoreIdentity.of(labeller, seed)
-    with LabelStore.open_to_append(path, identity, n_rows, token) as store:
-        _append(store, labeller, store.n_wanted, seed, workers, scheduler, progress, token)
-    return store
-
-
-def _append(
-    store: LabelStore,
-    labeller: Labeller,
-    n_rows: int,
-    seed: int,
-    workers: int | None,
-    scheduler: str | None,
-    progress: StatusCallback,
-    cancel: CancelToken,
-) -> None:
-    chunks = range(-(-n_rows // ROWS_A_CHUNK))
+    store = LabelStore.open_or_make(path, StoreIdentity.of(labeller, seed))
+    total = max(n_rows, store.end)
     missing, done, n_colliding = [], 0, 0
-    for chunk in chunks:
-        wanted = min(ROWS_A_CHUNK, n_rows - chunk * ROWS_A_CHUNK)
-        if store.rows_in_chunk(chunk) < wanted:
-            missing.append(ChunkTask(chunk, wanted))
+    for chunk in chunks_of(total):
+        token.raise_if_cancelled()
+        try:
+            rows = store.read(chunk)
+        except LabelStoreError:
+            missing.append(chunk)
         else:
-            done += store.rows_in_chunk(chunk)
-            n_colliding += store.colliding_in_chunk(chunk)
-    total = done + sum(task.n_rows for task in missing)
-    before, started = done, time.monotonic()
-    progress(LabelStatus(done, total, n_colliding, None, None))
+            done += len(rows)
+            n_colliding += int(np.count_nonzero(rows.colliding))
+    status = LabelStatus(done, total, n_colliding)
+    progress(status)
+    started = time.monotonic()
 
-    def count(new_rows: int, new_colliding: int) -> None:
-        nonlocal done, n_colliding
-        done += new_rows
-        n_colliding += new_colliding
-        rate = (done - before) / max(time.monotonic() - started, 1e-9)
-        progress(LabelStatus(done, total, n_colliding, rate, (total - done) / rate))
+    def count(rows: LabelRows) -> None:
+        nonlocal status
+        labelled = status.labelled + len(rows)
+        n_colliding = status.n_colliding + int(np.count_nonzero(rows.colliding))
+        seconds = time.monotonic() - started
+        status = LabelStatus(done + labelled, total, n_colliding, labelled, seconds)
+        progress(status)
 
     if not missing:
-        return
+        return status
     if scheduler is None:
         n_threads = available_cores() if workers is None else workers
-        results = label_locally(labeller, seed, missing, n_threads, count, cancel)
+        results = label_locally(labeller, seed, missing, n_threads, count, token)
     else:
-        results = label_on_cluster(labeller, seed, missing, scheduler, count, cancel)
+        results = label_on_cluster(labeller, seed, missing, scheduler, count, token)
     # Closed even when a chunk cannot be written: the workers must not label on.
     with closing(results):
-        for task, rows in results:
-            store.write_chunk(task.chunk, rows)
+        for chunk, rows in results:
+            store.write(chunk, rows)
+    return status

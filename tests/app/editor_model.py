@@ -23,7 +23,7 @@ def trained_tube() -> PoseModel:
     )
     bare = PoseModel.from_training("tube", train_embedding(poses, config), poses, "a tube", "CC0")
     labeller = Labeller(bare.embedding, bare.height, bare.near_exclusion, bare.fingerprint)
-    rows = labeller.label_block(0, 0)
+    rows = labeller.label_rows(0, range(32))
     # The mean of the weights would lag behind: two passes are few.
     quick = replace(PRESETS["paper"], epochs=2, average_passes=0.0)
     predictor = train_predictor(rows, bare.embedding, quick)

@@ -21,9 +21,9 @@ BARS = {
     "label": (
         "from app.cli.label import _labelling_bar as bar\n"
         "from lcollision_core.labels import LabelStatus\n"
-        "status = LabelStatus(30, 200, 15, 7.0, 61.0)\n"
+        "status = LabelStatus(30, 200, 15, 28, 10.0)\n"
         "made = bar()",
-        ("Labelling", "30/200", "7/s, 0:01:01 left, 50.0 % collide"),
+        ("Labelling", "30/200", "3/s, 0:01:01 left, 50.0 % collide"),
     ),
     "embedding": (
         "from app.cli.train import _training_bar as bar\n"

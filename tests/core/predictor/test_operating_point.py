@@ -126,7 +126,7 @@ def test_a_trained_predictor_calls_from_there(
     # What chose stays apart where fewer rows are read, and where the store has grown.
     choosing = {row.tobytes() for row in chosen_by.latent}
     for n_read, n_measured in ((1000, 270), (6000, 1620)):
-        read = held_out_rows(rows.head(n_read), chosen, len(rows))
+        read = held_out_rows(rows.taken(slice(n_read)), chosen, len(rows))
         assert len(read) == n_measured
         assert not choosing & {row.tobytes() for row in read.latent}
     assert len(held_out_rows(rows, chosen, 4000)) == 1800 - 120

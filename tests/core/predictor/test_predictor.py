@@ -265,7 +265,7 @@ def test_evaluation_counts_what_it_is_given(
     assert metrics.accuracy == (called == others.colliding).mean()
     assert sum(entry.samples for entry in metrics.calibration) == 300
     with pytest.raises(LabelStoreError, match="no rows to evaluate"):
-        evaluate_predictor(predictor, rows.head(0))
+        evaluate_predictor(predictor, rows.taken(slice(0)))
 
 
 def test_values_out_of_range_are_refused() -> None:

@@ -439,7 +439,7 @@ def test_two_processes_learn_what_one_does(
 ) -> None:
     # One pass, for sums in another order grow apart with every step. Of the 1026 rows to train on,
     # the last batch has 2: the second process gets none of them.
-    embedding, chosen, some = tube_model.embedding, config(epochs=1), rows.head(1464)
+    embedding, chosen, some = tube_model.embedding, config(epochs=1), rows.taken(slice(1464))
     _train_in_two(tmp_path, "", some, embedding, chosen, tmp_path / "checkpoint")
     first, second = (pickle.loads((tmp_path / f"shared{rank}").read_bytes()) for rank in (0, 1))
     assert weights_of(first[0]) == weights_of(second[0])
@@ -468,7 +468,7 @@ def test_rows_that_cannot_teach_are_refused(tube_model: PoseModel, rows: LabelRo
     with pytest.raises(LabelStoreError, match="0 of the 1050 rows to train on collide"):
         train_predictor(none, embedding, config())
     with pytest.raises(LabelStoreError, match="0 are held out"):
-        train_predictor(rows.head(6), embedding, config())
+        train_predictor(rows.taken(slice(6)), embedding, config())
     with pytest.raises(LCollisionError, match="unknown device 'abacus'"):
         train_predictor(rows, embedding, PAPER, device="abacus")
 

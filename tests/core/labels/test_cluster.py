@@ -18,19 +18,12 @@ from lcollision_core.labels import (
     ROWS_A_CHUNK,
     Labeller,
     LabelStatus,
-    LabelStore,
     cluster,
     label_poses,
 )
-from lcollision_core.model import PoseModel
-from tests.core.labelled import as_bytes, labeller_of
+from tests.core.labelled import files_of
 
 N_ROWS = 4 * ROWS_A_CHUNK + 200
-
-
-@pytest.fixture(scope="module")
-def labeller(tube_model: PoseModel) -> Labeller:
-    return labeller_of(tube_model)
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +48,8 @@ def test_a_cluster_gives_the_rows_of_this_process(
         scheduler=scheduler,
         progress=statuses.append,
     )
-    here = {
-        file.relative_to(tmp_path / "here"): file.read_bytes()
-        for file in (tmp_path / "here").rglob("*")
-        if file.is_file()
-    }
-    there = {
-        file.relative_to(tmp_path / "there"): file.read_bytes()
-        for file in (tmp_path / "there").rglob("*")
-        if file.is_file()
-    }
-    assert len(here) > 30
-    assert here == there
+    assert len(files_of(tmp_path / "here")) == 6
+    assert files_of(tmp_path / "here") == files_of(tmp_path / "there")
     assert statuses[-1].done == N_ROWS
     assert len(statuses) == 6
 
@@ -84,12 +67,10 @@ def test_a_cancelled_run_goes_on_here(scheduler: str, labeller: Labeller, tmp_pa
             cancel=token,
         )
     statuses: list[LabelStatus] = []
-    finished = label_poses(
-        labeller, tmp_path / "store", N_ROWS, seed=5, progress=statuses.append
-    ).load()
+    label_poses(labeller, tmp_path / "store", N_ROWS, seed=5, progress=statuses.append)
     assert statuses[0].done > 0
     label_poses(labeller, tmp_path / "whole", N_ROWS, seed=5)
-    assert as_bytes(finished) == as_bytes(LabelStore.open(tmp_path / "whole").load())
+    assert files_of(tmp_path / "store") == files_of(tmp_path / "whole")
 
 
 def test_the_others_do_the_work_of_a_worker_that_dies(
@@ -108,8 +89,7 @@ def test_the_others_do_the_work_of_a_worker_that_dies(
         )
         assert killed.is_set()
     label_poses(labeller, tmp_path / "here", N_ROWS, seed=5)
-    here, there = (LabelStore.open(tmp_path / name).load() for name in ("here", "there"))
-    assert as_bytes(here) == as_bytes(there)
+    assert files_of(tmp_path / "here") == files_of(tmp_path / "there")
 
 
 def test_a_worker_of_another_version_is_refused(

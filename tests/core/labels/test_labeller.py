@@ -1,0 +1,117 @@
+"""Exact labels: how samples are drawn, and what is said of them."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lcollision_core.contact import domain_energy
+from lcollision_core.errors import ShapeError
+from lcollision_core.labels import (
+    BOX_SCALE,
+    ROWS_A_BLOCK,
+    Labeller,
+    LabelRows,
+    LatentBox,
+    is_held_out,
+)
+from lcollision_core.model import PoseModel
+from tests.core.labelled import as_bytes
+from tests.core.labels.conftest import SEED
+
+PINNED_BITS = [12324809925222472078, 2472481397521176968]
+
+
+def test_the_samples_of_a_seed_never_change() -> None:
+    """A store that an older program began must go on with the same rows."""
+    box = LatentBox(np.array([0.0, -2.0]), np.array([1.0, 2.0]))
+    first = box.draw(7, 11)[0]
+    bits = np.random.Philox(np.random.SeedSequence([7, 11])).random_raw(2)
+    assert bits.tolist() == PINNED_BITS
+    assert first[0] == np.float32((PINNED_BITS[0] >> 11) / 2**53)
+    assert first[1] == np.float32(-2.0 + 4.0 * ((PINNED_BITS[1] >> 11) / 2**53))
+
+
+def test_samples_fill_the_box_evenly() -> None:
+    low, high = np.array([-1.0, 3.0, 0.5]), np.array([2.0, 3.5, 10.0])
+    box = LatentBox(low, high)
+    samples = np.concatenate([box.draw(0, block) for block in range(200)]).astype(np.float64)
+    place = (samples - low) / (high - low)
+    assert place.min() >= 0.0
+    assert place.max() <= 1.0 + 1e-6
+    shares = np.stack([np.histogram(column, 8, (0, 1))[0] for column in place.T]) / len(place)
+    # Five standard deviations of a share of 1/8 among 6400.
+    assert np.abs(shares - 0.125).max() < 5 * np.sqrt(0.125 * 0.875 / len(place))
+    assert np.abs(np.corrcoef(place.T) - np.eye(3)).max() < 5 / np.sqrt(len(place))
+
+
+def test_blocks_and_seeds_differ() -> None:
+    box = LatentBox(np.zeros(4), np.ones(4))
+    drawn = [box.draw(seed, block) for seed in range(3) for block in range(3)]
+    assert len({block.tobytes() for block in drawn}) == 9
+    assert np.array_equal(box.draw(1, 2), drawn[5])
+
+
+def test_the_box_is_the_one_that_poses_are_sampled_from(
+    labeller: Labeller, tube_model: PoseModel
+) -> None:
+    assert BOX_SCALE == 1.2
+    assert np.array_equal(labeller.box.low, 1.2 * tube_model.latent_space.minimum)
+    assert np.array_equal(labeller.box.high, 1.2 * tube_model.latent_space.maximum)
+
+
+def test_labels_are_those_of_the_exact_check_of_the_exported_mesh(
+    truth: LabelRows, tube_model: PoseModel
+) -> None:
+    chosen = np.concatenate([np.flatnonzero(truth.colliding)[:8], np.arange(8)])
+    for row in chosen:
+        exported = tube_model.decode(truth.latent[row]).astype(np.float32)
+        found = tube_model.detector.detect(exported)
+        assert truth.n_pairs[row] == len(found.pairs)
+        assert truth.n_near_pairs[row] == len(found.near_pairs) == 0
+        assert truth.energy[row] == pytest.approx(found.energy, rel=1e-12)
+        by_domain = domain_energy(found.vertex_energy[None], tube_model.attention_mask)[0]
+        assert truth.domain_energy[row] == pytest.approx(by_domain, rel=1e-12)
+
+
+def test_domains_share_out_all_of_the_energy(truth: LabelRows) -> None:
+    assert truth.energy[truth.colliding].min() > 0.0
+    assert (truth.energy[~truth.colliding] == 0.0).all()
+    assert truth.domain_energy.sum(axis=1) == pytest.approx(truth.energy, rel=1e-6)
+    assert (truth.domain_energy[truth.colliding].max(axis=0) > 0.0).all()
+
+
+def test_near_pairs_are_counted_apart(labeller: Labeller, truth: LabelRows) -> None:
+    every = np.flatnonzero(truth.colliding)[:20]
+    excluded = replace(labeller, near_exclusion=0.5).label(truth.latent[every])
+    assert excluded.n_near_pairs.max() > 0
+    assert np.array_equal(excluded.n_pairs + excluded.n_near_pairs, truth.n_pairs[every])
+    assert (excluded.energy <= truth.energy[every] * (1.0 + 1e-12)).all()
+    assert excluded.energy.sum() < truth.energy[every].sum()
+
+
+def test_a_row_has_the_same_bits_alone_and_in_a_batch(labeller: Labeller, truth: LabelRows) -> None:
+    alone = [labeller.label(truth.latent[row : row + 1]) for row in range(70)]
+    assert as_bytes(LabelRows.joined(alone)) == as_bytes(truth.taken(slice(70)))
+
+
+def test_a_labeller_that_travelled_says_the_same(labeller: Labeller, truth: LabelRows) -> None:
+    copy = pickle.loads(pickle.dumps(labeller))
+    assert copy.fingerprint == labeller.fingerprint
+    assert as_bytes(copy.label_rows(SEED, range(ROWS_A_BLOCK))) == as_bytes(
+        truth.taken(slice(ROWS_A_BLOCK))
+    )
+
+
+def test_a_latent_of_another_size_is_refused(labeller: Labeller) -> None:
+    with pytest.raises(ShapeError, match="latent must have shape"):
+        labeller.label(np.zeros((2, 5)))
+
+
+def test_three_rows_in_ten_are_held_out_for_good() -> None:
+    held_out = is_held_out(np.arange(100_000))
+    assert held_out.mean() == 0.3
+    assert np.flatnonzero(held_out[:20]).tolist() == [7, 8, 9, 17, 18, 19]
