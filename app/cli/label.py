@@ -120,23 +120,24 @@ def _check(model: PoseModel, path: Path, as_json: bool) -> None:
     store = LabelStore.open(path)
     require_store_of(store, model)
     with cancel_on_interrupt() as cancel, progress_bar("Reading") as progress:
-        found = store.check(progress, cancel)
+        damaged = store.check(progress, cancel)
+    n_sound = store.end - sum(map(len, damaged))
     if as_json:
         print_json(
             {
                 "store": str(path),
-                "rows": found.n_rows,
-                "damaged": [[rows[0], rows[-1]] for rows in found.damaged],
+                "rows": n_sound,
+                "damaged": [[rows[0], rows[-1]] for rows in damaged],
                 "description_verified": True,  # or it would not have opened
             }
         )
-    elif found.damaged:
-        listed = ", ".join(f"{rows[0]} to {rows[-1]}" for rows in found.damaged[:_LISTED])
-        more = f" and {len(found.damaged) - _LISTED} more" if found.damaged[_LISTED:] else ""
+    elif damaged:
+        listed = ", ".join(f"{rows[0]} to {rows[-1]}" for rows in damaged[:_LISTED])
+        more = f" and {len(damaged) - _LISTED} more" if damaged[_LISTED:] else ""
         tell(f"{path}: damaged, rows {listed}{more}; {store.repair_advice}")
     else:
-        tell(f"{path}: sound, {counted(found.n_rows, 'row')} of {model.name}")
-    if found.damaged:
+        tell(f"{path}: sound, {counted(n_sound, 'row')} of {model.name}")
+    if damaged:
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 

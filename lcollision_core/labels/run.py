@@ -95,7 +95,8 @@ def label_poses(
 
     Raises
     ------
-    LabelStoreError : the store belongs to another model or seed, is damaged, or cannot be written.
+    LabelStoreError : the store belongs to another model or seed, or its manifest is damaged.
+    MeshFileError : it cannot be written.
     MissingExtraError : `scheduler` without Dask installed.
     LCollisionError : no scheduler or worker answers at the address, or a worker has another
         version of the program.

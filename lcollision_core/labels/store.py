@@ -14,20 +14,20 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import LabelStoreError, MeshFileError
+from lcollision_core.errors import LabelStoreError, LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.labels.box import ROWS_A_BLOCK
 from lcollision_core.labels.identity import StoreIdentity
 from lcollision_core.labels.labeller import LabelRows
-from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.atomic import atomic_files, atomic_write
 from lcollision_core.meshes.npz import read_npz
 from lcollision_core.model_file import required_array
 from lcollision_core.regular_files import read_regular
@@ -48,20 +48,6 @@ def chunks_of(n_rows: int) -> Iterator[range]:
     """Give the rows of each chunk that the first `n_rows` rows are kept in."""
     for first in range(0, n_rows, ROWS_A_CHUNK):
         yield range(first, min(first + ROWS_A_CHUNK, n_rows))
-
-
-@dataclass(frozen=True)
-class StoreCheck:
-    """What reading all of a store found.
-
-    Attributes
-    ----------
-    n_rows : rows that read back as they were labelled
-    damaged : stretches of rows that do not, or are missing before later ones
-    """
-
-    n_rows: int
-    damaged: tuple[range, ...]
 
 
 class LabelStore:
@@ -139,34 +125,22 @@ class LabelStore:
 
         Raises
         ------
-        LabelStoreError : as for `open`, or the store labels something else, or cannot be written.
+        LabelStoreError : as for `open`, or the store labels something else.
+        MeshFileError : it cannot be made.
         """
         target = Path(path)
-        if not target.parent.is_dir():
-            raise LabelStoreError(
-                f"{path} cannot be made: there is no folder {target.parent}; create it first"
-            )
-        try:
-            # A hidden file is the unfinished manifest of another run, alive or killed.
-            if not target.exists() or (
-                target.is_dir() and all(file.name.startswith(".") for file in target.iterdir())
-            ):
-                target.mkdir(exist_ok=True)
-                manifest = {
-                    "kind": KIND,
-                    "format_version": FORMAT_VERSION,
-                    "rows_per_chunk": ROWS_A_CHUNK,
-                    "labels": asdict(identity),
-                }
-                manifest["sha256"] = _digest(manifest)
-                with atomic_write(target / MANIFEST) as file:
-                    file.write(json.dumps(manifest, indent=1).encode())
-        except MeshFileError as error:
-            raise LabelStoreError(str(error)) from error
-        except OSError as error:
-            raise LabelStoreError(
-                f"{path} cannot be written: {error.strerror or error}; choose another folder"
-            ) from error
+        # A hidden file is the unfinished manifest of another run, alive or killed.
+        is_empty = target.is_dir() and not any(target.glob("[!.]*"))
+        if is_empty or not target.exists():
+            manifest: dict[str, Any] = {
+                "kind": KIND,
+                "format_version": FORMAT_VERSION,
+                "rows_per_chunk": ROWS_A_CHUNK,
+                "labels": asdict(identity),
+            }
+            manifest["sha256"] = _digest(manifest)
+            with atomic_files(target) as folder, atomic_write(folder / MANIFEST) as file:
+                file.write(json.dumps(manifest, indent=1).encode())
         store = cls.open(target)
         store.require(identity)
         return store
@@ -267,7 +241,7 @@ class LabelStore:
             if not np.array_equal(labelled.latent[0], expected[0]):
                 raise ValueError("rows of another place")
             _require_finite(labelled)
-        except (MeshFileError, ValueError) as error:
+        except (LCollisionError, ValueError) as error:
             raise self._unreadable(rows, "damaged") from error
         return labelled
 
@@ -281,25 +255,27 @@ class LabelStore:
 
         Raises
         ------
-        LabelStoreError : a label is not finite, or the disk is full.
+        LabelStoreError : a label is not finite.
+        MeshFileError : the file cannot be written.
         """
-        try:
-            _require_finite(labelled)
-            with atomic_write(self._file(rows)) as file:
-                np.savez(file, **vars(labelled))
-        except (MeshFileError, ValueError) as error:
-            raise LabelStoreError(str(error)) from error
+        _require_finite(labelled)
+        with atomic_write(self._file(rows)) as file:
+            np.savez(file, **vars(labelled))
         self._ends[rows.start] = max(self._ends.get(rows.start, 0), rows.stop)
 
     def check(
         self, progress: Progress = no_progress, cancel: CancelToken | None = None
-    ) -> StoreCheck:
-        """Read everything, and tell what is damaged.
+    ) -> tuple[range, ...]:
+        """Read everything, and return the rows that are damaged or missing before later ones.
 
         Parameters
         ----------
         progress : called with (rows read, all rows)
         cancel : polled between chunks
+
+        Returns
+        -------
+        damaged : stretches of rows, each as long as it can be
 
         Raises
         ------
@@ -312,10 +288,11 @@ class LabelStore:
             try:
                 self.read(rows)
             except LabelStoreError:
-                first = damaged.pop().start if damaged and damaged[-1].stop == rows.start else None
-                damaged.append(range(rows.start if first is None else first, rows.stop))
+                if damaged and damaged[-1].stop == rows.start:
+                    rows = range(damaged.pop().start, rows.stop)
+                damaged.append(rows)
             progress(rows.stop, self.end)
-        return StoreCheck(self.end - sum(map(len, damaged)), tuple(damaged))
+        return tuple(damaged)
 
     @property
     def repair_advice(self) -> str:
@@ -352,4 +329,6 @@ def _digest(manifest: Mapping[str, Any]) -> str:
 def _require_finite(labelled: LabelRows) -> None:
     for name in ("latent", "domain_energy", "energy"):
         if not np.isfinite(getattr(labelled, name)).all():
-            raise ValueError(f"the {name} of a labelled pose is not finite; train the model again")
+            raise LabelStoreError(
+                f"the {name} of a labelled pose is not finite; train the model again"
+            )
