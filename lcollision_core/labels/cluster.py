@@ -58,14 +58,15 @@ def label_on_cluster(
         from distributed import Client, wait
     except ImportError as error:
         raise MissingExtraError(
-            "labelling on a cluster needs Dask; install it with pip install 'lcollision[cluster]'"
+            "labelling on a cluster needs Dask",
+            "install it with pip install 'lcollision[cluster]'",
         ) from error
     try:
         client = Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise LCollisionError(
-            f"no Dask scheduler answers at {scheduler}; start one with `dask scheduler`, or check "
-            f"the address"
+            f"no Dask scheduler answers at {scheduler}",
+            "start one with `dask scheduler`, or check the address",
         ) from error
     with client:
         _require_workers(client, scheduler)
@@ -112,8 +113,8 @@ def _require_workers(client: Client, scheduler: str) -> None:
         versions = client.run(program_version)
     except TimeoutError as error:
         raise LCollisionError(
-            f"the scheduler at {scheduler} has no workers; start some with `dask worker "
-            f"{scheduler}`"
+            f"the scheduler at {scheduler} has no workers",
+            f"start some with `dask worker {scheduler}`",
         ) from error
     except ImportError as error:
         raise _lacks_program(scheduler, error) from error
@@ -124,15 +125,15 @@ def _require_workers(client: Client, scheduler: str) -> None:
 def _require_version(worker: str, found: str) -> None:
     if found != program_version():
         raise LCollisionError(
-            f"the worker {worker} has lcollision {found}, this is {program_version()}; "
-            f"install the same version there"
+            f"the worker {worker} has lcollision {found}, this is {program_version()}",
+            "install the same version there",
         )
 
 
 def _lacks_program(scheduler: str, error: ImportError) -> LCollisionError:
     return LCollisionError(
-        f"a worker of {scheduler} lacks this program ({error}); install lcollision "
-        f"{program_version()} there"
+        f"a worker of {scheduler} lacks this program ({error})",
+        f"install lcollision {program_version()} there",
     )
 
 
@@ -148,8 +149,8 @@ def _result(future: Any, scheduler: str) -> LabelRows:
         raise _lacks_program(scheduler, error) from error
     except (KilledWorker, LostError) as error:
         raise LCollisionError(
-            f"the workers of {scheduler} died while labelling; give them more memory, then run "
-            f"the same command again to go on"
+            f"the workers of {scheduler} died while labelling",
+            "give them more memory, then run the same command again to go on",
         ) from error
     # Of every chunk: workers that come late are not asked before.
     _require_version(worker, found)

@@ -82,12 +82,13 @@ class LabelStore:
         target = Path(path)
         if not target.exists():
             raise LabelStoreError(
-                f"there is no label store {path}; make one with `lcollision label`"
+                f"there is no label store {path}", "make one with `lcollision label`"
             )
         if (target / "zarr.json").is_file():
             raise LabelStoreError(
-                f"{path} is a label store of an older version of this program, which is not read "
-                f"any more; run `lcollision label` again, into another folder"
+                "was made by an older version of this program and is not read any more",
+                "run `lcollision label` again, into another folder",
+                where=path,
             )
         try:
             manifest = parse_json(read_regular(target / MANIFEST, _MAX_MANIFEST_BYTES))
@@ -96,22 +97,19 @@ class LabelStore:
             is_ours = False
         if not is_ours:
             raise LabelStoreError(
-                f"{path} is no label store; name one that `lcollision label` made"
+                "is no label store", "name one that `lcollision label` made", where=path
             )
         version = manifest.get("format_version")
         if isinstance(version, int) and version > FORMAT_VERSION:
-            raise LabelStoreError(
-                f"{path} has format version {version}, this program reads version "
-                f"{FORMAT_VERSION}; update the program"
-            )
+            raise LabelStoreError.too_new(path, version, FORMAT_VERSION)
         try:
             checksum = manifest.pop("sha256", None)
             if checksum != _digest(manifest) or version != FORMAT_VERSION:
-                raise ValueError("another checksum or version")
+                raise ValueError(f"its {MANIFEST} was changed")
             return cls(target, from_json(StoreIdentity, manifest.get("labels"), "labels"))
         except (OSError, ValueError) as error:
-            raise LabelStoreError(
-                f"{path} is damaged: its {MANIFEST} was changed; label again into another folder"
+            raise LabelStoreError.because(
+                path, "is damaged", error, "label again, into another folder"
             ) from error
 
     @classmethod
@@ -161,13 +159,16 @@ class LabelStore:
             ours, theirs = getattr(self.identity, name), getattr(identity, name)
             if ours != theirs:
                 raise LabelStoreError(
-                    f"{self.path} labels {what.format(ours)}, not {what.format(theirs)}; name "
-                    "another store, or the model and seed that this one was made with (a model "
-                    "whose embedding is trained anew is another)"
+                    f"labels {what.format(ours)}, not {what.format(theirs)}",
+                    "name another store, or the model and seed that this one was made with (a "
+                    "model whose embedding is trained anew is another)",
+                    where=self.path,
                 )
         if self.identity != identity:
             raise LabelStoreError(
-                f"{self.path} labels another latent box than the model's; name another store"
+                "labels another latent box than the model's",
+                "name another store",
+                where=self.path,
             )
 
     @property
@@ -197,8 +198,9 @@ class LabelStore:
         wanted = self.end if n_rows is None else n_rows
         if wanted > self.end:
             raise LabelStoreError(
-                f"{self.path} has {self.end} rows, not {wanted}; run `lcollision label` on it for "
-                f"more"
+                f"has {self.end} rows, not {wanted}",
+                "run `lcollision label` on it for more",
+                where=self.path,
             )
         columns = {
             name: np.empty((wanted, *shape), dtype)
@@ -305,7 +307,9 @@ class LabelStore:
 
     def _unreadable(self, rows: range, how: str) -> LabelStoreError:
         return LabelStoreError(
-            f"{self.path} is damaged: rows {rows[0]} to {rows[-1]} are {how}; {self.repair_advice}"
+            f"is damaged: rows {rows[0]} to {rows[-1]} are {how}",
+            self.repair_advice,
+            where=self.path,
         )
 
     def _file(self, rows: range) -> Path:
@@ -330,5 +334,5 @@ def _require_finite(labelled: LabelRows) -> None:
     for name in ("latent", "domain_energy", "energy"):
         if not np.isfinite(getattr(labelled, name)).all():
             raise LabelStoreError(
-                f"the {name} of a labelled pose is not finite; train the model again"
+                f"the {name} of a labelled pose is not finite", "train the model again"
             )
