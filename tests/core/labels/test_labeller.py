@@ -107,7 +107,7 @@ def test_a_labeller_that_travelled_says_the_same(labeller: Labeller, truth: Labe
 
 
 def test_a_latent_of_another_size_is_refused(labeller: Labeller) -> None:
-    with pytest.raises(ShapeError, match="latent must have shape"):
+    with pytest.raises(ShapeError, match="latent must be of shape"):
         labeller.label(np.zeros((2, 5)))
 
 
