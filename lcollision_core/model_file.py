@@ -23,8 +23,11 @@ from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.regular_files import open_regular
 
-FORMAT_VERSION = 1
-"""The version that `write_model_file` stores; later ones are refused."""
+FORMAT_VERSION = 2
+"""The version that `write_model_file` stores; older ones are read, later ones are refused.
+
+Since version 2 the embedding's section has the latent box.
+"""
 
 MAX_HEADER_BYTES = 16 * 2**20
 MAX_FILE_BYTES = 4 * 2**30
@@ -287,7 +290,7 @@ def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _He
         version = document["format_version"]
         if isinstance(version, int) and version > FORMAT_VERSION:
             raise ModelFileError.too_new(path, quoted(version), FORMAT_VERSION)
-        if version != FORMAT_VERSION or isinstance(version, bool):
+        if type(version) is not int or version < 1:
             _refuse_damaged(path)
         if not all(isinstance(section, dict) for section in document["sections"].values()):
             _refuse_damaged(path)

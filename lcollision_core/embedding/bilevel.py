@@ -25,6 +25,7 @@ from lcollision_core.embedding.autoencoders import (
 )
 from lcollision_core.embedding.decoder import FeatureDecoder, Float32Array
 from lcollision_core.embedding.fitting import MAX_STEPS, LatentFit, fit_latent
+from lcollision_core.embedding.latent_box import LatentBox
 from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
@@ -38,9 +39,6 @@ _LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e6
 _LEAST_LEADING, _LEAST_SIZE = 1e-6, 1e-3
 """What the arrays of a file may hold: weights of norm 1 and features within 1 of 0, the others far
 beyond what training finds, and far below what overflows."""
-
-_LEAST_RANGE = 1e-6
-"""So that the range of a code that no training pose uses still straddles 0."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +59,7 @@ class Embedding:
     level2 : K autoencoders, on the vertices of their domains
     attention_mask : (K, V) float32 array, each column sums to 1
     training_latent : (N, D) float32 array, codes of the training poses
+    box : the latent box
     metrics : what training measured, None before it has
     config : how it was trained, the values of an `EmbeddingConfig` by name; kept as they are, so
         that a model outlives the choices of the program that trained it
@@ -76,6 +75,7 @@ class Embedding:
     level2: tuple[AutoencoderWeights, ...]
     attention_mask: Float32Array
     training_latent: Float32Array
+    box: LatentBox
     metrics: EmbeddingMetrics | None
     config: Mapping[str, Any]
     seed: int
@@ -115,18 +115,6 @@ class Embedding:
     def latent_size(self) -> int:
         """D = |Z_all|."""
         return sum(self.group_sizes)
-
-    @cached_property
-    def latent_min(self) -> Float32Array:
-        """(D,) least code of the training poses, below 0."""
-        least: Float32Array = np.minimum(self.training_latent.min(axis=0), -_LEAST_RANGE)
-        return least
-
-    @cached_property
-    def latent_max(self) -> Float32Array:
-        """(D,) largest code of the training poses, above 0."""
-        largest: Float32Array = np.maximum(self.training_latent.max(axis=0), _LEAST_RANGE)
-        return largest
 
     @cached_property
     def latent_deviation(self) -> FloatArray:
@@ -235,6 +223,7 @@ class Embedding:
             "alignment_weights": self.alignment_weights,
             "mean_features": self.mean_features,
             "training_latent": self.training_latent,
+            **self.box.to_arrays(),
         }
         for name, part in self._named_parts():
             arrays[f"{name}_components"] = part.components
@@ -310,6 +299,9 @@ class Embedding:
         if np.abs(mask.sum(axis=0) - 1.0).max() > 1e-5:
             raise ValueError("its attention masks do not sum to 1")
         latent_size = sum(len(part.components) for part in parts)
+        training_latent = required_array(
+            arrays, "training_latent", np.float32, (None, latent_size), _LARGEST_CODE
+        )
         return cls(
             topology=topology,
             rest_vertices=rest,
@@ -319,9 +311,8 @@ class Embedding:
             level1=parts[0],
             level2=tuple(parts[1:]),
             attention_mask=mask,
-            training_latent=required_array(
-                arrays, "training_latent", np.float32, (None, latent_size), _LARGEST_CODE
-            ),
+            training_latent=training_latent,
+            box=LatentBox.from_arrays(arrays, training_latent),
             metrics=values.metrics,
             config=dict(values.config),
             seed=values.seed,

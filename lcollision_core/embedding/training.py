@@ -23,6 +23,7 @@ from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.checkpoint import Checkpoint, run_key
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.fitting import Decoder, fit_latent
+from lcollision_core.embedding.latent_box import LatentBox
 from lcollision_core.embedding.masks import judge_masks
 from lcollision_core.embedding.metrics import EmbeddingMetrics, feature_pca, vertex_distances
 from lcollision_core.errors import PoseSetError
@@ -170,7 +171,9 @@ class _Run:
         fitted = self._fit_codes(
             "all poses", "codes", embedding.decoder, guess, embedding.latent_deviation, everyone
         )
-        embedding = replace(embedding, training_latent=fitted.latent)
+        embedding = replace(
+            embedding, training_latent=fitted.latent, box=LatentBox.around(fitted.latent)
+        )
         level1 = build_decoder(
             (embedding.level1,), embedding.scaling, embedding.mean_features, embedding.topology
         )
@@ -241,6 +244,7 @@ class _Run:
             level2=learnt.level2,
             attention_mask=learnt.attention_mask,
             training_latent=latent,
+            box=LatentBox.around(latent),
             metrics=None,
             config=asdict(self._config),
             seed=self._seed,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.labels.box import LatentBox
+from lcollision_core.embedding import LatentBox
 from lcollision_core.labels.labeller import Labeller
 
 
@@ -64,8 +64,8 @@ class StoreIdentity:
             n_domains=labeller.embedding.n_domains,
             height=labeller.height,
             near_exclusion=labeller.near_exclusion,
-            box_low=tuple(labeller.box.low.tolist()),
-            box_high=tuple(labeller.box.high.tolist()),
+            box_low=tuple(labeller.embedding.box.low.tolist()),
+            box_high=tuple(labeller.embedding.box.high.tolist()),
         )
 
     @property

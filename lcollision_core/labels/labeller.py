@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.embedding import Embedding
-from lcollision_core.labels.box import ROWS_A_BLOCK, LatentBox
+from lcollision_core.embedding import ROWS_A_BLOCK, Embedding
 
 
 def blocks_of(rows: range) -> Iterator[range]:
@@ -84,11 +83,6 @@ class Labeller:
     fingerprint: str
 
     @cached_property
-    def box(self) -> LatentBox:
-        """The box that is sampled."""
-        return LatentBox.of(self.embedding)
-
-    @cached_property
     def detector(self) -> CollisionDetector:
         """The exact check, in the data's unit."""
         return CollisionDetector(
@@ -99,7 +93,7 @@ class Labeller:
 
     def prepare(self) -> None:
         """Build what labelling needs, once, before several threads would each begin to."""
-        _ = self.box, self.detector, self.embedding.codec, self.embedding.decoder
+        _ = self.detector, self.embedding.codec, self.embedding.decoder
 
     def label_rows(self, seed: int, rows: range) -> LabelRows:
         """Draw samples of the box and label them, on the calling thread alone.
@@ -110,7 +104,7 @@ class Labeller:
         rows : their indices, at least one, from a multiple of `ROWS_A_BLOCK` on
         """
         drawn = (
-            self.box.draw(seed, block.start // ROWS_A_BLOCK)[: len(block)]
+            self.embedding.box.draw(seed, block.start // ROWS_A_BLOCK)[: len(block)]
             for block in blocks_of(rows)
         )
         return LabelRows.joined([self.label(latent) for latent in drawn])

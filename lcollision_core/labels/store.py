@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.embedding import ROWS_A_BLOCK
 from lcollision_core.errors import LabelStoreError, LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.json_values import from_json, parse_json
-from lcollision_core.labels.box import ROWS_A_BLOCK
 from lcollision_core.labels.identity import StoreIdentity
 from lcollision_core.labels.labeller import LabelRows
 from lcollision_core.meshes.atomic import atomic_files, atomic_write

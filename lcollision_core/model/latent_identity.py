@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.embedding.latent_box import BOX_ARRAYS
 from lcollision_core.errors import ModelFileError
 from lcollision_core.model.library import ListedModel, list_models
 from lcollision_core.model_file import read_section
@@ -19,14 +20,14 @@ EMBEDDING = "embedding"
 
 
 def fingerprint_of(arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]) -> str:
-    """Return 16 hexadecimal digits that tell a latent space from others.
+    """Return 16 hexadecimal digits that tell a latent space from others, whatever its box.
 
     Parameters
     ----------
     arrays, metadata : of `Embedding.to_arrays`, or of a model file's section
     """
     digest = hashlib.sha256(json.dumps(metadata["scaling"], sort_keys=True).encode())
-    for name in sorted(arrays):
+    for name in sorted(arrays.keys() - BOX_ARRAYS):
         array = np.ascontiguousarray(arrays[name])
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.labels.box import BOX_SCALE
-
 WHOLE_BODY = "Whole body"
 
 
@@ -43,28 +41,17 @@ class LatentSpace:
     Attributes
     ----------
     groups : 1 + K groups in the latent's order
-    minimum, maximum : (D,) float64 arrays, read-only: the training poses' range of each code,
-        the first below 0 and the second above
+    low, high : (D,) float64 arrays, read-only: the ends of the model's box, below 0 and above
     """
 
     groups: tuple[LatentGroup, ...]
-    minimum: npt.NDArray[np.float64]
-    maximum: npt.NDArray[np.float64]
+    low: npt.NDArray[np.float64]
+    high: npt.NDArray[np.float64]
 
     @property
     def size(self) -> int:
         """D, the number of codes."""
-        return len(self.minimum)
-
-    @property
-    def low(self) -> npt.NDArray[np.float64]:
-        """(D,) array, the lower end of the box that is sampled: `BOX_SCALE` times the minimum."""
-        return BOX_SCALE * self.minimum
-
-    @property
-    def high(self) -> npt.NDArray[np.float64]:
-        """(D,) array, the upper end of that box."""
-        return BOX_SCALE * self.maximum
+        return len(self.low)
 
     def sample(self, n_poses: int, generator: np.random.Generator) -> npt.NDArray[np.float64]:
         """Draw poses uniformly from the box between `low` and `high`.
@@ -73,5 +60,4 @@ class LatentSpace:
         -------
         latent : (n_poses, D) float64 array
         """
-        low, high = self.low, self.high
-        return low + (high - low) * generator.random((n_poses, self.size))
+        return self.low + (self.high - self.low) * generator.random((n_poses, self.size))

@@ -529,17 +529,15 @@ class PoseModel:
         ------
         ModelFileError : the model has no predictor, or a damaged one.
         """
-        from lcollision_core.labels import LatentBox
         from lcollision_core.resolve import PoseResolver
 
-        box = LatentBox.of(self.embedding)
         return PoseResolver(
             self.embedding,
             self.require_predictor(),
             self.detector,
             self.height,
             self.free_latent,
-            (box.low, box.high),
+            (self.embedding.box.low, self.embedding.box.high),
         )
 
     @cached_property
@@ -591,8 +589,8 @@ class PoseModel:
             start += size
         return LatentSpace(
             groups=tuple(groups),
-            minimum=_read_only(embedding.latent_min.astype(np.float64)),
-            maximum=_read_only(embedding.latent_max.astype(np.float64)),
+            low=_read_only(embedding.box.low),
+            high=_read_only(embedding.box.high),
         )
 
     @cached_property

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
-from lcollision_core.labels import BOX_SCALE
 from lcollision_core.model_file import required_array
 from lcollision_core.predictor.inference.field_kernels import REACHES, SUMS_A_REACH
 
@@ -152,7 +151,7 @@ def _require_default(reader: _Reader, embedding: Embedding) -> None:
 
 def _require_paper(reader: _Reader, embedding: Embedding, by_domain: bool) -> None:
     groups, state = embedding.group_sizes, ENCODER_SIZES[-1]
-    codes = BOX_SCALE * float(np.abs(embedding.training_latent).max())
+    codes = float(max(-embedding.box.low.min(), embedding.box.high.max()))
     names = [f"encoder.{2 * number}" for number in range(len(ENCODER_SIZES))]
     bound = reader.layers(names, (sum(groups), *ENCODER_SIZES), None, codes)
     if by_domain:

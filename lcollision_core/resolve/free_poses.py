@@ -7,7 +7,6 @@ import numpy as np
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.labels import LatentBox
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.exact import ExactCheck
 
@@ -55,7 +54,6 @@ def find_free_poses(
     chosen = np.unique(np.linspace(0, len(training) - 1, MOST_POSES - 1).round().astype(int))
     sources = [np.concatenate([np.zeros((1, embedding.latent_size)), training[chosen]])]
     sources += [share * training[chosen] for share in _SHRINKINGS]
-    box = LatentBox.of(embedding)
     found: list[FloatArray] = []
     n_checked, total = 0, len(sources[0])
     for number in range(len(sources) + SEARCHED_BLOCKS):
@@ -64,7 +62,7 @@ def find_free_poses(
         poses = (
             sources[number]
             if number < len(sources)
-            else box.draw(seed, number - len(sources)).astype(np.float64)
+            else embedding.box.draw(seed, number - len(sources)).astype(np.float64)
         )
         total = max(total, n_checked + len(poses))
         for start in range(0, len(poses), _AT_ONCE):

@@ -315,7 +315,7 @@ def test_the_window_closes_in_the_middle_of_resolve(
 
 def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
     document, model = window.document, window.document.model
-    latent = 0.6 * model.latent_space.maximum
+    latent = 0.5 * model.latent_space.high
     vertices = model.decode(latent) + np.array([3.0, -2.0, 1.0]) * model.height
     write_mesh(tmp_path / "bent.obj", vertices, model.faces)
     with qtbot.waitSignal(document.latent_changed, timeout=PATIENCE):
@@ -371,7 +371,7 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
     document, model = window.document, window.document.model
-    document.blend_towards(0.5 * model.latent_space.minimum, 1.0)
+    document.blend_towards(0.4 * model.latent_space.low, 1.0)
     rest(qtbot, window)
     on_screen = shown(window)
     path = tmp_path / f"pose{suffix}"
@@ -491,7 +491,7 @@ def test_resolve_waits_for_a_mesh_that_is_read_and_undo_keeps_what_was_edited_me
     document, model = window.document, window.document.model
     resolve, button = window.actions_by_key["resolve"], window.collision.resolve.button
     mesh, tip = tmp_path / "bent.obj", resolve.toolTip()
-    write_mesh(mesh, model.decode(0.6 * model.latent_space.maximum), model.faces)
+    write_mesh(mesh, model.decode(0.5 * model.latent_space.high), model.faces)
     encode, go_on = PoseModel.encode, threading.Event()
 
     def slow(*arguments: Any, **options: Any) -> EncodedPose:

@@ -60,7 +60,7 @@ def test_box_is_not_all_collisions(scape_embedding: Embedding) -> None:
     from lcollision_core.contact import CollisionDetector
 
     rng = np.random.default_rng(0)
-    low, high = 1.2 * scape_embedding.latent_min, 1.2 * scape_embedding.latent_max
+    low, high = scape_embedding.box.low, scape_embedding.box.high
     decoded = scape_embedding.decode(rng.uniform(low, high, (100, scape_embedding.latent_size)))
     detector = CollisionDetector(scape_embedding.topology, scape_embedding.rest_vertices)
     assert 0.1 < np.mean(detector.are_colliding(decoded)) < 0.9

@@ -138,9 +138,10 @@ def test_unit_of_the_poses_does_not_matter() -> None:
 
 def test_latent_ranges_straddle_zero() -> None:
     embedding = trained_tube()
-    assert (embedding.latent_min < 0.0).all()
-    assert (embedding.latent_max > 0.0).all()
-    assert embedding.latent_min.shape == (embedding.latent_size,) == (3 + 3 * 4,)
+    assert (embedding.box.low < 0.0).all()
+    assert (embedding.box.high > 0.0).all()
+    assert np.allclose(embedding.box.low, 1.2 * embedding.training_latent.min(axis=0))
+    assert embedding.box.low.shape == (embedding.latent_size,) == (3 + 3 * 4,)
     assert embedding.group_sizes == (3, 4, 4, 4)
 
 
@@ -240,7 +241,7 @@ def test_fewer_poses_than_codes() -> None:
 def test_encode_gives_the_code_of_a_moved_mesh_back() -> None:
     embedding = trained_tube()
     rng = np.random.default_rng(1)
-    latent = 0.8 * rng.uniform(embedding.latent_min, embedding.latent_max, (3, 15))
+    latent = 0.6 * rng.uniform(embedding.box.low, embedding.box.high, (3, 15))
     decoded = embedding.decode(latent)
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     turn *= np.linalg.det(turn)
@@ -266,7 +267,7 @@ def test_encode_improves_on_the_guess() -> None:
 def test_decode_serial_and_batch_agree() -> None:
     embedding = trained_tube()
     rng = np.random.default_rng(0)
-    latent = rng.uniform(embedding.latent_min, embedding.latent_max, (19, 15))
+    latent = rng.uniform(embedding.box.low, embedding.box.high, (19, 15))
     batch = embedding.decode(latent, n_threads=2)
     for row, vertices in zip(latent, batch, strict=True):
         assert np.array_equal(embedding.decode(row[None])[0], vertices)

@@ -88,7 +88,7 @@ def test_info_prints_what_scripts_read(lcollision: Lcollision, tube: Path) -> No
         report.items()
         >= {
             "name": "tube",
-            "version": 1,
+            "version": 2,
             "vertices": 210,
             "faces": 416,
             "latent_size": 8,

@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from lcollision_core.contact import domain_energy
+from lcollision_core.embedding import ROWS_A_BLOCK, LatentBox
 from lcollision_core.errors import ShapeError
 from lcollision_core.labels import (
-    BOX_SCALE,
-    ROWS_A_BLOCK,
     Labeller,
     LabelRows,
-    LatentBox,
     is_held_out,
 )
 from lcollision_core.model import PoseModel
@@ -53,14 +51,6 @@ def test_blocks_and_seeds_differ() -> None:
     drawn = [box.draw(seed, block) for seed in range(3) for block in range(3)]
     assert len({block.tobytes() for block in drawn}) == 9
     assert np.array_equal(box.draw(1, 2), drawn[5])
-
-
-def test_the_box_is_the_one_that_poses_are_sampled_from(
-    labeller: Labeller, tube_model: PoseModel
-) -> None:
-    assert BOX_SCALE == 1.2
-    assert np.array_equal(labeller.box.low, 1.2 * tube_model.latent_space.minimum)
-    assert np.array_equal(labeller.box.high, 1.2 * tube_model.latent_space.maximum)
 
 
 def test_labels_are_those_of_the_exact_check_of_the_exported_mesh(

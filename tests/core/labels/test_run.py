@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from lcollision_core.embedding import ROWS_A_BLOCK
 from lcollision_core.errors import CancelledError, LabelStoreError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import (
-    ROWS_A_BLOCK,
     ROWS_A_CHUNK,
     Labeller,
     LabelRows,

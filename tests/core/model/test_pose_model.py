@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.embedding import LatentBox
 from lcollision_core.errors import LCollisionError, ModelFileError, PoseSetError, ShapeError
-from lcollision_core.labels import BOX_SCALE
 from lcollision_core.meshes import PoseSet, Topology
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.model_file import Section, read_model_file, write_model_file
 from tests.bending_tube import LENGTH_IN_FILES
+from tests.core.labelled import labeller_of
 from tests.core.shapes import random_rotation
 
 
@@ -126,9 +127,9 @@ def test_fitted_code_is_a_minimum(model: PoseModel) -> None:
 
     best = squared_distance(encoded.latent)
     for code in range(model.latent_size):
-        for step in (-0.05, 0.05):
+        for step in (-0.04, 0.04):
             tried = encoded.latent.copy()
-            tried[code] += step * model.latent_space.maximum[code]
+            tried[code] += step * model.latent_space.high[code]
             assert squared_distance(tried) > 0.999 * best
 
 
@@ -161,17 +162,15 @@ def test_latent_space_names_every_code_and_straddles_zero(model: PoseModel) -> N
     assert space.groups[0].code_names == model.domain_names
     assert space.groups[0].full_name(1) == model.domain_names[1]
     assert space.groups[1].full_name(2) == f"{model.domain_names[0]}, motion 3"
-    assert (space.minimum < 0).all()
-    assert (space.maximum > 0).all()
-    assert (model.training_latent >= space.minimum).all()
-    assert (model.training_latent <= space.maximum).all()
+    assert (space.low < 0).all()
+    assert (space.high > 0).all()
+    assert (model.training_latent >= space.low / 1.2).all()
+    assert (model.training_latent <= space.high / 1.2).all()
     sampled = _box(model, 2000)
-    assert np.array_equal(space.low, BOX_SCALE * space.minimum)
-    assert np.array_equal(space.high, BOX_SCALE * space.maximum)
     assert (sampled >= space.low).all()
     assert (sampled <= space.high).all()
-    assert (sampled.min(axis=0) < 1.15 * space.minimum).all()
-    assert (sampled.max(axis=0) > 1.15 * space.maximum).all()
+    assert (sampled.min(axis=0) < 0.95 * space.low).all()
+    assert (sampled.max(axis=0) > 0.95 * space.high).all()
 
 
 def test_what_a_model_gives_cannot_be_written_to(model: PoseModel) -> None:
@@ -181,8 +180,8 @@ def test_what_a_model_gives_cannot_be_written_to(model: PoseModel) -> None:
         model.reference,
         model.attention_mask,
         model.training_latent,
-        space.minimum,
-        space.maximum,
+        space.low,
+        space.high,
     ):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
@@ -392,7 +391,8 @@ def test_sampled_poses_are_of_the_kind_asked_for(model: PoseModel, colliding: bo
 def test_sampling_gives_up_in_a_sentence(model: PoseModel, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lcollision_core.model.sampling._MOST_MISSES", 128)
     # Poses this near to the mean one are all free.
-    calm = replace(model.embedding, training_latent=0.01 * model.embedding.training_latent)
+    box = model.embedding.box
+    calm = replace(model.embedding, box=LatentBox(0.01 * box.low, 0.01 * box.high))
     calm_model = PoseModel("calm", calm, model.card)
     with pytest.raises(LCollisionError, match="none of 128 poses"):
         sample_poses(calm_model, 1, seed=0, colliding=True)
@@ -410,3 +410,36 @@ def test_models_of_programs_with_other_training_options_still_load(path: Path) -
     before.edit_domains({0: "tail"}).save(path)
     assert read_model_file(path)["embedding"].metadata["config"] == config
     assert PoseModel.load(path).fingerprint == before.fingerprint
+
+
+def test_the_box_is_kept_in_the_file_and_is_no_part_of_the_fingerprint(
+    model: PoseModel, path: Path
+) -> None:
+    box = LatentBox(2.0 * model.embedding.box.low, 3.0 * model.embedding.box.high)
+    wider = PoseModel("wider", replace(model.embedding, box=box), model.card)
+    wider.save(path)
+    loaded = PoseModel.load(path)
+    assert np.array_equal(loaded.latent_space.low, box.low)
+    assert np.array_equal(loaded.latent_space.high, box.high)
+    assert np.array_equal(labeller_of(loaded).label_rows(0, range(2)).latent, box.draw(0, 0)[:2])
+    assert loaded.fingerprint == wider.fingerprint == model.fingerprint
+
+
+def test_a_box_that_is_none_is_refused(model: PoseModel, path: Path) -> None:
+    model.save(path)
+    sections = read_model_file(path)
+    arrays = dict(sections["embedding"].arrays)
+    low, high = arrays["box_low"], arrays["box_high"]
+    for changes, sentence in (
+        ({"box_low": high, "box_high": low}, "must lie below 0 and above 0"),
+        ({"box_low": 0.0 * low}, "must lie below 0 and above 0"),
+        ({"box_high": high[1:]}, "its array box_high must be"),
+        ({"box_low": low.astype(np.float32)}, "its array box_low must be"),
+        ({"box_high": 1e9 * high}, "its array box_high holds"),
+        ({"box_high": None}, "its array box_high is missing"),
+    ):
+        held = {key: array for key, array in {**arrays, **changes}.items() if array is not None}
+        section = Section(held, sections["embedding"].metadata)
+        write_model_file(path, {**sections, "embedding": section})
+        with pytest.raises(ModelFileError, match=sentence):
+            PoseModel.load(path)

@@ -14,7 +14,6 @@ import pytest
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken
-from lcollision_core.labels import LatentBox
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model import PoseModel, sample_poses
@@ -89,7 +88,7 @@ def around_the_mean(latent: FloatArray, radius: float, steepness: float = 100.0)
 def resolver_of(
     model: PoseModel, predictor: CollisionModel, free_latents: npt.ArrayLike
 ) -> PoseResolver:
-    box = LatentBox.of(model.embedding)
+    box = model.embedding.box
     return PoseResolver(
         model.embedding, predictor, model.detector, model.height, free_latents, (box.low, box.high)
     )
