@@ -18,7 +18,7 @@ import numpy.typing as npt
 from app.benchmarks.detection import contacts_of_fcl, missing_peers
 from app.benchmarks.timing import median_seconds
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.embedding import ROWS_A_BLOCK
+from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.model import PoseModel
 from lcollision_core.predictor import CollisionPredictor
@@ -122,7 +122,7 @@ def time_predictor(
 def drawn_poses(model: PoseModel, n_poses: int) -> npt.NDArray[np.float32]:
     """Draw the first (n, D) samples of seed 0 from a model's latent box."""
     box = model.embedding.box
-    blocks = range(-(-n_poses // ROWS_A_BLOCK))
+    blocks = range(-(-n_poses // ROWS_PER_BLOCK))
     return np.concatenate([box.draw(0, block) for block in blocks])[:n_poses]
 
 

@@ -5,13 +5,13 @@ from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.decoder import FeatureDecoder
 from lcollision_core.embedding.fitting import LatentFit
-from lcollision_core.embedding.latent_box import ROWS_A_BLOCK, LatentBox
+from lcollision_core.embedding.latent_box import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.embedding.masks import MaskQuality, attention_mask, judge_masks
 from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.embedding.training import TrainingStatus, train_embedding
 
 __all__ = [
-    "ROWS_A_BLOCK",
+    "ROWS_PER_BLOCK",
     "AutoencoderWeights",
     "Embedding",
     "EmbeddingConfig",

@@ -21,7 +21,7 @@ _LARGEST_BOUND = 1e7
 
 BOX_ARRAYS = frozenset({"box_low", "box_high"})
 
-ROWS_A_BLOCK = 32
+ROWS_PER_BLOCK = 32
 """Rows that one thread draws, decodes and labels in one go."""
 
 
@@ -70,8 +70,8 @@ class LatentBox:
     def draw(self, seed: int, block: int) -> npt.NDArray[np.float32]:
         """Draw one block of the endless sequence of samples.
 
-        Row i of the sequence is row i % `ROWS_A_BLOCK` of block i // `ROWS_A_BLOCK`, whoever draws
-        it, in whatever order.
+        Row i of the sequence is row i % `ROWS_PER_BLOCK` of block i // `ROWS_PER_BLOCK`, whoever
+        draws it, in whatever order.
 
         Parameters
         ----------
@@ -80,12 +80,12 @@ class LatentBox:
 
         Returns
         -------
-        latent : (ROWS_A_BLOCK, D) float32 array, in the box up to rounding
+        latent : (ROWS_PER_BLOCK, D) float32 array, in the box up to rounding
         """
         # NumPy promises to keep seeding and raw bits for good, but not what `Generator` makes of
         # them: a store must go on with the same rows after an update.
         bits = np.random.Philox(np.random.SeedSequence([seed, block]))
-        raw = bits.random_raw((ROWS_A_BLOCK, len(self.low)))
+        raw = bits.random_raw((ROWS_PER_BLOCK, len(self.low)))
         uniform = (raw >> np.uint64(11)) * 2.0**-53
         latent: npt.NDArray[np.float32] = (self.low + (self.high - self.low) * uniform).astype(
             np.float32

@@ -3,10 +3,10 @@
 from lcollision_core.labels.identity import StoreIdentity, is_held_out
 from lcollision_core.labels.labeller import Labeller, LabelRows
 from lcollision_core.labels.run import LabelStatus, StatusCallback, label_poses, no_status
-from lcollision_core.labels.store import ROWS_A_CHUNK, LabelStore
+from lcollision_core.labels.store import ROWS_PER_CHUNK, LabelStore
 
 __all__ = [
-    "ROWS_A_CHUNK",
+    "ROWS_PER_CHUNK",
     "LabelRows",
     "LabelStatus",
     "LabelStore",

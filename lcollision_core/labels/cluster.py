@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator, Sequence
+from contextlib import suppress
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lcollision_core.errors import LCollisionError, MissingExtraError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels.labeller import Labeller, LabelRows
 from lcollision_core.labels.local import CountRows
 
-if TYPE_CHECKING:
-    from distributed import Client
-
 _CONNECT_SECONDS = 20
 _POLL_SECONDS = 0.5
 _CHUNKS_AHEAD = 2
-"""Chunks in hand for each thread of the cluster: none idles while its result travels."""
+"""Chunks submitted for each thread of the cluster, so that none idles while its result travels."""
 
 
 def label_on_cluster(
@@ -55,7 +53,8 @@ def label_on_cluster(
     CancelledError : `cancel` was set.
     """
     try:
-        from distributed import Client, wait
+        from distributed import CancelledError as LostError
+        from distributed import Client, KilledWorker, wait
     except ImportError as error:
         raise MissingExtraError(
             "labelling on a cluster needs Dask",
@@ -69,29 +68,44 @@ def label_on_cluster(
             "start one with `dask scheduler`, or check the address",
         ) from error
     with client:
-        _require_workers(client, scheduler)
-        shared = client.scatter(labeller, broadcast=True, hash=False)
-        remaining = deque(chunks)
-        in_hand: dict[Any, range] = {}
-        while remaining or in_hand:
-            # Workers come and go; with none, a chunk waits for the next.
-            n_threads = max(sum(client.nthreads().values()), 1)
-            while remaining and len(in_hand) < _CHUNKS_AHEAD * n_threads:
-                chunk = remaining.popleft()
-                in_hand[client.submit(label_on_worker, shared, seed, chunk, pure=False)] = chunk
-            cancel.raise_if_cancelled()
-            try:
-                with client.as_current():
-                    finished = wait(
-                        list(in_hand), timeout=_POLL_SECONDS, return_when="FIRST_COMPLETED"
-                    ).done
-            except TimeoutError:
-                continue
-            for future in finished:
-                chunk = in_hand.pop(future)
-                labelled = _result(future, scheduler)
-                count(labelled)
-                yield chunk, labelled
+        try:
+            client.wait_for_workers(1, timeout=_CONNECT_SECONDS)
+            for worker, found in client.run(program_version).items():
+                _require_version(worker, found)
+            shared = client.scatter(labeller, broadcast=True, hash=False)
+            remaining = deque(chunks)
+            pending: dict[Any, range] = {}
+            while remaining or pending:
+                # Workers come and go; with none, a chunk waits for the next.
+                n_threads = max(sum(client.nthreads().values()), 1)
+                while remaining and len(pending) < _CHUNKS_AHEAD * n_threads:
+                    rows = remaining.popleft()
+                    pending[client.submit(label_on_worker, shared, seed, rows, pure=False)] = rows
+                cancel.raise_if_cancelled()
+                with client.as_current(), suppress(TimeoutError):
+                    wait(list(pending), timeout=_POLL_SECONDS, return_when="FIRST_COMPLETED")
+                for future in [future for future in pending if future.done()]:
+                    rows = pending.pop(future)
+                    worker, found, labelled = future.result()
+                    # Of every chunk: workers that come late are not asked before.
+                    _require_version(worker, found)
+                    count(labelled)
+                    yield rows, labelled
+        except TimeoutError as error:
+            raise LCollisionError(
+                f"the scheduler at {scheduler} has no workers",
+                f"start some with `dask worker {scheduler}`",
+            ) from error
+        except ImportError as error:
+            raise LCollisionError(
+                f"a worker of {scheduler} lacks this program ({error})",
+                f"install lcollision {program_version()} there",
+            ) from error
+        except (KilledWorker, LostError) as error:
+            raise LCollisionError(
+                f"the workers of {scheduler} died while labelling",
+                "give them more memory, then run the same command again to go on",
+            ) from error
 
 
 def program_version() -> str:
@@ -106,52 +120,9 @@ def label_on_worker(labeller: Labeller, seed: int, rows: range) -> tuple[str, st
     return get_worker().address, program_version(), labeller.label_rows(seed, rows)
 
 
-def _require_workers(client: Client, scheduler: str) -> None:
-    """Wait for a worker, and ask all that there are for their version, before they get work."""
-    try:
-        client.wait_for_workers(1, timeout=_CONNECT_SECONDS)
-        versions = client.run(program_version)
-    except TimeoutError as error:
-        raise LCollisionError(
-            f"the scheduler at {scheduler} has no workers",
-            f"start some with `dask worker {scheduler}`",
-        ) from error
-    except ImportError as error:
-        raise _lacks_program(scheduler, error) from error
-    for worker, found in versions.items():
-        _require_version(worker, found)
-
-
 def _require_version(worker: str, found: str) -> None:
     if found != program_version():
         raise LCollisionError(
             f"the worker {worker} has lcollision {found}, this is {program_version()}",
             "install the same version there",
         )
-
-
-def _lacks_program(scheduler: str, error: ImportError) -> LCollisionError:
-    return LCollisionError(
-        f"a worker of {scheduler} lacks this program ({error})",
-        f"install lcollision {program_version()} there",
-    )
-
-
-def _result(future: Any, scheduler: str) -> LabelRows:
-    from distributed import CancelledError as LostError
-    from distributed import KilledWorker
-
-    worker: str
-    rows: LabelRows
-    try:
-        worker, found, rows = future.result()
-    except ImportError as error:
-        raise _lacks_program(scheduler, error) from error
-    except (KilledWorker, LostError) as error:
-        raise LCollisionError(
-            f"the workers of {scheduler} died while labelling",
-            "give them more memory, then run the same command again to go on",
-        ) from error
-    # Of every chunk: workers that come late are not asked before.
-    _require_version(worker, found)
-    return rows

@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.embedding import ROWS_A_BLOCK, Embedding
+from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding
 
 
 def blocks_of(rows: range) -> Iterator[range]:
-    """Cut rows, from a multiple of `ROWS_A_BLOCK` on, into those that one thread labels at once."""
-    for first in range(rows.start, rows.stop, ROWS_A_BLOCK):
-        yield range(first, min(first + ROWS_A_BLOCK, rows.stop))
+    """Cut rows, from a multiple of `ROWS_PER_BLOCK` on, into what a thread labels in one go."""
+    for first in range(rows.start, rows.stop, ROWS_PER_BLOCK):
+        yield range(first, min(first + ROWS_PER_BLOCK, rows.stop))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +101,10 @@ class Labeller:
         Parameters
         ----------
         seed : of the samples
-        rows : their indices, at least one, from a multiple of `ROWS_A_BLOCK` on
+        rows : their indices, at least one, from a multiple of `ROWS_PER_BLOCK` on
         """
         drawn = (
-            self.embedding.box.draw(seed, block.start // ROWS_A_BLOCK)[: len(block)]
+            self.embedding.box.draw(seed, block.start // ROWS_PER_BLOCK)[: len(block)]
             for block in blocks_of(rows)
         )
         return LabelRows.joined([self.label(latent) for latent in drawn])

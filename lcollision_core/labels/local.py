@@ -17,7 +17,7 @@ CountRows = Callable[[LabelRows], None]
 """Called with the rows that were labelled since the last call."""
 
 _BLOCKS_AHEAD = 2
-"""Blocks in hand for each thread, so that none idles while a chunk is written."""
+"""Blocks submitted for each thread, so that none idles while a chunk is written."""
 
 
 def label_locally(
@@ -49,16 +49,16 @@ def label_locally(
     """
     labeller.prepare()
     blocks = (rows for chunk in chunks for rows in blocks_of(chunk))
-    in_hand: deque[Future[LabelRows]] = deque()
+    pending: deque[Future[LabelRows]] = deque()
     pool = ThreadPoolExecutor(n_threads, thread_name_prefix="labels")
     try:
         for chunk in chunks:
             parts: list[LabelRows] = []
             for _ in blocks_of(chunk):
-                while len(in_hand) < _BLOCKS_AHEAD * n_threads and (rows := next(blocks, None)):
-                    in_hand.append(pool.submit(labeller.label_rows, seed, rows))
+                while len(pending) < _BLOCKS_AHEAD * n_threads and (rows := next(blocks, None)):
+                    pending.append(pool.submit(labeller.label_rows, seed, rows))
                 cancel.raise_if_cancelled()
-                parts.append(in_hand.popleft().result())
+                parts.append(pending.popleft().result())
                 count(parts[-1])
             yield chunk, LabelRows.joined(parts)
     finally:

@@ -1,10 +1,10 @@
-"""The folder of labelled samples: a manifest, and one NumPy archive for each chunk of rows.
+"""The folder of labelled rows: a manifest, and one shard, a NumPy archive, for each chunk of rows.
 
 ``labels.json`` says what is labelled. ``FIRST-LAST.npz`` holds the columns of `LabelRows` of the
-samples FIRST to LAST; FIRST is a multiple of `ROWS_A_CHUNK`, and of files with one FIRST the
-longest counts. Rows are a function of the manifest and their indices alone, and a file appears
-under its name whole: what is there is done, whoever wrote it. A damaged file is found by the CRC-32
-of its arrays, or by other samples than its name says.
+samples FIRST to LAST; FIRST is a multiple of `ROWS_PER_CHUNK`, and of shards with one FIRST the
+longest counts. Rows are a function of the manifest and their indices alone, and a shard appears
+under its name whole: what is there is done, whoever wrote it. A damaged shard is found by the
+CRC-32 of its arrays, or by other samples than its name says.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.embedding import ROWS_A_BLOCK
+from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.errors import LabelStoreError, LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.json_values import from_json, parse_json
@@ -35,8 +35,8 @@ from lcollision_core.regular_files import read_regular
 FORMAT_VERSION = 2
 """The version that stores are written in; version 1 was a Zarr group."""
 
-ROWS_A_CHUNK = 1024
-"""What an interruption may cost; a multiple of `ROWS_A_BLOCK`."""
+ROWS_PER_CHUNK = 1024
+"""What an interruption may cost; a multiple of `ROWS_PER_BLOCK`."""
 
 MANIFEST = "labels.json"
 KIND = "lcollision labels"
@@ -46,8 +46,8 @@ _MAX_MANIFEST_BYTES = 2**20
 
 def chunks_of(n_rows: int) -> Iterator[range]:
     """Give the rows of each chunk that the first `n_rows` rows are kept in."""
-    for first in range(0, n_rows, ROWS_A_CHUNK):
-        yield range(first, min(first + ROWS_A_CHUNK, n_rows))
+    for first in range(0, n_rows, ROWS_PER_CHUNK):
+        yield range(first, min(first + ROWS_PER_CHUNK, n_rows))
 
 
 class LabelStore:
@@ -67,7 +67,7 @@ class LabelStore:
         for file in path.iterdir():
             if name := _CHUNK_NAME.fullmatch(file.name):
                 first, last = int(name[1]), int(name[2])
-                if first % ROWS_A_CHUNK == 0 and first <= last < first + ROWS_A_CHUNK:
+                if first % ROWS_PER_CHUNK == 0 and first <= last < first + ROWS_PER_CHUNK:
                     self._ends[first] = max(self._ends.get(first, 0), last + 1)
 
     @classmethod
@@ -133,7 +133,7 @@ class LabelStore:
             manifest: dict[str, Any] = {
                 "kind": KIND,
                 "format_version": FORMAT_VERSION,
-                "rows_per_chunk": ROWS_A_CHUNK,
+                "rows_per_chunk": ROWS_PER_CHUNK,
                 "labels": asdict(identity),
             }
             manifest["sha256"] = _digest(manifest)
@@ -239,7 +239,7 @@ class LabelStore:
                     for name, (dtype, shape) in columns.items()
                 }
             )
-            expected = self.identity.box.draw(self.identity.seed, rows.start // ROWS_A_BLOCK)
+            expected = self.identity.box.draw(self.identity.seed, rows.start // ROWS_PER_BLOCK)
             if not np.array_equal(labelled.latent[0], expected[0]):
                 raise ValueError("rows of another place")
             _require_finite(labelled)

@@ -16,7 +16,7 @@ import pytest
 
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.training import train_embedding
-from lcollision_core.labels import ROWS_A_CHUNK, LabelStore
+from lcollision_core.labels import ROWS_PER_CHUNK, LabelStore
 from lcollision_core.model import PoseModel
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
@@ -129,7 +129,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_rows(
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     kept = LabelStore.open(killed)
-    assert 2 * ROWS_A_CHUNK <= kept.n_rows < 200_000
+    assert 2 * ROWS_PER_CHUNK <= kept.n_rows < 200_000
     before = kept.load()
 
     n_rows = kept.n_rows + 300
@@ -152,7 +152,7 @@ def test_ctrl_c_keeps_what_is_there_and_says_so(model: Path, tmp_path: Path) -> 
     assert process.returncode == 130
     assert stdout == ""
     n_rows = LabelStore.open(store).n_rows
-    assert n_rows >= ROWS_A_CHUNK
+    assert n_rows >= ROWS_PER_CHUNK
     assert stderr == (
         f"lcollision: stopped; {store} keeps {n_rows} rows, run the same command again to go on\n"
     )

@@ -15,7 +15,7 @@ from distributed import Client, LocalCluster
 from lcollision_core.errors import CancelledError, LCollisionError, MissingExtraError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import (
-    ROWS_A_CHUNK,
+    ROWS_PER_CHUNK,
     Labeller,
     LabelStatus,
     cluster,
@@ -23,7 +23,7 @@ from lcollision_core.labels import (
 )
 from tests.core.labelled import files_of
 
-N_ROWS = 4 * ROWS_A_CHUNK + 200
+N_ROWS = 4 * ROWS_PER_CHUNK + 200
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_workers_that_come_late_are_asked_for_their_version(
                 label_poses(
                     labeller,
                     tmp_path / "store",
-                    12 * ROWS_A_CHUNK,
+                    12 * ROWS_PER_CHUNK,
                     scheduler=scheduler,
                     progress=change_one,
                 )
@@ -154,7 +154,7 @@ def test_workers_that_come_late_get_as_much_to_do(labeller: Labeller, tmp_path: 
         label_poses(
             labeller,
             tmp_path / "store",
-            8 * ROWS_A_CHUNK,
+            8 * ROWS_PER_CHUNK,
             scheduler=local.scheduler_address,
             progress=add_two,
         )

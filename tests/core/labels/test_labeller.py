@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.contact import domain_energy
-from lcollision_core.embedding import ROWS_A_BLOCK, LatentBox
+from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.errors import ShapeError
 from lcollision_core.labels import (
     Labeller,
@@ -91,8 +91,8 @@ def test_a_row_has_the_same_bits_alone_and_in_a_batch(labeller: Labeller, truth:
 def test_a_labeller_that_travelled_says_the_same(labeller: Labeller, truth: LabelRows) -> None:
     copy = pickle.loads(pickle.dumps(labeller))
     assert copy.fingerprint == labeller.fingerprint
-    assert as_bytes(copy.label_rows(SEED, range(ROWS_A_BLOCK))) == as_bytes(
-        truth.taken(slice(ROWS_A_BLOCK))
+    assert as_bytes(copy.label_rows(SEED, range(ROWS_PER_BLOCK))) == as_bytes(
+        truth.taken(slice(ROWS_PER_BLOCK))
     )
 
 

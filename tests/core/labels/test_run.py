@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from lcollision_core.embedding import ROWS_A_BLOCK
+from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.errors import CancelledError, LabelStoreError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import (
-    ROWS_A_CHUNK,
+    ROWS_PER_CHUNK,
     Labeller,
     LabelRows,
     LabelStatus,
@@ -65,14 +65,14 @@ def test_no_more_than_two_blocks_a_thread_are_begun_beyond_the_chunk_in_work(
         return label_rows(self, seed, rows)
 
     monkeypatch.setattr(Labeller, "label_rows", count_and_label)
-    chunks = [range(first, first + ROWS_A_CHUNK) for first in range(0, 4096, ROWS_A_CHUNK)]
+    chunks = [range(first, first + ROWS_PER_CHUNK) for first in range(0, 4096, ROWS_PER_CHUNK)]
     labelled = label_locally(labeller, SEED, chunks, 4, lambda _: None, CancelToken())
     chunk, rows = next(labelled)
     labelled.close()
-    assert (chunk, len(rows)) == (range(ROWS_A_CHUNK), ROWS_A_CHUNK)
-    first_ones = list(range(0, ROWS_A_CHUNK + 8 * ROWS_A_BLOCK, ROWS_A_BLOCK))
+    assert (chunk, len(rows)) == (range(ROWS_PER_CHUNK), ROWS_PER_CHUNK)
+    first_ones = list(range(0, ROWS_PER_CHUNK + 8 * ROWS_PER_BLOCK, ROWS_PER_BLOCK))
     assert sorted(begun) == first_ones[: len(begun)]
-    assert len(begun) >= ROWS_A_CHUNK // ROWS_A_BLOCK
+    assert len(begun) >= ROWS_PER_CHUNK // ROWS_PER_BLOCK
 
 
 def test_a_cancelled_run_keeps_its_chunks_and_goes_on(
@@ -81,7 +81,7 @@ def test_a_cancelled_run_keeps_its_chunks_and_goes_on(
     path, token = tmp_path / "store", CancelToken()
 
     def cancel_in_the_second_chunk(status: LabelStatus) -> None:
-        if status.done > ROWS_A_CHUNK + ROWS_A_BLOCK:
+        if status.done > ROWS_PER_CHUNK + ROWS_PER_BLOCK:
             token.cancel()
 
     with pytest.raises(CancelledError):
@@ -89,12 +89,12 @@ def test_a_cancelled_run_keeps_its_chunks_and_goes_on(
             labeller, path, N_ROWS, seed=SEED, progress=cancel_in_the_second_chunk, cancel=token
         )
     kept = LabelStore.open(path)
-    assert kept.n_rows == ROWS_A_CHUNK
-    assert as_bytes(kept.load()) == as_bytes(truth.taken(slice(ROWS_A_CHUNK)))
+    assert kept.n_rows == ROWS_PER_CHUNK
+    assert as_bytes(kept.load()) == as_bytes(truth.taken(slice(ROWS_PER_CHUNK)))
     statuses: list[LabelStatus] = []
     label_poses(labeller, path, N_ROWS, seed=SEED, progress=statuses.append)
-    assert statuses[0].done == ROWS_A_CHUNK
-    assert statuses[0].n_colliding == truth.colliding[:ROWS_A_CHUNK].sum()
+    assert statuses[0].done == ROWS_PER_CHUNK
+    assert statuses[0].n_colliding == truth.colliding[:ROWS_PER_CHUNK].sum()
     assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
 
 
@@ -104,9 +104,9 @@ def test_a_store_grows_and_never_shrinks(
     path = tmp_path / "store"
     for wanted, kept, labelled in (
         (100, 100, 100),
-        (ROWS_A_CHUNK + 7, ROWS_A_CHUNK + 7, ROWS_A_CHUNK + 7),
-        (20, ROWS_A_CHUNK + 7, 0),
-        (ROWS_A_CHUNK + 40, ROWS_A_CHUNK + 40, 40),
+        (ROWS_PER_CHUNK + 7, ROWS_PER_CHUNK + 7, ROWS_PER_CHUNK + 7),
+        (20, ROWS_PER_CHUNK + 7, 0),
+        (ROWS_PER_CHUNK + 40, ROWS_PER_CHUNK + 40, 40),
     ):
         status = label_poses(labeller, path, wanted, seed=SEED)
         assert (status.done, status.labelled) == (kept, labelled)
@@ -127,7 +127,7 @@ def test_progress_tells_rate_time_left_and_share(
         assert status.n_colliding == truth.colliding[: status.done].sum()
         assert status.rows_per_second is not None
         assert status.seconds_left == pytest.approx((500 - status.done) / status.rows_per_second)
-    assert [status.done for status in statuses[:3]] == [0, ROWS_A_BLOCK, 2 * ROWS_A_BLOCK]
+    assert [status.done for status in statuses[:3]] == [0, ROWS_PER_BLOCK, 2 * ROWS_PER_BLOCK]
     assert statuses[-1] == last
     assert last.done == 500
     assert last.colliding_share == pytest.approx(truth.colliding[:500].mean())

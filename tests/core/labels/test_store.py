@@ -14,7 +14,7 @@ import pytest
 
 from lcollision_core.errors import LabelStoreError, LCollisionError, MeshFileError
 from lcollision_core.labels import (
-    ROWS_A_CHUNK,
+    ROWS_PER_CHUNK,
     Labeller,
     LabelRows,
     LabelStore,
@@ -94,7 +94,7 @@ def test_rows_are_read_whole_and_in_part(finished: Path, truth: LabelRows) -> No
         np.float32,
     )
     assert rows.domain_energy.dtype == rows.energy.dtype == np.float64
-    for n_rows in (0, 1, ROWS_A_CHUNK, ROWS_A_CHUNK + 1, N_ROWS):
+    for n_rows in (0, 1, ROWS_PER_CHUNK, ROWS_PER_CHUNK + 1, N_ROWS):
         assert as_bytes(opened.load(n_rows)) == as_bytes(truth.taken(slice(n_rows)))
     with pytest.raises(LabelStoreError, match=f"has {N_ROWS} rows, not {N_ROWS + 1}"):
         opened.load(N_ROWS + 1)
@@ -107,7 +107,7 @@ def test_anyone_can_read_it_with_numpy(finished: Path, truth: LabelRows) -> None
     assert np.array_equal(chunk["energy"], truth.energy[1024:2048])
     assert np.array_equal(chunk["latent"], truth.latent[1024:2048])
     manifest = json.loads((finished / MANIFEST).read_text())
-    assert (manifest["format_version"], manifest["rows_per_chunk"]) == (2, ROWS_A_CHUNK)
+    assert (manifest["format_version"], manifest["rows_per_chunk"]) == (2, ROWS_PER_CHUNK)
     assert manifest["labels"]["seed"] == SEED
 
 
@@ -123,19 +123,19 @@ def test_a_chunk_that_is_not_whole_is_noticed_and_labelled_again(
 ) -> None:
     damage(path / MIDDLE)
     opened = LabelStore.open(path)
-    for n_rows in (None, ROWS_A_CHUNK + 1):
+    for n_rows in (None, ROWS_PER_CHUNK + 1):
         with pytest.raises(LabelStoreError) as excinfo:
             opened.load(n_rows)
-        assert f"rows {ROWS_A_CHUNK} to " in _sentence(excinfo)
+        assert f"rows {ROWS_PER_CHUNK} to " in _sentence(excinfo)
         assert f"run `lcollision label M -n {N_ROWS} -o {path} --seed 3`" in _sentence(excinfo)
-    assert as_bytes(opened.load(ROWS_A_CHUNK)) == as_bytes(truth.taken(slice(ROWS_A_CHUNK)))
-    assert opened.check() == (range(ROWS_A_CHUNK, 2 * ROWS_A_CHUNK),)
+    assert as_bytes(opened.load(ROWS_PER_CHUNK)) == as_bytes(truth.taken(slice(ROWS_PER_CHUNK)))
+    assert opened.check() == (range(ROWS_PER_CHUNK, 2 * ROWS_PER_CHUNK),)
     if damage is _as_pipe:
         with pytest.raises(MeshFileError, match=f"{MIDDLE} cannot be written: it is not a plain"):
             label_poses(labeller, path, 5, seed=SEED)
         return
     # However few are asked for: what was there before is there again.
-    assert label_poses(labeller, path, 5, seed=SEED).labelled == ROWS_A_CHUNK
+    assert label_poses(labeller, path, 5, seed=SEED).labelled == ROWS_PER_CHUNK
     assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
     assert LabelStore.open(path).check() == ()
 
@@ -145,7 +145,7 @@ def test_stretches_of_damaged_rows_are_told_together(path: Path) -> None:
     _flip(path / MIDDLE)
     progress: list[tuple[int, int]] = []
     found = LabelStore.open(path).check(lambda done, total: progress.append((done, total)))
-    assert found == (range(2 * ROWS_A_CHUNK),)
+    assert found == (range(2 * ROWS_PER_CHUNK),)
     assert progress == [(1024, N_ROWS), (2048, N_ROWS), (N_ROWS, N_ROWS)]
 
 
@@ -304,11 +304,11 @@ def test_what_is_no_store_is_refused(
 
 
 def test_labels_that_are_not_finite_are_not_written(path: Path, truth: LabelRows) -> None:
-    rows, before = truth.taken(slice(ROWS_A_CHUNK)), files_of(path)
+    rows, before = truth.taken(slice(ROWS_PER_CHUNK)), files_of(path)
     energy = rows.energy.copy()
     energy[5] = np.nan
     with pytest.raises(LabelStoreError, match="the energy of a labelled pose is not finite"):
-        LabelStore.open(path).write(range(ROWS_A_CHUNK), replace(rows, energy=energy))
+        LabelStore.open(path).write(range(ROWS_PER_CHUNK), replace(rows, energy=energy))
     assert files_of(path) == before
 
 
