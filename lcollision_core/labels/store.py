@@ -128,8 +128,7 @@ class LabelStore:
         """
         target = Path(path)
         # A hidden file is the unfinished manifest of another run, alive or killed.
-        is_empty = target.is_dir() and not any(target.glob("[!.]*"))
-        if is_empty or not target.exists():
+        if not target.exists() or (target.is_dir() and not any(target.glob("[!.]*"))):
             manifest: dict[str, Any] = {
                 "kind": KIND,
                 "format_version": FORMAT_VERSION,

@@ -81,7 +81,7 @@ def test_label_says_how_many_and_what_share_collides(
     assert share > 0.5
     expected = f"{store}: 600 rows of tube, {share:.1f} % collide (600 labelled now, "
     assert result.stdout.startswith(expected)
-    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion"
+    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 domains, no near exclusion"
     assert result.stdout.endswith(f"/s)\n  {sizes}\n")
 
 
