@@ -1,8 +1,9 @@
 """Exact self-collision: candidates, penetration depths, penetration energy.
 
 Two triangles collide when they share no vertex and their penetration depth, the shortest
-translation that separates them, exceeds `DEPTH_TOLERANCE` heights. Surfaces that coincide exactly
-have depth 0: they touch, and do not collide. `CollisionDetector.summarise` counts them.
+translation that separates them, exceeds `DEPTH_TOLERANCE` in normalised length. Surfaces that
+coincide exactly have depth 0: they touch, and do not collide. `CollisionDetector.summarise` counts
+them.
 """
 
 from lcollision_core.contact.depth import penetration_depth

@@ -51,7 +51,7 @@ class PoseWork(NamedTuple):
     Attributes
     ----------
     middle : (3,) float64, the middle of the pose's bounding box, in its unit
-    triangles : (S, 3, 3) float64, corners in heights about that middle
+    triangles : (S, 3, 3) float64, corners in normalised length about that middle
     boxes : (6 S,) float32, leaf by leaf the lower x of its slots, lower y, lower z, upper x, ...
     node_boxes : (n, 6) float32, lower x, y, z, upper x, y, z
     stack : (depth bound, 2) int32, pairs of nodes still to be visited
@@ -72,7 +72,7 @@ class Found(NamedTuple):
     Attributes
     ----------
     slots : (P, 2) int32, the slots of the two faces
-    squared_depth : (P,) float64, in squared heights
+    squared_depth : (P,) float64, in normalised length squared
     is_near : (P,) bool
     """
 

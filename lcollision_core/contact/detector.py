@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lcollision_core.contact.arrays import FaceTree, Found, NearVertices, PoseWork
 from lcollision_core.contact.kernels import (
     LEAF_SIZE,
-    MAX_REACH,
+    MAX_DISTANCE,
     add_vertex_energy,
     search_pose,
 )
@@ -23,16 +23,16 @@ from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress
 from lcollision_core.meshes.topology import Topology
-from lcollision_core.meshes.units import height
+from lcollision_core.meshes.units import body_size
 
 IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
 
 DEPTH_TOLERANCE = 1e-9
-"""Depth in heights up to which two faces touch; beyond it they collide."""
+"""Depth in normalised length up to which two faces touch; beyond it they collide."""
 
-MAX_HEIGHT = 1e150
-"""The reference's height in its unit is at most this and at least its inverse: squared lengths
+MAX_BODY_SIZE = 1e150
+"""The body size in its unit is at most this and at least its inverse: squared lengths
 then neither overflow nor vanish, either of which would call a colliding pose free."""
 
 _PAIRS_AT_ONCE = 1 << 14
@@ -50,7 +50,7 @@ _TASKS_A_THREAD = 4
 
 @dataclass(frozen=True, slots=True)
 class SelfCollisions:
-    """All colliding pairs of one pose. Lengths are in heights.
+    """All colliding pairs of one pose; lengths are normalised, that is, divided by the body size.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class SelfCollisions:
     penetration_depth : (P,) float64, PD of each pair, > 1e-9
     near_pairs, near_penetration_depth : (Q, 2) and (Q,), the same of the pairs within the near
         exclusion: folds of the skin, which count neither for the verdict nor for the energy
-    vertex_energy : (V,) float64, PDe of Algorithm 1 in squared heights
+    vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
     """
 
     pairs: IntArray
@@ -74,7 +74,7 @@ class SelfCollisions:
 
     @property
     def energy(self) -> float:
-        """PDe-sum, the penetration energy of the pose, in squared heights."""
+        """PDe-sum, the penetration energy of the pose, in normalised length squared."""
         return float(self.vertex_energy.sum())
 
 
@@ -86,7 +86,7 @@ class BatchCollisions:
     ----------
     n_pairs : (B,) int64, colliding pairs
     n_near_pairs : (B,) int64, pairs within the near exclusion
-    vertex_energy : (B, V) float64, PDe of Algorithm 1 in squared heights
+    vertex_energy : (B, V) float64, PDe of Algorithm 1 in normalised length squared
     """
 
     n_pairs: npt.NDArray[np.int64]
@@ -101,7 +101,7 @@ class BatchCollisions:
 
 @dataclass(frozen=True, slots=True)
 class CollisionSummary:
-    """What `CollisionDetector.summarise` finds in one pose. Lengths are in heights.
+    """What `CollisionDetector.summarise` finds in one pose; lengths are normalised.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class CollisionSummary:
     deepest_depth : (P,) float64, their penetration depths
     n_coincident_pairs : pairs of faces that share no vertex, lie in one plane and overlap there:
         their depth is 0, so they do not collide
-    vertex_energy : (V,) float64, PDe of Algorithm 1 in squared heights
+    vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
     """
 
     n_pairs: int
@@ -128,7 +128,7 @@ class CollisionSummary:
 
     @property
     def energy(self) -> float:
-        """PDe-sum, the penetration energy of the pose, in squared heights."""
+        """PDe-sum, the penetration energy of the pose, in normalised length squared."""
         return float(self.vertex_energy.sum())
 
 
@@ -142,15 +142,15 @@ class CollisionDetector:
     Parameters
     ----------
     topology : of all poses
-    reference : (V, 3) array, a typical pose: the tree is built on it, and its height, the
-        longest side of its bounding box, is the unit of every result
+    reference : (V, 3) array, a typical pose: the tree is built on it, and the longest
+        side of its bounding box, the body size, is the unit of every result
     near_exclusion : pairs with an edge path of at most this length between them on the
-        reference, in heights, are counted apart; 0 excludes nothing
+        reference, in normalised length, are counted apart; 0 excludes nothing
 
     Raises
     ------
-    ShapeError : `reference` is not a finite (V, 3) array with an extent between 1 / `MAX_HEIGHT`
-        and `MAX_HEIGHT`, or `near_exclusion` is negative, or relates too many vertices.
+    ShapeError : `reference` is not a finite (V, 3) array with an extent between 1 / `MAX_BODY_SIZE`
+        and `MAX_BODY_SIZE`, or `near_exclusion` is negative, or relates too many vertices.
     """
 
     def __init__(
@@ -165,18 +165,18 @@ class CollisionDetector:
             vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
             raise ShapeError("is not finite", where=f"vertex {vertex} of the reference")
         if not near_exclusion >= 0.0:
-            raise ShapeError.must_be("the near exclusion", "0 or more heights", near_exclusion)
+            raise ShapeError.must_be("the near exclusion", "0 or more", near_exclusion)
         self.topology = topology
         self.near_exclusion = float(near_exclusion)
-        self.height = height(vertices, topology)
-        if self.height == 0.0:
+        self.body_size = body_size(vertices, topology)
+        if self.body_size == 0.0:
             raise ShapeError("all vertices are in one point", "give it a mesh with an extent")
-        if not 1.0 / MAX_HEIGHT <= self.height <= MAX_HEIGHT:
-            needed = f"{1.0 / MAX_HEIGHT:.0e} to {MAX_HEIGHT:.0e}"
-            raise ShapeError.must_be("the mesh's height", needed, f"{self.height:.1e}", "scale it")
+        if not 1.0 / MAX_BODY_SIZE <= self.body_size <= MAX_BODY_SIZE:
+            needed = f"{1.0 / MAX_BODY_SIZE:.0e} to {MAX_BODY_SIZE:.0e}"
+            raise ShapeError.must_be("the body size", needed, f"{self.body_size:.1e}", "scale it")
         self._tree: FaceTree = build_tree(vertices, topology.faces)
         self._near: NearVertices = near_vertices(
-            topology, vertices, self.near_exclusion * self.height
+            topology, vertices, self.near_exclusion * self.body_size
         )
         self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()
 
@@ -356,7 +356,7 @@ class CollisionDetector:
         try:
             searcher = self._idle.get_nowait()
         except queue.Empty:
-            searcher = _Searcher(self._tree, self._near, self.topology, self.height)
+            searcher = _Searcher(self._tree, self._near, self.topology, self.body_size)
         try:
             yield searcher
         finally:
@@ -370,12 +370,12 @@ class _Searcher:
     """One thread's work arrays and the search with them."""
 
     def __init__(
-        self, tree: FaceTree, near: NearVertices, topology: Topology, height: float
+        self, tree: FaceTree, near: NearVertices, topology: Topology, body_size: float
     ) -> None:
         self._tree = tree
         self._near = near
-        self._height = height
-        self._inverse_height = 1.0 / height
+        self._body_size = body_size
+        self._scale = 1.0 / body_size
         self._work: PoseWork = allocate_work(tree)
         self._pose = np.empty((topology.n_vertices, 3))
         self._unused = topology.unused_vertices
@@ -399,12 +399,12 @@ class _Searcher:
         """
         np.copyto(self._pose, pose)
         self._pose[self._unused] = self._pose[self._used]
-        self._inverse_height = unit / self._height
+        self._scale = unit / self._body_size
         self._waiting = 0
         while True:
             n_found, self._waiting = search_pose(
                 self._pose,
-                self._inverse_height,
+                self._scale,
                 DEPTH_TOLERANCE,
                 self._tree,
                 self._near,
@@ -427,12 +427,12 @@ class _Searcher:
         return 1.0 - float(self._work.share[: self._waiting].sum())
 
     def _refuse(self, number: int | None) -> NoReturn:
-        within = np.abs(self._pose) * self._inverse_height <= MAX_REACH  # False for NaN
+        within = np.abs(self._pose) * self._scale <= MAX_DISTANCE  # False for NaN
         vertex = int(np.flatnonzero(~within.all(axis=1))[0])
         where = "" if number is None else f" of pose {number}"
         position = self._pose[vertex].tolist()
         what = (
-            f"is more than {MAX_REACH:.0e} heights away from the origin"
+            f"is more than {MAX_DISTANCE:.0e} body sizes away from the origin"
             if np.isfinite(position).all()
             else "is not finite"
         )

@@ -15,7 +15,7 @@ def domain_energy(
 
     Parameters
     ----------
-    vertex_energy : (B, V) float64 array, PDe of Algorithm 1, in squared heights
+    vertex_energy : (B, V) float64 array, PDe of Algorithm 1, in normalised length squared
     attention_mask : (K, V) array, each column sums to 1
 
     Returns

@@ -31,9 +31,9 @@ Relative, so the same at every scale. Any direction gives an upper bound of the 
 tolerance only has to keep out cross products that are rounding noise.
 """
 
-MAX_REACH = 1e9
-"""Heights from the origin beyond which a pose is refused as a mistake. Within it, products of
-coordinates stay far from overflow."""
+MAX_DISTANCE = 1e9
+"""Normalised length from the origin beyond which a pose is refused as a mistake. Within it,
+products of coordinates stay far from overflow."""
 
 SMALL_SINE_SQUARED = 1e-6
 """Below this squared sine of their angle, two edges' cross product is freed of rounding."""
@@ -152,8 +152,8 @@ def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArra
 
 
 @compiled
-def _refit(pose, inverse_height, tree, work):
-    """Fill `work` for one pose and return True, or False where it is not within `MAX_REACH`.
+def _refit(pose, scale, tree, work):
+    """Fill `work` for one pose and return True, or False where it is not within `MAX_DISTANCE`.
 
     Coordinates are taken from the middle of the pose's bounding box, so that a pose far from
     the origin loses no precision to its distance.
@@ -164,7 +164,7 @@ def _refit(pose, inverse_height, tree, work):
         high = -np.inf
         for v in range(len(pose)):
             # Written so that NaN fails it.
-            if not abs(pose[v, c]) * inverse_height <= MAX_REACH:
+            if not abs(pose[v, c]) * scale <= MAX_DISTANCE:
                 return False
             low = min(low, pose[v, c])
             high = max(high, pose[v, c])
@@ -183,9 +183,9 @@ def _refit(pose, inverse_height, tree, work):
                 boxes[base + c * LEAF_SIZE] = np.inf
                 boxes[base + (3 + c) * LEAF_SIZE] = -np.inf
                 continue
-            p = (pose[first, c] - middle[c]) * inverse_height
-            q = (pose[second, c] - middle[c]) * inverse_height
-            r = (pose[third, c] - middle[c]) * inverse_height
+            p = (pose[first, c] - middle[c]) * scale
+            q = (pose[second, c] - middle[c]) * scale
+            r = (pose[third, c] - middle[c]) * scale
             work.triangles[slot, 0, c] = p
             work.triangles[slot, 1, c] = q
             work.triangles[slot, 2, c] = r
@@ -211,6 +211,13 @@ def _refit(pose, inverse_height, tree, work):
                 node_boxes[node, c] = min(node_boxes[a, c], node_boxes[b, c])
                 node_boxes[node, 3 + c] = max(node_boxes[a, 3 + c], node_boxes[b, 3 + c])
     return True
+
+
+@njit(inline="always", error_model="numpy")
+def _push(stack, n_waiting, a, b):
+    stack[n_waiting, 0] = a
+    stack[n_waiting, 1] = b
+    return n_waiting + 1
 
 
 @njit(inline="always", error_model="numpy")
@@ -252,21 +259,6 @@ def _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
 
 
 @compiled
-def _is_near(corners, slot_a, slot_b, near):
-    """Whether some corner of one face is near some corner of the other."""
-    if len(near.vertex) == 0:
-        return False
-    base_a = slot_a // LEAF_SIZE * 3 * LEAF_SIZE + slot_a % LEAF_SIZE
-    base_b = slot_b // LEAF_SIZE * 3 * LEAF_SIZE + slot_b % LEAF_SIZE
-    for i in range(3):
-        v = corners[base_a + i * LEAF_SIZE]
-        for j in range(3):
-            if _are_vertices_near(v, corners[base_b + j * LEAF_SIZE], near):
-                return True
-    return False
-
-
-@compiled
 def _are_vertices_near(v, w, near):
     low = near.start[v]
     high = near.start[v + 1]
@@ -277,6 +269,18 @@ def _are_vertices_near(v, w, near):
         else:
             high = probe
     return low < near.start[v + 1] and near.vertex[low] == w
+
+
+@compiled
+def _are_faces_near(face_a, face_b, near):
+    """Whether some corner of one face, a tuple of vertices, is near some corner of the other."""
+    if len(near.vertex) == 0:
+        return False
+    for v in face_a:
+        for w in face_b:
+            if _are_vertices_near(v, w, near):
+                return True
+    return False
 
 
 @compiled
@@ -294,11 +298,8 @@ def find_near(
     pairs : (n, 2) of them
     """
     for n in range(len(pairs)):
-        is_near[n] = False
-        for i in range(3):
-            for j in range(3):
-                v, w = faces[pairs[n, 0], i], faces[pairs[n, 1], j]
-                is_near[n] |= len(near.vertex) > 0 and _are_vertices_near(v, w, near)
+        a, b = faces[pairs[n, 0]], faces[pairs[n, 1]]
+        is_near[n] = _are_faces_near((a[0], a[1], a[2]), (b[0], b[1], b[2]), near)
 
 
 @compiled
@@ -409,7 +410,8 @@ def _search_leaves(
                 if len(n_coincident) > 0 and _coincide(work.triangles, slot_a, slot_b, tolerance):
                     n_coincident[0] += 1
                 continue
-            is_near = _is_near(corners, slot_a, slot_b, near)
+            other = (corners[c], corners[c + _LEAF], corners[c + uint64(2) * _LEAF])
+            is_near = _are_faces_near((f0, f1, f2), other, near)
             found.slots[n_found, 0] = slot_a
             found.slots[n_found, 1] = slot_b
             found.squared_depth[n_found] = squared_depth
@@ -423,7 +425,7 @@ def _search_leaves(
 @compiled
 def search_pose(
     pose: FloatArray,
-    inverse_height: float,
+    scale: float,
     tolerance: float,
     tree: FaceTree,
     near: NearVertices,
@@ -431,7 +433,7 @@ def search_pose(
     first_only: bool,
     found: Found,
     n_coincident: npt.NDArray[np.int64],
-    waiting: int,
+    n_waiting: int,
     leaf_size: int,
 ) -> tuple[int, int]:
     """Find the pairs of faces that share no vertex and penetrate each other in one pose.
@@ -441,43 +443,40 @@ def search_pose(
     Parameters
     ----------
     pose : (V, 3) float64 array
-    inverse_height : factor from the pose's unit to heights
-    tolerance : depth in heights up to which two faces touch rather than penetrate
+    scale : factor from the pose's unit to normalised length
+    tolerance : depth in normalised length up to which two faces touch rather than penetrate
     tree, near, work : of one topology; `work` is overwritten
     first_only : end the search at the first pair that is not near
     found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
     n_coincident : (1,) array that the pairs that touch face to face are added to, or (0,) where
         nobody asks for them
-    waiting : 0 to begin, else what the call before returned
+    n_waiting : 0 to begin, else what the call before returned
     leaf_size : `LEAF_SIZE`
 
     Returns
     -------
     n_found : how many pairs this call has put into `found`; -1 where a vertex is not finite or
-        beyond `MAX_REACH`
-    waiting : how many pairs of nodes are still to be visited, 0 at the end; `work.share` says what
-        share of the search each of them is guessed to be
+        beyond `MAX_DISTANCE`
+    n_waiting : how many pairs of nodes are still to be visited, 0 at the end; `work.share` says
+        what share of the search each of them is guessed to be
     """
     boxes = work.node_boxes
     stack = work.stack
     share = work.share
     # Not a plain 0, for which the search of leaves would be compiled apart.
     n_found: int = int(np.int64(0))
-    height = waiting
-    if waiting == 0:
-        if not _refit(pose, inverse_height, tree, work):
+    if n_waiting == 0:
+        if not _refit(pose, scale, tree, work):
             return -1, 0
-        stack[0, 0] = 0
-        stack[0, 1] = 0
+        n_waiting = _push(stack, 0, 0, 0)
         share[0] = 1.0
-        height = 1
-    while height > 0:
-        height -= 1
-        a = stack[height, 0]
-        b = stack[height, 1]
+    while n_waiting > 0:
+        n_waiting -= 1
+        a = stack[n_waiting, 0]
+        b = stack[n_waiting, 1]
         if tree.leaf[a] >= 0 and tree.leaf[b] >= 0:
             if n_found + LEAF_SIZE * LEAF_SIZE > len(found.slots):
-                return n_found, height + 1
+                return n_found, n_waiting + 1
             n_found, stop = _search_leaves(
                 tree,
                 work,
@@ -495,40 +494,23 @@ def search_pose(
             if stop:
                 return n_found, 0
             continue
-        first = height
+        first = n_waiting
         part = share[first]
         if a == b:
-            one = tree.left[a]
-            two = tree.right[a]
-            stack[height, 0] = one
-            stack[height, 1] = one
-            stack[height + 1, 0] = two
-            stack[height + 1, 1] = two
-            height += 2
+            one, two = tree.left[a], tree.right[a]
+            n_waiting = _push(stack, n_waiting, one, one)
+            n_waiting = _push(stack, n_waiting, two, two)
             if _overlap(boxes, one, two):
-                stack[height, 0] = one
-                stack[height, 1] = two
-                height += 1
+                n_waiting = _push(stack, n_waiting, one, two)
         else:
             # Open the larger node of the two.
-            if tree.leaf[b] >= 0 or (tree.leaf[a] < 0 and tree.size[a] >= tree.size[b]):
-                one = tree.left[a]
-                two = tree.right[a]
-                other = b
-            else:
-                one = tree.left[b]
-                two = tree.right[b]
-                other = a
-            if _overlap(boxes, one, other):
-                stack[height, 0] = one
-                stack[height, 1] = other
-                height += 1
-            if _overlap(boxes, two, other):
-                stack[height, 0] = two
-                stack[height, 1] = other
-                height += 1
-        for k in range(first, height):
-            share[k] = part / (height - first)
+            if tree.leaf[b] < 0 and (tree.leaf[a] >= 0 or tree.size[a] < tree.size[b]):
+                a, b = b, a
+            for child in (tree.left[a], tree.right[a]):
+                if _overlap(boxes, child, b):
+                    n_waiting = _push(stack, n_waiting, child, b)
+        for k in range(first, n_waiting):
+            share[k] = part / (n_waiting - first)
     return n_found, 0
 
 
@@ -538,7 +520,7 @@ def add_vertex_energy(
 ) -> None:
     """Add a sixth of each pair's squared depth to its six vertices: Algorithm 1 of the paper.
 
-    Near pairs add nothing. `vertex_energy` (V,) float64, in squared heights, is added to.
+    Near pairs add nothing. `vertex_energy` (V,) float64, in normalised length squared, is added to.
     """
     for pair in range(n_found):
         if found.is_near[pair]:

@@ -32,7 +32,7 @@ from lcollision_core.meshes.alignment import align_rigid
 from lcollision_core.meshes.pose_set import PoseSet
 from lcollision_core.meshes.precision import can_hold
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.meshes.units import height
+from lcollision_core.meshes.units import body_size
 
 _RUN_VERSION = 1
 """Goes up when training changes, so that no checkpoint is continued by other rules."""
@@ -135,7 +135,7 @@ class _Run:
         if not can_hold(vertices[0], pose_set.topology, np.float32):
             # So far from the origin that what is drawn and learnt in float32 would lose its shape.
             vertices = vertices - vertices[0, pose_set.topology.picked].mean(axis=0)
-        vertices = vertices / height(vertices[0], pose_set.topology)
+        vertices = vertices / body_size(vertices[0], pose_set.topology)
         key = run_key(
             {"vertices": pose_set.vertices, "faces": pose_set.faces},
             {**asdict(config), "seed": seed, "version": _RUN_VERSION},

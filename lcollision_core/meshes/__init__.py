@@ -33,7 +33,7 @@ from lcollision_core.meshes.pose_set import (
 )
 from lcollision_core.meshes.precision import as_stored, can_hold
 from lcollision_core.meshes.topology import Topology
-from lcollision_core.meshes.units import front_direction, height, up_axis
+from lcollision_core.meshes.units import body_size, front_direction, up_axis
 from lcollision_core.meshes.upright import UpGuess, guess_up
 
 __all__ = [
@@ -54,6 +54,7 @@ __all__ = [
     "atomic_files",
     "atomic_write",
     "audit_mesh",
+    "body_size",
     "can_hold",
     "file_stamp",
     "file_stem",
@@ -62,7 +63,6 @@ __all__ = [
     "front_direction",
     "guess_up",
     "has_known_suffix",
-    "height",
     "inspect_pose_set",
     "locked",
     "mesh_files",

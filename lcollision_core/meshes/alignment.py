@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken
-from lcollision_core.meshes.units import height
+from lcollision_core.meshes.units import body_size
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -172,7 +172,7 @@ def align_rigid(
     target = np.asarray(reference, dtype=np.float64)
     rotations, translations = fit_rigid(poses, target)
     # Below this, motion is rounding, and dividing by it would let rounding choose the weights.
-    least_motion = 1e-14 * height(target) + np.finfo(np.float64).tiny
+    least_motion = 1e-14 * body_size(target) + np.finfo(np.float64).tiny
     weights = np.ones(len(target))
     for _ in range(_MAX_ROUNDS):
         if cancel is not None:

@@ -51,7 +51,7 @@ class PoseSet:
     names : N names, the mesh files' or "pose 12"
     source : the folder or file that it was read from, if it was
     notes : sentences on what was done on reading
-    near_exclusion : fraction of the height below which pairs are near, not colliding
+    near_exclusion : normalised length up to which pairs are near, not colliding
     up_axis : 0, 1 or 2 for x, y or z; None where it is to be guessed
     vertex_labels : (V,) array of printable strings, the body part of each vertex, if known
 

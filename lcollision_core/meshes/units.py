@@ -22,8 +22,8 @@ def _sides(vertices: npt.NDArray[Any], topology: Topology | None) -> npt.NDArray
     return sides
 
 
-def height(vertices: npt.NDArray[Any], topology: Topology | None = None) -> float:
-    """Return the height of a mesh: the longest side of its bounding box.
+def body_size(vertices: npt.NDArray[Any], topology: Topology | None = None) -> float:
+    """Return the body size: the longest side of the bounding box of a mesh.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def height(vertices: npt.NDArray[Any], topology: Topology | None = None) -> floa
 
     Returns
     -------
-    the height in the same unit; lengths in reports are divided by it
+    the size in the same unit; normalised lengths are divided by it
 
     Raises
     ------
@@ -47,7 +47,7 @@ def up_axis(vertices: npt.NDArray[Any], topology: Topology | None = None) -> int
     Parameters
     ----------
     vertices : (V, 3) array, the reference mesh
-    topology : as of `height`
+    topology : as of `body_size`
 
     Raises
     ------

@@ -14,10 +14,10 @@ from lcollision_core.meshes.units import up_axis
 
 _MOST_POSES = 12
 _SUPPORT, _LEGS = 0.04, 0.12
-"""Shares of the height: what stands on the floor, and what legs are looked for in."""
+"""Shares of the extent along the axis: what stands on the floor, and where legs are looked for."""
 _CELLS = 24
 _SYMMETRIC = 0.01
-"""In heights: the mean distance of a symmetric body from its mirror image."""
+"""Normalised: the mean distance of a symmetric body from its mirror image."""
 _LEAST_EXTENT = 0.35
 """Of the longest side: what is flatter lies, and does not stand."""
 _LONGEST = 0.1

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import PoseSetError, ShapeError, WrongScaleError
-from lcollision_core.meshes import Topology, can_hold, height
+from lcollision_core.meshes import Topology, body_size, can_hold
 from lcollision_core.meshes.likeness import LARGEST_SIZE, is_torn, scale_of
 from lcollision_core.meshes.topology import FloatArray
 
@@ -98,11 +98,11 @@ def checked_mesh(
     size, limit = scale_of(lengths, known), LARGEST_SIZE
     if size is None:
         # Not scaled as a whole: not a pose perhaps, but no other unit unless it is far off.
-        size, limit = height(mesh, topology) / height(reference, topology), _MOST_SIZE
+        size, limit = body_size(mesh, topology) / body_size(reference, topology), _MOST_SIZE
     if not 1.0 / limit < size < limit:
         sentence = (
             f"the mesh is {float(f'{size:.3g}'):g} times as large as the body of {model!r}, "
-            f"which is {height(reference, topology):.3g} tall in its own unit"
+            f"which is {body_size(reference, topology):.3g} tall in its own unit"
         )
         if not 0.0 < size < np.inf:
             raise PoseSetError(sentence, "export it again")

@@ -22,8 +22,8 @@ from lcollision_core.meshes import (
     PoseSet,
     RigidTransform,
     Topology,
+    body_size,
     front_direction,
-    height,
 )
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect, code_effects, code_names
@@ -173,7 +173,7 @@ class PoseModel:
                 embedding.attention_mask, pose_set.vertex_labels, reference[:, up]
             )
         card = ModelCard(
-            height=height(reference, pose_set.topology),
+            height=body_size(reference, pose_set.topology),
             up_axis=up,
             near_exclusion=pose_set.near_exclusion,
             domain_names=names,

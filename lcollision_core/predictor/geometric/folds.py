@@ -50,7 +50,7 @@ class FoldDetector:
         topology, rest = embedding.topology, embedding.rest_vertices
         reach = near_exclusion + FOLD_REACH
         self._detector = CollisionDetector(topology, rest, near_exclusion=reach)
-        self._excluded = near_vertices(topology, rest, near_exclusion * self._detector.height)
+        self._excluded = near_vertices(topology, rest, near_exclusion * self._detector.body_size)
 
     def detect(
         self, vertices: npt.NDArray[np.floating]

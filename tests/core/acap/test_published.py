@@ -8,7 +8,7 @@ import pytest
 from lcollision_core.acap.codec import AcapCodec
 from lcollision_core.meshes import PoseSet
 from lcollision_core.meshes.alignment import align_rigid
-from lcollision_core.meshes.units import height
+from lcollision_core.meshes.units import body_size
 from tests.core.acap.jumps import n_jumps
 
 
@@ -25,8 +25,8 @@ def test_round_trip_of_aligned_poses(
     most_jumps: int,
 ) -> None:
     poses: PoseSet = request.getfixturevalue(name)
-    reference = poses.vertices[0] / height(poses.vertices[0])
-    aligned = align_rigid(poses.vertices[::step] / height(poses.vertices[0]), reference)
+    reference = poses.vertices[0] / body_size(poses.vertices[0])
+    aligned = align_rigid(poses.vertices[::step] / body_size(poses.vertices[0]), reference)
     codec = AcapCodec(poses.topology, reference, aligned.weights)
     features = codec.encode(aligned.vertices)
     # Anchored like the alignment, so that no translation is left to take out.

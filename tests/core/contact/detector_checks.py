@@ -16,13 +16,13 @@ def detector_for(mesh: Mesh) -> CollisionDetector:
 def check_against_brute_force(
     detector: CollisionDetector, vertices: np.ndarray, faces: np.ndarray
 ) -> SelfCollisions:
-    """Compare every mode with the reference: the same pairs, depths to 1e-12 heights."""
+    """Compare every mode with the reference: the same pairs, depths to 1e-12 normalised."""
     found = detector.detect(vertices)
-    expected = all_pairs(vertices, faces, DEPTH_TOLERANCE * detector.height)
+    expected = all_pairs(vertices, faces, DEPTH_TOLERANCE * detector.body_size)
     assert found.pairs.dtype == np.int32
     assert found.pairs.tolist() == expected.pairs.tolist()
     np.testing.assert_allclose(
-        found.penetration_depth, expected.depth / detector.height, rtol=0, atol=1e-12
+        found.penetration_depth, expected.depth / detector.body_size, rtol=0, atol=1e-12
     )
     assert len(found.near_pairs) == len(found.near_penetration_depth) == 0
     batch = detector.detect_batch(vertices[None], workers=1)

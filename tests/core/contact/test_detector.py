@@ -45,8 +45,8 @@ COLLIDING = {
         box([-3, -1, -1], [3, 1, 1]), box([-1.1, -3, -0.9], [0.9, 3, 1.1])
     ),
     "spheres that overlap": join(sphere(), sphere().moved([1.5, 0, 0])),
-    "a block pressed in by 1e-6 heights": pressed_block(1.5e-6),
-    "a block pressed in by 2e-9 heights": pressed_block(3e-9),
+    "a block pressed in by 1e-6 body sizes": pressed_block(1.5e-6),
+    "a block pressed in by 2e-9 body sizes": pressed_block(3e-9),
     "a corner in a face": join(BLOCK, box([0.9, 0.9, 0.9], [2, 2, 2])),
 }
 
@@ -64,7 +64,7 @@ FREE = {
     "blocks that share an edge": join(BLOCK, BLOCK.moved([1, 1, 0])),
     "blocks that share a corner": join(BLOCK, BLOCK.moved([1, 1, 1])),
     "the same block twice": join(BLOCK, BLOCK),
-    "a block pressed in by 1e-10 heights": pressed_block(1.5e-10),
+    "a block pressed in by 1e-10 body sizes": pressed_block(1.5e-10),
     "a sheet": grid(5),
 }
 
@@ -100,9 +100,9 @@ def test_results_do_not_depend_on_the_frame(shift: float) -> None:
     mesh = interlocked_tori(0.6).turned(random_rotation(rng))
     detector = detector_for(mesh)
     at_home = detector.detect(mesh.vertices)
-    away = mesh.turned(random_rotation(rng)).moved(shift * detector.height * np.ones(3))
+    away = mesh.turned(random_rotation(rng)).moved(shift * detector.body_size * np.ones(3))
     found = detector.detect(away.vertices)
-    # Coordinates of `shift` heights are rounded by 2^-53 of them.
+    # Coordinates of `shift` body sizes are rounded by 2^-53 of them.
     rounding = 1e-14 + 1e-15 * shift
     assert at_home.penetration_depth.min() > 1e-7
     assert np.array_equal(found.pairs, at_home.pairs)
@@ -147,7 +147,7 @@ def test_a_pose_may_be_larger_or_smaller_than_the_reference() -> None:
 def test_an_absurdly_large_pose_is_refused_rather_than_called_free(factor: float) -> None:
     mesh = interlocked_tori(0.6)
     detector = detector_for(mesh)
-    with pytest.raises(ShapeError, match=r"vertex \d+ is more than 1e\+09 heights away"):
+    with pytest.raises(ShapeError, match=r"vertex \d+ is more than 1e\+09 body sizes away"):
         detector.detect(factor * mesh.vertices)
     with pytest.raises(ShapeError, match=r"vertex \d+ of pose 1 is more than"):
         detector.are_colliding(np.stack([mesh.vertices, factor * mesh.vertices]))
@@ -207,7 +207,7 @@ def test_all_of_many_pairs_are_reported() -> None:
     with_floor = found.pairs[:, 0] == 0
     assert found.pairs[with_floor, 1].tolist() == list(range(1, 3001))
     np.testing.assert_allclose(
-        found.penetration_depth[with_floor] * detector.height, depth, rtol=1e-11
+        found.penetration_depth[with_floor] * detector.body_size, depth, rtol=1e-11
     )
     # Again, now that there is room, and a sparse pose after a crowded one.
     again = detector.detect(mesh.vertices)
@@ -314,7 +314,7 @@ def test_no_shallow_pair_slips_between_the_boxes(spread: float) -> None:
     blades = (size * blade - lift) * np.concatenate([side**2, side**2, side], axis=2)
     triangles = np.stack([size * floor + places, blades + places], axis=1).reshape(-1, 3, 3)
     mesh = soup(triangles)
-    # The unit is that of a reference of height 1, whatever the spread of the pose.
+    # The unit is that of a reference of body size 1, whatever the spread of the pose.
     reference = soup(triangles / spread)
     detector = detector_for(reference)
     found = detector.detect(mesh.vertices)

@@ -45,7 +45,7 @@ def test_scape_against_brute_force(scape: PoseSet, pose: int) -> None:
 def test_bent_scape_against_brute_force(scape: PoseSet) -> None:
     """Wring the body about its long axis and fold it: limbs go through limbs."""
     detector = CollisionDetector(scape.topology, scape.vertices[0])
-    body = scape.vertices[20].astype(float) / detector.height
+    body = scape.vertices[20].astype(float) / detector.body_size
     bent = body + 0.08 * np.sin(body @ np.array([[9.0, 3, 7], [-5, 8, 11], [8, -9, 6]]))
     found = check_against_brute_force(detector, bent, scape.faces)
     assert len(found.pairs) > 100
@@ -95,7 +95,7 @@ def check_against_fcl(detector: CollisionDetector, vertices: np.ndarray, faces: 
     assert ours <= theirs
     for a, b in theirs - ours:
         depth = exact_depth(vertices[faces[a]], vertices[faces[b]])
-        assert depth <= DEPTH_TOLERANCE * detector.height
+        assert depth <= DEPTH_TOLERANCE * detector.body_size
     return len(ours)
 
 

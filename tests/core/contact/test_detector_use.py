@@ -73,8 +73,8 @@ def test_another_reference_changes_the_unit_alone(
         expected, found = detector.detect(pose), other.detect(pose)
         assert np.array_equal(found.pairs, expected.pairs)
         np.testing.assert_allclose(
-            found.penetration_depth * other.height,
-            expected.penetration_depth * detector.height,
+            found.penetration_depth * other.body_size,
+            expected.penetration_depth * detector.body_size,
             atol=1e-14,
         )
 

@@ -103,7 +103,7 @@ def test_lengths_are_those_of_the_reference_not_of_the_pose() -> None:
     # On the loop itself the way round is longer than all of its height.
     detector = CollisionDetector(LOOP.topology, LOOP.vertices, near_exclusion=0.625)
     round_trip = pair_distances(LOOP, np.array(AT_DISTANCE_4 + AT_DISTANCE_5))
-    assert round_trip.min() > 0.625 * detector.height
+    assert round_trip.min() > 0.625 * detector.body_size
     assert len(detector.detect(LOOP.vertices).pairs) == 3
 
 
@@ -168,8 +168,8 @@ def test_near_pairs_of_a_crumpled_sheet_against_brute_force(near_exclusion: floa
     uneven = Mesh(sheet.vertices + rng.normal(scale=0.02, size=sheet.vertices.shape), sheet.faces)
     pose = uneven.vertices + rng.normal(scale=0.3, size=sheet.vertices.shape)
     detector = CollisionDetector(sheet.topology, uneven.vertices, near_exclusion=near_exclusion)
-    expected = all_pairs(pose, sheet.faces, DEPTH_TOLERANCE * detector.height)
-    limit = near_exclusion * detector.height
+    expected = all_pairs(pose, sheet.faces, DEPTH_TOLERANCE * detector.body_size)
+    limit = near_exclusion * detector.body_size
     is_near = pair_distances(uneven, expected.pairs) <= limit
     assert 0 < np.count_nonzero(is_near) < len(is_near)
 
@@ -177,7 +177,7 @@ def test_near_pairs_of_a_crumpled_sheet_against_brute_force(near_exclusion: floa
     assert np.array_equal(found.pairs, expected.pairs[~is_near])
     assert np.array_equal(found.near_pairs, expected.pairs[is_near])
     np.testing.assert_allclose(
-        found.near_penetration_depth * detector.height, expected.depth[is_near], atol=1e-12
+        found.near_penetration_depth * detector.body_size, expected.depth[is_near], atol=1e-12
     )
 
 

@@ -12,8 +12,8 @@ from lcollision_core.meshes import (
     PoseSet,
     RigidTransform,
     align_rigid,
+    body_size,
     fit_rigid,
-    height,
     up_axis,
 )
 
@@ -176,16 +176,16 @@ def test_cancel_ends_the_alignment() -> None:
 
 def test_height_and_up_axis_are_the_longest_side() -> None:
     box = np.array([[0.0, -1.0, 0.0], [1.0, 2.0, 0.5]])
-    assert height(box) == 3.0
+    assert body_size(box) == 3.0
     assert up_axis(box) == 1
     with pytest.raises(ShapeError, match=r"\(V, 3\)"):
-        height(np.empty((0, 3)))
+        body_size(np.empty((0, 3)))
 
 
 def _calm_motion(vertices: np.ndarray) -> float:
-    """Return how far the calmest tenth of the body strays from its mean place, in heights."""
+    """Return how far the calmest tenth of the body strays from its mean position, normalised."""
     spread = np.sqrt(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
-    return float(np.quantile(spread, 0.1)) / height(vertices[0])
+    return float(np.quantile(spread, 0.1)) / body_size(vertices[0])
 
 
 def test_scape_torsos_stay_put(scape: PoseSet) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.training import train_embedding
-from lcollision_core.meshes import PoseSet, Topology, height, up_axis
+from lcollision_core.meshes import PoseSet, Topology, body_size, up_axis
 from lcollision_core.model import PoseModel
 from tests.bending_tube import LENGTH_IN_FILES
 
@@ -40,7 +40,7 @@ def stray_model(tube_poses: PoseSet) -> PoseModel:
 
 def test_height_and_up_are_of_the_vertices_in_use(tube_poses: PoseSet) -> None:
     poses = with_strays(tube_poses)
-    assert height(poses.vertices[0], poses.topology) == height(tube_poses.vertices[0])
+    assert body_size(poses.vertices[0], poses.topology) == body_size(tube_poses.vertices[0])
     assert up_axis(poses.vertices[0], poses.topology) == up_axis(tube_poses.vertices[0]) == 1
 
 
@@ -51,7 +51,7 @@ def test_training_and_encoding_take_no_notice_of_strays(
     assert stray_model.metrics is not None
     assert tube_model.metrics is not None
     assert stray_model.metrics.mean == pytest.approx(tube_model.metrics.mean, rel=0.2)
-    assert stray_model.detector.height == stray_model.height
+    assert stray_model.detector.body_size == stray_model.height
     mesh = with_strays(tube_poses).vertices[5].copy()
     encoded = stray_model.encode(mesh)
     mesh[[0, -1]] *= -3.0

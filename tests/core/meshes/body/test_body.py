@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MissingExtraError, ShapeError
-from lcollision_core.meshes import Topology, height
+from lcollision_core.meshes import Topology, body_size
 from lcollision_core.meshes.body import BodyKind, BodySet, body_set, cache, make_body
 from lcollision_core.meshes.body.decimate import HalfMesh, mirror_whole
 from lcollision_core.meshes.body.figure import Arm, Figure, Foot, Leg
@@ -26,10 +26,10 @@ from lcollision_core.meshes.body.template import Template, build_template
 
 MAX_COLLIDING = 5
 MIN_DIFFERENCE = 0.015
-"""Mean vertex distance between any two authored poses, in heights."""
+"""Mean vertex distance between any two authored poses, normalised."""
 
 MAX_ACCELERATION = {"body-swing": 0.036, "body-jump": 0.026}
-"""Of any vertex from frame to frame, in heights; a lost frame exceeds it."""
+"""Of any vertex from frame to frame, normalised; a lost frame exceeds it."""
 
 KINDS: tuple[BodyKind, ...] = ("body", "body-swing", "body-jump")
 
@@ -102,7 +102,7 @@ def test_progress_counts_every_pose(template: Template) -> None:
 
 def test_every_authored_pose_stands_on_the_floor(poses: BodySet) -> None:
     np.testing.assert_allclose(poses.vertices[..., 2].min(axis=1), 0.0, atol=1e-6)
-    assert 1.5 < height(poses.rest_vertices) < 1.8
+    assert 1.5 < body_size(poses.rest_vertices) < 1.8
 
 
 @pytest.mark.parametrize("n_vertices", [0, 499, 12001])
@@ -224,7 +224,7 @@ def test_no_two_poses_are_alike(poses: BodySet) -> None:
     vertices -= vertices.mean(axis=1, keepdims=True)
     difference = np.array(
         [np.linalg.norm(vertices - pose, axis=2).mean(axis=1) for pose in vertices]
-    ) / height(poses.rest_vertices)
+    ) / body_size(poses.rest_vertices)
     np.fill_diagonal(difference, np.inf)
     assert difference.min() > MIN_DIFFERENCE
 
@@ -324,7 +324,7 @@ def test_hands_stay_rigid_in_every_pose(poses: BodySet, template: Template) -> N
 def acceleration(body: BodySet, frames: np.ndarray) -> float:
     vertices = body.vertices[frames].astype(np.float64)
     steps = np.linalg.norm(np.diff(vertices, 2, axis=0), axis=2)
-    return float(steps.max() / height(body.rest_vertices))
+    return float(steps.max() / body_size(body.rest_vertices))
 
 
 @pytest.mark.parametrize("kind", ["body-swing", "body-jump"])
