@@ -24,25 +24,12 @@ class MeshAudit:
     Attributes
     ----------
     watertight : every edge has two faces that run along it in opposite directions
-    boundary_edges : number of edges with one face
-    non_manifold_edges : number of edges with more than two faces
-    pinched_vertices : indices of the vertices in which fans of faces touch without sharing an
-        edge, int32
-    components : number of connected parts, unused vertices not counted
-    unused_vertices : indices of the vertices in no face, int32
     degenerate_faces : indices of the faces without area, int32
-    duplicate_vertices : indices of the vertices at the position of an earlier one, int32
     problems : a sentence for each kind of defect; several parts are no defect
     """
 
     watertight: bool
-    boundary_edges: int
-    non_manifold_edges: int
-    pinched_vertices: npt.NDArray[np.int32]
-    components: int
-    unused_vertices: npt.NDArray[np.int32]
     degenerate_faces: npt.NDArray[np.int32]
-    duplicate_vertices: npt.NDArray[np.int32]
     problems: tuple[str, ...]
 
 
@@ -65,66 +52,50 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
     points = np.asarray(vertices)
     if points.shape != (topology.n_vertices, 3):
         raise ShapeError.must_be("vertices", f"({topology.n_vertices}, 3)", points.shape)
-    watertight = topology.is_watertight
-    n_boundary = len(topology.boundary_edges)
-    n_non_manifold = len(topology.non_manifold_edges)
-    pinched = topology.pinched_vertices
-    unused = topology.unused_vertices
     degenerate = degenerate_faces(topology, points)
-    duplicates = _duplicates(points)
-    problems = []
-    if n_boundary:
-        problems.append(
-            f"the mesh is open: {_count(n_boundary, 'edge has', 'edges have')} one face"
-        )
-    if n_non_manifold:
-        problems.append(
-            f"the mesh is not manifold: {_count(n_non_manifold, 'edge has', 'edges have')} more "
-            f"than two faces, the first between vertices "
-            f"{' and '.join(map(str, topology.non_manifold_edges[0]))}"
-        )
-    if len(pinched):
-        problems.append(
-            f"the mesh is not manifold: {_count(len(pinched), 'vertex joins', 'vertices join')} "
-            f"parts of the surface that share no edge there, the first is vertex {pinched[0]}"
-        )
-    if not watertight and not n_boundary and not n_non_manifold:
-        problems.append("the mesh has neighbouring faces that are wound in opposite senses")
-    if len(unused):
-        problems.append(
-            f"{_count(len(unused), 'vertex is', 'vertices are')} in no face, the first is "
-            f"vertex {unused[0]}"
-        )
-    if len(degenerate):
-        problems.append(
-            f"{_count(len(degenerate), 'face has', 'faces have')} no area, the first is "
-            f"face {degenerate[0]}"
-        )
-    if len(duplicates):
-        problems.append(
-            f"{_count(len(duplicates), 'vertex lies', 'vertices lie')} exactly on an earlier "
-            f"vertex, the first is vertex {duplicates[0]}"
-        )
-    return MeshAudit(
-        watertight=watertight,
-        boundary_edges=n_boundary,
-        non_manifold_edges=n_non_manifold,
-        pinched_vertices=pinched,
-        components=topology.vertex_components[0] - len(unused),
-        unused_vertices=unused,
-        degenerate_faces=degenerate,
-        duplicate_vertices=duplicates,
-        problems=tuple(problems),
-    )
-
-
-def _count(number: int, one: str, several: str) -> str:
-    return f"{number} {one if number == 1 else several}"
-
-
-def _duplicates(points: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
     first = first_at_each_position(points)
-    return np.flatnonzero(first != np.arange(len(first))).astype(np.int32)
+    duplicates = np.flatnonzero(first != np.arange(len(first)))
+    open_edges, crowded_edges = topology.boundary_edges, topology.non_manifold_edges
+    defects: tuple[tuple[npt.NDArray[np.integer], str, str, str], ...] = (
+        (open_edges, "edge has", "edges have", "the mesh is open: {} one face"),
+        (
+            crowded_edges,
+            "edge has",
+            "edges have",
+            "the mesh is not manifold: {} more than two faces, the first between vertices {}",
+        ),
+        (
+            topology.pinched_vertices,
+            "vertex joins",
+            "vertices join",
+            "the mesh is not manifold: {} parts of the surface that share no edge there, the first "
+            "is vertex {}",
+        ),
+        (
+            topology.unused_vertices,
+            "vertex is",
+            "vertices are",
+            "{} in no face, the first is vertex {}",
+        ),
+        (degenerate, "face has", "faces have", "{} no area, the first is face {}"),
+        (
+            duplicates,
+            "vertex lies",
+            "vertices lie",
+            "{} exactly on an earlier vertex, the first is vertex {}",
+        ),
+    )
+    problems = [
+        sentence.format(
+            f"{len(found)} {one if len(found) == 1 else several}",
+            " and ".join(map(str, np.atleast_1d(found[0]))),
+        )
+        for found, one, several, sentence in defects
+        if len(found)
+    ]
+    if not (topology.is_watertight or len(open_edges) or len(crowded_edges)):
+        problems.append("the mesh has neighbouring faces that are wound in opposite senses")
+    return MeshAudit(topology.is_watertight, degenerate, tuple(problems))
 
 
 @dataclass(frozen=True, eq=False)

@@ -265,9 +265,15 @@ def _alike(collected: Collected, report: Callable[[LCollisionError], None]) -> C
     for pose, defect in unlike.items():
         report(PoseSetError.like(defect, f"pose {poses.names[pose]} of {poses.source}"))
     kept = [pose for pose in range(len(poses)) if pose not in unlike]
+    return replace(collected, pose_set=_only(poses, kept))
+
+
+def _only(poses: PoseSet, kept: list[int]) -> PoseSet | None:
+    """Return some poses of a set, None without any."""
+    if len(kept) in (0, len(poses)):
+        return poses if kept else None
     names = tuple(poses.names[pose] for pose in kept)
-    alike = replace(poses, vertices=poses.vertices[kept], names=names) if kept else None
-    return replace(collected, pose_set=alike)
+    return replace(poses, vertices=poses.vertices[kept], names=names)
 
 
 def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
@@ -397,37 +403,27 @@ def _too_large(path: Path, n_poses: int, n_vertices: int) -> MeshFileError | Non
 def _collect_npz(
     path: Path, report: Callable[[LCollisionError], None], progress: Progress
 ) -> Collected:
-    nothing = Collected(None, 0, same_topology=False)
     try:
         arrays, held = read_npz(path, (*_MESH_ARRAYS, *((name,) for name in _EXTRA_ARRAYS)))
         vertices, faces = _meshes_of(arrays, held)
         topology = Topology(faces, vertices.shape[1])
-        extras = _extras_of(arrays, vertices.shape)
+        names = tuple(f"pose {pose}" for pose in range(len(vertices)))
+        extras = {"names": names} | _extras_of(arrays, vertices.shape)
+        pose_set = PoseSet(vertices, topology, source=path, **extras)
     except LCollisionError as error:
         report(MeshFileError.because(path, "cannot be read as a pose set", error))
-        return nothing
-    names = extras.pop("names") or tuple(f"pose {pose}" for pose in range(len(vertices)))
-    usable = np.ones(len(vertices), dtype=np.bool_)
+        return Collected(None, 0, same_topology=False)
+    kept = []
     for pose, mesh in enumerate(vertices):
-        where = f"pose {pose} ({names[pose]}) of {path}"
-        defect = _too_far_to_compute(where, mesh)
-        if defect is not None:
-            report(defect)
+        where = f"pose {pose} ({pose_set.names[pose]}) of {path}"
+        if (too_far := _too_far_to_compute(where, mesh)) is not None:
+            report(too_far)
         elif mesh.dtype == np.float32 and (coarseness := coarseness_of(mesh, topology)):
             report(PoseSetError(f"is damaged: {coarseness}", where=where))
         else:
-            continue
-        usable[pose] = False
-    if not usable.any():
-        return Collected(None, len(vertices), same_topology=True)
-    kept = np.flatnonzero(usable)
-    if len(kept) < len(vertices):
-        vertices = vertices[kept]
-        names = tuple(names[pose] for pose in kept)
-    progress(len(usable), len(usable))
-    return Collected(
-        PoseSet(vertices, topology, names, path, **extras), len(usable), same_topology=True
-    )
+            kept.append(pose)
+    progress(len(vertices), len(vertices))
+    return Collected(_only(pose_set, kept), len(vertices), same_topology=True)
 
 
 def _meshes_of(
@@ -468,7 +464,7 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
         # Half a character, of a file name that was no text, cannot be printed.
         return [text[:_MAX_TEXT_LENGTH].encode(errors="replace").decode() for text in texts]
 
-    extras: dict[str, Any] = {"names": None}
+    extras: dict[str, Any] = {}
     if "format_version" in arrays and scalar("format_version", "iu") > FORMAT_VERSION:
         raise MeshFileError.too_new("it", scalar("format_version", "iu"), FORMAT_VERSION)
     if "names" in arrays:
@@ -477,15 +473,10 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
         extras["notes"] = tuple(strings("notes", arrays["notes"].size))
     if "near_exclusion" in arrays:
         extras["near_exclusion"] = float(scalar("near_exclusion", "fiu"))
-        if not 0.0 <= extras["near_exclusion"] < 1.0:
-            raise MeshFileError.must_be("near_exclusion", "in [0, 1)", extras["near_exclusion"])
     if "up_axis" in arrays:
         extras["up_axis"] = scalar("up_axis", "iu")
-        if extras["up_axis"] not in (0, 1, 2):
-            raise MeshFileError.must_be("up_axis", "0, 1 or 2", extras["up_axis"])
     if "vertex_labels" in arrays:
         extras["vertex_labels"] = np.array(strings("vertex_labels", shape[1]))
-        _require_labels(extras["vertex_labels"])
     return extras
 
 
