@@ -199,7 +199,7 @@ def write_result(
     ------
     LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
-    from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, spare_name
+    from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, unused_name
     from lcollision_core.model import export_frame, export_mesh, write_poses
     from lcollision_core.resolve import exported_vertices
 
@@ -224,7 +224,7 @@ def write_result(
     with locked(path):
         n_replaced = int(path.exists())
         if n_replaced and file_stamp(path) != output.before:
-            path, n_replaced = spare_name(path), 0
+            path, n_replaced = unused_name(path), 0
             note(
                 f"{output.path} was changed by another command meanwhile and stays as it is; the "
                 f"result goes to {path}"

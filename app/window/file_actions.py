@@ -435,7 +435,7 @@ class FileActions(QObject):
 
 def _unused(folder: Path, name: str, suffix: str) -> Path:
     """Return a file of a folder that is not there yet, called as a pose is."""
-    from lcollision_core.meshes import file_stem, spare_name
+    from lcollision_core.meshes import file_stem, unused_name
 
     path = folder / f"{file_stem(name)}{suffix}"
-    return spare_name(path) if path.exists() else path
+    return unused_name(path) if path.exists() else path

@@ -1,6 +1,6 @@
 """Exact penetration depth of two triangles, in closed form.
 
-The depth of Tan et al. (2021) is the shortest translation that takes two triangles apart. It is
+The depth of Tan et al. (2021) is the shortest translation that separates two triangles. It is
 the distance from the origin to the boundary of their Minkowski difference, a convex polytope
 whose faces are normal to one of eleven directions: the two triangle normals and the nine cross
 products of an edge of one with an edge of the other. Along a direction ``d`` the triangles are
@@ -31,8 +31,8 @@ def penetration_depth(
 
     Returns
     -------
-    penetration_depth : (P,) float64 array >= 0, same unit; 0 where the triangles are apart or
-        only touch. Coplanar triangles touch at most.
+    penetration_depth : (P,) float64 array >= 0, same unit; 0 where the triangles are disjoint
+        or only touch. Coplanar triangles touch at most.
 
     Raises
     ------

@@ -145,7 +145,7 @@ class CollisionDetector:
     reference : (V, 3) array, a typical pose: the tree is built on it, and the longest
         side of its bounding box, the body size, is the unit of every result
     near_exclusion : pairs with an edge path of at most this length between them on the
-        reference, in normalised length, are counted apart; 0 excludes nothing
+        reference, in normalised length, are counted separately; 0 excludes nothing
 
     Raises
     ------
@@ -226,7 +226,7 @@ class CollisionDetector:
         Parameters
         ----------
         vertices : (V, 3) array in the unit of the reference
-        n_deepest : at most so many pairs are kept; of equally deep ones the first
+        n_deepest : the most pairs that are kept; of equally deep ones the first
         progress : called with an estimate of (shares of the search done, all shares)
         cancel : polled every few thousand pairs
 

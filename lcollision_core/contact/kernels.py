@@ -54,7 +54,7 @@ def _across(ux, uy, uz, vx, vy, vz):
         if length_squared <= PARALLEL_SINE_SQUARED * u_squared * v_squared:
             return 0.0, 0.0, 0.0, 0.0
         # Rounding leans the product towards the edges by up to 2^-53 / sine. The edges then no
-        # longer project to points, which the overlaps count on, and long edges seem apart.
+        # longer project to points, which the overlaps count on, and long edges seem separate.
         if u_squared >= v_squared:
             lean = (dx * ux + dy * uy + dz * uz) / u_squared
             dx, dy, dz = dx - lean * ux, dy - lean * uy, dz - lean * uz
@@ -322,7 +322,7 @@ def _coincide(triangles, a, b, tolerance):
     for k in range(3):
         if abs(_along(triangles, b, k, ox, oy, oz, nx, ny, nz)) > limit:
             return False
-    # Directions in the plane, across each edge: one of them parts convex shapes that are apart.
+    # Directions in the plane, across each edge: disjoint convex shapes are separated by one.
     for side in range(2):
         p = a if side == 0 else b
         for i in range(3):
@@ -449,7 +449,7 @@ def search_pose(
     first_only : end the search at the first pair that is not near
     found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
     n_coincident : (1,) array that the pairs that touch face to face are added to, or (0,) where
-        nobody asks for them
+        they are not counted
     n_waiting : 0 to begin, else what the call before returned
     leaf_size : `LEAF_SIZE`
 
@@ -463,7 +463,7 @@ def search_pose(
     boxes = work.node_boxes
     stack = work.stack
     share = work.share
-    # Not a plain 0, for which the search of leaves would be compiled apart.
+    # Not a plain 0, for which the search of leaves would be compiled twice.
     n_found: int = int(np.int64(0))
     if n_waiting == 0:
         if not _refit(pose, scale, tree, work):

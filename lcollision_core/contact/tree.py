@@ -41,7 +41,7 @@ def build_tree(vertices: FloatArray, faces: IntArray) -> FaceTree:
 def _select(keys: FloatArray, items: IntArray, start: int, stop: int, wanted: int) -> None:
     """Reorder `keys` and `items` from `start` to `stop`: none after index `wanted` is smaller.
 
-    Quickselect with random pivots and equal keys set apart, so that neither sorted nor equal keys
+    Quickselect with random pivots and equal keys grouped, so that neither sorted nor equal keys
     take long.
     """
     low, high, state = start, stop, 12345

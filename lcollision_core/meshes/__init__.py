@@ -7,7 +7,7 @@ from lcollision_core.meshes.atomic import (
     atomic_write,
     file_stamp,
     require_writable,
-    spare_name,
+    unused_name,
 )
 from lcollision_core.meshes.audit import (
     MeshAudit,
@@ -69,7 +69,7 @@ __all__ = [
     "read_mesh",
     "read_pose_set",
     "require_writable",
-    "spare_name",
+    "unused_name",
     "up_axis",
     "write_mesh",
     "write_pose_set",

@@ -20,7 +20,7 @@ from lcollision_core.meshes.locks import is_named, lock_open_file, locked, short
 _MAX_NAME_BYTES = 100
 """Of the name that a file has while it is written, but for what marks it so."""
 _MAX_STEM_BYTES = 200
-"""Of a spare name, so that the number fits."""
+"""Of an unused name, so that the number fits."""
 _SECONDS_TO_RENAME = 60.0
 """On Windows, where a file is closed, and so no longer locked, before it is renamed."""
 
@@ -59,7 +59,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            if sys.platform != "win32":  # while it is locked: nobody takes it for a dead one
+            if sys.platform != "win32":  # while it is locked: no other writer removes it
                 unfinished.replace(target)
         if sys.platform == "win32":
             unfinished.replace(target)
@@ -133,7 +133,7 @@ def _move_all(folder: Path, target: Path) -> None:
 
 
 def _remove_dead_folders(target: Path) -> None:
-    """Remove what processes that are no more were to move into a folder."""
+    """Remove what killed processes were to move into a folder."""
     for unfinished in target.iterdir():
         if re.fullmatch(r"\.[0-9a-f]{12}\.part", unfinished.name) and unfinished.is_dir():
             with suppress(MeshFileError), locked(unfinished, wait=0.0):  # unless it is alive
@@ -141,7 +141,7 @@ def _remove_dead_folders(target: Path) -> None:
 
 
 def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
-    """Return what tells a file from any that is later in its place; None where there is none.
+    """Return what tells a file from any that replaces it; None where there is no file.
 
     Compared inside `locked`, it says whether the file is still the one that was read.
     """
@@ -152,12 +152,12 @@ def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def spare_name(path: Path) -> Path:
+def unused_name(path: Path) -> Path:
     """Return a name beside `path` that no file has: "m 2.obj"."""
     stem, number = shortened(path.stem, _MAX_STEM_BYTES), 2
-    while (spare := path.with_name(f"{stem} {number}{path.suffix}")).exists():
+    while (unused := path.with_name(f"{stem} {number}{path.suffix}")).exists():
         number += 1
-    return spare
+    return unused
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
@@ -201,7 +201,7 @@ def _new_part(target: Path) -> tuple[Path, BinaryIO]:
     while True:
         part = target.with_name(_part_name(target, secrets.token_hex(6)))
         file = part.open("xb")
-        with suppress(OSError):  # a disk without locks, where nobody removes it either
+        with suppress(OSError):  # a disk without locks, where no other writer removes it either
             lock_open_file(file)
         if is_named(file, part):
             return part, file
@@ -210,7 +210,7 @@ def _new_part(target: Path) -> tuple[Path, BinaryIO]:
 
 
 def _remove_dead_parts(target: Path) -> None:
-    """Remove the hidden files of writers of `target` that are no more."""
+    """Remove the hidden files that killed writers of `target` left."""
     head, tail = map(re.escape, _part_name(target, "/").split("/"))
     is_part = re.compile(rf"{head}[0-9a-f]{{12}}{tail}")
     with suppress(OSError):  # a folder that may be written to, but not listed

@@ -21,9 +21,9 @@ _MAX_NAME_BYTES = 200
 
 @contextmanager
 def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
-    """Keep everyone else who asks for the same lock away from a file meanwhile.
+    """Hold a file's lock, so that no other holder changes the file meanwhile.
 
-    Reading, changing and writing back a file inside the block loses nobody's change, in this
+    Reading, changing and writing back a file inside the block loses no other change, in this
     process or another: ``with locked(path): write(change(read(path)))``. The lock is on a hidden
     file beside `path`, which is removed at the end; after a kill it is free, and the next holder
     removes it. A thread that holds the lock must not ask for it again.
@@ -88,7 +88,7 @@ def is_named(file: BinaryIO, path: Path) -> bool:
 
 
 def shortened(name: str, n_bytes: int) -> str:
-    """Cut a file name to so many bytes, which is what file systems count, between characters."""
+    """Cut a file name to `n_bytes` bytes, which is what file systems count, between characters."""
     while len(os.fsencode(name)) > n_bytes:
         name = name[:-1]
     return name
@@ -107,7 +107,7 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
         ) from error
     try:
         lock_open_file(file)
-        # The one who held it before has removed it: a lock on that keeps nobody away.
+        # Its last holder may have removed it, and a lock on a removed file holds nobody off.
         if is_named(file, lock):
             return file
     except (BlockingIOError, PermissionError):

@@ -38,7 +38,7 @@ _ORDER = re.compile(rb"'fortran_order': *(True|False)")
 _SHAPE = re.compile(rb"'shape': *\(([0-9, ]*)\)")
 _PLAIN_KINDS = "biufSU"
 _MOST_DEFLATED = 1032
-"""A byte of a compressed entry stands for so many bytes at most."""
+"""The most bytes that one byte of a compressed entry stands for."""
 
 _CHUNK_BYTES = 1 << 24
 
@@ -113,7 +113,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> n
 
 
 def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple[int, ...]]:
-    """Read a header as NumPy writes it, whose own reader evaluates it, and warns."""
+    """Read a header as NumPy writes it. NumPy's own reader evaluates it, and warns."""
     start = file.read(8)
     n_length_bytes = 2 if start[6:7] == b"\1" else 4
     length = int.from_bytes(file.read(n_length_bytes), "little")

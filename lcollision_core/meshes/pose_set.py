@@ -23,8 +23,8 @@ from lcollision_core.meshes.files import (
     first_not_finite,
     read_mesh,
 )
-from lcollision_core.meshes.likeness import unlike_poses
 from lcollision_core.meshes.npz import MAX_ITEMS, read_npz, write_npz
+from lcollision_core.meshes.outliers import outlier_poses
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.upright import UpGuess, guess_up
 
@@ -127,8 +127,8 @@ class PoseSet:
 def natural_key(path: Path) -> tuple[list[str | int], str]:
     """Return a sorting key under which mesh2.obj comes before mesh10.obj, in any case."""
     parts = re.split(r"([0-9]+)", path.stem.casefold())
-    # Digits stand at the odd places of every name, so numbers meet numbers and text meets text.
-    return [int(part) if place % 2 else part for place, part in enumerate(parts)], path.name
+    # Every second part is digits, so numbers are compared with numbers and text with text.
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], path.name
 
 
 def mesh_files(folder: Path) -> tuple[list[Path], list[str]]:
@@ -230,10 +230,10 @@ def collect_poses(
         report(MeshFileError.unreadable(path, error, "check the name"))
         return Collected(None, 0, same_topology=False)
     if is_folder:
-        return _alike(_collect_folder(path, report, progress, cancel), report)
+        return _without_outliers(_collect_folder(path, report, progress, cancel), report)
     suffix = path.suffix.lower()
     if exists and suffix == ".npz":
-        return _alike(_collect_npz(path, report, progress), report)
+        return _without_outliers(_collect_npz(path, report, progress), report)
     if not exists:
         what, next_step = "does not exist", "name a folder of meshes or an .npz file"
     elif suffix in READABLE_SUFFIXES:
@@ -256,15 +256,15 @@ def _too_far_to_compute(where: str, vertices: npt.NDArray[Any]) -> PoseSetError 
     return PoseSetError(what, "remove or scale that pose", where=where)
 
 
-def _alike(collected: Collected, report: Callable[[LCollisionError], None]) -> Collected:
+def _without_outliers(collected: Collected, report: Callable[[LCollisionError], None]) -> Collected:
     """Leave out the poses that are another body, or the same in another unit."""
     poses = collected.pose_set
-    unlike = {} if poses is None else unlike_poses(poses.topology, poses.vertices)
-    if poses is None or not unlike:
+    outliers = {} if poses is None else outlier_poses(poses.topology, poses.vertices)
+    if poses is None or not outliers:
         return collected
-    for pose, defect in unlike.items():
+    for pose, defect in outliers.items():
         report(PoseSetError.like(defect, f"pose {poses.names[pose]} of {poses.source}"))
-    kept = [pose for pose in range(len(poses)) if pose not in unlike]
+    kept = [pose for pose in range(len(poses)) if pose not in outliers]
     return replace(collected, pose_set=_only(poses, kept))
 
 

@@ -104,10 +104,10 @@ def _side(reference: FloatArray) -> int | None:
     if extent == 0.0:
         return None
     tree = cKDTree(reference)
-    apart = []
+    distances = []
     for axis in range(3):
         image = reference.copy()
         image[:, axis] = image[:, axis].min() + image[:, axis].max() - image[:, axis]
-        apart.append(float(tree.query(image)[0].mean()) / extent)
-    nearest, other = np.sort(apart)[:2]
-    return int(np.argmin(apart)) if nearest < _SYMMETRIC and other > 3.0 * nearest else None
+        distances.append(float(tree.query(image)[0].mean()) / extent)
+    nearest, other = np.sort(distances)[:2]
+    return int(np.argmin(distances)) if nearest < _SYMMETRIC and other > 3.0 * nearest else None

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lcollision_core.errors import ModelFileError
-from lcollision_core.meshes import FileStamp, file_stamp, locked, spare_name
+from lcollision_core.meshes import FileStamp, file_stamp, locked, unused_name
 from lcollision_core.model.pose_model import PoseModel
 
 
@@ -62,7 +62,7 @@ def save_trained(
         stamp = file_stamp(destination)
         if stamp not in (None, before):
             now = _of_same_space(destination, model) if add is not None else None
-            path, base = (destination, now) if now is not None else (spare_name(path), model)
+            path, base = (destination, now) if now is not None else (unused_name(path), model)
         (base if add is None else add(base)).save(path)
     return path
 

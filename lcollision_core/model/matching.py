@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import PoseSetError, ShapeError, WrongScaleError
 from lcollision_core.meshes import Topology, body_size, can_hold
-from lcollision_core.meshes.likeness import LARGEST_SIZE, is_torn, scale_of
+from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
 from lcollision_core.meshes.topology import FloatArray
 
 _MOST_SIZE = 20.0

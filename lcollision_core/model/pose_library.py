@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
-from lcollision_core.meshes import FileStamp, file_stamp, locked, spare_name
+from lcollision_core.meshes import FileStamp, file_stamp, locked, unused_name
 from lcollision_core.model.naming import unique_names
 from lcollision_core.model.pose_file import (
     DamagedPosesError,
@@ -148,7 +148,7 @@ class PoseLibrary:
         except (DamagedPosesError, OtherModelError) as error:
             aside = self.path.with_name(f"{self.path.stem} damaged.json")
             if aside.exists():
-                aside = spare_name(aside)
+                aside = unused_name(aside)
             self.path.rename(aside)
             what = f"was damaged and has been set aside as {aside}: {error.headline}"
             next_step = "poses that you keep from now on go to a new one"

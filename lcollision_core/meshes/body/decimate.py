@@ -24,9 +24,9 @@ SHAPE_WEIGHT = 60.0
 class HalfMesh:
     """The half x >= 0 of a mirror-symmetric closed mesh, open along the plane x = 0.
 
-    Greedy collapse of the edge that is shortest for its place. Besides the link condition, which
-    keeps a manifold a manifold, no inner edge may join two vertices of the rim: its mirror image
-    would be the same edge again, with four faces.
+    Greedy collapse of the edge that is shortest relative to the length wanted there. Besides the
+    link condition, which keeps a manifold a manifold, no inner edge may join two vertices of the
+    rim: its mirror image would be the same edge again, with four faces.
 
     Parameters
     ----------

@@ -177,10 +177,10 @@ def _standing_leg(
     reflect = np.eye(3) if side == "left" else MIRROR
     hip, knee, ankle, ball = _leg_joints(skeleton)
     length = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
-    place = np.array([foot.out, -foot.ahead, ankle[2] + foot.height])
+    position = np.array([foot.out, -foot.ahead, ankle[2] + foot.height])
     heading = turn_z(foot.heading)
     sole = heading @ turn_x(foot.heel)
-    target = place + heading @ (ball - ankle) + sole @ (ankle - ball)
+    target = position + heading @ (ball - ankle) + sole @ (ankle - ball)
     offset = reflect @ orientation @ reflect @ (hip - skeleton.positions[0])
     return reflect @ location + offset, target, length
 

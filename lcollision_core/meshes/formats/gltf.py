@@ -59,18 +59,18 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
     # Before a mark trimesh would look for its text elsewhere.
     data = read_rest(file).removeprefix(b"\xef\xbb\xbf")
     _require_one_mesh(data)
-    kind = "glb" if data.startswith(_GLB_MAGIC) else "gltf"
+    file_type = "glb" if data.startswith(_GLB_MAGIC) else "gltf"
     try:
         with np.errstate(all="ignore"):
             scene = trimesh.load_scene(
                 BytesIO(data),
-                file_type=kind,
+                file_type=file_type,
                 resolver=BuffersBeside(path),
                 process=False,
                 skip_materials=True,
             )
             shown = [scene.graph[node] for node in scene.graph.nodes_geometry]
-            meshes = [(place, scene.geometry[name]) for place, name in shown]
+            meshes = [(transform, scene.geometry[name]) for transform, name in shown]
     except MeshFileError:
         raise
     # On a damaged file trimesh raises whatever its line at hand raises; nothing of ours runs here.
@@ -80,7 +80,7 @@ def read(file: BinaryIO, path: Path, topology: Topology | None = None) -> Polygo
         raise MeshFileError(f"it shows {len(meshes)} meshes, one of triangles is needed")
     transform, mesh = meshes[0]
     vertices = np.array(mesh.vertices, dtype=np.float64)
-    # A node may place float32 vertices far away, where the product keeps their digits.
+    # A node may move float32 vertices far away, where the product keeps their digits.
     is_placed = not np.array_equal(transform, np.eye(4))
     if is_placed:
         # A coordinate that is not finite is refused with all others.

@@ -84,8 +84,8 @@ def _faces(text: bytes) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
             where=f"face {face} (from 0)",
         )
     sizes = announced.astype(np.int64)
-    place = np.arange(len(values)) - np.repeat(starts, n_words)
-    is_corner = (place > 0) & (place <= np.repeat(sizes, n_words))
+    column = np.arange(len(values)) - np.repeat(starts, n_words)
+    is_corner = (column > 0) & (column <= np.repeat(sizes, n_words))
     return sizes, vertex_numbers(values[is_corner], sizes)
 
 

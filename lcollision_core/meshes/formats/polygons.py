@@ -69,7 +69,7 @@ def with_order_of(
 
     Returns
     -------
-    the triangles; None where corners that the topology calls one vertex lie apart
+    the triangles; None where corners of one vertex of the topology differ
     """
     if topology is None or len(corners) != 3 * topology.n_faces or len(topology.unused_vertices):
         return None

@@ -68,7 +68,8 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
         )
     else:
         raise MeshFileError(f"it has {size} bytes, too few for an STL file")
-    points = corners.reshape(-1, 3) + 0.0  # -0.0 becomes 0.0, as which corner is kept is chance
+    # -0.0 becomes 0.0: which of equal corners is kept is arbitrary.
+    points = corners.reshape(-1, 3) + 0.0
     is_single = not (is_text and expected != size)
     ordered = with_order_of(points, topology, _REORDERED, is_single)
     return ordered or _joined(points, is_single)

@@ -13,7 +13,7 @@ from threading import Barrier, Thread
 import pytest
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes import atomic_write, file_stamp, locked, locks, spare_name
+from lcollision_core.meshes import atomic_write, file_stamp, locked, locks, unused_name
 from lcollision_core.regular_files import require_regular
 
 _READ_THEN_WRITE = """
@@ -167,4 +167,4 @@ def test_stamp_tells_a_replaced_file_from_the_one_before(tmp_path: Path) -> None
 
 def test_spare_name_is_nobodys(tmp_path: Path) -> None:
     (tmp_path / "m 2.obj").touch()
-    assert spare_name(tmp_path / "m.obj") == tmp_path / "m 3.obj"
+    assert unused_name(tmp_path / "m.obj") == tmp_path / "m 3.obj"

@@ -1,4 +1,4 @@
-"""Whether meshes of one topology are poses of one body: of one size, in one order of vertices."""
+"""Poses of a set that are not of the set's body: of another size, or order of vertices."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from lcollision_core.errors import PoseSetError
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 LARGEST_SIZE = 1.25
-"""Times larger or smaller that a body may be; poses stretch its edges by a few percent."""
+"""The largest ratio of two sizes of one body; poses stretch its edges by a few percent."""
 
 _UNIFORM = 1.5
-"""Between the edges that are scaled most and least, all but tenths: within it, it is the unit."""
+"""Largest ratio of the 90th to the 10th percentile of edge scales where only the unit differs."""
 
 _TORN = 3.0
-"""Times that half of the edges of a body are longer only where others are joined."""
+"""The median edge scale above which other vertices must be joined."""
 
 _COMPARED_POSES = 25
 
 
 def scale_of(lengths: FloatArray, known: FloatArray) -> float | None:
-    """Return how many times all edges are longer than they are known, None where each has its own.
+    """Return the common scale of edges against known lengths, None where each has its own.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def scale_of(lengths: FloatArray, known: FloatArray) -> float | None:
 
 
 def is_torn(lengths: FloatArray, known: FloatArray) -> bool:
-    """Tell whether edges are so much longer than they are known that others must be meant.
+    """Tell whether edges are so much longer than known that they must join other vertices.
 
     Parameters
     ----------
@@ -44,8 +44,8 @@ def is_torn(lengths: FloatArray, known: FloatArray) -> bool:
     return high > _UNIFORM * low and middle > _TORN
 
 
-def unlike_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, PoseSetError]:
-    """Find the poses that are no poses of the body that most of them show.
+def outlier_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, PoseSetError]:
+    """Find the poses that are not of the body that most poses show.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def unlike_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, Po
 
     Returns
     -------
-    What is wrong with each, by its place.
+    defects : what is wrong with each, by its index
     """
     if len(vertices) < 2:
         return {}
@@ -83,7 +83,7 @@ def unlike_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, Po
 
 
 def _spread(lengths: FloatArray, known: FloatArray) -> tuple[float, float, float]:
-    """Return the tenths and the median of how many times edges are longer than they are known."""
+    """Return the 10th, 50th and 90th percentile of edge lengths over known ones."""
     used = known > 0.0
     if not used.any():
         return 1.0, 1.0, 1.0
