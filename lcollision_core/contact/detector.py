@@ -381,7 +381,11 @@ class _Searcher:
         self._unused = topology.unused_vertices
         self._used = topology.faces[0, 0]
         self._waiting = 0
-        self.found = _buffer(_PAIRS_AT_ONCE)
+        self.found = Found(
+            slots=np.empty((_PAIRS_AT_ONCE, 2), dtype=np.int32),
+            squared_depth=np.empty(_PAIRS_AT_ONCE),
+            is_near=np.empty(_PAIRS_AT_ONCE, dtype=np.bool_),
+        )
 
     def search(
         self,
@@ -392,9 +396,9 @@ class _Searcher:
         unit: float = 1.0,
         n_coincident: npt.NDArray[np.int64] = _NOT_COUNTED,
     ) -> Iterator[int]:
-        """Yield at least once how many pairs of a pose (V, 3) `found` holds, until all were there.
+        """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
 
-        `number` is the pose's place in its batch, for the error message; `unit` is as of
+        `number` is the pose's index in its batch, for the error message; `unit` is as of
         `CollisionDetector.detect`; `n_coincident` is as of `search_pose`.
         """
         np.copyto(self._pose, pose)
@@ -437,11 +441,3 @@ class _Searcher:
             else "is not finite"
         )
         raise ShapeError(f"vertex {vertex}{where} {what}, at {position}", "move or repair the mesh")
-
-
-def _buffer(n_pairs: int) -> Found:
-    return Found(
-        slots=np.empty((n_pairs, 2), dtype=np.int32),
-        squared_depth=np.empty(n_pairs),
-        is_near=np.empty(n_pairs, dtype=np.bool_),
-    )

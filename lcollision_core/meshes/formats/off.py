@@ -1,7 +1,7 @@
 """Object File Format (OFF), text form.
 
-An own reader, because trimesh reorders the triangles of mixed polygons, drops faces that end early
-without a word, and writes ten digits.
+An own reader, because trimesh reorders the triangles of quads, leaves out faces that end early
+without an error, and writes ten digits.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Stanford PLY, text and binary of either byte order.
 
 An own reader, because trimesh reorders the triangles of quads, refuses binary polygons of different
-sizes, passes over what is no number in text, and writes single precision.
+sizes, takes 1.5 for vertex 1, and writes single precision.
 """
 
 from __future__ import annotations
