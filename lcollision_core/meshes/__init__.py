@@ -17,7 +17,6 @@ from lcollision_core.meshes.audit import (
 )
 from lcollision_core.meshes.file_names import file_stem, file_stems, has_known_suffix
 from lcollision_core.meshes.files import (
-    MAX_FACES,
     READABLE_SUFFIXES,
     WRITABLE_SUFFIXES,
     Mesh,
@@ -37,7 +36,6 @@ from lcollision_core.meshes.units import body_size, front_direction, up_axis
 from lcollision_core.meshes.upright import UpGuess, guess_up
 
 __all__ = [
-    "MAX_FACES",
     "READABLE_SUFFIXES",
     "WRITABLE_SUFFIXES",
     "Alignment",

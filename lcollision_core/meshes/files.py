@@ -15,12 +15,7 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats import gltf, obj, off, ply, stl
-from lcollision_core.meshes.formats.polygons import (
-    MAX_FACES,
-    MAX_FILE_BYTES,
-    Polygons,
-    triangulate,
-)
+from lcollision_core.meshes.formats.polygons import MAX_FACES, Polygons, triangulate
 from lcollision_core.meshes.precision import as_stored, can_hold, rounding_step
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.regular_files import open_regular
@@ -242,15 +237,3 @@ def _turn_to_y(up: FloatArray) -> FloatArray:
     aside = np.cross(towards, y)
     turn: FloatArray = np.outer(y, towards) - np.outer(towards, y) + np.outer(aside, aside)
     return turn
-
-
-__all__ = [
-    "MAX_FACES",
-    "MAX_FILE_BYTES",
-    "READABLE_SUFFIXES",
-    "WRITABLE_SUFFIXES",
-    "Mesh",
-    "first_not_finite",
-    "read_mesh",
-    "write_mesh",
-]

@@ -165,6 +165,6 @@ def test_stamp_tells_a_replaced_file_from_the_one_before(tmp_path: Path) -> None
     assert file_stamp(path) != before
 
 
-def test_spare_name_is_nobodys(tmp_path: Path) -> None:
+def test_an_unused_name_is_no_files(tmp_path: Path) -> None:
     (tmp_path / "m 2.obj").touch()
     assert unused_name(tmp_path / "m.obj") == tmp_path / "m 3.obj"
