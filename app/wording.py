@@ -21,12 +21,12 @@ _MIRRORED = " mirrored"
 
 
 def overlap_text(energy: float) -> str:
-    """Write an normalised energy as the depth that it stands for, as in "1.1 %"."""
+    """Write a normalised energy as the depth that it stands for, as in "1.1 %"."""
     return "none" if energy == 0.0 else height_text(math.sqrt(energy))
 
 
 def height_text(distance: float) -> str:
-    """Write a normalised distance as a share of the body size, as in "1.1 %"."""
+    """Write a normalised distance as a fraction of the body size, as in "1.1 %"."""
     percent = 100.0 * distance
     if 0.0 < percent < 0.05:
         return "below 0.1 %"

@@ -82,12 +82,12 @@ def time_detection(
     detector = CollisionDetector(poses.topology, vertices[0])
     peers = {name: find for name, find in _PEERS.items() if find_spec(_MODULES[name])}
 
-    truth = []
+    n_expected = []
     theirs: dict[str, list[float]] = {name: [] for name in peers}
     agrees = dict.fromkeys(peers, True)
     for done, pose in enumerate(vertices):
         found = detector.detect(pose)
-        truth.append(len(found.pairs))
+        n_expected.append(len(found.pairs))
         expected = set(map(tuple, found.pairs.tolist()))
         for name, find in peers.items():
             seconds, contacts = _timed(partial(find, pose, poses.faces))
@@ -111,7 +111,7 @@ def time_detection(
     # Many poses a thread, so that its start and the last one's wait do not count.
     repeats = -(-BATCH_POSES_A_THREAD * threads // len(vertices))
     batch = np.tile(vertices, (repeats, 1, 1))
-    n_pairs = np.tile(truth, repeats)
+    n_pairs = np.tile(n_expected, repeats)
     thread_counts = [1] if threads == 1 else [1, threads]
     ours: dict[int, list[float]] = {count: [] for count in thread_counts}
     first: list[float] = []
@@ -146,8 +146,8 @@ def _timed(call: Callable[[], T]) -> tuple[float, T]:
 def _disjoint_pairs(contacts: npt.NDArray[np.int64], faces: IntArray) -> set[tuple[int, ...]]:
     """Drop contacts of a face with itself or with one that shares a vertex."""
     first, second = faces[contacts[:, 0]], faces[contacts[:, 1]]
-    share = (first[:, :, None] == second[:, None, :]).any(axis=(1, 2))
-    return set(map(tuple, np.sort(contacts[~share], axis=1).tolist()))
+    adjacent = (first[:, :, None] == second[:, None, :]).any(axis=(1, 2))
+    return set(map(tuple, np.sort(contacts[~adjacent], axis=1).tolist()))
 
 
 def contacts_of_fcl(vertices: FloatArray, faces: IntArray) -> npt.NDArray[np.int64]:

@@ -37,7 +37,7 @@ class EditorTiming:
     render_ms : drawing one picture
     event_p50_ms, event_p95_ms : from a slider's move until the window shows it
     burst_lag_seconds : from the last of 250 moves within two seconds to the picture that shows it
-    idle_cpu : share of one core while nothing happens, once the library's pictures are drawn
+    idle_cpu : fraction of one core while nothing happens, once the library's pictures are drawn
     start_seconds : from the command to a window that shows the pose, with warm caches
     memory_mb : the most that the process held at once
     actions : random actions done after that

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import rich  # noqa: F401 - what the command would have loaded by then, as the next line
 import typer  # noqa: F401
-from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
+from PySide6.QtCore import QEventLoop, QObject, QTimer, Slot
 
 from app.benchmarks.timing import median_seconds
 from app.editing.document import PoseDocument
@@ -48,8 +48,6 @@ class Session(QObject):
     ----------
     window : that shows its first pose
     """
-
-    _looked = Signal()
 
     def __init__(self, window: MainWindow) -> None:
         super().__init__()
@@ -116,14 +114,14 @@ class Session(QObject):
                 self._slider.setValue(round((event + 1) / _BURST_EVENTS * self._slider.maximum()))
             last = time.monotonic()
             done = max(done, min(due, _BURST_EVENTS))
-            self.turn()
+            self.pause()
         self.wait_for(self.is_shown)
         lag = time.monotonic() - last
         self._document.end_gesture()
         return lag
 
     def idle_cpu(self) -> float:
-        """Do nothing for a while and return the share of a core that this took.
+        """Do nothing for a while and return the fraction of a core that this took.
 
         Once the library's pictures are drawn: they come one by one while nothing else is to do.
         """
@@ -166,46 +164,34 @@ class Session(QObject):
             act()
         except Exception as error:
             self._on_exception(type(error), error, error.__traceback__)
-        self.turn()
+        self.pause()
 
     def _actions(self, chance: random.Random) -> dict[Callable[[], object], float]:
         """Return what to do with how much weight."""
         document, window = self._document, self._window
-        size, n_domains = document.model.latent_size, len(document.model.domain_names)
+        viewport, model = window.viewport, document.model
+        n_domains = len(model.domain_names)
 
         def slide() -> None:
-            row = window.sliders.row_of(chance.randrange(size))
-            row.slider.setValue(chance.randrange(row.slider.maximum() + 1))
+            slider = window.sliders.row_of(chance.randrange(model.latent_size)).slider
+            slider.setValue(chance.randrange(slider.maximum() + 1))
 
         def load() -> None:
-            n_poses = len(document.model.pose_names)
-            document.load_pose(document.training_pose(chance.randrange(n_poses)))
+            document.load_pose(document.training_pose(chance.randrange(len(model.pose_names))))
 
         def resolve() -> None:
             if document.can_resolve:
                 document.resolve()
 
-        def shade() -> None:
-            window.viewport.set_shading(chance.choice(list(Shading)))
-
-        def resize() -> None:
-            window.resize(chance.randrange(1100, 1500), chance.randrange(700, 950))
-
-        def hover() -> None:
-            window.viewport.highlight_domain(chance.choice([None, *range(n_domains)]))
-
-        def lock() -> None:
-            document.set_locked(chance.randrange(n_domains), chance.random() < 0.5)
+        def mirror() -> None:
+            if document.can_mirror:
+                document.mirror()
 
         def keep() -> None:
             if len(document.poses) < _MOST_KEPT:
                 document.add_pose_to_library("kept")
             else:
                 document.remove_poses_from_library([document.poses[0].name])
-
-        def mirror() -> None:
-            if document.can_mirror:
-                document.mirror()
 
         return {
             slide: 60.0,
@@ -214,17 +200,17 @@ class Session(QObject):
             load: 4.0,
             resolve: 3.0,
             document.cancel_resolve: 2.0,
-            shade: 3.0,
-            resize: 1.0,
-            hover: 3.0,
-            lock: 2.0,
+            lambda: viewport.set_shading(chance.choice(list(Shading))): 3.0,
+            lambda: window.resize(chance.randrange(1100, 1500), chance.randrange(700, 950)): 1.0,
+            lambda: viewport.highlight_domain(chance.choice([None, *range(n_domains)])): 3.0,
+            lambda: document.set_locked(chance.randrange(n_domains), chance.random() < 0.5): 2.0,
             keep: 1.0,
             mirror: 1.0,
             document.reset_all: 1.0,
-            lambda: window.viewport.set_camera(chance.choice(CAMERAS)): 1.0,
+            lambda: viewport.set_camera(chance.choice(CAMERAS)): 1.0,
             lambda: window.set_theme(chance.choice(["light", "dark"])): 0.5,
             lambda: document.randomise(chance.random(), chance.randrange(1000)): 3.0,
-            lambda: self.wait_for(self.is_settled): 2.0,
+            self.settle: 2.0,
         }
 
     def mesh_is_right(self) -> bool:
@@ -272,21 +258,12 @@ class Session(QObject):
         deadline = time.monotonic() + _TIMEOUT_SECONDS
         while not condition():
             if time.monotonic() > deadline:
-                raise TimeoutError(
-                    f"the window does not come to rest: shown {self.is_shown()}, busy with "
-                    f"{self._document.busy!r}, checked {self._document.exact is not None}, at rest "
-                    f"{self._window.viewport.is_at_rest}"
-                )
-            self.turn(wait=True)
+                busy = self._document.busy
+                raise TimeoutError(f"the window does not come to rest, busy with {busy!r}")
+            self.pause(0.001)
 
-    def turn(self, wait: bool = False) -> None:
-        """Run one turn of the event loop, that of deferred deletions included."""
-        loop = QEventLoop()
-        QTimer.singleShot(1 if wait else 0, loop.quit)
-        loop.exec()
-
-    def pause(self, seconds: float) -> None:
-        """Let the window live for a while."""
+    def pause(self, seconds: float = 0.0) -> None:
+        """Let the window live for a while, or one turn; what is to be deleted later is deleted."""
         loop = QEventLoop()
         QTimer.singleShot(int(1000 * seconds), loop.quit)
         loop.exec()

@@ -83,7 +83,7 @@ class PredictorTiming:
 
 @dataclass(frozen=True)
 class _Exact:
-    """What finding the truth costs, per pose in seconds."""
+    """What decoding and the exact check cost, per pose in seconds."""
 
     decode: float
     check: float
@@ -180,7 +180,7 @@ def _time_on(
     finally:
         torch.set_num_threads(n_threads)
     cores = available_cores()
-    truth = exact.decode + exact.check
+    exact_seconds = exact.decode + exact.check
     return PredictorTiming(
         device=device,
         preset=predictor.preset,
@@ -190,11 +190,11 @@ def _time_on(
         gradient_ms=1e3 * gradient,
         exact_ms_per_pose=1e3 * exact.check,
         decode_ms_per_pose=1e3 * exact.decode,
-        speedup=truth / predicted,
+        speedup=exact_seconds / predicted,
         gemm_fraction=predictor.flops(BATCH) / (BATCH * predicted) / _gemm_rate(device),
         table_poses=len(latent),
         predicted_seconds=predicted_all,
-        exact_seconds=truth * len(latent),
+        exact_seconds=exact_seconds * len(latent),
         exact_poses=n_exact,
         colliding_share=exact.colliding_share,
         fcl_seconds=None if exact.fcl is None else exact.fcl * len(latent) / cores,

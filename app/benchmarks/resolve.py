@@ -41,9 +41,9 @@ class ResolveScore:
         brings to a point that it calls free; None for the baseline
     exactly_free_rate : at the end, by the exact check
     free_before_walk_back : exactly free without the ladder's last step; None for the baseline
-    energy_decrease : mean share of the exact energy that is gone at the solver's feasible points
+    energy_decrease : mean fraction of the exact energy that is gone at the solver's feasible points
     latent_distance : mean ||Z - Z*|| / ||Z*||
-    vertex_distance : mean distance over vertices, in heights
+    vertex_distance : mean distance over vertices, in normalised lengths
     """
 
     solver: str

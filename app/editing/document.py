@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.commands import DocumentState, Source
 from app.editing.history import UNNAMED, PoseHistory, read_only
-from app.wording import counted, heading, height_text, mirrored_text
+from app.wording import counted, fit_error, heading, height_text, mirrored_text
 from app.work import jobs
 from app.work.frames import ExactVerdict, LiveFrame, PosePrediction
 from app.work.live_pose import LivePose
@@ -25,7 +26,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError
 if TYPE_CHECKING:
     from lcollision_core.meshes import FileStamp
     from lcollision_core.model import MirroredPose, NamedPose, PoseModel
-    from lcollision_core.resolve import ResolveOptions
+    from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 __all__ = ["ExactVerdict", "Failure", "LiveFrame", "PoseDocument", "PosePrediction"]
 
@@ -54,6 +55,10 @@ class PoseDocument(PoseHistory):
 
     Attributes
     ----------
+    model_file : that the model was read from, or the name of one that was not
+    locked_domains : that Resolve, Randomise, Reset all and blending leave as they are
+    frame : the newest computed one; while a slider moves, an instant behind `latent`
+    exact : the exact check of `latent`; None until it is known
     may_replace : asked before a model or a file comes in over edits made while it was read
 
     Signals
@@ -103,12 +108,12 @@ class PoseDocument(PoseHistory):
         super().__init__(parent)
         self._library_folder = library_folder
         self._model: PoseModel | None = None
-        self._model_file = ""
+        self.model_file = ""
         self._file_stamp: FileStamp | None = None
         self._predicts = False
-        self._locked: frozenset[int] = frozenset()
-        self._frame: LiveFrame | None = None
-        self._exact: ExactVerdict | None = None
+        self.locked_domains: frozenset[int] = frozenset()
+        self.frame: LiveFrame | None = None
+        self.exact: ExactVerdict | None = None
 
         self._solve: int | None = None
         self._solve_began = 0.0
@@ -140,26 +145,6 @@ class PoseDocument(PoseHistory):
         if self._model is None:
             raise LCollisionError("no model is open yet", "open one first")
         return self._model
-
-    @property
-    def model_file(self) -> str:
-        """The file that the model was read from, or the name of one that was not."""
-        return self._model_file
-
-    @property
-    def locked_domains(self) -> frozenset[int]:
-        """Domains that Resolve, Randomise, Reset all and blending leave as they are."""
-        return self._locked
-
-    @property
-    def frame(self) -> LiveFrame | None:
-        """The newest computed frame; while a slider moves, an instant behind `latent`."""
-        return self._frame
-
-    @property
-    def exact(self) -> ExactVerdict | None:
-        """The exact check of `latent`; None until it is known."""
-        return self._exact
 
     @property
     def solving(self) -> bool:
@@ -198,15 +183,11 @@ class PoseDocument(PoseHistory):
         """
         if not np.isfinite(value) or value == self.latent[index]:
             return
-        latent = self.latent.copy()
-        latent[index] = value
-        self._edit(f"Move {self.code_name(index)}", latent, run=index)
+        self._set_codes(f"Move {self.code_name(index)}", index, value, run=index)
 
     def reset_code(self, index: int) -> None:
         """Set one number of the latent to 0."""
-        latent = self.latent.copy()
-        latent[index] = 0.0
-        self._edit(f"Reset {self.code_name(index)}", latent)
+        self._set_codes(f"Reset {self.code_name(index)}", index, 0.0)
 
     def reset_all(self) -> None:
         """Set all numbers to 0, but for those of locked domains."""
@@ -238,10 +219,13 @@ class PoseDocument(PoseHistory):
         ------
         LCollisionError : the model has no two sides.
         """
+        from lcollision_core.resolve import ResolveOptions
+
         _ = self.model.pose_mirror
         self.end_gesture()
         self._long.cancel(self._mirroring)
-        work = jobs.mirrored(self.model, self.pose, self._locked)
+        pose, options = self.pose, ResolveOptions(locked_domains=self.locked_domains)
+        work = partial(self.model.mirror, pose.latent, pose.placement, pose.mirror_of, options)
         self._mirroring = self._long.start("Mirroring", work, self._on_mirrored)
 
     def mirror_poses(self, poses: Sequence[NamedPose]) -> None:
@@ -256,7 +240,7 @@ class PoseDocument(PoseHistory):
         """
         _ = self.model.pose_mirror
         self._long.cancel(self._mirroring_poses)
-        work = jobs.mirrored_poses(self.model, tuple(poses))
+        work = partial(jobs.mirror_poses, self.model, tuple(poses))
         label = f"Mirroring {counted(len(poses), 'pose')}"
         self._mirroring_poses = self._long.start(label, work, self._on_poses_mirrored)
 
@@ -268,15 +252,19 @@ class PoseDocument(PoseHistory):
 
     def reset_domain(self, domain: int) -> None:
         """Set all numbers of a domain to 0: its own, and the whole body's that its lock holds."""
+        codes = self.model.embedding.codes_of([domain])
+        self._set_codes(f"Reset {self.model.domain_names[domain]}", codes, 0.0)
+
+    def _set_codes(self, label: str, codes: Any, value: float, run: int | None = None) -> None:
         latent = self.latent.copy()
-        latent[self.model.embedding.codes_of([domain])] = 0.0
-        self._edit(f"Reset {self.model.domain_names[domain]}", latent)
+        latent[codes] = value
+        self._edit(label, latent, run)
 
     def set_locked(self, domain: int, locked: bool) -> None:
         """Lock a domain against Resolve, Randomise, Reset all and blending, or let it go."""
-        changed = self._locked | {domain} if locked else self._locked - {domain}
-        if changed != self._locked:
-            self._locked = changed
+        changed = self.locked_domains | {domain} if locked else self.locked_domains - {domain}
+        if changed != self.locked_domains:
+            self.locked_domains = changed
             self.cancel_resolve()
             self.locks_changed.emit()
 
@@ -289,7 +277,7 @@ class PoseDocument(PoseHistory):
     @property
     def all_locked(self) -> bool:
         """Whether every domain is locked, so that nothing but a slider can move the pose."""
-        return self.has_model and len(self._locked) == len(self.model.domain_names)
+        return self.has_model and len(self.locked_domains) == len(self.model.domain_names)
 
     # Models and files.
 
@@ -308,15 +296,15 @@ class PoseDocument(PoseHistory):
 
         self.retry_library()
         self._model = opened.model
-        self._model_file = opened.file
-        self._locked = frozenset()
+        self.model_file = opened.file
+        self.locked_domains = frozenset()
         self.cancel_resolve()
         # What is being exported is a snapshot, and goes on.
         others = (self._mirroring, self._mirroring_poses, self._incoming, self._loading)
         for number in others:
             self._long.cancel(number)
-        self._frame = self._exact = self._gesture = self._file = None
-        self._file_poses = ()
+        self.frame = self.exact = self._gesture = self.file = None
+        self.file_poses = ()
         folder = self._library_folder or user_poses_folder()
         self._library = PoseLibrary(opened.model, folder, self._tell_of_library)
         self._held = self._blank()
@@ -327,6 +315,9 @@ class PoseDocument(PoseHistory):
         self.undo_stack.clear()
         # All of it is in before anyone is told: who looks finds poses of that model only, and
         # may edit at once.
+        self._tell_all()
+
+    def _tell_all(self) -> None:
         for changed in (
             self.model_changed,
             self.latent_changed,
@@ -343,7 +334,9 @@ class PoseDocument(PoseHistory):
 
     def open_model(self, name_or_path: str | Path) -> None:
         """Read a model in the long worker and put it in."""
-        self._bring(f"Opening {name_or_path}", jobs.opened_model(name_or_path), self._on_model)
+        self._bring(
+            f"Opening {name_or_path}", partial(jobs.open_model, name_or_path), self._on_model
+        )
 
     def edit_parts(self, edits: jobs.PartEdits) -> None:
         """Rename, recolour or reorder body parts in the model's file, in the long worker.
@@ -354,7 +347,7 @@ class PoseDocument(PoseHistory):
         ----------
         edits : what changes, and the name of the copy where the model's own file is not to
         """
-        work = jobs.edited_parts(self.model, self._model_file, edits)
+        work = partial(jobs.edit_parts, self.model, self.model_file, edits)
         self._long.start("Saving the body parts", work, self._on_parts)
 
     def new_pose(self) -> None:
@@ -372,24 +365,24 @@ class PoseDocument(PoseHistory):
         model_file : the model that comes in too; the poses are the present one's where None. Of
             a file of another model that is known, `of_other_model` tells.
         """
-        work = jobs.read(None if model_file else self.model, model_file or "", Path(path))
+        work = partial(
+            jobs.read_poses, None if model_file else self.model, model_file or "", Path(path)
+        )
         self._bring(f"Opening {Path(path).name}", work, self._on_poses)
 
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
         """Read what a crash left, as `LostPose` tells of it, and make it the pose, unsaved."""
-        model = self.model if model_file == self._model_file else None
+        model = self.model if model_file == self.model_file else None
 
-        def put_in(read: jobs.ReadPoses) -> None:
-            self._on_recovered(read, name, file)
-
-        self._bring(f"Recovering {name}", jobs.read(model, model_file, poses_file), put_in)
+        work = partial(jobs.read_poses, model, model_file, poses_file)
+        self._bring(f"Recovering {name}", work, partial(self._on_recovered, name, file))
 
     @property
     def file_is_another_s(self) -> bool:
         """Whether another program has written the file since it was opened or saved here."""
         from lcollision_core.meshes import file_stamp
 
-        return self._file is not None and file_stamp(self._file) not in (None, self._file_stamp)
+        return self.file is not None and file_stamp(self.file) not in (None, self._file_stamp)
 
     def save(self, path: str | Path | None = None) -> None:
         """Write the working pose and the file's other poses, and clear the modified mark.
@@ -408,7 +401,7 @@ class PoseDocument(PoseHistory):
         from lcollision_core.model import name_of_file, write_poses
 
         self.end_gesture()
-        target = Path(path) if path is not None else self._file
+        target = Path(path) if path is not None else self.file
         if target is None:
             raise ModelFileError("the pose has no file yet", "save it under a name")
         name = self.pose_name if self.pose_name != UNNAMED else name_of_file(target)
@@ -423,8 +416,10 @@ class PoseDocument(PoseHistory):
 
         `scale` brings it into the model's unit; `wrong_scale` tells where it is another.
         """
-        work = jobs.encoded(self.model, Path(path), scale)
-        self._bring(f"Importing {Path(path).name}", work, self._on_encoded, ask=False)
+        work = partial(jobs.encode, self.model, Path(path), scale)
+        self._bring(
+            f"Importing {Path(path).name}", work, partial(self._on_encoded, Path(path)), ask=False
+        )
 
     def export_mesh(
         self, path: str | Path, axes: str = "model", scale: float | None = None
@@ -436,8 +431,19 @@ class PoseDocument(PoseHistory):
         path : of the file
         axes, scale : see `export_frame`
         """
-        work = jobs.exported(self.model, self.pose, self.outcome, Path(path), axes, scale)
-        self._exports.append(self._long.start(f"Exporting {Path(path).name}", work, self._tell))
+        path = Path(path)
+        work = partial(jobs.export, self.model, self.pose, self.outcome, path, axes, scale)
+        self.write(f"Exporting {path.name}", work)
+
+    def write(self, label: str, work: Job) -> None:
+        """Write a file in the long worker; `finish_exports` waits for it.
+
+        Parameters
+        ----------
+        label : as in "Exporting body.obj"
+        work : returns what the status bar is to say of it
+        """
+        self._exports.append(self._long.start(label, work, self.message.emit))
 
     def finish_exports(self) -> None:
         """Write here and now what still waits to be exported, as before the window closes.
@@ -471,8 +477,8 @@ class PoseDocument(PoseHistory):
             )
         self.end_gesture()
         self.cancel_resolve()
-        chosen = replace(options or ResolveOptions(), locked_domains=self._locked)
-        work = jobs.resolved(self.model, self.latent, self.placement, chosen)
+        chosen = replace(options or ResolveOptions(), locked_domains=self.locked_domains)
+        work = partial(jobs.resolve, self.model, self.latent, self.placement, chosen)
         self._solve_began = time.monotonic()
         self._solve = self._long.start("Resolving", work, self._on_resolved, self.cancel_resolve)
         self.solve_started.emit()
@@ -512,12 +518,12 @@ class PoseDocument(PoseHistory):
 
     @Slot(object)
     def _on_frame_computed(self, frame: LiveFrame) -> None:
-        self._frame = frame
+        self.frame = frame
         self.frame_changed.emit()
 
     @Slot(object)
     def _on_verdict_computed(self, verdict: ExactVerdict) -> None:
-        self._exact = verdict
+        self.exact = verdict
         self.exact_changed.emit()
 
     @Slot(int, object)
@@ -543,23 +549,19 @@ class PoseDocument(PoseHistory):
         self.message.emit(f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}")
         self.opened.emit(read.path)
 
-    def _on_parts(self, changed: jobs.ChangedParts) -> None:
+    def _on_parts(self, changed: jobs.OpenedModel) -> None:
         if changed.model.fingerprint != self.model.fingerprint:
             return
         # The slider that is being dragged goes with its old name.
         self.end_gesture()
-        self._model, self._model_file = changed.model, changed.file
+        self._model, self.model_file = changed.model, changed.file
         self._live.follow(self.model, self.latent, self._predicts)
         self._load_predictor()
-        for told in (self.model_changed, self.frame_changed, self.exact_changed):
-            told.emit()
-        for told in (self.locks_changed, self.outcome_changed, self.ghost_changed):
-            told.emit()
-        self.file_changed.emit()
+        self._tell_all()
         self.message.emit(f"Saved the body parts in {self.model.name}")
 
     def _on_recovered(
-        self, read: jobs.ReadPoses | jobs.OtherModel, name: str, file: Path | None
+        self, name: str, file: Path | None, read: jobs.ReadPoses | jobs.OtherModel
     ) -> None:
         from lcollision_core.meshes import file_stamp
 
@@ -578,20 +580,18 @@ class PoseDocument(PoseHistory):
         self.recovered.emit(read.path)
 
     def _tell_of_library(self, error: LCollisionError) -> None:
-        # It was told before; by now nobody is there to read it.
+        # It was told before; by now no window can show it.
         if not self._closed:
             self.failed.emit(Failure.of(error))
 
-    def _on_encoded(self, imported: jobs.Imported | jobs.WrongScale) -> None:
-        if isinstance(imported, jobs.WrongScale):
-            self.wrong_scale.emit(imported)
+    def _on_encoded(self, path: Path, pose: NamedPose | jobs.WrongScale) -> None:
+        if isinstance(pose, jobs.WrongScale):
+            self.wrong_scale.emit(pose)
             return
-        self._load(f"Import {imported.pose.name}", imported.pose, Source.MESH)
-        self._tell(imported)
-        self.imported.emit(imported.path)
-
-    def _tell(self, done: jobs.Imported | jobs.Exported) -> None:
-        self.message.emit(done.sentence)
+        self._load(f"Import {pose.name}", pose, Source.MESH)
+        error = fit_error(pose.fit_error_mean, pose.fit_error_max)
+        self.message.emit(f"Imported {pose.name}: {error}")
+        self.imported.emit(path)
 
     def _on_mirrored(self, image: MirroredPose) -> None:
         self.end_gesture()
@@ -604,7 +604,7 @@ class PoseDocument(PoseHistory):
         said = [heading(mirrored_text(image))]
         if image.lost_freedom and image.resolution is not None and image.resolution.note:
             said.append(image.resolution.note)
-        if self._locked and not image.restored:
+        if self.locked_domains and not image.restored:
             said.append("locked parts were mirrored too")
         self.message.emit("; ".join(said))
 
@@ -627,8 +627,9 @@ class PoseDocument(PoseHistory):
                     said.append(f"{count} {words}")
         self.message.emit("; ".join(said))
 
-    def _on_resolved(self, resolved: jobs.Resolved) -> None:
-        result, self._solve = resolved.result, None
+    def _on_resolved(self, found: tuple[ResolveResult, npt.NDArray[np.float32]]) -> None:
+        result, ghost = found
+        self._solve = None
         seconds = time.monotonic() - self._solve_began
         self.end_gesture()
         if np.array_equal(result.latent, self.latent):
@@ -637,14 +638,14 @@ class PoseDocument(PoseHistory):
         else:
             latent = read_only(np.array(result.latent, dtype=np.float64))
             pose = replace(self.pose, latent=latent, fit_error_mean=None, fit_error_max=None)
-            found = replace(self._state, pose=pose, ghost=resolved.ghost, outcome=result)
-            self._push("Resolve", replace(found, outcome_seconds=seconds))
+            after = replace(self._state, pose=pose, ghost=ghost, outcome=result)
+            self._push("Resolve", replace(after, outcome_seconds=seconds))
         self.solve_finished.emit(result)
 
     def _load_predictor(self) -> None:
         """Have predictions soon: the pose is shown, and can be edited, before."""
         if self.can_resolve and not self._predicts and not self._closed:
-            work = jobs.loaded_predictor(self.model)
+            work = partial(jobs.load_predictor, self.model)
             self._loading = self._long.start("Loading predictions", work, self._on_predictor)
 
     def _on_predictor(self, model: PoseModel) -> None:
@@ -678,8 +679,8 @@ class PoseDocument(PoseHistory):
         self.cancel_resolve()
         self._long.cancel(self._mirroring)
         self._live.follow(self.model, self.latent, self._predicts)
-        if self._exact is not None:
-            self._exact = None
+        if self.exact is not None:
+            self.exact = None
             self.exact_changed.emit()
 
     def _tell_if_locked(self) -> None:
@@ -688,4 +689,4 @@ class PoseDocument(PoseHistory):
 
     def _with_locked(self, latent: FloatArray) -> FloatArray:
         """Return the latent with the present codes of locked domains."""
-        return np.where(self.model.embedding.codes_of(self._locked), self.latent, latent)
+        return np.where(self.model.embedding.codes_of(self.locked_domains), self.latent, latent)

@@ -38,6 +38,13 @@ class PoseHistory(QObject):
     began. The library is a file of its own, written at every change; the poses of the file that
     was opened are a third thing, which nothing here changes. `PoseDocument`, which is what the
     window holds, tells what the signals mean.
+
+    Attributes
+    ----------
+    undo_stack : of all steps
+    file : the poses file that Save writes; None asks for one
+    file_poses : the poses of the file that was opened, which Save writes as they are
+    ghost_shown : whether a ghost is drawn where there is one; see `show_ghost`
     """
 
     latent_changed = Signal()
@@ -53,10 +60,10 @@ class PoseHistory(QObject):
         self._held: DocumentState | None = None
         self._library: PoseLibrary | None = None
         self._gesture: tuple[str, DocumentState] | None = None
-        self._file: Path | None = None
-        self._file_poses: tuple[NamedPose, ...] = ()
+        self.file: Path | None = None
+        self.file_poses: tuple[NamedPose, ...] = ()
         self._saved: NamedPose | None = None
-        self._ghost_shown = True
+        self.ghost_shown = True
         self._told_modified = self._told_changed = False
         self.undo_stack = QUndoStack(self)
         self.undo_stack.setUndoLimit(UNDO_STEPS)
@@ -87,16 +94,6 @@ class PoseHistory(QObject):
         return () if self._library is None else self._library.poses
 
     @property
-    def file_poses(self) -> tuple[NamedPose, ...]:
-        """The poses of the file that was opened, which Save writes as they are."""
-        return self._file_poses
-
-    @property
-    def file(self) -> Path | None:
-        """The poses file that Save writes; None asks for one."""
-        return self._file
-
-    @property
     def library_pose(self) -> NamedPose | None:
         """The pose of the library that the working pose came from, as it is there now."""
         origin = self._state.origin
@@ -119,13 +116,12 @@ class PoseHistory(QObject):
     def modified(self) -> bool:
         """Whether there is something to save.
 
-        A pose that nobody has touched since it was loaded is where it came from, and needs no
-        file.
+        A pose that was not touched since it was loaded is where it came from, and needs no file.
         """
         if self._saved is not None and self._saved.same_as(self.pose):
             return False
         origin, library = self._state.origin, self._library
-        if self._file is not None or self._saved is None or origin is None:
+        if self.file is not None or self._saved is None or origin is None:
             return True
         if origin.source is Source.LIBRARY and not (library and library.is_written):
             return True
@@ -135,17 +131,12 @@ class PoseHistory(QObject):
     @property
     def ghost(self) -> npt.NDArray[np.float32] | None:
         """(V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`, if shown."""
-        return self._state.ghost if self._ghost_shown else None
+        return self._state.ghost if self.ghost_shown else None
 
     @property
     def vertices_before(self) -> npt.NDArray[np.float32] | None:
         """(V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`."""
         return self._state.ghost
-
-    @property
-    def ghost_shown(self) -> bool:
-        """Whether a ghost is drawn where there is one."""
-        return self._ghost_shown
 
     @property
     def outcome(self) -> ResolveResult | None:
@@ -159,8 +150,8 @@ class PoseHistory(QObject):
 
     def show_ghost(self, shown: bool) -> None:
         """Draw or hide the mesh before Resolve."""
-        if shown != self._ghost_shown:
-            self._ghost_shown = shown
+        if shown != self.ghost_shown:
+            self.ghost_shown = shown
             self.ghost_changed.emit()
 
     def begin_gesture(self, label: str) -> None:
@@ -185,14 +176,14 @@ class PoseHistory(QObject):
             self._gesture = None
             self._apply(before)
 
-    def blend_towards(self, latent: npt.ArrayLike, share: float) -> None:
-        """Blend from the pose at the gesture's begin, share 0, to a (D,) other one, share 1.
+    def blend_towards(self, latent: npt.ArrayLike, fraction: float) -> None:
+        """Blend from the pose at the gesture's begin, fraction 0, to a (D,) other one, 1.
 
         Locked domains stay as they are.
         """
         start = self._gesture[1].pose.latent if self._gesture else self.latent
         target = np.asarray(latent, dtype=np.float64)
-        blended = target.copy() if share == 1.0 else start + share * (target - start)
+        blended = target.copy() if fraction == 1.0 else start + fraction * (target - start)
         self._edit("Blend", self._with_locked(blended))
 
     def undo(self) -> None:
@@ -350,7 +341,7 @@ class PoseHistory(QObject):
             self._tell_modified()
 
     def retry_library(self) -> None:
-        """Write what could not be written before, as when the disk has room again."""
+        """Write what could not be written before, as when the disk was full."""
         if self._library is not None and not self._library.is_written:
             self._library.change(())
 
@@ -445,7 +436,7 @@ class PoseHistory(QObject):
 
     def _keep_saved(self, pose: NamedPose, file: Path) -> None:
         """Remember what a file holds now, whichever way undo comes back to it."""
-        self._file, self._saved = file, pose
+        self.file, self._saved = file, pose
         origin = self._state.origin
         if origin is None or origin.source is not Source.LIBRARY:
             origin = Origin(Source.FILE, pose)
@@ -473,7 +464,7 @@ class PoseHistory(QObject):
     ) -> None:
         """Put in a state without a past."""
         self._gesture = None
-        self._file, self._file_poses, self._saved = file, file_poses, state.pose
+        self.file, self.file_poses, self._saved = file, file_poses, state.pose
         self._apply(state)
         self.undo_stack.clear()
         self.library_changed.emit()

@@ -14,13 +14,16 @@ import time
 import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from PySide6.QtCore import QLockFile, QObject, QThread, QTimer, Signal, Slot
+from PySide6.QtCore import QLockFile, QObject, Signal, Slot
 
 from app.editing.document import PoseDocument
-from app.work.threads import Failure, end_thread, single_shot, started_thread
+from app.work.long_work import Job, LongWork
+from app.work.threads import Failure, guarded, single_shot
+from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.json_values import parse_json
 from lcollision_core.meshes import atomic_write
 from lcollision_core.regular_files import read_regular, require_regular
@@ -156,50 +159,6 @@ def _lost(parent: Path) -> Iterator[LostPose]:
             session.discard()
 
 
-@dataclass(frozen=True, eq=False)
-class _Snapshot:
-    """What is to be written; None as the working pose deletes what was."""
-
-    session: Session
-    model: PoseModel
-    model_file: str
-    file: Path | None
-    locked: tuple[int, ...]
-    file_poses: tuple[NamedPose, ...]
-    working: NamedPose | None
-
-
-class _Writer(QObject):
-    """Writes snapshots in its own thread, as a disk may take longer than a frame."""
-
-    failed = Signal(object)
-    written = Signal()
-
-    @Slot(object)
-    def write(self, snapshot: _Snapshot) -> None:
-        from lcollision_core.model import write_poses
-
-        folder = snapshot.session.folder
-        try:
-            if snapshot.working is None:
-                (folder / _POSES).unlink(missing_ok=True)
-                (folder / _SESSION).unlink(missing_ok=True)
-                return
-            write_poses(folder / _POSES, snapshot.model, snapshot.file_poses, snapshot.working)
-            held = {
-                "model": snapshot.model_file,
-                "pose_name": snapshot.working.name,
-                "file": str(snapshot.file) if snapshot.file else None,
-                "locked": snapshot.locked,
-            }
-            with atomic_write(folder / _SESSION) as file:
-                file.write(json.dumps(held).encode())
-            self.written.emit()
-        except Exception as error:
-            _log.warning("autosave failed", exc_info=True)
-            self.failed.emit(error)
-
-
 class Autosave(QObject):
     """Keeps what a document has not saved, until it is saved or given up.
 
@@ -218,8 +177,6 @@ class Autosave(QObject):
     failed = Signal(object)
     written = Signal()
 
-    _wanted = Signal(object)
-
     def __init__(
         self,
         document: PoseDocument,
@@ -235,12 +192,10 @@ class Autosave(QObject):
             self._session = Session.new(parent_folder or sessions_folder())
         except OSError as error:
             _log.warning("there is no autosave: %s", error)
-        self._writer = _Writer()
-        self._thread: QThread = started_thread("autosave", self._writer, self)
-        self._wanted.connect(self._writer.write)
-        self._writer.failed.connect(self._on_failed)
-        self._writer.written.connect(self._on_written)
-        self._due: QTimer = single_shot(self, int(1000 * seconds), self._write)
+        # A thread of its own: a disk may take longer than a frame, and no Resolve is waited for.
+        self._work = LongWork(self)
+        self._work.failed.connect(self._on_failed)
+        self._due = single_shot(self, int(1000 * seconds), self._write)
         for changed in (
             document.latent_changed,
             document.locks_changed,
@@ -272,12 +227,12 @@ class Autosave(QObject):
         ended : whether the thread has ended in time
         """
         self._due.stop()
-        ended = end_thread(self._thread, time.monotonic() + timeout)
+        ended = self._work.close(time.monotonic() + timeout)
         if self._session is None:
             return ended
         if keep and self._document.modified:
             if ended:
-                self._writer.write(self._snapshot(self._session))
+                guarded(0, "Autosave", self._snapshot(), no_progress, CancelToken())
             self._session.release()
         else:
             self._session.discard()
@@ -300,19 +255,21 @@ class Autosave(QObject):
     @Slot()
     def _write(self) -> None:
         if self._session is not None and self._document.has_model:
-            self._wanted.emit(self._snapshot(self._session))
+            self._work.start("Autosave", self._snapshot(), self._on_written)
 
-    def _snapshot(self, session: Session) -> _Snapshot:
-        document = self._document
-        return _Snapshot(
-            session=session,
-            model=document.model,
-            model_file=document.model_file,
-            file=document.file,
-            locked=tuple(sorted(document.locked_domains)),
-            file_poses=document.file_poses,
-            working=document.pose if document.modified else None,
-        )
+    def _snapshot(self) -> Job:
+        """Return what writes the document as it is now, or deletes what was written."""
+        assert self._session is not None
+        document, folder = self._document, self._session.folder
+        if not document.modified:
+            return partial(_delete, folder)
+        session = {
+            "model": document.model_file,
+            "pose_name": document.pose_name,
+            "file": str(document.file) if document.file else None,
+            "locked": sorted(document.locked_domains),
+        }
+        return partial(_write, folder, session, document.model, document.file_poses, document.pose)
 
     @Slot(object)
     def _on_recovered(self, poses_file: Path) -> None:
@@ -325,14 +282,37 @@ class Autosave(QObject):
             for domain in range(self._document.model.embedding.n_domains):
                 self._document.set_locked(domain, domain in lost.locked)
 
-    @Slot()
-    def _on_written(self) -> None:
-        self._told = False
-        self.written.emit()
+    def _on_written(self, is_kept: bool) -> None:
+        if is_kept:
+            self._told = False
+            self.written.emit()
 
     @Slot(object)
-    def _on_failed(self, error: Exception) -> None:
+    def _on_failed(self, failure: Failure) -> None:
         if not self._told:
             self._told = True
-            headline = f"your changes cannot be kept safe ({error})"
-            self.failed.emit(Failure(headline, "save them to a file", repr(error)))
+            headline = f"your changes cannot be kept safe ({failure.headline})"
+            self.failed.emit(Failure(headline, "save them to a file", failure.details))
+
+
+def _write(
+    folder: Path,
+    session: dict[str, Any],
+    model: PoseModel,
+    file_poses: tuple[NamedPose, ...],
+    working: NamedPose,
+    _: Progress,
+    __: CancelToken,
+) -> bool:
+    from lcollision_core.model import write_poses
+
+    write_poses(folder / _POSES, model, file_poses, working)
+    with atomic_write(folder / _SESSION) as file:
+        file.write(json.dumps(session).encode())
+    return True
+
+
+def _delete(folder: Path, _: Progress, __: CancelToken) -> bool:
+    for name in (_POSES, _SESSION):
+        (folder / name).unlink(missing_ok=True)
+    return False

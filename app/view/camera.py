@@ -18,7 +18,7 @@ VIEW_ANGLE = 24.0
 
 _MARGIN = 1.2
 _NEAREST, _FARTHEST = 0.05, 15.0
-"""Limits of zooming, in heights of the body."""
+"""Limits of zooming, in body sizes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,58 +144,42 @@ def zoomed(
         where the body is a dot
     vertices : (V, 3) array; turning goes round a point of the line of sight that is as deep in the
         scene as they are
-    height : of the body, in the data's unit
+    height : the body size, in the data's unit
     """
     arm = view.position - anchor
-    reach = float(np.linalg.norm(arm))
+    distance = float(np.linalg.norm(arm))
     near, far = _NEAREST * height, _FARTHEST * height
-    wanted = reach * factor
-    allowed = max(wanted, min(near, reach)) if factor < 1.0 else min(wanted, max(far, reach))
-    factor = allowed / reach
+    # Never past a limit, but one that is beyond it already may stay.
+    factor = float(np.clip(factor, min(near / distance, 1.0), max(far / distance, 1.0)))
     position = anchor + factor * arm
     sight = view.focus - view.position
-    distance = float(np.linalg.norm(sight))
-    sight = sight / distance
+    depth = float(np.linalg.norm(sight))
+    sight = sight / depth
     depths = (vertices - position) @ sight
-    distance = float(np.clip(factor * distance, depths.min(), depths.max()))
-    return View(position, position + max(distance, 0.5 * near) * sight, view.up)
+    depth = float(np.clip(factor * depth, depths.min(), depths.max()))
+    return View(position, position + max(depth, 0.5 * near) * sight, view.up)
 
 
-def turned(view: View, angle: float) -> View:
-    """Turn a camera round its focus about its upright.
-
-    Parameters
-    ----------
-    angle : radians, to the right-hand side of `up`
-    """
-    arm = view.position - view.focus
-    along = (arm @ view.up) * view.up
-    across = arm - along
-    turned_arm = along + np.cos(angle) * across + np.sin(angle) * np.cross(view.up, across)
-    return View(view.focus + turned_arm, view.focus, view.up)
-
-
-def between(start: View, end: View, share: float) -> View:
+def between(start: View, end: View, fraction: float) -> View:
     """Blend two cameras, on an arc round their focus.
 
     Parameters
     ----------
-    share : 0 at the start, 1 at the end
+    fraction : 0 at the start, 1 at the end
     """
-    if share >= 1.0:
+    from scipy.spatial.transform import Rotation
+
+    if fraction >= 1.0:
         return end
-    focus = (1.0 - share) * start.focus + share * end.focus
     arms = [view.position - view.focus for view in (start, end)]
     lengths = [float(np.linalg.norm(arm)) for arm in arms]
     a, b = (arm / length for arm, length in zip(arms, lengths, strict=True))
-    angle = float(np.arccos(np.clip(a @ b, -1.0, 1.0)))
-    if np.pi - angle < 1e-3:
+    axis = np.cross(a, b)
+    angle = np.arctan2(np.linalg.norm(axis), a @ b)
+    if np.linalg.norm(axis) < 1e-3:
         # From front to back there are many ways: the one round the upright.
-        quarter = np.cross(end.up, a)
-        direction = np.cos(share * np.pi) * a + np.sin(share * np.pi) * quarter
-    elif angle < 1e-6:
-        direction = b
-    else:
-        direction = (np.sin((1.0 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
-    length = (1.0 - share) * lengths[0] + share * lengths[1]
-    return View(focus + length * direction, focus, end.up)
+        axis = end.up
+    turn = Rotation.from_rotvec(fraction * angle * axis / np.linalg.norm(axis))
+    length = (1.0 - fraction) * lengths[0] + fraction * lengths[1]
+    focus = (1.0 - fraction) * start.focus + fraction * end.focus
+    return View(focus + length * turn.apply(a), focus, end.up)

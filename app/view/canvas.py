@@ -11,9 +11,6 @@ import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPointF, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import (
     QContextMenuEvent,
-    QDragEnterEvent,
-    QDropEvent,
-    QKeyEvent,
     QMouseEvent,
     QNativeGestureEvent,
     QResizeEvent,
@@ -31,6 +28,14 @@ _HOVER_MILLISECONDS = 30
 _SMOOTH_SAMPLES = 4
 _NOTCH = 120.0  # of a wheel, in eighths of a degree
 _ZOOM_A_NOTCH = 1.15
+
+_FOR_THE_WINDOW = (
+    QEvent.Type.KeyPress,
+    QEvent.Type.KeyRelease,
+    QEvent.Type.DragEnter,
+    QEvent.Type.Drop,
+)
+"""VTK has keys of its own, and pyvistaqt would add any file as a mesh."""
 
 _SLOW_SECONDS, _FAST_SECONDS = 0.020, 0.012
 """A smooth picture that takes longer makes a drag stutter; one that takes less leaves time for
@@ -217,22 +222,6 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         super().resizeEvent(event)
         self.redraw()
 
-    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
-        """Leave keys to the window: VTK has shortcuts of its own."""
-        event.ignore()
-
-    def keyReleaseEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
-        """Leave keys to the window."""
-        event.ignore()
-
-    def dragEnterEvent(self, event: QDragEnterEvent) -> None:  # noqa: N802 - Qt's name
-        """Leave files to the window: pyvistaqt would add any as a mesh."""
-        event.ignore()
-
-    def dropEvent(self, event: QDropEvent) -> None:  # noqa: N802 - Qt's name
-        """Leave files to the window."""
-        event.ignore()
-
     def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
         """Begin to turn, to shift, to zoom, or to click."""
         super().mousePressEvent(event)
@@ -274,7 +263,10 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
             self.zoom_wanted.emit(event.position(), _ZOOM_A_NOTCH**-notches)
 
     def event(self, event: QEvent) -> bool:
-        """Zoom as two fingers on a touchpad are spread."""
+        """Zoom as two fingers on a touchpad are spread; leave keys and files to the window."""
+        if event.type() in _FOR_THE_WINDOW:
+            event.ignore()
+            return False
         if (
             isinstance(event, QNativeGestureEvent)
             and event.gestureType() is Qt.NativeGestureType.ZoomNativeGesture

@@ -7,28 +7,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from vtkmodules.util.numpy_support import numpy_to_vtk
-from vtkmodules.vtkCommonCore import vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkPolyData
+import pyvista as pv
 
 from app.view.camera import VIEW_ANGLE
-from app.view.drawing import actor_of, cells_of, share_of
+from app.view.surface import actor_of
 
 if TYPE_CHECKING:
-    from vtkmodules.vtkRenderingCore import vtkActor, vtkRenderer
+    from vtkmodules.vtkRenderingCore import vtkRenderer
 
 Float32Array = npt.NDArray[np.float32]
 
-_STROKES = ((1.4, "#ffffff"), (3.0, "#14171c"))
-"""Widths to each side in device-independent pixels, the inner first: seen on any colour."""
+_STROKES = ((1.4, "#ffffff", 9.0), (3.0, "#14171c", 6.0))
+"""Width to each side, colour, and how much before the skin the border is drawn that lies in it,
+both in device-independent pixels; the inner first: seen on any colour."""
 
 _SMOOTHINGS = 4
 
 _BORDER_WIDTH = 1.5
 """Times the width to one side: on the body a line of both sides would look heavier than the rim."""
-
-_NEARER = (9.0, 6.0)
-"""Pixels that the border is drawn before the skin in which it lies, the inner stroke first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +34,14 @@ class PartShape:
     Attributes
     ----------
     ends : (P, 2) integer array, the mesh edges that the border of the part crosses
-    shares : (P, 1) float32 array, where: 0 at the first end, 1 at the second
+    fractions : (P, 1) float32 array, where: 0 at the first end, 1 at the second
     segments : (S, 2) integer array, pieces of the border between those P points
     vertices : (Q,) integer array, the vertices of faces that are all the part's
-    faces : (F, 3) integer array, these faces, as places in `vertices`
+    faces : (F, 3) integer array, these faces, as indices into `vertices`
     """
 
     ends: npt.NDArray[np.int64]
-    shares: Float32Array
+    fractions: Float32Array
     segments: npt.NDArray[np.int64]
     vertices: npt.NDArray[np.int64]
     faces: npt.NDArray[np.int64]
@@ -79,11 +75,11 @@ class PartShape:
         pairs = np.sort(np.stack([corner, after, corner, before], axis=1).reshape(-1, 2), axis=1)
         ends, place = np.unique(pairs, axis=0, return_inverse=True)
         at_first, at_second = lead[ends[:, 0]], lead[ends[:, 1]]
-        shares = (at_first / (at_first - at_second)).astype(np.float32)
+        fractions = (at_first / (at_first - at_second)).astype(np.float32)
         vertices, corners = np.unique(faces[count == 3], return_inverse=True)
         return cls(
             ends=ends,
-            shares=shares[:, None],
+            fractions=fractions[:, None],
             segments=place.reshape(-1, 2),
             vertices=vertices.astype(np.int64),
             faces=corners.reshape(-1, 3),
@@ -92,7 +88,7 @@ class PartShape:
     def border(self, vertices: Float32Array) -> Float32Array:
         """Return the (P, 3) points of the border on a (V, 3) pose."""
         first, second = vertices[self.ends[:, 0]], vertices[self.ends[:, 1]]
-        points: Float32Array = first + self.shares * (second - first)
+        points: Float32Array = first + self.fractions * (second - first)
         return points
 
 
@@ -110,27 +106,33 @@ class Outline:
     def __init__(self, renderer: vtkRenderer) -> None:
         self._renderer = renderer
         self._shape: PartShape | None = None
-        self._layers = [_Layer(width, colour) for width, colour in _STROKES]
-        for layer in self._layers:
-            for actor in layer.actors:
+        self._strokes = []
+        for width, colour, nearer in _STROKES:
+            border, shell = pv.PolyData(), pv.PolyData()
+            line = actor_of(border, color=colour, lighting=False)
+            # Only its far side is seen, beside the part.
+            rim = actor_of(shell, color=colour, lighting=False, culling="front")
+            for actor in (line, rim):
+                actor.SetVisibility(False)
                 renderer.AddActor(actor)
+            self._strokes.append((width, nearer, border, shell, line, rim))
 
     @property
     def is_shown(self) -> bool:
         """Whether a part is outlined."""
         return self._shape is not None
 
-    def remove(self) -> None:
-        """Take it out of the renderer."""
-        for layer in self._layers:
-            for actor in layer.actors:
-                self._renderer.RemoveActor(actor)
-
     def show(self, shape: PartShape | None) -> None:
         """Outline a part from the next `fit` on, or none."""
         self._shape = shape
-        for layer in self._layers:
-            layer.take(shape)
+        for _, _, border, shell, *actors in self._strokes:
+            if shape is not None:
+                border.points = np.zeros((len(shape.ends), 3), dtype=np.float32)
+                border.SetLines(pv.CellArray.from_regular_cells(shape.segments))
+                shell.points = np.zeros((len(shape.vertices), 3), dtype=np.float32)
+                shell.SetPolys(pv.CellArray.from_regular_cells(shape.faces))
+            for actor in actors:
+                actor.SetVisibility(shape is not None)
 
     def fit(self, vertices: Float32Array, normals: Float32Array, sharpness: float) -> None:
         """Follow the pose and the camera.
@@ -150,47 +152,10 @@ class Outline:
         distance = float(np.linalg.norm(eye - middle))
         n_pixels = max(1, self._renderer.GetSize()[1]) / sharpness
         pixel = 2.0 * distance * np.tan(np.radians(0.5 * VIEW_ANGLE)) / n_pixels
-        for layer, nearer in zip(self._layers, _NEARER, strict=True):
-            shell = skin + np.float32(layer.width * pixel) * outward
-            layer.fit(border + np.float32(nearer * pixel / distance) * (eye - border), shell)
-            layer.set_line_width(_BORDER_WIDTH * layer.width * sharpness)
-
-
-class _Layer:
-    """One stroke of the outline: lines along the border, and a shell round the part."""
-
-    def __init__(self, width: float, colour: str) -> None:
-        self.width = width
-        self._lines, self._shell = vtkPolyData(), vtkPolyData()
-        self._line_actor, self._shell_actor = (
-            _flat(held, colour) for held in (self._lines, self._shell)
-        )
-        self._shell_actor.GetProperty().FrontfaceCullingOn()
-
-    @property
-    def actors(self) -> tuple[vtkActor, vtkActor]:
-        return self._line_actor, self._shell_actor
-
-    def take(self, shape: PartShape | None) -> None:
-        if shape is not None:
-            for held, n_points in (
-                (self._lines, len(shape.ends)),
-                (self._shell, len(shape.vertices)),
-            ):
-                points = vtkPoints()
-                points.SetData(numpy_to_vtk(np.zeros((n_points, 3), dtype=np.float32), deep=True))
-                held.SetPoints(points)
-            self._lines.SetLines(cells_of(shape.segments))
-            self._shell.SetPolys(cells_of(shape.faces))
-        for actor in self.actors:
-            actor.SetVisibility(shape is not None)
-
-    def fit(self, border: Float32Array, shell: Float32Array) -> None:
-        for held, points in ((self._lines, border), (self._shell, shell)):
-            held.GetPoints().SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=True))
-
-    def set_line_width(self, width: float) -> None:
-        self._line_actor.GetProperty().SetLineWidth(width)
+        for width, nearer, lines, shell, line, _ in self._strokes:
+            lines.points = border + np.float32(nearer * pixel / distance) * (eye - border)
+            shell.points = skin + np.float32(width * pixel) * outward
+            line.prop.line_width = _BORDER_WIDTH * width * sharpness
 
 
 def _smooth(values: npt.NDArray[np.float64], faces: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
@@ -201,13 +166,3 @@ def _smooth(values: npt.NDArray[np.float64], faces: npt.NDArray[Any]) -> npt.NDA
         of_faces = np.repeat(values[faces].mean(axis=1), 3)
         values = np.bincount(corners, of_faces, minlength=len(values)) / n_faces
     return values
-
-
-def _flat(held: vtkPolyData, colour: str) -> vtkActor:
-    """Return an actor of one colour that no light changes and no pointer hits."""
-    actor = actor_of(held)
-    actor.SetPickable(False)
-    actor.SetVisibility(False)
-    actor.GetProperty().SetColor(*share_of(colour))
-    actor.GetProperty().LightingOff()
-    return actor

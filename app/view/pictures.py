@@ -1,4 +1,4 @@
-"""Screenshots and turntables of what a viewport shows, in other sizes."""
+"""Screenshots and turntable videos of what a viewport shows, in other sizes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QObject, Signal, Slot
+from PySide6.QtCore import QObject, QTimer, Signal, Slot
 
-from app.view.rendering import PoseRenderer
+from app.view.rendering import PoseRenderer, save_png
 from app.view.theme import current_theme
-from app.view.turntable import Turntable, TurntableStyle
-from app.work.threads import Failure
+from app.view.turntable import TurntableStyle, TurntableVideo
+from app.work.threads import guarded
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 class Pictures(QObject):
     """Copies a viewport's scene off the screen, and writes what is seen of it.
+
+    Frames of a video are drawn one by one between the window's own events; the document's long
+    worker packs them.
 
     Parameters
     ----------
@@ -36,13 +39,15 @@ class Pictures(QObject):
     def __init__(self, document: PoseDocument, parent: QObject) -> None:
         super().__init__(parent)
         self._document = document
-        self._film: Turntable | None = None
+        self._video: TurntableVideo | None = None
+        # With 0 ms between two frames the window's own events still have their turn.
+        self._next = QTimer(self, interval=0)
+        self._next.timeout.connect(self._on_next)
 
     @property
     def busy(self) -> str:
-        """Which film is being made, or "" where none is."""
-        film = self._film
-        return f"Making {film.path.name}" if film is not None and film.is_running else ""
+        """Which video is being drawn, or "" where none is."""
+        return f"Making {self._video.path.name}" if self._video is not None else ""
 
     def screenshot(
         self,
@@ -55,58 +60,59 @@ class Pictures(QObject):
         """Save a scene as a .png file; see `Viewport.screenshot`."""
         renderer = self._copy(scene, width, height, transparent)
         try:
-            renderer.save(path)
+            save_png(renderer.drawn(), path)
         finally:
             renderer.close()
 
-    def turntable(
-        self, scene: Scene, path: str | os.PathLike[str], style: TurntableStyle
-    ) -> Turntable:
-        """Begin a film of a scene, in place of one that is being drawn."""
-        self.stop()
-        transparent = style.background == "transparent"
-        renderer = self._copy(scene, style.width, style.height, transparent)
+    def turntable(self, scene: Scene, path: str | os.PathLike[str], style: TurntableStyle) -> None:
+        """Begin a video of a scene, in place of one that is being drawn.
+
+        Raises
+        ------
+        MeshFileError : the format is unknown or cannot hold what `style` asks for, or the folder
+            of a PNG sequence is there already.
+        """
+        refusal = style.refusal(Path(path))
+        if refusal is not None:
+            raise refusal
+        self.cancel()
+        renderer = self._copy(scene, style.width, style.height, style.background == "transparent")
         if style.background == "plain":
             renderer.scene.show_floor(False)
             renderer.scene.set_plain_background(style.colour)
-        self._film = Turntable(renderer, scene.view, Path(path), style, self)
-        self._film.progressed.connect(self._on_progressed)
-        self._film.finished.connect(self._on_finished)
-        self._film.failed.connect(self._on_failed)
+        self._video = TurntableVideo(renderer, Path(path), style)
+        self._next.start()
         self.busy_changed.emit()
-        return self._film
 
+    @Slot()
     def cancel(self) -> None:
-        """Give up the film that is being made."""
-        if self._film is not None:
-            self._film.cancel()
+        """Give up the video that is being drawn."""
+        if self._video is not None:
+            self._end().close()
+            self._document.message.emit("The turntable was cancelled")
 
-    def stop(self) -> None:
-        """Cancel a film that is being drawn, and wait for one that is being packed."""
-        if self._film is not None:
-            self._film.wait()
-            self._film.deleteLater()
-            self._film = None
-            self.busy_changed.emit()
+    def _end(self) -> TurntableVideo:
+        assert self._video is not None
+        video, self._video = self._video, None
+        self._next.stop()
+        self.busy_changed.emit()
+        return video
 
     def _copy(self, scene: Scene, width: int, height: int, transparent: bool) -> PoseRenderer:
-        renderer = PoseRenderer(
-            self._document.model, width, height, current_theme().is_dark, transparent
-        )
+        renderer = PoseRenderer(self._document.model, width, height, current_theme(), transparent)
         renderer.scene.look_like(scene)
         return renderer
 
-    @Slot(int, int)
-    def _on_progressed(self, n_drawn: int, n_frames: int) -> None:
-        self._document.message.emit(f"Turntable: frame {n_drawn} of {n_frames}")
-
-    @Slot(object)
-    def _on_finished(self, path: Path | None) -> None:
-        words = f"Saved {path.name}" if path is not None else "The turntable was cancelled"
-        self._document.message.emit(words)
-        self.busy_changed.emit()
-
-    @Slot(object)
-    def _on_failed(self, failure: Failure) -> None:
-        self._document.failed.emit(failure)
-        self.busy_changed.emit()
+    @Slot()
+    def _on_next(self) -> None:
+        video, label = self._video, self.busy
+        assert video is not None
+        drawn = guarded(0, label, video.draw_next)
+        if drawn.failure is not None:
+            self._end().close()
+            self._document.failed.emit(drawn.failure)
+            return
+        self._document.message.emit(f"Turntable: frame {video.n_drawn} of {video.n_frames}")
+        if video.n_drawn == video.n_frames:
+            self._end().close()
+            self._document.write(label, video.pack)

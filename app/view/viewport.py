@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from functools import partial
 from importlib import import_module
 from threading import Thread
 from typing import TYPE_CHECKING, Any
@@ -15,15 +16,15 @@ from PySide6.QtGui import QCloseEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QStackedLayout, QVBoxLayout, QWidget
 
-from app.view.animation import CameraTurn, PoseTransition
-from app.view.camera import View, kept_in_view, preset_view, zoomed
+from app.view.animation import Animation
+from app.view.camera import View, between, kept_in_view, preset_view, zoomed
 from app.view.legend import DomainTag, LegendStrip
 from app.view.pictures import Pictures
-from app.view.shading import Legend, Shader, Shading
+from app.view.shading import Known, Legend, Shader, Shading
 from app.view.theme import current_theme
 from app.view.waiting import WaitingPage
 from app.wording import heading
-from app.work.frames import FrameEvaluator, LiveFrame
+from app.work.frames import LiveFrame
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -31,11 +32,18 @@ if TYPE_CHECKING:
     from app.view.canvas import Canvas
     from app.view.outline import PartShape
     from app.view.scene import Scene
-    from app.view.turntable import Turntable, TurntableStyle
+    from app.view.turntable import TurntableStyle
+    from lcollision_core.model import PoseModel
     from lcollision_core.resolve import ResolveResult
 
-_ROOM = 1.15
+_GROWTH = 1.15
 """How much larger than its first pose a body may grow before a limb leaves the view."""
+
+_TRANSITION_MILLISECONDS = 320
+"""From the pose before Resolve to the one after."""
+
+_TURN_MILLISECONDS = 260
+"""From one camera to another."""
 
 _ZOOM_SECONDS = 0.5
 """A wheel that turns on within this goes on towards the same point, if the pointer stays."""
@@ -55,6 +63,16 @@ class Viewport(QWidget):
     document : may have no model yet
     parent : of the widget
 
+    Attributes
+    ----------
+    shading : what the colours say; see `set_shading`
+    shown_frame : the frame that the last picture shows, or is animated towards
+    canvas : the widget that draws and takes the mouse; None before the first model is in
+    scene : what stands before the camera; likewise
+    hovered_domain : the domain under the pointer, or None
+    pictures : makes screenshots and turntable videos
+    waiting : the page before the first model is in
+
     Signals
     -------
     domain_hovered : int, the domain under the pointer, or None
@@ -72,15 +90,15 @@ class Viewport(QWidget):
     def __init__(self, document: PoseDocument, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._document = document
-        self._shading = Shading.PLAIN
+        self.shading = Shading.PLAIN
         self._highlight: int | None = None
-        self._hovered: int | None = None
-        self._canvas: Canvas | None = None
-        self._scene: Scene | None = None
+        self.hovered_domain: int | None = None
+        self.canvas: Canvas | None = None
+        self.scene: Scene | None = None
         self._shader: Shader | None = None
-        self._evaluator: FrameEvaluator | None = None
+        self._model: PoseModel | None = None
         self._front = np.zeros(3)
-        self._shown: LiveFrame | None = None
+        self.shown_frame: LiveFrame | None = None
         self._pose_stale = self._colours_stale = self._crossing_stale = False
         self._place_camera = False
         self._framed: npt.NDArray[np.float64] | None = None
@@ -107,9 +125,9 @@ class Viewport(QWidget):
         self._first_gl_widget.resize(1, 1)
         self._first_gl_widget.lower()
 
-        self._transition = PoseTransition(self)
-        self._transition.moved.connect(self._on_transitiond)
-        self._turn = CameraTurn(self)
+        self._transition = Animation(_TRANSITION_MILLISECONDS, self)
+        self._transition.moved.connect(self._on_pose_moved)
+        self._turn = Animation(_TURN_MILLISECONDS, self)
         self._turn.moved.connect(self._on_turned)
         self.pictures = Pictures(document, self)
         # VTK takes a second to import: meanwhile the window is alive.
@@ -130,62 +148,27 @@ class Viewport(QWidget):
     # What is shown.
 
     @property
-    def shading(self) -> Shading:
-        """What the colours say."""
-        return self._shading
-
-    @property
-    def shown_frame(self) -> LiveFrame | None:
-        """The frame that the last picture shows, or glides towards."""
-        return self._shown
-
-    @property
-    def canvas(self) -> Canvas | None:
-        """The widget that draws and takes the mouse; None before the first model is in."""
-        return self._canvas
-
-    @property
-    def scene(self) -> Scene | None:
-        """What stands before the camera; likewise."""
-        return self._scene
-
-    @property
-    def hovered_domain(self) -> int | None:
-        """The domain under the pointer."""
-        return self._hovered
-
-    @property
     def legend(self) -> Legend:
         """What explains the colours now."""
         return self._legend.legend
 
     @property
-    def n_painted(self) -> int:
-        """How many pictures have been drawn since the model came in."""
-        return self._canvas.n_painted if self._canvas is not None else 0
-
-    @property
-    def is_ready(self) -> bool:
-        """Whether the mesh is on the screen instead of the waiting page."""
-        return self._canvas is not None and self._shown is not None
-
-    @property
     def is_at_rest(self) -> bool:
         """Whether what is on the screen is the newest pose, smooth, and nothing moves."""
         return (
-            self._canvas is not None
-            and self._shown is not None
-            and self._shown.latent is self._document.latent
+            self.canvas is not None
+            and self.shown_frame is not None
+            and self.shown_frame.latent is self._document.latent
             and not self._transition.is_running
             and not self._turn.is_running
-            and self._canvas.is_settled
+            and self.canvas.is_settled
         )
 
     def set_shading(self, shading: Shading) -> None:
         """Choose what the colours say."""
-        if shading is self._shading:
+        if shading is self.shading:
             return
-        self._shading = shading
+        self.shading = shading
         self._recolour(crossing=True)
         self.shading_changed.emit(shading)
 
@@ -198,33 +181,33 @@ class Viewport(QWidget):
         """
         if domain != self._highlight:
             self._highlight = domain
-            if self._scene is not None and self._canvas is not None:
-                self._scene.outline.show(None if domain is None else self._shape_of(domain))
-                self._canvas.redraw()
+            if self.scene is not None and self.canvas is not None:
+                self.scene.outline.show(None if domain is None else self._shape_of(domain))
+                self.canvas.redraw()
 
     # The camera.
 
-    def set_camera(self, name: str, glide: bool = True) -> None:
+    def set_camera(self, name: str, animated: bool = True) -> None:
         """Look at the whole pose from a side.
 
         Parameters
         ----------
         name : one of `app.view.camera.CAMERAS`
-        glide : False jumps there
+        animated : False jumps there
 
         Raises
         ------
         KeyError : `name` is no preset.
         """
-        if self._canvas is None or self._scene is None or self._shown is None:
+        if self.canvas is None or self.scene is None or self.shown_frame is None:
             return
-        end = self._preset(name, self._shown.vertices)
-        if not glide:
+        end = self._preset(name, self.shown_frame.vertices)
+        if not animated:
             self._turn.stop()
-            self._scene.view = end
-            self._canvas.redraw()
+            self.scene.view = end
+            self.canvas.redraw()
             return
-        self._turn.begin(self._scene.view, end)
+        self._turn.begin(partial(between, self.scene.view, end))
 
     @Slot()
     def frame_pose(self) -> None:
@@ -234,7 +217,7 @@ class Viewport(QWidget):
     @property
     def view(self) -> View | None:
         """From where the mesh is looked at; None before there is one."""
-        return self._scene.view if self._scene is not None else None
+        return self.scene.view if self.scene is not None else None
 
     # Pictures.
 
@@ -255,8 +238,8 @@ class Viewport(QWidget):
         """
         self.pictures.screenshot(self._scene_now(), path, width, height, transparent)
 
-    def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> Turntable:
-        """Begin a film of one turn round what is seen; the document tells when it is saved.
+    def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> None:
+        """Begin a video of one turn round what is seen; the document tells when it is saved.
 
         Parameters
         ----------
@@ -266,16 +249,16 @@ class Viewport(QWidget):
 
         Raises
         ------
-        MeshFileError : see `Turntable`.
+        MeshFileError : see `Pictures.turntable`.
         """
-        return self.pictures.turntable(self._scene_now(), path, style)
+        self.pictures.turntable(self._scene_now(), path, style)
 
     def _scene_now(self) -> Scene:
         """Return the scene with what waits for the next picture on the screen."""
-        if self._scene is None or self._shown is None:
+        if self.scene is None or self.shown_frame is None:
             raise LCollisionError("the mesh is not on the screen yet", "try again in a moment")
         self._bring_up_to_date()
-        return self._scene
+        return self.scene
 
     def shut_down(self) -> None:
         """Stop everything that moves and free what VTK holds; the widget stays empty."""
@@ -283,12 +266,12 @@ class Viewport(QWidget):
         self._turn.stop()
         self.waiting.stop()
         self._importer.join()
-        self.pictures.stop()
-        if self._canvas is not None:
-            self._canvas.shut_down()
-            self._layout.removeWidget(self._canvas)
-            self._canvas.deleteLater()
-        self._canvas = self._scene = None
+        self.pictures.cancel()
+        if self.canvas is not None:
+            self.canvas.shut_down()
+            self._layout.removeWidget(self.canvas)
+            self.canvas.deleteLater()
+        self.canvas = self.scene = None
 
     # Qt's.
 
@@ -299,9 +282,9 @@ class Viewport(QWidget):
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
         """Follow the theme."""
         super().changeEvent(event)
-        if event.type() is QEvent.Type.PaletteChange and self._scene is not None:
-            self._scene.set_dark(current_theme().is_dark)
-            self._shader = Shader.of(self._document.model, current_theme().is_dark)
+        if event.type() is QEvent.Type.PaletteChange and self.scene is not None:
+            self.scene.set_theme(current_theme())
+            self._shader = self._new_shader()
             self._recolour()
 
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
@@ -320,50 +303,40 @@ class Viewport(QWidget):
         self._transition.stop()
         self._turn.stop()
         model = self._document.model
-        if self._canvas is None:
-            self._canvas = Canvas(self._bring_up_to_date, self)
-            self._canvas.hovered.connect(self._on_hovered)
-            self._canvas.painted.connect(self.painted)
-            self._canvas.camera_moved.connect(self._turn.stop)
-            self._canvas.zoom_wanted.connect(self._on_zoom_wanted)
-            self._canvas.menu_wanted.connect(self._on_menu_wanted)
+        if self.canvas is None:
+            self.canvas = Canvas(self._bring_up_to_date, self)
+            self.canvas.hovered.connect(self._on_hovered)
+            self.canvas.painted.connect(self.painted)
+            self.canvas.camera_moved.connect(self._turn.stop)
+            self.canvas.zoom_wanted.connect(self._on_zoom_wanted)
+            self.canvas.menu_wanted.connect(self._on_menu_wanted)
         view = None
-        if self._scene is not None:
+        if self.scene is not None:
             # The same body with other names or colours is looked at as before.
-            is_same = (
-                self._evaluator is not None and self._evaluator.model.embedding is model.embedding
-            )
-            view = self._scene.view if is_same else None
-            self._scene.remove()
-        self._scene = Scene(
-            self._canvas,
-            model.faces,
-            model.n_vertices,
-            model.up_axis,
-            model.height,
-            current_theme().is_dark,
-        )
-        self._evaluator = FrameEvaluator(model)
+            is_same = self._model is not None and self._model.embedding is model.embedding
+            view = self.scene.view if is_same else None
+        self.scene = Scene(self.canvas, model, current_theme())
+        self._model = model
         self._front = model.front
         self._tag.hide()
         self._legend.set_legend(Legend())
-        self._shader = Shader.of(self._document.model, current_theme().is_dark)
-        self._shown = None
-        self._highlight = self._hovered = None
+        self._shader = self._new_shader()
+        self.shown_frame = None
+        self._highlight = self.hovered_domain = None
         self._place_camera = view is None
         if view is not None:
-            self._scene.view = view
+            self.scene.view = view
         if self._document.frame is not None:
             self._on_frame_changed()
         self._on_ghost_changed()
 
     @Slot()
     def _on_frame_changed(self) -> None:
-        if self._canvas is None or self._document.frame is None:
+        if self.canvas is None or self._document.frame is None:
             return
-        if self._layout.currentWidget() is not self._canvas:
-            self._layout.addWidget(self._canvas)
-            self._layout.setCurrentWidget(self._canvas)
+        if self._layout.currentWidget() is not self.canvas:
+            self._layout.addWidget(self.canvas)
+            self._layout.setCurrentWidget(self.canvas)
             self.waiting.stop()
             self._legend.show()
             self._tag.raise_()
@@ -372,20 +345,20 @@ class Viewport(QWidget):
 
     @Slot()
     def _on_exact_changed(self) -> None:
-        if self._shading in (Shading.EXACT, Shading.PREDICTED):
+        if self.shading in (Shading.EXACT, Shading.PREDICTED):
             self._recolour(crossing=True)
 
     @Slot()
     def _on_ghost_changed(self) -> None:
-        if self._canvas is None or self._scene is None or self._evaluator is None:
+        if self.canvas is None or self.scene is None:
             return
         ghost = self._document.ghost
-        self._scene.show_ghost(ghost, None if ghost is None else self._evaluator.normals(ghost))
-        self._canvas.redraw()
+        self.scene.show_ghost(ghost, None if ghost is None else self._normals(ghost))
+        self.canvas.redraw()
 
     @Slot()
     def _on_outcome_changed(self) -> None:
-        if self._shading is Shading.MOVEMENT:
+        if self.shading is Shading.MOVEMENT:
             self._recolour()
 
     @Slot(object)
@@ -401,16 +374,16 @@ class Viewport(QWidget):
     def _recolour(self, crossing: bool = False) -> None:
         self._colours_stale = True
         self._crossing_stale = self._crossing_stale or crossing
-        if self._canvas is not None:
+        if self.canvas is not None:
             self._explain_colours()
-            self._canvas.redraw()
+            self.canvas.redraw()
 
     def _bring_up_to_date(self) -> None:
         """Write the newest pose and its colours, just before they are drawn.
 
         However many frames come between two pictures, only the last is written.
         """
-        frame, scene = self._document.frame, self._scene
+        frame, scene = self._document.frame, self.scene
         if scene is None or frame is None:
             return
         if self._pose_stale:
@@ -422,12 +395,12 @@ class Viewport(QWidget):
         if self._crossing_stale:
             self._crossing_stale = False
             exact = self._document.exact
-            shown = self._shading is Shading.EXACT and exact is not None
+            shown = self.shading is Shading.EXACT and exact is not None
             scene.show_crossing(exact.pairs if exact is not None and shown else None)
         scene.fit_outline(self.devicePixelRatioF())
 
     def _put(self, scene: Scene, frame: LiveFrame) -> None:
-        before, self._shown = self._shown, frame
+        before, self.shown_frame = self.shown_frame, frame
         self._transition.stop()
         is_framed = frame.latent is self._framed
         if is_framed:
@@ -437,22 +410,23 @@ class Viewport(QWidget):
             self._turn.stop()
             scene.show(frame.vertices, frame.normals)
             middle = frame.vertices.mean(axis=0)
-            scene.view = self._preset("Three-quarter", middle + _ROOM * (frame.vertices - middle))
+            scene.view = self._preset("Three-quarter", middle + _GROWTH * (frame.vertices - middle))
         elif self._transition_to is not None and np.array_equal(self._transition_to, frame.latent):
-            self._transition.begin(scene.surface.vertices.copy(), frame.vertices)
+            shown = np.array(scene.surface.vertices)
+            self._transition.begin(partial(_between_poses, shown, frame.vertices))
         else:
             scene.show(frame.vertices, frame.normals)
             if frame.latent is self._loaded and before is not None:
                 view = kept_in_view(scene.view, before.vertices, frame.vertices, self._aspect)
                 if view is not None:
-                    self._turn.begin(scene.view, view)
+                    self._turn.begin(partial(between, scene.view, view))
         self._transition_to = self._loaded = None
-        if self._shading is Shading.EXACT:
+        if self.shading is Shading.EXACT:
             self._crossing_stale = True
 
     def _paint(self, scene: Scene, frame: LiveFrame) -> None:
         assert self._shader is not None
-        scene.paint(self._shader.colours(self._shading, *self._known_of(frame)))
+        scene.paint(self._shader.colours(self.shading, self._known_of(frame)))
 
     def _shape_of(self, domain: int) -> PartShape:
         from app.view.outline import PartShape
@@ -460,10 +434,16 @@ class Viewport(QWidget):
         model = self._document.model
         return PartShape.of(model.attention_mask, model.faces, domain)
 
-    def _known_of(
-        self, frame: LiveFrame
-    ) -> tuple[FloatArray | None, FloatArray | None, FloatArray | None]:
-        """Return the estimate, the exact energy and the movement, None what is not known."""
+    def _normals(self, vertices: Float32Array) -> Float32Array:
+        from lcollision_core.meshes.normals import vertex_normals
+
+        return vertex_normals(vertices, self._document.model.faces)
+
+    def _new_shader(self) -> Shader:
+        model = self._document.model
+        return Shader(model.attention_mask, model.domain_colours, current_theme().skin)
+
+    def _known_of(self, frame: LiveFrame) -> Known:
         document = self._document
         predicted, exact, before = frame.prediction, document.exact, document.vertices_before
         outcome, moved = document.outcome, None
@@ -472,7 +452,7 @@ class Viewport(QWidget):
         elif before is not None and frame.latent is document.latent:
             away = frame.vertices.astype(np.float64) - before
             moved = np.linalg.norm(away, axis=1) / document.model.height
-        return (
+        return Known(
             predicted.domain_energy if predicted is not None else None,
             exact.vertex_energy if exact is not None else None,
             moved,
@@ -485,7 +465,7 @@ class Viewport(QWidget):
             return
         has_predictor = self._document.model.has_predictor
         self._legend.set_legend(
-            self._shader.legend(self._shading, *self._known_of(frame), has_predictor=has_predictor)
+            self._shader.legend(self.shading, self._known_of(frame), has_predictor)
         )
 
     def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
@@ -494,68 +474,74 @@ class Viewport(QWidget):
 
     @property
     def _aspect(self) -> float:
-        seen = self if self._canvas is None else self._canvas
+        seen = self if self.canvas is None else self.canvas
         return seen.width() / max(1, seen.height())
 
     # Motion.
 
     @Slot(object)
-    def _on_transitiond(self, vertices: Float32Array) -> None:
-        if self._scene is None or self._canvas is None or self._evaluator is None:
+    def _on_pose_moved(self, vertices: Float32Array) -> None:
+        if self.scene is None or self.canvas is None:
             return
-        frame = self._shown
+        frame = self.shown_frame
         arrived = frame is not None and vertices is frame.vertices
-        normals = frame.normals if frame and arrived else self._evaluator.normals(vertices)
-        self._scene.show(vertices, normals)
-        self._canvas.redraw()
+        normals = frame.normals if frame and arrived else self._normals(vertices)
+        self.scene.show(vertices, normals)
+        self.canvas.redraw()
 
     @Slot(object)
     def _on_turned(self, view: View) -> None:
-        if self._scene is not None and self._canvas is not None:
-            self._scene.view = view
-            self._canvas.redraw()
+        if self.scene is not None and self.canvas is not None:
+            self.scene.view = view
+            self.canvas.redraw()
 
     @Slot(QPointF, float)
     def _on_zoom_wanted(self, place: QPointF, factor: float) -> None:
-        if self._scene is None or self._canvas is None:
+        if self.scene is None or self.canvas is None:
             return
         self._turn.stop()
-        view, now = self._scene.view, time.monotonic()
+        view, now = self.scene.view, time.monotonic()
         anchor = self._zoom_anchor
         if anchor is None or anchor[0] != place or now - anchor[2] > _ZOOM_SECONDS:
-            point = self._canvas.point_at(place, self._scene.body, view.focus)
+            point = self.canvas.point_at(place, self.scene.body, view.focus)
         else:
             point = anchor[1]
         self._zoom_anchor = (place, point, now)
-        vertices, height = self._scene.surface.vertices, self._document.model.height
-        self._scene.view = zoomed(view, point, factor, vertices, height)
-        self._canvas.redraw()
+        vertices, height = self.scene.surface.vertices, self._document.model.height
+        self.scene.view = zoomed(view, point, factor, vertices, height)
+        self.canvas.redraw()
 
     # The pointer.
 
     @Slot(QPointF)
     def _on_menu_wanted(self, place: QPointF) -> None:
-        if self._canvas is not None:
-            where = self._canvas.mapToGlobal(place.toPoint())
+        if self.canvas is not None:
+            where = self.canvas.mapToGlobal(place.toPoint())
             self.menu_wanted.emit(self._domain_at(place), where)
 
     def _domain_at(self, place: QPointF) -> int | None:
-        if self._canvas is None or self._scene is None or self._shader is None:
+        if self.canvas is None or self.scene is None or self._shader is None:
             return None
-        vertex = self._canvas.pick_vertex(place, self._scene.body)
+        vertex = self.canvas.pick_vertex(place, self.scene.body)
         return None if vertex is None else self._shader.leading_domain(vertex)
 
     @Slot(object)
     def _on_hovered(self, place: QPointF | None) -> None:
-        if self._canvas is None:
+        if self.canvas is None:
             return
-        domain = None if place is None or self._shown is None else self._domain_at(place)
+        domain = None if place is None or self.shown_frame is None else self._domain_at(place)
         if domain is None or place is None:
             self._tag.hide()
         else:
             model = self._document.model
             name = heading(model.domain_names[domain])
             self._tag.point_at(place, name, model.domain_colours[domain])
-        if domain != self._hovered:
-            self._hovered = domain
+        if domain != self.hovered_domain:
+            self.hovered_domain = domain
             self.domain_hovered.emit(domain)
+
+
+def _between_poses(start: Float32Array, end: Float32Array, fraction: float) -> Float32Array:
+    """Return (V, 3) vertices on the lines between two poses; at the end that very array."""
+    moved: Float32Array = start + np.float32(fraction) * (end - start)
+    return end if fraction >= 1.0 else moved

@@ -1,4 +1,4 @@
-"""What is computed of a pose for the screen: the mesh, its normals, the prediction, the truth."""
+"""What is computed of a pose for the screen: mesh, normals, prediction and exact check."""
 
 from __future__ import annotations
 
@@ -20,18 +20,15 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PosePrediction:
-    """What the model's network believes of one pose; never the truth.
+    """What the predictor estimates of one pose.
 
     Attributes
     ----------
-    domain_energy : (K,) float64 array, read-only, >= 0, in squared heights
-    energy : their total, in squared heights
-    collision_logit, collision_probability : above 0, and above 0.5, where it is called colliding
+    domain_energy : (K,) float64 array, read-only, >= 0, in normalised lengths squared
+    collision_probability : above 0.5 where the pose is estimated to collide
     """
 
     domain_energy: FloatArray
-    energy: float
-    collision_logit: float
     collision_probability: float
 
 
@@ -66,11 +63,9 @@ class ExactVerdict:
     request_id : of the frame that was checked
     pairs : (P, 2) int32 array, read-only, the colliding faces, the smaller first
     n_near_pairs : pairs that are folds of the skin and do not count
-    energy : of the whole pose, in squared heights
-    vertex_energy : (V,) float64 array, read-only, in squared heights
-    domain_energy : (K,) float64 array, read-only, in squared heights
+    energy : of the whole pose, in normalised lengths squared
+    vertex_energy : (V,) float64 array, read-only, in normalised lengths squared
     colliding : whether there is a pair that counts
-    seconds : what the check took
     """
 
     request_id: int
@@ -78,9 +73,7 @@ class ExactVerdict:
     n_near_pairs: int
     energy: float
     vertex_energy: FloatArray
-    domain_energy: FloatArray
     colliding: bool
-    seconds: float
 
 
 class FrameEvaluator:
@@ -135,27 +128,19 @@ class FrameEvaluator:
         predicted = self.model.predict(latent[None])
         return PosePrediction(
             domain_energy=_frozen(predicted.domain_energy[0]),
-            energy=float(predicted.energy[0]),
-            collision_logit=float(predicted.collision_logit[0]),
             collision_probability=float(predicted.collision_probability[0]),
         )
 
     def verdict(self, frame: LiveFrame) -> ExactVerdict:
         """Check the vertices of a frame exactly."""
-        from lcollision_core.contact import domain_energy
-
-        start = time.perf_counter()
         found = self.model.detector.detect(frame.vertices)
-        by_domain = domain_energy(found.vertex_energy[None], self.model.attention_mask)[0]
         return ExactVerdict(
             request_id=frame.request_id,
             pairs=_frozen(found.pairs),
             n_near_pairs=len(found.near_pairs),
             energy=found.energy,
             vertex_energy=_frozen(found.vertex_energy),
-            domain_energy=_frozen(by_domain),
             colliding=found.colliding,
-            seconds=time.perf_counter() - start,
         )
 
     def normals(self, vertices: Float32Array) -> Float32Array:

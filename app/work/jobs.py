@@ -1,7 +1,11 @@
-"""The long work of the editor, as functions of a snapshot that run in another thread."""
+"""The long work of the editor, as functions of a snapshot that run in another thread.
+
+Each becomes a `Job` by `functools.partial`: the progress and the cancel token come last.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,9 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from app.wording import counted, fit_error, mirrored_name
+from app.wording import counted, mirrored_name
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
-from app.work.long_work import Job
 from app.work.threads import Failure
 from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
@@ -21,18 +24,13 @@ if TYPE_CHECKING:
     from lcollision_core.model import ListedModel, MirroredPose, NamedPose, PoseFile, PoseModel
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
+Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class OpenedModel:
-    """A model that is ready for the first drag.
-
-    Attributes
-    ----------
-    model : has been used once, so that nothing is left to compile or to load
-    file : that it was read from
-    """
+    """A model and the file that it was read from, or written to."""
 
     model: PoseModel
     file: str
@@ -72,36 +70,6 @@ class OtherModel:
     failure: Failure
 
 
-@dataclass(frozen=True, eq=False)
-class Imported:
-    """A mesh that was read as a pose."""
-
-    path: Path
-    pose: NamedPose
-
-    @property
-    def sentence(self) -> str:
-        """What the status bar says of it."""
-        pose = self.pose
-        return f"Imported {pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}"
-
-
-@dataclass(frozen=True)
-class Exported:
-    """A mesh that was written, and how many pairs of its triangles collide."""
-
-    path: Path
-    n_pairs: int
-
-    @property
-    def sentence(self) -> str:
-        """What the status bar says of it."""
-        state = "no collisions (checked)"
-        if self.n_pairs:
-            state = f"{counted(self.n_pairs, 'pair')} of its triangles collide"
-        return f"Exported {self.path.name}: {state}"
-
-
 @dataclass(frozen=True)
 class PartEdits:
     """How a user wants body parts called, coloured and listed.
@@ -119,42 +87,15 @@ class PartEdits:
     copy_name: str | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class ChangedParts:
-    """The same model with other names, colours or order of its parts, and its file."""
+def open_model(name_or_path: str | Path, _: Progress, cancel: CancelToken) -> OpenedModel:
+    """Read a model and use it once, so that nothing is left to compile before the first drag."""
+    from lcollision_core.model import PoseModel, find_model
 
-    model: PoseModel
-    file: str
-
-
-@dataclass(frozen=True, eq=False)
-class Resolved:
-    """What Resolve found, and the mesh before, (V, 3) float32, read-only."""
-
-    result: ResolveResult
-    ghost: npt.NDArray[np.float32]
-
-
-def drawn_vertices(model: PoseModel, latent: FloatArray) -> npt.NDArray[np.float32]:
-    """Return the (V, 3) vertices, read-only, that a frame of the pose has, to the bit."""
-    vertices = model.decode(latent, n_threads=1).astype(np.float32)
-    vertices.flags.writeable = False
-    return vertices
-
-
-def opened_model(name_or_path: str | Path) -> Job:
-    """Read a model and warm it up."""
-
-    def work(_: Progress, cancel: CancelToken) -> OpenedModel:
-        from lcollision_core.model import PoseModel, find_model
-
-        path = find_model(name_or_path).absolute()
-        model = PoseModel.load(path)
-        cancel.raise_if_cancelled()
-        warm_up(model)
-        return OpenedModel(model, str(path))
-
-    return work
+    path = find_model(name_or_path).absolute()
+    model = PoseModel.load(path)
+    cancel.raise_if_cancelled()
+    warm_up(model)
+    return OpenedModel(model, str(path))
 
 
 def warm_up(model: PoseModel) -> None:
@@ -167,45 +108,42 @@ def warm_up(model: PoseModel) -> None:
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
 
 
-def loaded_predictor(model: PoseModel) -> Job:
+def load_predictor(model: PoseModel, _: Progress, __: CancelToken) -> PoseModel:
     """Load what predicts, and use it once: what it compiles or imports may take seconds."""
-
-    def work(_: Progress, __: CancelToken) -> PoseModel:
-        keep_torch_to_one_thread(model)
-        model.predict(np.zeros(model.latent_size))
-        return model
-
-    return work
+    keep_torch_to_one_thread(model)
+    model.predict(np.zeros(model.latent_size))
+    return model
 
 
-def read(model: PoseModel | None, model_file: str | Path, path: Path) -> Job:
+def read_poses(
+    model: PoseModel | None,
+    model_file: str | Path,
+    path: Path,
+    progress: Progress,
+    cancel: CancelToken,
+) -> ReadPoses | OtherModel:
     """Read a poses file of a model, which is opened first where it is None.
 
-    The work's value is `OtherModel` where the file belongs to another model that is known.
+    Returns `OtherModel` where the file belongs to another model that is known.
     """
+    from lcollision_core.meshes import file_stamp
+    from lcollision_core.model import OtherModelError, read_pose_file
 
-    def work(progress: Progress, cancel: CancelToken) -> ReadPoses | OtherModel:
-        from lcollision_core.meshes import file_stamp
-        from lcollision_core.model import OtherModelError, read_pose_file
-
-        opened: OpenedModel | None = None
-        owner = model
-        if owner is None:
-            opened = opened_model(model_file)(progress, cancel)
-            owner = opened.model
-        stamp = file_stamp(path)
-        try:
-            held = read_pose_file(path, owner)
-        except OtherModelError as error:
-            if error.model is None:
-                raise
-            return OtherModel(path, error.model, Failure.of(error))
-        cancel.raise_if_cancelled()
-        if not held.all_poses:
-            raise ModelFileError("holds no poses", "open a file that has some", where=path)
-        return ReadPoses(path, held, stamp, opened)
-
-    return work
+    opened = None
+    if model is None:
+        opened = open_model(model_file, progress, cancel)
+        model = opened.model
+    stamp = file_stamp(path)
+    try:
+        held = read_pose_file(path, model)
+    except OtherModelError as error:
+        if error.model is None:
+            raise
+        return OtherModel(path, error.model, Failure.of(error))
+    cancel.raise_if_cancelled()
+    if not held.all_poses:
+        raise ModelFileError("holds no poses", "open a file that has some", where=path)
+    return ReadPoses(path, held, stamp, opened)
 
 
 @dataclass(frozen=True)
@@ -224,106 +162,92 @@ class WrongScale:
     factor: float
 
 
-def encoded(model: PoseModel, path: Path, scale: float = 1.0) -> Job:
+def encode(
+    model: PoseModel, path: Path, scale: float, _: Progress, cancel: CancelToken
+) -> NamedPose | WrongScale:
     """Read a mesh of a model's topology as a latent pose, named after its file.
 
     `scale` brings it into the model's unit. Without the right one it comes back as `WrongScale`.
     """
+    from lcollision_core.model import encode_mesh, read_model_mesh
 
-    def work(_: Progress, cancel: CancelToken) -> Imported | WrongScale:
-        from lcollision_core.model import encode_mesh, read_model_mesh
-
-        mesh = read_model_mesh(path, model)
-        cancel.raise_if_cancelled()
-        try:
-            pose = encode_mesh(mesh, model, scale, cancel)
-        except WrongScaleError as error:
-            return WrongScale(path, error.headline, error.factor)
-        return Imported(path, pose)
-
-    return work
+    mesh = read_model_mesh(path, model)
+    cancel.raise_if_cancelled()
+    try:
+        return encode_mesh(mesh, model, scale, cancel)
+    except WrongScaleError as error:
+        return WrongScale(path, error.headline, error.factor)
 
 
-def mirrored(model: PoseModel, pose: NamedPose, locked: frozenset[int]) -> Job:
-    """Exchange left and right; what Resolve must move then leaves the locked domains."""
-
-    def work(progress: Progress, cancel: CancelToken) -> MirroredPose:
-        from lcollision_core.resolve import ResolveOptions
-
-        options = ResolveOptions(locked_domains=locked)
-        return model.mirror(pose.latent, pose.placement, pose.mirror_of, options, progress, cancel)
-
-    return work
-
-
-def mirrored_poses(model: PoseModel, poses: tuple[NamedPose, ...]) -> Job:
+def mirror_poses(
+    model: PoseModel, poses: Sequence[NamedPose], progress: Progress, cancel: CancelToken
+) -> list[tuple[NamedPose, MirroredPose]]:
     """Return the mirror images of poses, and what there is to say of each."""
+    from lcollision_core.model import MAX_NAME_LENGTH
 
-    def work(progress: Progress, cancel: CancelToken) -> list[tuple[NamedPose, MirroredPose]]:
-        from lcollision_core.model import MAX_NAME_LENGTH
-
-        images = []
-        for done, pose in enumerate(poses, 1):
-            image = model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel)
-            name = mirrored_name(pose.name)[:MAX_NAME_LENGTH]
-            images.append((replace(pose.mirrored(image), name=name), image))
-            progress(done, len(poses))
-        return images
-
-    return work
+    images = []
+    for done, pose in enumerate(poses, 1):
+        image = model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel)
+        name = mirrored_name(pose.name)[:MAX_NAME_LENGTH]
+        images.append((replace(pose.mirrored(image), name=name), image))
+        progress(done, len(poses))
+    return images
 
 
-def exported(
+def export(
     model: PoseModel,
     pose: NamedPose,
     outcome: ResolveResult | None,
     path: Path,
     axes: str,
     scale: float | None,
-) -> Job:
+    _: Progress,
+    __: CancelToken,
+) -> str:
     """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
 
     A pose that Resolve ended in is written with the vertices of its `outcome`. The check is of what
-    the file holds, in its axes and unit.
+    the file holds, in its axes and unit. Returns a sentence for the status bar.
     """
+    from lcollision_core.model import export_frame, export_mesh
 
-    def work(_: Progress, __: CancelToken) -> Exported:
-        from lcollision_core.model import export_frame, export_mesh
-
-        placement = pose.placement
-        if outcome is not None and np.array_equal(outcome.latent, pose.latent):
-            vertices = outcome.vertices
-        else:
-            vertices = model.exported_vertices(pose.latent, placement)
-        frame = export_frame(model, axes, path, scale)
-        written = export_mesh(path, model, vertices, placement, frame)
-        unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
-        return Exported(path, len(model.detector.detect(written, unit=unit).pairs))
-
-    return work
+    placement = pose.placement
+    if outcome is not None and np.array_equal(outcome.latent, pose.latent):
+        vertices = outcome.vertices
+    else:
+        vertices = model.exported_vertices(pose.latent, placement)
+    frame = export_frame(model, axes, path, scale)
+    written = export_mesh(path, model, vertices, placement, frame)
+    unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
+    n_pairs = len(model.detector.detect(written, unit=unit).pairs)
+    collide = f"{counted(n_pairs, 'pair')} of its triangles collide"
+    return f"Exported {path.name}: {collide if n_pairs else 'no collisions (checked)'}"
 
 
-def resolved(
+def resolve(
     model: PoseModel,
     latent: FloatArray,
     placement: RigidTransform | None,
     options: ResolveOptions,
-) -> Job:
-    """Find the nearest pose that is free where it is exported to."""
+    progress: Progress,
+    cancel: CancelToken,
+) -> tuple[ResolveResult, Float32Array]:
+    """Find the nearest pose that is free where it is exported to.
 
-    def work(progress: Progress, cancel: CancelToken) -> Resolved:
-        from lcollision_core.compiled import seconds_compiling
+    Returns
+    -------
+    result : what Resolve found
+    ghost : (V, 3) float32 array, read-only: the mesh before, to the bit as it was drawn
+    """
+    from lcollision_core.compiled import seconds_compiling
 
-        ghost = drawn_vertices(model, latent)
-        before = seconds_compiling()
-        result = model.resolve(
-            latent, options, progress=progress, cancel=cancel, placement=placement
-        )
-        # Compiling, at the first use, is preparation and no search.
-        searched = max(0.0, result.seconds - (seconds_compiling() - before))
-        return Resolved(replace(result, seconds=searched), ghost)
-
-    return work
+    ghost = model.decode(latent, n_threads=1).astype(np.float32)
+    ghost.flags.writeable = False
+    before = seconds_compiling()
+    result = model.resolve(latent, options, progress=progress, cancel=cancel, placement=placement)
+    # Compiling, at the first use, is preparation and no search.
+    searched = max(0.0, result.seconds - (seconds_compiling() - before))
+    return replace(result, seconds=searched), ghost
 
 
 def is_bundled(model_file: str) -> bool:
@@ -334,34 +258,32 @@ def is_bundled(model_file: str) -> bool:
     return not path.is_file() or path.parent == bundled_folder("models")
 
 
-def edited_parts(model: PoseModel, model_file: str, edits: PartEdits) -> Job:
+def edit_parts(
+    model: PoseModel, model_file: str, edits: PartEdits, _: Progress, __: CancelToken
+) -> OpenedModel:
     """Write a model's parts into its file, as that is now, or into a copy of the user's own."""
+    from lcollision_core.meshes import locked
+    from lcollision_core.model import change_model, model_destination
 
-    def work(_: Progress, __: CancelToken) -> ChangedParts:
-        from lcollision_core.meshes import locked
-        from lcollision_core.model import change_model, model_destination
+    def change(held: PoseModel) -> PoseModel:
+        if held.fingerprint != model.fingerprint:
+            raise ModelFileError(
+                "holds another model by now",
+                "open it again to change its body parts",
+                where=model_file,
+            )
+        return held.edit_domains(edits.names, edits.colours, edits.order)
 
-        def change(held: PoseModel) -> PoseModel:
-            if held.fingerprint != model.fingerprint:
+    if edits.copy_name is None:
+        written, path = change_model(model_file, change), Path(model_file)
+    else:
+        path = model_destination(edits.copy_name)
+        with locked(path):
+            if path.exists():
                 raise ModelFileError(
-                    "holds another model by now",
-                    "open it again to change its body parts",
-                    where=model_file,
+                    f"there is a model {edits.copy_name!r} already", "choose another name"
                 )
-            return held.edit_domains(edits.names, edits.colours, edits.order)
-
-        if edits.copy_name is None:
-            written, path = change_model(model_file, change), Path(model_file)
-        else:
-            path = model_destination(edits.copy_name)
-            with locked(path):
-                if path.exists():
-                    raise ModelFileError(
-                        f"there is a model {edits.copy_name!r} already", "choose another name"
-                    )
-                written = change(model)
-                written.save(path)
-        # What the open model has loaded and compiled stays.
-        return ChangedParts(model.with_card(written.card, path.stem), str(path))
-
-    return work
+            written = change(model)
+            written.save(path)
+    # What the open model has loaded and compiled stays.
+    return OpenedModel(model.with_card(written.card, path.stem), str(path))

@@ -29,12 +29,15 @@ class JobRequest:
     label : what is done, as in "Opening poses.json"
     work : called in the worker's thread
     cancel : set by the document to stop the work
+    done, failed : called in the window's thread with the work's value, or where it fails
     """
 
     request_id: int
     label: str
     work: Job
     cancel: CancelToken
+    done: Callable[[Any], None]
+    failed: Callable[[], None]
 
 
 class LongWorker(QObject):
@@ -82,17 +85,17 @@ class LongWork(QObject):
         self._wanted.connect(self._worker.answer)
         self._worker.answered.connect(self._on_answered)
         self._worker.progressed.connect(self._on_progressed)
-        self._jobs: dict[int, tuple[JobRequest, Callable[[Any], None], Callable[[], None]]] = {}
+        self._jobs: dict[int, JobRequest] = {}
         self._last_id = 0
 
     @property
     def busy(self) -> str:
         """What is being done, or ""."""
-        return next((job.label for job, _, _ in self._jobs.values()), "")
+        return next((job.label for job in self._jobs.values()), "")
 
     def label_of(self, number: int) -> str:
         """Return what a job does, or "" where it is done."""
-        return self._jobs[number][0].label if number in self._jobs else ""
+        return self._jobs[number].label if number in self._jobs else ""
 
     def start(
         self,
@@ -115,17 +118,17 @@ class LongWork(QObject):
         number : of the job
         """
         self._last_id += 1
-        job = JobRequest(self._last_id, label, work, CancelToken())
-        self._jobs[job.request_id] = (job, done, failed)
+        job = JobRequest(self._last_id, label, work, CancelToken(), done, failed)
+        self._jobs[job.request_id] = job
         self._wanted.emit(job)
         self.busy_changed.emit(self.busy)
         return job.request_id
 
     def cancel(self, number: int) -> None:
         """Stop a job; nothing more is heard of it. Does nothing where it is done."""
-        held = self._jobs.pop(number, None)
-        if held is not None:
-            held[0].cancel.cancel()
+        job = self._jobs.pop(number, None)
+        if job is not None:
+            job.cancel.cancel()
             self.busy_changed.emit(self.busy)
 
     def cancel_all(self) -> None:
@@ -138,11 +141,10 @@ class LongWork(QObject):
 
         Raises whatever its work raises.
         """
-        held = self._jobs.get(number)
-        if held is not None:
-            job, done, _ = held
+        job = self._jobs.get(number)
+        if job is not None:
             self.cancel(number)
-            done(job.work(no_progress, CancelToken()))
+            job.done(job.work(no_progress, CancelToken()))
 
     def close(self, deadline: float) -> bool:
         """Cancel all jobs and end the thread.
@@ -165,13 +167,12 @@ class LongWork(QObject):
 
     @Slot(object)
     def _on_answered(self, answer: Response) -> None:
-        held = self._jobs.pop(answer.request_id, None)
-        if held is None:
+        job = self._jobs.pop(answer.request_id, None)
+        if job is None:
             return
-        _, done, failed = held
         if answer.failure is not None:
-            failed()
+            job.failed()
             self.failed.emit(answer.failure)
         elif not answer.cancelled:
-            done(answer.value)
+            job.done(answer.value)
         self.busy_changed.emit(self.busy)

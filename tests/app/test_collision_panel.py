@@ -68,7 +68,7 @@ def test_the_result_of_resolve_scrolls_into_sight(
 def test_the_panel_keeps_the_width_that_its_cards_need_also_where_a_layout_says_less(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = PosePrediction(np.zeros(2), 0.0, 9.0, 1.0)
+    told = PosePrediction(np.zeros(2), 1.0)
     monkeypatch.setattr(FrameEvaluator, "_predict", lambda *_: told)
     settings = settings_in(tmp_path)
     before = open_window(qtbot, document, settings)
@@ -121,7 +121,7 @@ def test_the_estimate_steps_back_once_the_check_has_spoken(
     right: bool,
 ) -> None:
     document, card, headline = window.document, window.collision.prediction, window.collision.exact
-    told = PosePrediction(np.zeros(2), 0.0, 0.0, 0.99 if collides == right else 0.01)
+    told = PosePrediction(np.zeros(2), 0.99 if collides == right else 0.01)
     monkeypatch.setattr(FrameEvaluator, "_predict", lambda *_: told)
     said = "Probably colliding" if collides == right else "Probably clear"
     alarm = getattr(current_theme(), "colliding" if collides == right else "free")

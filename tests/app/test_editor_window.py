@@ -237,7 +237,7 @@ def words_on_the_screen(window: MainWindow) -> Iterator[str]:
     for action in window.findChildren(QAction):
         yield from (action.text(), action.toolTip(), action.statusTip())
     legend = window.viewport.legend
-    yield from (legend.title, legend.note, *(name for name, _ in legend.swatches))
+    yield from (legend.title, legend.note, legend.crossing)
 
 
 def test_nothing_on_the_screen_speaks_of_the_mathematics(

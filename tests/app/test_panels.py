@@ -184,12 +184,12 @@ def test_escape_stops_a_turntable_that_the_status_bar_tells_of(
 ) -> None:
     cancel = window.actions_by_key["cancel"]
     assert not cancel.isEnabled()
-    film = window.viewport.turntable(tmp_path / "turn.gif", TurntableStyle(width=60, height=60))
+    window.viewport.turntable(tmp_path / "turn.gif", TurntableStyle(width=60, height=60))
     assert cancel.isEnabled()
     assert "Making turn.gif…" in told_as_busy(window)
-    with qtbot.waitSignal(film.finished, timeout=PATIENCE) as finished:
+    with qtbot.waitSignal(window.document.message, timeout=PATIENCE) as told:
         QTest.keyClick(window, Qt.Key.Key_Escape)
-    assert finished.args == [None]
+    assert told.args == ["The turntable was cancelled"]
     assert not cancel.isEnabled()
     assert told_as_busy(window) == []
     assert not list(tmp_path.glob("*turn*"))

@@ -14,8 +14,6 @@ from pytestqt.qtbot import QtBot
 from app.window.main_window import MainWindow
 from app.wording import seconds_text
 from app.work import jobs
-from app.work.jobs import Resolved
-from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.model import NamedPose, PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult, Step
 from tests.app.windows import PATIENCE, rest
@@ -87,24 +85,19 @@ def test_the_time_told_is_what_was_waited_as_well(
     colliding: npt.NDArray[np.float64],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    real = jobs.resolved
+    real = jobs.resolve
 
     def slow(*arguments: object) -> object:
-        work = real(*arguments)  # type: ignore[arg-type]
-
-        def prepared(progress: Progress, cancel: CancelToken) -> Resolved:
-            time.sleep(0.8)
-            found = work(progress, cancel)
-            return replace(found, result=replace(found.result, seconds=0.194))
-
-        return prepared
+        time.sleep(0.8)
+        result, ghost = real(*arguments)  # type: ignore[arg-type]
+        return replace(result, seconds=0.194), ghost
 
     card = window.collision.resolve
     window.document.blend_towards(colliding, 1.0)
     resolve(qtbot, window)
     assert not any("of preparation" in text for text in texts(card))
     window.document.undo()
-    monkeypatch.setattr(jobs, "resolved", slow)
+    monkeypatch.setattr(jobs, "resolve", slow)
     resolve(qtbot, window)
     (told,) = (text for text in texts(card) if "of preparation" in text)
     assert told.startswith("194 ms, after ")

@@ -8,6 +8,7 @@ from PySide6.QtCore import QEvent, QPoint, QPointF
 from PySide6.QtGui import (
     QImage,
 )
+from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
@@ -35,16 +36,15 @@ def rest(qtbot: QtBot, viewport: Viewport) -> None:
         assert frame is document.frame, "the newest frame is not shown"
         assert viewport.canvas is not None
         assert viewport.canvas.is_settled, "the smooth picture has not been drawn"
-        assert viewport.is_at_rest, "something glides"
+        assert viewport.is_at_rest, "something is animated"
 
     qtbot.waitUntil(settle, timeout=20_000)
-    # Qt hands the picture to the screen after it is drawn.
-    qtbot.wait(30)
 
 
 def pixels(viewport: Viewport) -> npt.NDArray[np.int64]:
     """Return what the screen shows of the viewport, (SIDE, SIDE, 3)."""
-    QApplication.processEvents()
+    # Qt hands the picture to the screen after it is drawn.
+    QTest.qWait(30)
     image = viewport.screen().grabWindow(viewport.winId()).toImage()
     image = image.convertToFormat(QImage.Format.Format_RGB888)
     rows = np.frombuffer(image.constBits(), dtype=np.uint8).reshape(image.height(), -1)

@@ -18,8 +18,8 @@ def test_a_border_goes_round_where_one_part_hands_over_to_the_other(
     assert len(shape.segments) > 0
     # On a closed mesh it has no ends: each point is on two pieces.
     assert (np.bincount(shape.segments.ravel()) == 2).all()
-    assert (shape.shares > 0.0).all()
-    assert (shape.shares < 1.0).all()
+    assert (shape.fractions > 0.0).all()
+    assert (shape.fractions < 1.0).all()
     leads = mask.argmax(axis=0)
     part = np.flatnonzero(leads == domain)
     # Smoothing moves the border by a vertex at most here and there.

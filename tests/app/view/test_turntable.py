@@ -18,31 +18,36 @@ from lcollision_core.errors import MeshFileError
 from tests.app.windows import PATIENCE, answer, take_picture
 
 
-def film(qtbot: QtBot, window: MainWindow, path: Path, style: TurntableStyle) -> Path:
-    """Make a film, and return what has been written."""
-    made = window.viewport.turntable(path, style)
-    with qtbot.waitSignal(made.finished, timeout=PATIENCE) as finished:
-        pass
-    (written,) = finished.args
-    assert isinstance(written, Path)
+def video(qtbot: QtBot, window: MainWindow, path: Path, style: TurntableStyle) -> Path:
+    """Make a turntable video, and return what has been written."""
+    written = path.with_suffix("") if path.suffix == ".png" else path
+    with qtbot.waitSignal(
+        window.document.message,
+        timeout=PATIENCE,
+        check_params_cb=lambda words: words == f"Saved {written.name}",
+    ):
+        window.viewport.turntable(path, style)
     return written
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
-def test_a_film_has_the_size_the_rate_and_the_length_asked_for(
+def test_a_video_goes_round_once_in_the_size_and_the_time_asked_for(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
     path = tmp_path / f"turn{suffix}"
     style = TurntableStyle(seconds=0.5, width=72, height=48, rate=30)
-    assert film(qtbot, window, path, style) == path
+    assert video(qtbot, window, path, style) == path
     with Image.open(path) as image:
         assert (image.size, image.n_frames) == ((72, 48), 15)
-        lasting = 0
+        lasting, frames = 0, []
         for number in range(image.n_frames):
             image.seek(number)
-            image.load()
+            frames.append(np.asarray(image.convert("RGB"), dtype=int))
             lasting += image.info["duration"]
     assert lasting == 500
+    # Each frame is another: the last is not the first again.
+    assert min(np.abs(frame - frames[0]).mean() for frame in frames[1:]) > 0
+    assert [entry.name for entry in tmp_path.glob("turn*")] == [path.name]
 
 
 def test_durations_add_up_to_the_turn_in_every_unit() -> None:
@@ -59,7 +64,7 @@ def test_a_png_sequence_is_a_folder_of_numbered_pictures(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
     style = TurntableStyle(seconds=0.4, width=60, height=40, rate=10)
-    folder = film(qtbot, window, tmp_path / "turn.png", style)
+    folder = video(qtbot, window, tmp_path / "turn.png", style)
     assert folder == tmp_path / "turn"
     names = [f"turn_{number:04d}.png" for number in range(1, 5)]
     assert sorted(entry.name for entry in folder.iterdir()) == names
@@ -76,20 +81,22 @@ def test_a_cancelled_png_sequence_leaves_nothing(
 ) -> None:
     before = set(tmp_path.iterdir())
     style = TurntableStyle(seconds=8.0, width=60, height=40)
-    made = window.viewport.turntable(tmp_path / "turn.png", style)
-    qtbot.waitUntil(lambda: made._n_drawn > 2, timeout=PATIENCE)
-    with qtbot.waitSignal(made.finished, timeout=PATIENCE) as finished:
-        made.cancel()
-    assert finished.args == [None]
+    window.viewport.turntable(tmp_path / "turn.png", style)
+    pictures = window.viewport.pictures
+    qtbot.waitUntil(lambda: pictures._video.n_drawn > 2, timeout=PATIENCE)
+    with qtbot.waitSignal(window.document.message) as told:
+        pictures.cancel()
+    assert told.args == ["The turntable was cancelled"]
+    assert pictures.busy == ""
     assert set(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".png"])
-def test_a_transparent_film_shows_nothing_but_the_body(
+def test_a_transparent_video_shows_nothing_but_the_body(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
     style = TurntableStyle(seconds=0.2, width=60, height=60, rate=10, background="transparent")
-    written = film(qtbot, window, tmp_path / f"turn{suffix}", style)
+    written = video(qtbot, window, tmp_path / f"turn{suffix}", style)
     with Image.open(written / "turn_0002.png" if suffix == ".png" else written) as image:
         alpha = np.asarray(image.convert("RGBA"))[:, :, 3]
     assert alpha[0, 0] == 0
@@ -101,7 +108,7 @@ def test_one_colour_stands_behind_where_it_is_asked_for(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
     style = TurntableStyle(0.2, 60, 60, 10, background="plain", colour="#20a040")
-    written = film(qtbot, window, tmp_path / f"turn{suffix}", style)
+    written = video(qtbot, window, tmp_path / f"turn{suffix}", style)
     with Image.open(written / "turn_0001.png" if suffix == ".png" else written) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     for corner in (pixels[0, 0], pixels[-1, 0], pixels[0, -1], pixels[-1, -1]):
@@ -167,7 +174,7 @@ def pick(dialog: QDialog) -> None:
 
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
-def test_a_film_is_made_as_the_form_says(
+def test_a_video_is_made_as_the_form_says(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, theme: object
 ) -> None:
     apply_theme(QApplication.instance(), theme)
@@ -196,7 +203,7 @@ def test_a_film_is_made_as_the_form_says(
     timers = [answer(fill)]
     window.actions_by_key["turntable"].trigger()
     qtbot.waitUntil(path.is_file, timeout=PATIENCE)
-    qtbot.waitUntil(lambda: window.viewport.pictures.busy == "", timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not window.document.busy, timeout=PATIENCE)
     with Image.open(path) as image:
         assert (image.size, image.n_frames) == ((64, 80), 5)
     apply_theme(QApplication.instance(), LIGHT)

@@ -12,8 +12,9 @@ import pytest
 from PIL import Image
 from PySide6.QtCore import QEvent, QObject, Qt, QTimer
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication
+from PySide6.QtWidgets import QApplication, QWidget
 from pytestqt.qtbot import QtBot
+from shiboken6 import isValid
 
 from app.editing.document import PoseDocument
 from app.view.camera import View
@@ -52,16 +53,14 @@ def test_before_the_model_there_is_a_page_that_says_so(
     shown.show()
     qtbot.waitExposed(shown)
     document.busy_changed.emit("Opening body")
-    qtbot.wait(50)
     first = pixels(shown)
-    qtbot.wait(150)
-    assert changed(first, pixels(shown)).any(), "nothing turns"
-    assert not shown.is_ready
+    qtbot.waitUntil(lambda: changed(first, pixels(shown)).any(), timeout=20_000)
+    assert shown.shown_frame is None
     with pytest.raises(LCollisionError, match="not on the screen yet"):
         shown.screenshot("never.png", 10, 10, transparent=True)
     document.set_model(editor_model)
     rest(qtbot, shown)
-    assert shown.is_ready
+    assert shown.shown_frame is not None
     assert document.close()
     dispose(shown)
     document.deleteLater()
@@ -85,9 +84,7 @@ def test_where_no_model_could_be_opened_the_page_stands_still_and_offers_another
     assert "bad.safetensors" in page.text
     assert page.text.endswith("; open another model.")
     assert page.rect().contains(page.button.geometry())
-    still = pixels(shown)
-    qtbot.wait(150)
-    assert not changed(still, pixels(shown)).any()
+    assert active_timers(page) == []
     with qtbot.waitSignal(shown.waiting.open_wanted):
         QTest.mouseClick(page.button, Qt.MouseButton.LeftButton)
     editor_model.save(tmp_path / "tube.safetensors")
@@ -98,7 +95,7 @@ def test_where_no_model_could_be_opened_the_page_stands_still_and_offers_another
     rest(qtbot, shown)
     assert not page.turns
     document.failed.emit(Failure("later", "no matter"))
-    assert shown.is_ready
+    assert shown.shown_frame is not None
     assert not page.isVisible()
     qtbot.waitUntil(lambda: not document.busy, timeout=60_000)
     assert document.close()
@@ -129,7 +126,7 @@ def test_a_pose_is_drawn_in_place(
 def test_after_many_frames_the_last_is_shown_and_few_are_drawn(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport
 ) -> None:
-    painted = viewport.n_painted
+    painted = viewport.canvas.n_painted
     for value in np.linspace(-1.0, 1.0, 200):
         document.set_code(0, float(value))
         QApplication.processEvents()
@@ -138,7 +135,7 @@ def test_after_many_frames_the_last_is_shown_and_few_are_drawn(
     expected = document.model.decode(document.latent).astype(np.float32)
     assert document.latent[0] == 1.0
     assert (viewport.scene.surface.vertices == expected).all()
-    assert viewport.n_painted - painted < 202
+    assert viewport.canvas.n_painted - painted < 202
 
 
 @pytest.mark.parametrize("shading", Shading)
@@ -195,7 +192,7 @@ def test_an_outline_follows_the_pose_and_the_camera_in_one_width(
     document.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     bent = outlined()
-    viewport.set_camera("Back", glide=False)
+    viewport.set_camera("Back", animated=False)
     rest(qtbot, viewport)
     behind = outlined()
     assert min(straight.sum(), bent.sum(), behind.sum()) > 100
@@ -264,7 +261,7 @@ def test_the_legend_is_laid_out_while_nothing_is_painted(qtbot: QtBot, viewport:
     assert watch.meanwhile == []
 
 
-@pytest.mark.parametrize("width", [160, 240, 300, 340, 420, 900])
+@pytest.mark.parametrize("width", [160, 300, 420, 900])
 def test_the_legend_lies_beneath_the_mesh_and_holds_still_while_a_pose_changes(
     qtbot: QtBot,
     document: PoseDocument,
@@ -282,8 +279,8 @@ def test_the_legend_lies_beneath_the_mesh_and_holds_still_while_a_pose_changes(
         geometries = (legend.geometry(), canvas.geometry())
         assert not legend.geometry().intersects(canvas.geometry())
         assert legend.geometry().united(canvas.geometry()) == viewport.rect()
-        blocks = [place for _, place in legend._placed()]
-        assert blocks[-1].bottom() <= legend.height()
+        blocks = [block.geometry() for block in legend._blocks if block.isVisible()]
+        assert max(block.bottom() for block in blocks) <= legend.height()
         assert max(block.right() for block in blocks) <= width
         for latent in (colliding, np.zeros_like(colliding)):
             document.blend_towards(latent, 1.0)
@@ -406,61 +403,27 @@ def test_a_screenshot_has_its_size_and_is_cut_out(viewport: Viewport, tmp_path: 
         viewport.screenshot(tmp_path / "missing" / "x.png", 30, 20, transparent=True)
 
 
-@pytest.mark.parametrize("suffix", [".gif", ".webp"])
-def test_a_turntable_goes_round_once(
-    qtbot: QtBot, viewport: Viewport, tmp_path: Path, suffix: str
-) -> None:
-    path = tmp_path / f"turn{suffix}"
-    film = viewport.turntable(path, TurntableStyle(seconds=0.32, width=90, height=120))
-    with qtbot.waitSignal(film.finished, timeout=20_000) as finished:
-        assert film.is_running
-    assert finished.args == [path]
-    with Image.open(path) as image:
-        assert image.size == (90, 120)
-        assert image.n_frames == 8
-        frames = []
-        for number in range(8):
-            image.seek(number)
-            frames.append(np.asarray(image.convert("RGB"), dtype=int))
-    difference = [np.abs(frame - frames[0]).mean() for frame in frames]
-    assert min(difference[1:]) > 0
-    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
-
-
-def test_a_cancelled_turntable_leaves_no_file(
-    qtbot: QtBot, viewport: Viewport, tmp_path: Path
-) -> None:
-    film = viewport.turntable(
-        tmp_path / "turn.gif", TurntableStyle(seconds=4.0, width=60, height=60)
-    )
-    qtbot.waitSignal(film.progressed).wait()
-    with qtbot.waitSignal(film.finished) as finished:
-        film.cancel()
-    assert finished.args == [None]
-    assert not film.is_running
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
-    qtbot: QtBot, viewport: Viewport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    qtbot: QtBot,
+    document: PoseDocument,
+    viewport: Viewport,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    save, cancelled = Image.Image.save, threading.Event()
+    save, packing, cancelled = Image.Image.save, threading.Event(), threading.Event()
 
     def save_slowly(*arguments: object, **options: object) -> None:
         save(*arguments, **options)
+        packing.set()
         assert cancelled.wait(20.0)
 
     monkeypatch.setattr(Image.Image, "save", save_slowly)
-    film = viewport.turntable(
-        tmp_path / "turn.gif", TurntableStyle(seconds=0.08, width=60, height=60)
-    )
-    qtbot.waitUntil(lambda: film._packer is not None, timeout=20_000)
-    with qtbot.waitSignal(film.finished, timeout=20_000) as finished:
-        film.cancel()
-        cancelled.set()
-    assert finished.args == [None]
-    assert not film.is_running
-    assert list(tmp_path.iterdir()) == []
+    viewport.turntable(tmp_path / "turn.gif", TurntableStyle(seconds=0.08, width=60, height=60))
+    qtbot.waitUntil(packing.is_set, timeout=20_000)
+    document.cancel_all()
+    cancelled.set()
+    qtbot.waitUntil(lambda: list(tmp_path.iterdir()) == [], timeout=20_000)
+    assert not document.busy
 
 
 @pytest.mark.parametrize(
@@ -487,14 +450,11 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
     monkeypatch.setattr(owner, act, fail)
     told: list[Failure] = []
     document.failed.connect(told.append)
-    film = viewport.turntable(
-        tmp_path / "turn.webp", TurntableStyle(seconds=0.08, width=60, height=60)
-    )
+    viewport.turntable(tmp_path / "turn.webp", TurntableStyle(seconds=0.08, width=60, height=60))
     assert "turn.webp" in viewport.pictures.busy
-    qtbot.waitUntil(lambda: not film.is_running, timeout=20_000)
+    qtbot.waitUntil(lambda: bool(told) and not document.busy, timeout=20_000)
     (failure,) = told
-    assert "turn.webp could not be made" in failure.headline
-    assert failure.next_step.startswith("try")
+    assert failure.headline.startswith("Making turn.webp failed")
     assert type(error).__name__ in failure.details
     assert viewport.pictures.busy == ""
     assert list(tmp_path.iterdir()) == []
@@ -534,10 +494,14 @@ def test_another_model_takes_the_place_of_the_first(
 
 
 def test_nothing_is_drawn_at_rest(qtbot: QtBot, viewport: Viewport) -> None:
-    painted = viewport.n_painted
-    qtbot.wait(500)
-    assert viewport.n_painted == painted
-    assert [timer for timer in viewport.findChildren(QTimer) if timer.isActive()] == []
+    painted = viewport.canvas.n_painted
+    qtbot.waitUntil(lambda: active_timers(viewport) == [])
+    QApplication.processEvents()
+    assert viewport.canvas.n_painted == painted
+
+
+def active_timers(widget: QWidget) -> list[QTimer]:
+    return [timer for timer in widget.findChildren(QTimer) if timer.isActive()]
 
 
 def vtk_objects() -> list[str]:
@@ -562,18 +526,11 @@ def test_a_closed_viewport_leaves_no_vtk_object_no_timer_and_no_thread(
         shown.set_camera("Back")
         n_alive = len(vtk_objects())
         dispose(shown)
-        assert [timer for timer in shown_timers(shown) if timer.isActive()] == []
+        assert not isValid(shown)
         return n_alive
-
-    def shown_timers(shown: Viewport) -> list[QTimer]:
-        try:
-            return shown.findChildren(QTimer)
-        except RuntimeError:
-            return []
 
     # The first window makes what all windows share.
     show_and_close()
     before = vtk_objects()
     assert show_and_close() > len(before) + 20
     assert vtk_objects() == before
-    assert [thread.name for thread in threading.enumerate() if thread.name == "turntable"] == []

@@ -80,12 +80,14 @@ def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compute = FrameEvaluator.frame
+    begun: list[float] = []
     held = {0.1: threading.Event(), 0.2: threading.Event()}
 
     def starved(
         evaluator: FrameEvaluator, latent: npt.NDArray[np.float64], request_id: int
     ) -> LiveFrame:
         """Be quick, but late, as a thread is that gets no core."""
+        begun.append(latent[0])
         frame = compute(evaluator, latent, request_id)
         if latent[0] in held:
             held[latent[0]].wait(10)
@@ -95,13 +97,13 @@ def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
     told: list[float] = []
     document.frame_changed.connect(lambda: told.append(document.frame.latent[0]))
     document.set_code(0, 0.1)
-    qtbot.wait(50)
+    qtbot.waitUntil(lambda: begun == [0.1])
     document.set_code(0, 0.2)
-    qtbot.wait(50)
+    QApplication.processEvents()
     held[0.1].set()
-    qtbot.waitUntil(lambda: told == [0.1])
+    qtbot.waitUntil(lambda: told == [0.1] and begun == [0.1, 0.2])
     document.set_code(0, 0.3)
-    qtbot.wait(50)
+    QApplication.processEvents()
     held[0.2].set()
     settle(qtbot, document)
     assert told == [0.1, 0.2, 0.3]
