@@ -17,7 +17,7 @@ from app.editing.commands import DocumentState, Source
 from app.editing.history import UNNAMED, PoseHistory, read_only
 from app.wording import counted, fit_error, heading, height_text, mirrored_text
 from app.work import jobs
-from app.work.frames import ExactVerdict, LiveFrame, PosePrediction
+from app.work.frames import ExactVerdict, LiveFrame
 from app.work.live_pose import LivePose
 from app.work.long_work import Job, LongWork
 from app.work.threads import Failure
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from lcollision_core.meshes import FileStamp
     from lcollision_core.model import MirroredPose, NamedPose, PoseModel
     from lcollision_core.resolve import ResolveOptions, ResolveResult
-
-__all__ = ["ExactVerdict", "Failure", "LiveFrame", "PoseDocument", "PosePrediction"]
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -78,6 +78,12 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         then frees the framebuffer and the texture that are being drawn into
     parent : of the widget
 
+    Attributes
+    ----------
+    n_painted : how many pictures have been drawn
+    is_smooth : whether the next one has smooth edges
+    is_settled : whether the smooth picture of the scene is drawn, and no other is asked for
+
     Signals
     -------
     painted : float, the seconds that drawing one picture took; what it calls must leave widgets
@@ -99,9 +105,9 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         super().__init__(parent, auto_update=False, multi_samples=0)
         self.setAcceptDrops(False)
         self._before_paint = before_paint
-        self._painting = self._settled = self._shut = False
+        self._painting = self.is_settled = self._shut = False
         self._smoothness = Smoothness()
-        self._is_smooth = False
+        self.is_smooth = False
         self.n_painted = 0
         self._rest = QTimer(self, singleShot=True, interval=_REST_MILLISECONDS)
         self._rest.timeout.connect(self._on_rest)
@@ -122,20 +128,10 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         """Ask for a picture soon, and for a smooth one once nothing moves any more."""
         if self._shut:
             return
-        self._settled = False
+        self.is_settled = False
         self._draw_smooth(self._smoothness.while_moving)
         self._rest.start()
         self.update()
-
-    @property
-    def is_smooth(self) -> bool:
-        """Whether the next picture has smooth edges."""
-        return self._is_smooth
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether the smooth picture of the scene is drawn, and no other is asked for."""
-        return self._settled
 
     def pick_vertex(self, place: QPointF, actor: vtkActor) -> int | None:
         """Return the vertex that is seen at a place.
@@ -207,12 +203,12 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         finally:
             self._vtk_interactor.EnableRenderOff()
             self._painting = False
-        if self._is_smooth:
+        if self.is_smooth:
             # A graphics card is asked to draw and returns before it has.
             self.ren_win.WaitForCompletion()
         seconds = time.perf_counter() - start
-        self._settled = self._is_smooth
-        if self._is_smooth:
+        self.is_settled = self.is_smooth
+        if self.is_smooth:
             self._smoothness.note(seconds)
         self.n_painted += 1
         self.painted.emit(seconds)
@@ -284,13 +280,13 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
             self.hovered.emit(None)
 
     def _draw_smooth(self, smooth: bool) -> None:
-        if smooth != self._is_smooth:
-            self._is_smooth = smooth
+        if smooth != self.is_smooth:
+            self.is_smooth = smooth
             self.ren_win.SetMultiSamples(_SMOOTH_SAMPLES if smooth else 0)
 
     @Slot()
     def _on_rest(self) -> None:
-        if not self._settled:
+        if not self.is_settled:
             self._draw_smooth(True)
             self.update()
         if self.underMouse() and self._pointer is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,7 @@ class Pictures(QObject):
     Parameters
     ----------
     document : whose mesh the scene shows; tells the user what has been saved
+    scene_now : returns the scene as it is to be seen, or raises where there is none yet
     parent : of the object
 
     Signals
@@ -36,9 +38,12 @@ class Pictures(QObject):
 
     busy_changed = Signal()
 
-    def __init__(self, document: PoseDocument, parent: QObject) -> None:
+    def __init__(
+        self, document: PoseDocument, scene_now: Callable[[], Scene], parent: QObject
+    ) -> None:
         super().__init__(parent)
         self._document = document
+        self._scene_now = scene_now
         self._video: TurntableVideo | None = None
         # With 0 ms between two frames the window's own events still have their turn.
         self._next = QTimer(self, interval=0)
@@ -50,22 +55,36 @@ class Pictures(QObject):
         return f"Making {self._video.path.name}" if self._video is not None else ""
 
     def screenshot(
-        self,
-        scene: Scene,
-        path: str | os.PathLike[str],
-        width: int,
-        height: int,
-        transparent: bool,
+        self, path: str | os.PathLike[str], width: int, height: int, transparent: bool
     ) -> None:
-        """Save a scene as a .png file; see `Viewport.screenshot`."""
-        renderer = self._copy(scene, width, height, transparent)
+        """Save what is seen, without legend, in another size.
+
+        Parameters
+        ----------
+        path : a .png file
+        width, height : in pixels; as much is seen from bottom to top as in the window
+        transparent : without background, floor and shadow
+
+        Raises
+        ------
+        MeshFileError : the file cannot be written.
+        """
+        renderer = self._copy(width, height, transparent)
         try:
             save_png(renderer.drawn(), path)
         finally:
             renderer.close()
 
-    def turntable(self, scene: Scene, path: str | os.PathLike[str], style: TurntableStyle) -> None:
-        """Begin a video of a scene, in place of one that is being drawn.
+    def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> None:
+        """Begin a video of one turn round what is seen, in place of one that is being drawn.
+
+        The document tells when it is saved.
+
+        Parameters
+        ----------
+        path : a .gif or .webp file, or a .png one, whose name without that a new folder of
+            numbered pictures gets
+        style : its size, rate and background
 
         Raises
         ------
@@ -76,7 +95,7 @@ class Pictures(QObject):
         if refusal is not None:
             raise refusal
         self.cancel()
-        renderer = self._copy(scene, style.width, style.height, style.background == "transparent")
+        renderer = self._copy(style.width, style.height, style.background == "transparent")
         if style.background == "plain":
             renderer.scene.show_floor(False)
             renderer.scene.set_plain_background(style.colour)
@@ -98,7 +117,8 @@ class Pictures(QObject):
         self.busy_changed.emit()
         return video
 
-    def _copy(self, scene: Scene, width: int, height: int, transparent: bool) -> PoseRenderer:
+    def _copy(self, width: int, height: int, transparent: bool) -> PoseRenderer:
+        scene = self._scene_now()
         renderer = PoseRenderer(self._document.model, width, height, current_theme(), transparent)
         renderer.scene.look_like(scene)
         return renderer

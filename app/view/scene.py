@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pyvista as pv
 
 from app.view.camera import VIEW_ANGLE, View
-from app.view.outline import Outline
+from app.view.outline import Outline, PartShape
 from app.view.shading import COLLIDING_FACE
 from app.view.surface import Surface, actor_of
 
@@ -39,7 +39,8 @@ class Scene:
     def __init__(self, plotter: pv.BasePlotter, model: PoseModel, theme: Theme) -> None:
         self._renderer = plotter.renderer
         self._renderer.RemoveAllViewProps()
-        self._faces, self._up_axis, self._height = model.faces, model.up_axis, model.height
+        self._faces, self._mask = model.faces, model.attention_mask
+        self._up_axis, self._height = model.up_axis, model.height
         self.surface = Surface(model.faces, model.n_vertices)
         self.body = actor_of(
             self.surface.polydata, True, ambient=0.22, diffuse=0.92, specular=0.1, specular_power=18
@@ -148,6 +149,11 @@ class Scene:
             self._crossing.SetPolys(pv.CellArray.from_regular_cells(self._faces[chosen]))
         for actor in self._crossing_actors:
             actor.SetVisibility(len(chosen) > 0)
+
+    def outline_domain(self, domain: int | None) -> None:
+        """Outline a domain, by its index from 0, or none."""
+        shape = None if domain is None else PartShape.of(self._mask, self._faces, domain)
+        self.outline.show(shape)
 
     def fit_outline(self, sharpness: float) -> None:
         """Let the outline follow the pose and the camera, just before a picture.

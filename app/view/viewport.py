@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from functools import partial
 from importlib import import_module
@@ -30,9 +29,7 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.view.canvas import Canvas
-    from app.view.outline import PartShape
     from app.view.scene import Scene
-    from app.view.turntable import TurntableStyle
     from lcollision_core.model import PoseModel
     from lcollision_core.resolve import ResolveResult
 
@@ -97,7 +94,6 @@ class Viewport(QWidget):
         self.scene: Scene | None = None
         self._shader: Shader | None = None
         self._model: PoseModel | None = None
-        self._front = np.zeros(3)
         self.shown_frame: LiveFrame | None = None
         self._pose_stale = self._colours_stale = self._crossing_stale = False
         self._place_camera = False
@@ -129,7 +125,7 @@ class Viewport(QWidget):
         self._transition.moved.connect(self._on_pose_moved)
         self._turn = Animation(_TURN_MILLISECONDS, self)
         self._turn.moved.connect(self._on_turned)
-        self.pictures = Pictures(document, self)
+        self.pictures = Pictures(document, self.scene_now, self)
         # VTK takes a second to import: meanwhile the window is alive.
         self._importer = Thread(target=import_module, args=("app.view.canvas",), name="import VTK")
         self._importer.start()
@@ -182,7 +178,7 @@ class Viewport(QWidget):
         if domain != self._highlight:
             self._highlight = domain
             if self.scene is not None and self.canvas is not None:
-                self.scene.outline.show(None if domain is None else self._shape_of(domain))
+                self.scene.outline_domain(domain)
                 self.canvas.redraw()
 
     # The camera.
@@ -214,46 +210,7 @@ class Viewport(QWidget):
         """Look at the document's pose as at a model's first, as soon as it is drawn."""
         self._framed = self._document.latent
 
-    @property
-    def view(self) -> View | None:
-        """From where the mesh is looked at; None before there is one."""
-        return self.scene.view if self.scene is not None else None
-
-    # Pictures.
-
-    def screenshot(
-        self, path: str | os.PathLike[str], width: int, height: int, transparent: bool
-    ) -> None:
-        """Save what is seen, without legend, in another size.
-
-        Parameters
-        ----------
-        path : a .png file
-        width, height : in pixels; as much is seen from bottom to top as in the window
-        transparent : without background, floor and shadow
-
-        Raises
-        ------
-        MeshFileError : the file cannot be written.
-        """
-        self.pictures.screenshot(self._scene_now(), path, width, height, transparent)
-
-    def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> None:
-        """Begin a video of one turn round what is seen; the document tells when it is saved.
-
-        Parameters
-        ----------
-        path : a .gif or .webp file, or a .png one, whose name without that a new folder of
-            numbered pictures gets
-        style : its size, rate and background
-
-        Raises
-        ------
-        MeshFileError : see `Pictures.turntable`.
-        """
-        self.pictures.turntable(self._scene_now(), path, style)
-
-    def _scene_now(self) -> Scene:
+    def scene_now(self) -> Scene:
         """Return the scene with what waits for the next picture on the screen."""
         if self.scene is None or self.shown_frame is None:
             raise LCollisionError("the mesh is not on the screen yet", "try again in a moment")
@@ -317,7 +274,6 @@ class Viewport(QWidget):
             view = self.scene.view if is_same else None
         self.scene = Scene(self.canvas, model, current_theme())
         self._model = model
-        self._front = model.front
         self._tag.hide()
         self._legend.set_legend(Legend())
         self._shader = self._new_shader()
@@ -391,7 +347,8 @@ class Viewport(QWidget):
             self._put(scene, frame)
         if self._colours_stale:
             self._colours_stale = False
-            self._paint(scene, frame)
+            assert self._shader is not None
+            scene.paint(self._shader.colours(self.shading, self._known_of(frame)))
         if self._crossing_stale:
             self._crossing_stale = False
             exact = self._document.exact
@@ -423,16 +380,6 @@ class Viewport(QWidget):
         self._transition_to = self._loaded = None
         if self.shading is Shading.EXACT:
             self._crossing_stale = True
-
-    def _paint(self, scene: Scene, frame: LiveFrame) -> None:
-        assert self._shader is not None
-        scene.paint(self._shader.colours(self.shading, self._known_of(frame)))
-
-    def _shape_of(self, domain: int) -> PartShape:
-        from app.view.outline import PartShape
-
-        model = self._document.model
-        return PartShape.of(model.attention_mask, model.faces, domain)
 
     def _normals(self, vertices: Float32Array) -> Float32Array:
         from lcollision_core.meshes.normals import vertex_normals
@@ -469,8 +416,8 @@ class Viewport(QWidget):
         )
 
     def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
-        up_axis = self._document.model.up_axis
-        return preset_view(name, vertices, up_axis, self._front, self._aspect)
+        model = self._document.model
+        return preset_view(name, vertices, model.up_axis, model.front, self._aspect)
 
     @property
     def _aspect(self) -> float:

@@ -239,7 +239,7 @@ class FileActions(QObject):
             path = self.ask_save("Save screenshot", self._name, {"PNG": ".png"})
             if path is not None:
                 settings = self._settings
-                self._viewport.screenshot(
+                self._viewport.pictures.screenshot(
                     path,
                     settings["screenshot_width"],
                     settings["screenshot_height"],
@@ -267,7 +267,7 @@ class FileActions(QObject):
                     settings["turntable_background"],
                     settings["turntable_colour"],
                 )
-                self._viewport.turntable(path, style)
+                self._viewport.pictures.turntable(path, style)
 
         self._after(turntable_form(self._settings, self._window), shoot)
 

@@ -144,14 +144,10 @@ class LivePose(QObject):
             self._is_due = True
             self._due.emit()
 
-    def stop(self) -> None:
-        """Want nothing any more."""
-        self._rested.stop()
-        self._next = self._shown = self._model = None
-
     def close(self, deadline: float) -> bool:
         """End the thread; see `LongWork.close`."""
-        self.stop()
+        self._rested.stop()
+        self._next = self._shown = self._model = None
         return end_thread(self._thread, deadline)
 
     @Slot()

@@ -76,11 +76,11 @@ def test_the_rest_of_the_menu_is_made_of_the_window_s_own_actions(
     assert set(submenus) == {"Colour by", "Camera view"}
     chosen(submenus["Colour by"], "Exact").trigger()
     assert window.viewport.shading is Shading.EXACT
-    assert window.viewport.view is not None
-    before = window.viewport.view.position
+    assert window.viewport.scene.view is not None
+    before = window.viewport.scene.view.position
     chosen(submenus["Camera view"], "Back").trigger()
     rest(qtbot, window)
-    assert np.linalg.norm(window.viewport.view.position - before) > 1.0
+    assert np.linalg.norm(window.viewport.scene.view.position - before) > 1.0
     menu.close()
 
 

@@ -82,7 +82,7 @@ def test_parts_of_an_own_model_are_edited_in_its_file_and_the_pose_stays(
     document.set_locked(1, True)
     own.sliders.groups[2].set_open(True)
     rest(qtbot, own)
-    pose, steps, view = document.latent, document.undo_stack.count(), own.viewport.view
+    pose, steps, view = document.latent, document.undo_stack.count(), own.viewport.scene.view
     frame = document.frame
     dialog = dialog_of(own)
     type_name(dialog, "knee & <b>shin</b>")
@@ -106,9 +106,9 @@ def test_parts_of_an_own_model_are_edited_in_its_file_and_the_pose_stays(
     assert document.locked_domains == {1}
     assert own.collision.prediction.rows[1].lock.isChecked()
     assert own.sliders.groups[2].header.isChecked()
-    assert own.viewport.view is not None
+    assert own.viewport.scene.view is not None
     assert view is not None
-    assert own.viewport.view.position == pytest.approx(view.position)
+    assert own.viewport.scene.view.position == pytest.approx(view.position)
     assert document.frame is not None
     assert frame is not None
     assert np.array_equal(document.frame.vertices, frame.vertices)

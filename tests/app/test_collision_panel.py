@@ -14,10 +14,10 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QLabel, QScrollArea, QWidget
 from pytestqt.qtbot import QtBot
 
-from app.editing.document import PoseDocument, PosePrediction
+from app.editing.document import PoseDocument
 from app.view.theme import current_theme
 from app.window.main_window import MainWindow
-from app.work.frames import FrameEvaluator
+from app.work.frames import FrameEvaluator, PosePrediction
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in

@@ -163,7 +163,7 @@ def test_the_window_tells_of_a_name_that_is_too_long(
     write = {
         ".json": document.save,
         ".obj": document.export_mesh,
-        ".png": lambda path: window.viewport.screenshot(path, 64, 64, False),
+        ".png": lambda path: window.viewport.pictures.screenshot(path, 64, 64, False),
     }[suffix]
     window.attempt(lambda: write(path))
     qtbot.waitUntil(lambda: bool(window.findChildren(FailureDialog)), timeout=PATIENCE)

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
-from app.editing.document import Failure, PoseDocument
+from app.editing.document import PoseDocument
 from app.wording import counted
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
+from app.work.threads import Failure
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
 from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses

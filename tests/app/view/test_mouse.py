@@ -53,8 +53,8 @@ def test_each_camera_shows_the_whole_body(viewport: Viewport) -> None:
         assert across.min() > 0
         assert across.max() < SIDE
         assert np.ptp(across, axis=0).max() > 0.4 * SIDE
-        assert viewport.view is not None
-        positions.add(viewport.view.position.tobytes())
+        assert viewport.scene.view is not None
+        positions.add(viewport.scene.view.position.tobytes())
     assert len(positions) == len(CAMERAS)
 
 
@@ -95,12 +95,12 @@ def test_who_sees_the_whole_body_goes_on_seeing_it(
 
 def test_a_camera_is_turned_to_by_degrees_and_arrives(qtbot: QtBot, viewport: Viewport) -> None:
     viewport.set_camera("Back", animated=False)
-    assert viewport.view is not None
-    back = viewport.view
+    assert viewport.scene.view is not None
+    back = viewport.scene.view
     viewport.set_camera("Front")
-    assert viewport.view is not None
+    assert viewport.scene.view is not None
     rest(qtbot, viewport)
-    arms = [view.position - view.focus for view in (back, viewport.view)]
+    arms = [view.position - view.focus for view in (back, viewport.scene.view)]
     directions = [arm / np.linalg.norm(arm) for arm in arms]
     np.testing.assert_allclose(directions[0], -directions[1], atol=1e-6)
 
@@ -276,14 +276,14 @@ def test_the_mouse_turns_the_camera_upright_and_keys_do_nothing(
 ) -> None:
     canvas = viewport.canvas
     assert canvas is not None
-    assert viewport.view is not None
-    before = viewport.view
+    assert viewport.scene.view is not None
+    before = viewport.scene.view
     QTest.mousePress(canvas, Qt.MouseButton.LeftButton, pos=QPoint(200, 200))
     QTest.mouseMove(canvas, QPoint(240, 215))
     QTest.mouseMove(canvas, QPoint(280, 230))
     QTest.mouseRelease(canvas, Qt.MouseButton.LeftButton, pos=QPoint(280, 230))
     rest(qtbot, viewport)
-    turned = viewport.view
+    turned = viewport.scene.view
     assert np.linalg.norm(turned.position - before.position) > 1.0
     np.testing.assert_allclose(turned.up, before.up)
     up = viewport._document.model.up_axis

@@ -57,7 +57,7 @@ def test_before_the_model_there_is_a_page_that_says_so(
     qtbot.waitUntil(lambda: changed(first, pixels(shown)).any(), timeout=20_000)
     assert shown.shown_frame is None
     with pytest.raises(LCollisionError, match="not on the screen yet"):
-        shown.screenshot("never.png", 10, 10, transparent=True)
+        shown.pictures.screenshot("never.png", 10, 10, transparent=True)
     document.set_model(editor_model)
     rest(qtbot, shown)
     assert shown.shown_frame is not None
@@ -387,7 +387,7 @@ def test_resolve_transitions_to_the_new_pose_and_leaves_a_ghost(
 
 def test_a_screenshot_has_its_size_and_is_cut_out(viewport: Viewport, tmp_path: Path) -> None:
     path = tmp_path / "cut out.png"
-    viewport.screenshot(path, 300, 200, transparent=True)
+    viewport.pictures.screenshot(path, 300, 200, transparent=True)
     cut_out = np.asarray(Image.open(path)).astype(int)
     alpha = cut_out[:, :, 3]
     assert alpha.shape == (200, 300)
@@ -396,11 +396,11 @@ def test_a_screenshot_has_its_size_and_is_cut_out(viewport: Viewport, tmp_path: 
     inside, rim = (cut_out[where, :3].sum(axis=1) for where in (alpha == 255, alpha % 255 > 0))
     assert np.median(rim) > 0.6 * np.median(inside), "the rim is mixed with what is not there"
     opaque = tmp_path / "opaque.png"
-    viewport.screenshot(opaque, 800, 600, transparent=False)
+    viewport.pictures.screenshot(opaque, 800, 600, transparent=False)
     with Image.open(opaque) as image:
         assert (image.size, image.mode) == ((800, 600), "RGB")
     with pytest.raises(MeshFileError, match="missing"):
-        viewport.screenshot(tmp_path / "missing" / "x.png", 30, 20, transparent=True)
+        viewport.pictures.screenshot(tmp_path / "missing" / "x.png", 30, 20, transparent=True)
 
 
 def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
@@ -418,7 +418,9 @@ def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
         assert cancelled.wait(20.0)
 
     monkeypatch.setattr(Image.Image, "save", save_slowly)
-    viewport.turntable(tmp_path / "turn.gif", TurntableStyle(seconds=0.08, width=60, height=60))
+    viewport.pictures.turntable(
+        tmp_path / "turn.gif", TurntableStyle(seconds=0.08, width=60, height=60)
+    )
     qtbot.waitUntil(packing.is_set, timeout=20_000)
     document.cancel_all()
     cancelled.set()
@@ -450,7 +452,9 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
     monkeypatch.setattr(owner, act, fail)
     told: list[Failure] = []
     document.failed.connect(told.append)
-    viewport.turntable(tmp_path / "turn.webp", TurntableStyle(seconds=0.08, width=60, height=60))
+    viewport.pictures.turntable(
+        tmp_path / "turn.webp", TurntableStyle(seconds=0.08, width=60, height=60)
+    )
     assert "turn.webp" in viewport.pictures.busy
     qtbot.waitUntil(lambda: bool(told) and not document.busy, timeout=20_000)
     (failure,) = told
@@ -462,7 +466,7 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
 
 def test_a_turntable_of_another_kind_is_refused(viewport: Viewport, tmp_path: Path) -> None:
     with pytest.raises(MeshFileError, match=r"turn\.avi .* \.gif, \.webp, \.png"):
-        viewport.turntable(tmp_path / "turn.avi", TurntableStyle())
+        viewport.pictures.turntable(tmp_path / "turn.avi", TurntableStyle())
 
 
 def test_the_theme_changes_what_is_behind_and_not_the_pose(
@@ -521,8 +525,8 @@ def test_a_closed_viewport_leaves_no_vtk_object_no_timer_and_no_thread(
         shown.resize(SIDE, SIDE)
         shown.show()
         rest(qtbot, shown)
-        shown.screenshot(tmp_path / "shot.png", 50, 50, transparent=True)
-        shown.turntable(tmp_path / "cut.gif", TurntableStyle(width=50, height=50))
+        shown.pictures.screenshot(tmp_path / "shot.png", 50, 50, transparent=True)
+        shown.pictures.turntable(tmp_path / "cut.gif", TurntableStyle(width=50, height=50))
         shown.set_camera("Back")
         n_alive = len(vtk_objects())
         dispose(shown)
