@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
+from app.editing.codes import CodeEditing
 from app.editing.commands import DocumentState, Source
-from app.editing.history import UNNAMED, PoseHistory, read_only
+from app.editing.history import UNNAMED, read_only
 from app.wording import counted, fit_error, heading, height_text, mirrored_text
 from app.work import jobs
 from app.work.frames import ExactVerdict, LiveFrame
@@ -34,7 +35,7 @@ REST_MILLISECONDS = 60
 """How long a pose stays before it is checked exactly: a hand that pauses has come to rest."""
 
 
-class PoseDocument(PoseHistory):
+class PoseDocument(CodeEditing):
     """One model, one working pose of it, the user's library, and their history.
 
     Lives in the thread of the window and computes nothing there: each change asks two workers,
@@ -54,7 +55,6 @@ class PoseDocument(PoseHistory):
     Attributes
     ----------
     model_file : that the model was read from, or the name of one that was not
-    locked_domains : that Resolve, Randomise, Reset all and blending leave as they are
     frame : the newest computed one; while a slider moves, an instant behind `latent`
     exact : the exact check of `latent`; None until it is known
     may_replace : asked before a model or a file comes in over edits made while it was read
@@ -84,12 +84,10 @@ class PoseDocument(PoseHistory):
     model_changed = Signal()
     frame_changed = Signal()
     exact_changed = Signal()
-    locks_changed = Signal()
     solve_started = Signal()
     solve_progressed = Signal(object)
     solve_finished = Signal(object)
     busy_changed = Signal(str)
-    message = Signal(str)
     failed = Signal(object)
     opened = Signal(object)
     imported = Signal(object)
@@ -105,11 +103,9 @@ class PoseDocument(PoseHistory):
     ) -> None:
         super().__init__(parent)
         self._library_folder = library_folder
-        self._model: PoseModel | None = None
         self.model_file = ""
         self._file_stamp: FileStamp | None = None
         self._predicts = False
-        self.locked_domains: frozenset[int] = frozenset()
         self.frame: LiveFrame | None = None
         self.exact: ExactVerdict | None = None
 
@@ -131,18 +127,6 @@ class PoseDocument(PoseHistory):
             self.set_model(model)
 
     # What there is to look at.
-
-    @property
-    def has_model(self) -> bool:
-        """Whether the first model is in."""
-        return self._model is not None
-
-    @property
-    def model(self) -> PoseModel:
-        """The model that the pose belongs to."""
-        if self._model is None:
-            raise LCollisionError("no model is open yet", "open one first")
-        return self._model
 
     @property
     def solving(self) -> bool:
@@ -169,42 +153,7 @@ class PoseDocument(PoseHistory):
         """Whether the model's mesh has a left and a right that mirror each other."""
         return self._model is not None and self._model.symmetry is not None
 
-    # Editing.
-
-    def set_code(self, index: int, value: float) -> None:
-        """Set one number of the latent; a number that is not finite is ignored.
-
-        Parameters
-        ----------
-        index : from 0, in the latent's order
-        value : beyond the sliders' range too, as in poses that came in as meshes
-        """
-        if not np.isfinite(value) or value == self.latent[index]:
-            return
-        self._set_codes(f"Move {self.code_name(index)}", index, value, run=index)
-
-    def reset_code(self, index: int) -> None:
-        """Set one number of the latent to 0."""
-        self._set_codes(f"Reset {self.code_name(index)}", index, 0.0)
-
-    def reset_all(self) -> None:
-        """Set all numbers to 0, but for those of locked domains."""
-        self._tell_if_locked()
-        self._edit("Reset all", self._with_locked(np.zeros_like(self.latent)))
-
-    def randomise(self, amount: float, seed: int) -> None:
-        """Move the pose towards a random one, but for its locked domains.
-
-        Parameters
-        ----------
-        amount : 0 leaves the pose, 1 goes all the way to a pose drawn uniformly from the sliders'
-            range
-        seed : equal seeds draw equal poses
-        """
-        self._tell_if_locked()
-        drawn = self.model.latent_space.sample(1, np.random.default_rng(seed))[0]
-        latent = (1.0 - amount) * self.latent + amount * drawn
-        self._edit("Randomise", self._with_locked(latent))
+    # Mirroring.
 
     def mirror(self) -> None:
         """Exchange left and right of the whole pose, in the long worker.
@@ -241,41 +190,6 @@ class PoseDocument(PoseHistory):
         work = partial(jobs.mirror_poses, self.model, tuple(poses))
         label = f"Mirroring {counted(len(poses), 'pose')}"
         self._mirroring_poses = self._long.start(label, work, self._on_poses_mirrored)
-
-    def code_name(self, index: int) -> str:
-        """Return what a person would call one number of the latent."""
-        group = next(g for g in self.model.latent_space.groups if index < g.codes.stop)
-        name = self.model.code_names[index]
-        return name if group.colour is None else f"{group.name}, {name}"
-
-    def reset_domain(self, domain: int) -> None:
-        """Set all numbers of a domain to 0: its own, and the whole body's that its lock holds."""
-        codes = self.model.embedding.codes_of([domain])
-        self._set_codes(f"Reset {self.model.domain_names[domain]}", codes, 0.0)
-
-    def _set_codes(self, label: str, codes: Any, value: float, run: int | None = None) -> None:
-        latent = self.latent.copy()
-        latent[codes] = value
-        self._edit(label, latent, run)
-
-    def set_locked(self, domain: int, locked: bool) -> None:
-        """Lock a domain against Resolve, Randomise, Reset all and blending, or let it go."""
-        changed = self.locked_domains | {domain} if locked else self.locked_domains - {domain}
-        if changed != self.locked_domains:
-            self.locked_domains = changed
-            self.cancel_resolve()
-            self.locks_changed.emit()
-
-    def training_pose(self, number: int) -> NamedPose:
-        """Return a training pose of the model by its number, from 0."""
-        from lcollision_core.model import NamedPose
-
-        return NamedPose(self.model.pose_names[number], self.model.training_latent[number])
-
-    @property
-    def all_locked(self) -> bool:
-        """Whether every domain is locked, so that nothing but a slider can move the pose."""
-        return self.has_model and len(self.locked_domains) == len(self.model.domain_names)
 
     # Models and files.
 
@@ -673,6 +587,9 @@ class PoseDocument(PoseHistory):
 
         return DocumentState(NamedPose(UNNAMED, read_only(self.model.training_latent[0])))
 
+    def _follow_locks(self) -> None:
+        self.cancel_resolve()
+
     def _follow_latent(self) -> None:
         self.cancel_resolve()
         self._long.cancel(self._mirroring)
@@ -680,11 +597,3 @@ class PoseDocument(PoseHistory):
         if self.exact is not None:
             self.exact = None
             self.exact_changed.emit()
-
-    def _tell_if_locked(self) -> None:
-        if self.all_locked:
-            self.message.emit("All body parts are locked; unlock one to move the pose")
-
-    def _with_locked(self, latent: FloatArray) -> FloatArray:
-        """Return the latent with the present codes of locked domains."""
-        return np.where(self.model.embedding.codes_of(self.locked_domains), self.latent, latent)

@@ -176,16 +176,6 @@ class PoseHistory(QObject):
             self._gesture = None
             self._apply(before)
 
-    def blend_towards(self, latent: npt.ArrayLike, fraction: float) -> None:
-        """Blend from the pose at the gesture's begin, fraction 0, to a (D,) other one, 1.
-
-        Locked domains stay as they are.
-        """
-        start = self._gesture[1].pose.latent if self._gesture else self.latent
-        target = np.asarray(latent, dtype=np.float64)
-        blended = target.copy() if fraction == 1.0 else start + fraction * (target - start)
-        self._edit("Blend", self._with_locked(blended))
-
     def undo(self) -> None:
         """Take back the last step; a drag that has not ended is that step."""
         self.end_gesture()
@@ -491,10 +481,6 @@ class PoseHistory(QObject):
 
     def _follow_latent(self) -> None:
         """Tell the workers, before the widgets, that the pose is another."""
-
-    def _with_locked(self, latent: FloatArray) -> FloatArray:
-        """Return the latent with the present codes of locked domains."""
-        return latent
 
     def _tell_modified(self) -> None:
         if self.changed != self._told_changed:
