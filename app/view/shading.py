@@ -126,7 +126,7 @@ class Shader:
         if fraction is None:
             return np.broadcast_to(rgb(self.skin), self._domains.shape)
         step = np.minimum(fraction, 1.0) * (_RAMP_STEPS - 1)
-        picked: ColourArray = self._ramp(shading)[step.astype(np.intp)]
+        picked: ColourArray = ramp((self.skin, *_RAMPS[shading]))[step.astype(np.intp)]
         return picked
 
     def legend(self, shading: Shading, known: Known, has_predictor: bool = True) -> Legend:
@@ -162,12 +162,8 @@ class Shader:
             note = UNIT if most else "nothing moved"
             note = "shown after Resolve" if known.movement is None else note
             ticks = _ticks(most) if most else ((0.0, "none"), (1.0, "most"))
-        colours = self._ramp(shading).tolist()
-        scale = tuple(f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in colours)
+        scale = ramp_texts((self.skin, *_RAMPS[shading]))
         return Legend(shading.value, note, crossing, scale, ticks)
-
-    def _ramp(self, shading: Shading) -> ColourArray:
-        return ramp((self.skin, *_RAMPS[shading]))
 
 
 def mask_colours(attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ...]) -> ColourArray:
@@ -215,6 +211,12 @@ def ramp(stops: tuple[str, ...]) -> ColourArray:
     colours: ColourArray = mixed.round().astype(np.uint8)
     colours.flags.writeable = False
     return colours
+
+
+@cache
+def ramp_texts(stops: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the 256 colours of a `ramp` as "#rrggbb"."""
+    return tuple(f"#{bytes(colour).hex()}" for colour in ramp(stops))
 
 
 def rgb(colour: str) -> ColourArray:
