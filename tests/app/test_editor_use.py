@@ -211,13 +211,13 @@ def test_it_opens_with_the_camera_on_its_first_pose_and_then_steps_back_only(
     assert document.pose_name == ("kneeling" if opens_a_mesh else kneeling.name)
     # It was half before, framed as the standing body.
     assert 0.62 < share_of_height(window) < 0.85
-    view = window.viewport.view
+    view = window.viewport.scene.view
     document.begin_gesture("Drag")
     document.set_code(0, 0.0)
     document.end_gesture()
     document.load_pose(document.training_pose(0))
     rest(qtbot, window)
-    after = window.viewport.view
+    after = window.viewport.scene.view
     assert view is not None
     assert after is not None
     # The standing body would not be seen whole from there: only as far back as that takes.
