@@ -81,7 +81,7 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
         raise MeshFileError.because(path, "cannot be checked", error) from error
     if found.n_coincident_pairs:
         pairs = counted(found.n_coincident_pairs, "pair of faces lies", "pairs of faces lie")
-        note(f"{path}: {pairs} exactly on each other: such touch, which counts as no collision")
+        note(f"{path}: {pairs} exactly on each other; touching is no collision")
     return {
         "file": str(path),
         "vertices": mesh.topology.n_vertices,

@@ -71,33 +71,11 @@ class _Notes(logging.Handler):
 
 
 def tell_what_takes_time() -> None:
-    """Show on a terminal what the core logs of work that nobody asked for, such as compiling."""
+    """Show on a terminal what the core logs of implicit work, such as compiling."""
     core = logging.getLogger("lcollision_core")
     if sys.stderr.isatty() and not core.handlers:
         core.addHandler(_Notes())
         core.setLevel(logging.INFO)
-
-
-class _StatusLines:
-    """A `ShowStatus` for log files: a line every half minute.
-
-    Parameters
-    ----------
-    task, rows : see `status_bar`
-    """
-
-    def __init__(self, task: str, rows: bool) -> None:
-        self._task, self._rows = task, rows
-        self._told = time.monotonic()
-
-    def __call__(
-        self, done: float, total: float, facts: Iterable[str] = (), description: str | None = None
-    ) -> None:
-        if time.monotonic() - self._told < SECONDS_BETWEEN_LINES:
-            return
-        self._told = time.monotonic()
-        amount = f"{done:.0f} of {total:.0f}" if self._rows else f"{100.0 * done / total:.0f} %"
-        note(", ".join([f"{description or self._task}: {amount}", *facts]))
 
 
 @contextmanager
@@ -120,7 +98,18 @@ def status_bar(task: str, *, rows: bool = False) -> Iterator[ShowStatus]:
     rows : show how many of how many are done, not the share and the time left
     """
     if not sys.stderr.isatty():
-        yield _StatusLines(task, rows)
+        last = time.monotonic()
+
+        def tell_now_and_then(
+            done: float, total: float, facts: Iterable[str] = (), description: str | None = None
+        ) -> None:
+            nonlocal last
+            if time.monotonic() - last >= SECONDS_BETWEEN_LINES:
+                last = time.monotonic()
+                amount = f"{done:.0f} of {total:.0f}" if rows else f"{100.0 * done / total:.0f} %"
+                note(", ".join([f"{description or task}: {amount}", *facts]))
+
+        yield tell_now_and_then
         return
     with _bar(task, *(("count",) if rows else ("share", "time"))) as show:
         yield show

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from app.cli.console import JsonOption, print_json, progress_bar, tell
+from app.cli.inputs import RowsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from app.wording import counted
@@ -24,10 +25,7 @@ def evaluate(
     store_path: Annotated[
         Path, typer.Argument(metavar="STORE", help="Samples of the model, by `lcollision label`.")
     ],
-    n_rows: Annotated[
-        int | None,
-        typer.Option("--rows", min=1, metavar="N", help="Use the first N rows. Default: all."),
-    ] = None,
+    n_rows: RowsOption = None,
     threshold: Annotated[
         float,
         typer.Option(

@@ -16,6 +16,13 @@ if TYPE_CHECKING:
 
 Axis = Literal["x", "y", "z"]
 
+PosesArgument = Annotated[
+    Path, typer.Argument(metavar="POSES", readable=False, help="A .json file of poses.")
+]
+RowsOption = Annotated[
+    int | None,
+    typer.Option("--rows", min=1, metavar="N", help="Use the first N rows. Default: all."),
+]
 ScaleOption = Annotated[
     float,
     typer.Option(

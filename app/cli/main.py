@@ -98,7 +98,7 @@ def _refuse_usage(error: Any) -> NoReturn:
 app = typer.Typer(
     cls=_Commands,
     name="lcollision",
-    help="Find where a body runs into itself, and move it free. Without a command: the editor.",
+    help="Find a body's self-collisions and resolve them. Without a command: the editor.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
+from app.cli.inputs import PosesArgument
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
-from app.cli.poses import PosesOutput
-from app.cli.results import note_near_exclusion, require_output, write_result
+from app.cli.results import PosesOutput, note_near_exclusion, require_output, write_result
 from app.wording import counted, mirrored_text
 from lcollision_core.errors import ModelFileError
 
@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
 def mirror(
     model_name: ModelArgument,
-    poses: Annotated[
-        Path, typer.Argument(metavar="POSES", readable=False, help="A .json file of poses.")
-    ],
+    poses: PosesArgument,
     output: PosesOutput,
     as_json: JsonOption = False,
 ) -> None:
@@ -73,15 +71,12 @@ def mirror(
 
 
 def _row(model: PoseModel, source: str, output: Path, mirrored: MirroredPose) -> dict[str, Any]:
+    names = ("restored", "fit_error_mean", "fit_error_max")
+    pairs = ("pairs_before", "pairs_mirrored", "pairs_after")
     return {
         "source": source,
         "output": str(output),
-        "restored": mirrored.restored,
-        "fit_error_mean": mirrored.fit_error_mean,
-        "fit_error_max": mirrored.fit_error_max,
-        "pairs_before": mirrored.pairs_before,
-        "pairs_mirrored": mirrored.pairs_mirrored,
-        "pairs_after": mirrored.pairs_after,
+        **{name: getattr(mirrored, name) for name in (*names, *pairs)},
         "exactly_free": mirrored.pairs_after == 0,
         "resolved": mirrored.pairs_after == 0 < mirrored.pairs_mirrored,
         "near_exclusion": model.near_exclusion,

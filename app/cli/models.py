@@ -127,7 +127,7 @@ def upright(
         Axis | None, typer.Option(help="The axis that is up, which the model's file keeps.")
     ] = None,
 ) -> None:
-    """Say which axis of a model is up, or turn it upright once and for all."""
+    """Say which axis of a model is up, or change it in the model's file."""
     from lcollision_core.model import PoseModel, change_model, find_model
 
     path = find_model(model_name)

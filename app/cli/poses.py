@@ -9,12 +9,14 @@ from typing import Annotated
 import typer
 
 from app.cli.console import progress_bar, tell
-from app.cli.inputs import ScaleOption, cannot_encode, expanded
+from app.cli.inputs import PosesArgument, ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import (
     FormatOption,
+    FormOutput,
     MeshAxes,
+    PosesOutput,
     output_named,
     require_format_holds,
     require_output,
@@ -23,10 +25,6 @@ from app.cli.results import (
 from app.cli.unfinished import unfinished_poses
 from app.wording import fit_error
 from lcollision_core.errors import LCollisionError, PoseSetError
-
-PosesOutput = Annotated[
-    Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
-]
 
 
 def encode(
@@ -87,18 +85,8 @@ def encode(
 
 def decode(
     model_name: ModelArgument,
-    poses: Annotated[
-        Path, typer.Argument(metavar="POSES", readable=False, help="A .json file of poses.")
-    ],
-    output: Annotated[
-        str,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="OUT",
-            help="A mesh file for one pose, a folder for several, or a .json file.",
-        ),
-    ],
+    poses: PosesArgument,
+    output: FormOutput,
     mesh_format: FormatOption = "obj",
     axes: Annotated[
         MeshAxes,

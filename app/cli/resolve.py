@@ -15,6 +15,7 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.results import (
     FormatOption,
+    FormOutput,
     note_near_exclusion,
     output_named,
     require_format_holds,
@@ -52,15 +53,7 @@ def resolve(
             help="Files of poses, or meshes to encode, or folders of meshes.",
         ),
     ],
-    output: Annotated[
-        str,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="OUT",
-            help="A .json file, a mesh file for one pose, a folder for several.",
-        ),
-    ],
+    output: FormOutput,
     solver: Annotated[
         str, typer.Option(metavar="NAME", help="sqp, auglag (the paper's), slsqp or ccsaq.")
     ] = "sqp",

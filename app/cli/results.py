@@ -27,6 +27,18 @@ MeshFormat = Literal["obj", "ply", "off", "stl", "glb"]
 MeshAxes = Literal["model", "y-up", "blender", "maya", "unreal"]
 """The axes that a mesh may be written in: `ExportAxes`, which takes long to import."""
 
+PosesOutput = Annotated[
+    Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
+]
+FormOutput = Annotated[
+    str,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="OUT",
+        help="A mesh file for one pose, a folder for several, or a .json file.",
+    ),
+]
 FormatOption = Annotated[MeshFormat, typer.Option("--format", help="Of the meshes in a folder.")]
 
 
@@ -99,7 +111,7 @@ def output_named(name: str) -> Output:
 
     An existing folder and what ends in a slash are folders whatever they are called; else the
     extension decides. A name without one, or with what is no kind of file, as in "results_v0.9",
-    is a folder that is yet to be made.
+    is a folder to be created.
 
     Raises
     ------

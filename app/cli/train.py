@@ -2,25 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from app.cli.console import note, status_bar
-from app.cli.inputs import Axis, up_sentence
+from app.cli.evaluate import require_store_of, scores_sentence
+from app.cli.inputs import Axis, RowsOption, up_sentence
 from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import describe, error_sentence, note_if_beside
-from app.cli.train_predictor import predictor
+from app.cli.models import (
+    ModelArgument,
+    describe,
+    error_sentence,
+    measured_model_sentence,
+    note_if_beside,
+)
 from lcollision_core.errors import CancelledError
+from lcollision_core.jobs import CancelToken
 
 if TYPE_CHECKING:
-    from lcollision_core.embedding.training import StatusCallback, TrainingStatus
+    from lcollision_core.embedding import training
+    from lcollision_core.embedding.training import TrainingStatus
+    from lcollision_core.predictor import PredictorStatus, StatusCallback
 
 app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
-app.command("predictor")(predictor)
+
+OutputOption = Annotated[
+    str,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="M",
+        help="The .safetensors file to write; a name alone stores it with your models.",
+    ),
+]
 
 
 @app.command("embedding")
@@ -31,15 +51,7 @@ def embedding(
             metavar="DATASET", readable=False, help="A folder of meshes or an .npz file."
         ),
     ],
-    output: Annotated[
-        str,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="M",
-            help="The .safetensors file to write; a name alone stores it with your models.",
-        ),
-    ],
+    output: OutputOption,
     n_domains: Annotated[
         int, typer.Option("--domains", min=1, max=64, metavar="K", help="Domains of the body.")
     ] = 10,
@@ -76,11 +88,9 @@ def embedding(
     A checkpoint beside the output lets a run that was stopped or killed go on where it was when it
     is started again; it is removed at the end.
     """
-    from dataclasses import replace
-
     from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
-    from lcollision_core.meshes import file_stamp, locked, read_pose_set, require_writable
+    from lcollision_core.meshes import file_stamp, read_pose_set, require_writable
     from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
 
     destination = model_destination(output)
@@ -103,21 +113,10 @@ def embedding(
     config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)
     checkpoint = checkpoint_path(destination)
     require_writable(checkpoint)
-    if checkpoint.exists():
-        note(f"going on from {checkpoint}")
-    try:
-        with (
-            locked(checkpoint, wait=0.0),
-            cancel_on_interrupt() as cancel,
-            _training_bar() as progress,
-        ):
-            trained = train_embedding(
-                poses, config, checkpoint=checkpoint, progress=progress, cancel=cancel, seed=seed
-            )
-    except CancelledError:
-        if checkpoint.exists():
-            note(f"stopped; run the same command again to go on from {checkpoint}")
-        raise
+    with _resumable(checkpoint, Path.exists) as cancel, _embedding_bar() as progress:
+        trained = train_embedding(
+            poses, config, checkpoint=checkpoint, progress=progress, cancel=cancel, seed=seed
+        )
     model = PoseModel.from_training(
         destination.stem, trained, poses, source, licence, _provenance(poses.vertices, seed)
     )
@@ -125,6 +124,111 @@ def embedding(
     note_if_beside(written, destination)
     checkpoint.unlink(missing_ok=True)
     note(f"wrote {written}: {error_sentence(describe(model))}")
+
+
+@app.command("predictor")
+def predictor(
+    model_name: ModelArgument,
+    store_path: Annotated[
+        Path, typer.Argument(metavar="STORE", help="The model's store, by `lcollision label`.")
+    ],
+    output: OutputOption,
+    preset: Annotated[
+        Literal["default", "paper"],
+        typer.Option(help="What measures best, or the paper's network and training."),
+    ] = "default",
+    loss: Annotated[
+        Literal["full", "no-rank", "no-depth", "entropy"],
+        typer.Option(help="Of the paper's losses, leave out ranking, depth, or both."),
+    ] = "full",
+    no_domains: Annotated[
+        bool, typer.Option("--no-domains", help="Predict the whole body's energy alone (ND).")
+    ] = False,
+    n_rows: RowsOption = None,
+    seed: Annotated[
+        int, typer.Option(min=0, metavar="S", help="Equal seeds, equal predictors.")
+    ] = 0,
+    device: Annotated[
+        Literal["auto", "cpu", "cuda"],
+        typer.Option(help="Where to train; auto takes a GPU when there is one."),
+    ] = "auto",
+) -> None:
+    """Learn to predict collisions from labelled samples.
+
+    Three tenths of the rows are held out to measure the predictor; from 170 000 rows on, a tenth of
+    these sets the decision threshold of the preset default. A checkpoint beside the output lets a
+    run that was stopped or killed go on when it is started again; it is removed at the end. To use
+    several devices or machines, start it with `torchrun -m app train predictor ...`.
+    """
+    from lcollision_core.labels import LabelStore
+    from lcollision_core.meshes import file_stamp, require_writable
+    from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
+    from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
+    from lcollision_core.resolve import find_free_poses
+
+    destination = model_destination(output)
+    require_writable(destination)
+    checkpoint = checkpoint_path(destination)
+    require_writable(patches_path(checkpoint))
+    before = file_stamp(destination)
+    model = PoseModel.load(model_name)
+    store = LabelStore.open(store_path)
+    require_store_of(store, model)
+    config = PRESETS[preset].with_loss(loss)
+    # torchrun starts this command many times; the first process writes for all.
+    leads = os.environ.get("RANK", "0") == "0"
+    with _resumable(checkpoint, has_begun, leads) as cancel, _predictor_bar(leads) as progress:
+        trained = train_predictor(
+            store.load(n_rows),
+            model.embedding,
+            replace(config, by_domain=not no_domains),
+            store=store.identity,
+            device=device,
+            checkpoint=checkpoint,
+            progress=progress,
+            cancel=cancel,
+            seed=seed,
+        )
+    if leads:
+        free_latent = find_free_poses(model.exact_check())
+        if not len(free_latent):
+            note(
+                "no pose of this body that was tried is free of collision; Resolve has nowhere "
+                "to fall back to and may leave poses colliding"
+            )
+        written = save_trained(
+            destination,
+            before,
+            model,
+            lambda base: base.with_predictor(trained).with_free_poses(free_latent),
+        )
+        note_if_beside(written, destination)
+        checkpoint.unlink(missing_ok=True)
+        if trained.metrics is not None:
+            note(f"wrote {written}: {scores_sentence(trained.metrics)}")
+            share = 100.0 * trained.facts.colliding_share
+            note(f"{measured_model_sentence(model)}; {share:.1f} % of its box collides")
+
+
+@contextmanager
+def _resumable(
+    checkpoint: Path, has_begun: Callable[[Path], bool], leads: bool = True
+) -> Iterator[CancelToken]:
+    """Keep a checkpoint for the process that leads, and say how to go on from it."""
+    from lcollision_core.meshes import locked
+
+    if leads and has_begun(checkpoint):
+        note(f"going on from {checkpoint}")
+    try:
+        with (
+            locked(checkpoint, wait=0.0) if leads else nullcontext(),
+            cancel_on_interrupt() as cancel,
+        ):
+            yield cancel
+    except CancelledError:
+        if leads and has_begun(checkpoint):
+            note(f"stopped; run the same command again to go on from {checkpoint}")
+        raise
 
 
 def _provenance(vertices: Any, seed: int) -> dict[str, Any]:
@@ -143,7 +247,7 @@ def _provenance(vertices: Any, seed: int) -> dict[str, Any]:
 
 
 @contextmanager
-def _training_bar() -> Iterator[StatusCallback]:
+def _embedding_bar() -> Iterator[training.StatusCallback]:
     """Give a callback that draws the stage and both levels' errors on a terminal."""
     with status_bar("reading features") as draw:
 
@@ -158,5 +262,28 @@ def _training_bar() -> Iterator[StatusCallback]:
             ]
             facts = [f"error {', '.join(errors)}"] if errors else []
             draw(status.done, status.total, facts, f"{status.model}: learning {status.stage}")
+
+        yield show
+
+
+@contextmanager
+def _predictor_bar(leads: bool) -> Iterator[StatusCallback]:
+    """Give a callback that draws steps, loss and held-out accuracy on a terminal."""
+    from lcollision_core.predictor import no_status
+
+    if not leads:
+        yield no_status
+        return
+    with status_bar("reading rows") as draw:
+
+        def show(status: PredictorStatus) -> None:
+            if status.preparing is not None:
+                draw(status.preparing, 1.0, description="labelling patches")
+                return
+            facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
+            if status.held_out_accuracy is not None:
+                facts.append(f"{100.0 * status.held_out_accuracy:.1f} % accuracy")
+            epoch = f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}"
+            draw(status.done, status.total, facts, epoch)
 
         yield show

@@ -51,10 +51,15 @@ class UnfinishedPoses:
         self.finished[place] = (pose, facts)
         pause = max(_SECONDS_BETWEEN_WRITES, self._seconds / _LARGEST_SHARE)
         if time.monotonic() - self._written > pause:
-            self._write_or_say()
+            self._write()
 
-    def write(self) -> None:
-        """Write all that is done."""
+    def stop(self) -> None:
+        """Write what is done, and say how to go on."""
+        if self.finished and self._write():
+            note(f"stopped; {self.path} has {self._told}, run the same command again to go on")
+
+    def _write(self) -> bool:
+        """Write, or say once why not: a full disk neither ends the command nor hides what does."""
         from lcollision_core.model import write_poses
 
         started = time.monotonic()
@@ -65,26 +70,16 @@ class UnfinishedPoses:
             "done": [{"place": place, **self.finished[place][1]} for place in places],
         }
         poses = [self.finished[place][0] for place in places]
-        write_poses(self.path, self._model, poses, extra={"unfinished": record})
-        self._written = time.monotonic()
-        self._seconds = self._written - started
-
-    def stop(self) -> None:
-        """Write what is done, and say how to go on."""
-        if self.finished and self._write_or_say():
-            note(f"stopped; {self.path} has {self._told}, run the same command again to go on")
-
-    def _write_or_say(self) -> bool:
-        """Write, or say once why not: a full disk neither ends the command nor hides what does."""
+        failure = ""
         try:
-            self.write()
+            write_poses(self.path, self._model, poses, extra={"unfinished": record})
         except LCollisionError as error:
-            self._written = time.monotonic()
-            if str(error) != self._failure:
-                self._failure = str(error)
-                note(self._failure)
-            return False
-        return True
+            failure = str(error)
+            if failure != self._failure:
+                note(failure)
+        self._failure, self._written = failure, time.monotonic()
+        self._seconds = self._written - started
+        return not failure
 
     def damaged(self) -> LCollisionError:
         """Return the error for a file whose facts are not those that were kept."""

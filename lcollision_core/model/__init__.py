@@ -5,18 +5,15 @@ from lcollision_core.model.encode import encode_mesh, read_model_mesh, with_deta
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.export import (
     EXPORT_SCALES,
-    LARGEST_SCALE,
-    LEAST_SCALE,
     ExportAxes,
     ExportFrame,
     export_frame,
     export_mesh,
 )
 from lcollision_core.model.keeping import change_model, save_trained
-from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace
-from lcollision_core.model.library import (
-    MODEL_SUFFIX,
+from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry, fingerprint_of_pose
+from lcollision_core.model.model_store import (
     ListedModel,
     checkpoint_path,
     find_model,
@@ -24,7 +21,6 @@ from lcollision_core.model.library import (
     model_destination,
     user_models_folder,
 )
-from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry, fingerprint_of_pose
 from lcollision_core.model.naming import unique_names
 from lcollision_core.model.pose_file import (
     MAX_NAME_LENGTH,
@@ -44,11 +40,8 @@ from lcollision_core.model.sampling import sample_poses
 
 __all__ = [
     "EXPORT_SCALES",
-    "LARGEST_SCALE",
-    "LEAST_SCALE",
     "MAX_NAME_LENGTH",
     "MAX_TAGS",
-    "MODEL_SUFFIX",
     "EncodedPose",
     "ExportAxes",
     "ExportFrame",
@@ -70,7 +63,6 @@ __all__ = [
     "encode_mesh",
     "export_frame",
     "export_mesh",
-    "find_latent_space",
     "find_model",
     "fingerprint_of_pose",
     "list_models",

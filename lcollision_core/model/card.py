@@ -39,7 +39,7 @@ class ModelCard:
 
     Raises
     ------
-    ModelFileError : a value that cannot be.
+    ModelFileError : an invalid value.
     """
 
     height: float
@@ -54,38 +54,48 @@ class ModelCard:
     domain_order: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        names, colours = self.domain_names, self.domain_colours
-        for sound, needed in (
+        names, colours, order = self.domain_names, self.domain_colours, self.domain_order
+        texts = (*self.pose_names, self.source, self.licence)
+        allowed = f"use 1 to {MAX_NAME_LENGTH} printable characters"
+        for sound, problem, next_step in (
             (
                 _LEAST_HEIGHT <= self.height <= 1.0 / _LEAST_HEIGHT,
                 f"its height must be from {_LEAST_HEIGHT:g} to {1.0 / _LEAST_HEIGHT:g}",
+                "",
             ),
-            (self.up_axis in (0, 1, 2), "its up_axis must be 0, 1 or 2"),
-            (0.0 <= self.near_exclusion < 1.0, "its near_exclusion must be from 0 to below 1"),
+            (self.up_axis in (0, 1, 2), "its up_axis must be 0, 1 or 2", ""),
+            (0.0 <= self.near_exclusion < 1.0, "its near_exclusion must be from 0 to below 1", ""),
             (
-                all(0 < len(name) <= MAX_NAME_LENGTH and name.isprintable() for name in names),
-                f"its domain_names must be 1 to {MAX_NAME_LENGTH} printable characters",
-            ),
-            (len(set(names)) == len(names), "its domain_names must all differ"),
-            (
-                len(colours) == len(names)
-                and all(re.fullmatch("#[0-9a-f]{6}", colour) for colour in colours),
-                "its domain_colours must be one #rrggbb for each name",
-            ),
-            (
-                all(
-                    len(text) <= _MAX_TEXT_LENGTH
-                    for text in (*self.pose_names, self.source, self.licence)
-                ),
+                all(len(text) <= _MAX_TEXT_LENGTH for text in texts),
                 f"its names, source and licence must be at most {_MAX_TEXT_LENGTH} characters",
+                "",
+            ),
+            *((_is_name(name), f"{name[:80]!r} cannot name a domain", allowed) for name in names),
+            *(
+                (
+                    names.count(name) == 1,
+                    f"two domains would be called {name!r}",
+                    "choose another name",
+                )
+                for name in names
+            ),
+            (len(colours) == len(names), "it must have one colour for each domain", ""),
+            *(
+                (
+                    bool(re.fullmatch("#[0-9a-f]{6}", colour)),
+                    f"{colour!r} is not a colour",
+                    "write it as in #0077bb",
+                )
+                for colour in colours
             ),
             (
-                not self.domain_order or sorted(self.domain_order) == list(range(len(names))),
-                "its domain_order must hold each domain once",
+                not order or sorted(order) == list(range(len(names))),
+                f"{list(order)} is not an order of its {len(names)} domains",
+                "name each once",
             ),
         ):
             if not sound:
-                raise ModelFileError.because(_CARD, "is damaged", needed, _ADVICE)
+                raise ModelFileError(problem, next_step)
 
     def to_metadata(self) -> dict[str, Any]:
         """Return JSON values from which `from_metadata` builds the same card."""
@@ -100,9 +110,14 @@ class ModelCard:
 
         Raises
         ------
-        ModelFileError : something is missing or cannot be.
+        ModelFileError : something is missing or invalid.
         """
         try:
             return from_json(cls, metadata, "card")
-        except ValueError as error:
-            raise ModelFileError.because(_CARD, "is damaged", error, _ADVICE) from error
+        except (ValueError, ModelFileError) as error:
+            reason = getattr(error, "headline", error)
+            raise ModelFileError.because(_CARD, "is damaged", reason, _ADVICE) from error
+
+
+def _is_name(name: str) -> bool:
+    return 0 < len(name) <= MAX_NAME_LENGTH and name.isprintable()

@@ -32,7 +32,7 @@ class CodeEffect:
     Attributes
     ----------
     domain : index from 0 of the domain that the name refers to: in the first group, where each
-        domain has one code, that domain, however far it swings what hangs on it; in a domain's
+        domain has one code, that domain, however far it moves what is attached to it; in a domain's
         group that domain, unless the code mainly moves another
     motion : "up", "down", "forward", "back", "left" or "right" for a shift of that domain; "bend
         up" and so on where it turns, after its far end; "twist" about its long axis; "still" where

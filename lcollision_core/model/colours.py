@@ -1,4 +1,4 @@
-"""One colour per domain, told apart by colour-blind eyes too."""
+"""One colour per domain, distinct for colour-blind readers too."""
 
 from __future__ import annotations
 

@@ -43,7 +43,6 @@ EXPORT_SCALES = {
 }
 """The file's units in a metre, which is the unit that models are taken to be in."""
 
-LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6
 _ALREADY_FIXED = ".glb"
 """glTF's own axes and unit are y up, z forward and the metre."""
 

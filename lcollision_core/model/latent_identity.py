@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lcollision_core.embedding.latent_box import BOX_ARRAYS
 from lcollision_core.errors import ModelFileError
-from lcollision_core.model.library import ListedModel, list_models
+from lcollision_core.model.model_store import ListedModel, list_models
 from lcollision_core.model_file import read_section
 
 EMBEDDING = "embedding"

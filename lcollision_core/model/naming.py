@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import ModelFileError
-
 MAX_NAME_LENGTH = 60
 
 _MAIN_SHARE = 0.6
@@ -74,7 +72,7 @@ def names_from_labels(
         for first, found in zip(names, ranked, strict=True)
     ]
     mass = np.maximum(attention_mask.sum(axis=1), np.finfo(float).tiny)
-    return _told_apart(names, attention_mask @ levels / mass)
+    return _with_positions(names, attention_mask @ levels / mass)
 
 
 def join_names(first: str, second: str) -> str:
@@ -109,22 +107,6 @@ def _plural(part: str) -> str:
     return part if part.endswith("s") else f"{part}s"
 
 
-def checked_name(name: str) -> str:
-    """Return a name without the spaces round it.
-
-    Raises
-    ------
-    ModelFileError : it is empty, longer than `MAX_NAME_LENGTH`, or not printable.
-    """
-    stripped = name.strip()
-    if not stripped or len(stripped) > MAX_NAME_LENGTH or not stripped.isprintable():
-        raise ModelFileError(
-            f"{name[:80]!r} cannot name a domain",
-            f"use 1 to {MAX_NAME_LENGTH} printable characters",
-        )
-    return stripped
-
-
 def unique_names(names: Iterable[str], max_length: int = 200) -> list[str]:
     """Return the names, numbered where an earlier one differs by case at most: "a", "A 2".
 
@@ -147,8 +129,8 @@ def _shared(names: Sequence[str]) -> set[str]:
     return {name for name, count in Counter(names).items() if count > 1}
 
 
-def _told_apart(names: list[str], levels: npt.NDArray[Any]) -> tuple[str, ...]:
-    """Give domains of one name their places from top to bottom."""
+def _with_positions(names: list[str], levels: npt.NDArray[Any]) -> tuple[str, ...]:
+    """Add "upper", "lower" and so on to equal names, from top to bottom."""
     places = {2: ("upper", "lower"), 3: ("upper", "middle", "lower")}
     for shared in sorted(_shared(names)):
         domains = [k for k, name in enumerate(names) if name == shared]

@@ -17,8 +17,8 @@ from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes import RigidTransform, atomic_write
 from lcollision_core.model.latent_identity import find_latent_space
-from lcollision_core.model.library import ListedModel, user_models_folder
 from lcollision_core.model.mirror import MirroredPose, MirrorSource, pose_bytes
+from lcollision_core.model.model_store import ListedModel, user_models_folder
 from lcollision_core.model.naming import unique_names
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.regular_files import read_regular

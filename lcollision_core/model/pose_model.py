@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
@@ -31,7 +30,6 @@ from lcollision_core.model.colours import domain_colours
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_identity import EMBEDDING, fingerprint_of
 from lcollision_core.model.latent_space import WHOLE_BODY, LatentGroup, LatentSpace
-from lcollision_core.model.library import find_model
 from lcollision_core.model.matching import checked_mesh, require_same_faces
 from lcollision_core.model.mirror import (
     MirroredPose,
@@ -40,7 +38,8 @@ from lcollision_core.model.mirror import (
     Symmetry,
     find_symmetry,
 )
-from lcollision_core.model.naming import checked_name, names_from_labels, numbered_names
+from lcollision_core.model.model_store import find_model
+from lcollision_core.model.naming import names_from_labels, numbered_names
 from lcollision_core.model_file import (
     Section,
     read_model_file,
@@ -372,7 +371,7 @@ class PoseModel:
         Raises
         ------
         ModelFileError : there is no such domain, a name cannot be or is another domain's, or a
-            colour or an order is none.
+            colour or an order is invalid.
         """
         renamed, coloured = list(self.domain_names), list(self.domain_colours)
         for values, changes in ((renamed, names or {}), (coloured, colours or {})):
@@ -382,20 +381,7 @@ class PoseModel:
                         f"{self.name} has no domain {domain + 1}",
                         f"its domains are 1 to {len(values)}",
                     )
-                values[domain] = checked_name(value) if values is renamed else value.lower()
-        for name in renamed:
-            if renamed.count(name) > 1:
-                raise ModelFileError(f"two domains would be called {name!r}", "choose another name")
-        if order is not None and sorted(order) != list(range(len(renamed))):
-            raise ModelFileError(
-                f"{list(order)} is not an order of the {len(renamed)} domains of {self.name}",
-                "name each once",
-            )
-        for colour in coloured:
-            if not re.fullmatch("#[0-9a-f]{6}", colour):
-                raise ModelFileError(
-                    "is not a colour", "write it as in #0077bb", where=f"{colour!r}"
-                )
+                values[domain] = value.strip() if values is renamed else value.lower()
         return self.with_card(
             replace(
                 self.card,
@@ -523,7 +509,7 @@ class PoseModel:
 
     @cached_property
     def resolver(self) -> PoseResolver:
-        """Moves this model's poses free of self-collision.
+        """Resolves the self-collisions of this model's poses.
 
         Raises
         ------
@@ -532,12 +518,7 @@ class PoseModel:
         from lcollision_core.resolve import PoseResolver
 
         return PoseResolver(
-            self.embedding,
-            self.require_predictor(),
-            self.detector,
-            self.height,
-            self.free_latent,
-            (self.embedding.box.low, self.embedding.box.high),
+            self.exact_check(), self.require_predictor(), self.free_latent
         )
 
     @cached_property

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.model.pose_model import PoseModel
 
 _DRAWN_AT_ONCE = 64
@@ -19,7 +19,6 @@ def sample_poses(
     seed: int,
     colliding: bool | None = None,
     progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
 ) -> npt.NDArray[np.float64]:
     """Draw latent poses uniformly from the box of 1.2 times the training range.
 
@@ -31,7 +30,6 @@ def sample_poses(
     colliding : True and False keep only poses that do and do not intersect themselves, by the
         exact check of the vertices rounded to float32, as they are exported; None keeps all
     progress : called with (poses found, n_poses)
-    cancel : polled between blocks of poses
 
     Returns
     -------
@@ -40,7 +38,6 @@ def sample_poses(
     Raises
     ------
     LCollisionError : 10 000 poses in a row were not of the kind asked for.
-    CancelledError : `cancel` was set.
     """
     generator = np.random.default_rng(seed)
     if colliding is None:
@@ -48,8 +45,6 @@ def sample_poses(
     kept = np.empty((n_poses, model.latent_size))
     n_kept = n_misses = 0
     while n_kept < n_poses:
-        if cancel is not None:
-            cancel.raise_if_cancelled()
         drawn = model.latent_space.sample(_DRAWN_AT_ONCE, generator)
         vertices = model.decode(drawn).astype(np.float32)
         found = drawn[model.detector.are_colliding(vertices) == colliding][: n_poses - n_kept]

@@ -15,7 +15,7 @@ from lcollision_core.resolve.exact import ExactCheck
 from lcollision_core.resolve.problem import ResolveProblem
 
 MAX_REGIONS = 6
-"""The deepest pairs of domains that a pose's contacts are told apart by."""
+"""Contacts of a pose at most, one for each of the deepest pairs of domains."""
 
 CLEARANCE = 2e-4
 """In normalised length: how far apart touching surfaces are moved, as the model is linear."""

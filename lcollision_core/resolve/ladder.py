@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -40,10 +41,11 @@ _Tried = tuple[Step, FloatArray | None]
 """A step, and the free pose that it found or None."""
 
 
+@dataclass(eq=False)
 class Ladder:
     """One climb: see `PoseResolver.resolve`.
 
-    Parameters
+    Attributes
     ----------
     problem, check, options : of the pose
     free_latents : (F, D) float64 array of poses known to be free
@@ -52,26 +54,22 @@ class Ladder:
     remark : what there is to say of the request whatever comes of it, or None
     """
 
-    def __init__(
-        self,
-        problem: ResolveProblem,
-        check: ExactCheck,
-        options: ResolveOptions,
-        free_latents: FloatArray,
-        correction: FloatArray | None,
-        progress: Progress,
-        remark: str | None = None,
-    ) -> None:
-        self._problem, self._check, self._options = problem, check, options
-        self._free_latents, self._correction = free_latents, correction
-        self._progress, self._remark = progress, remark
-        self._margin = options.margin or 0.0
-        self._outcome = SolverOutcome(problem.target, "not run", False, False, 0)
+    problem: ResolveProblem
+    check: ExactCheck
+    options: ResolveOptions
+    free_latents: FloatArray
+    correction: FloatArray | None
+    progress: Progress
+    remark: str | None = None
+
+    def __post_init__(self) -> None:
+        self._margin = self.options.margin or 0.0
+        self._outcome = SolverOutcome(self.problem.target, "not run", False, False, 0)
         self._candidates: deque[FloatArray] = deque(maxlen=_REMEMBERED)
 
     def climb(self) -> ResolveResult:
         """Try the steps until one resolves the collisions, then pull back."""
-        problem, check = self._problem, self._check
+        problem, check = self.problem, self.check
         problem.deadline.poll()
         before = check.find(check.exported(check.decode(problem.target)[0]))
         latent, step, note = problem.target, Step.NONE, None
@@ -81,19 +79,19 @@ class Ladder:
             note = ALL_LOCKED
         else:
             for done, (tried, found) in enumerate(self._steps(), 1):
-                self._progress(done, self._n_steps)
+                self.progress(done, self._n_steps)
                 if found is not None:
                     latent, step = pull_back(check, problem, found), tried
                     break
             else:
                 note = self._why_not()
         result = self._result(latent, step, before, note)
-        self._progress(self._n_steps, self._n_steps)
+        self.progress(self._n_steps, self._n_steps)
         return result
 
     def solve_only(self) -> ResolveResult:
         """Solve the paper's problem and check nothing exactly."""
-        problem = self._problem
+        problem = self.problem
         if not problem.movable.any():
             excess, _ = problem.excess(problem.target[None])
             if excess[0] + self._margin <= 0.0:
@@ -107,27 +105,27 @@ class Ladder:
     @property
     def _n_steps(self) -> int:
         """Count, at most, what `_steps` yields and pulling back."""
-        if self._options.solver == Solver.SQP:
+        if self.options.solver == Solver.SQP:
             n_tries = len(ITERATIONS) + 1
         else:
-            n_tries = len(MARGINS) + min(len(self._free_latents), _KNOWN_STARTS) + _RANDOM_STARTS
+            n_tries = len(MARGINS) + min(len(self.free_latents), _KNOWN_STARTS) + _RANDOM_STARTS
         # The neighbour's correction, the tries, polishing, falling back and pulling back.
-        return int(self._correction is not None) + n_tries + _POLISHED + 2
+        return int(self.correction is not None) + n_tries + _POLISHED + 2
 
     def _steps(self) -> Iterator[_Tried]:
-        problem = self._problem
-        if self._correction is not None:
-            near = np.clip(problem.target + self._correction, problem.low, problem.high)
+        problem = self.problem
+        if self.correction is not None:
+            near = np.clip(problem.target + self.correction, problem.low, problem.high)
             yield Step.NEIGHBOUR, self._first_free([near])
         tries = chain(self._by_margins(), self._by_polish(), self._by_restarts())
         while not problem.deadline.expired and (tried := next(tries, None)) is not None:
             yield tried
-        yield Step.FALL_BACK, fall_back(self._check, problem, self._free_latents)
+        yield Step.FALL_BACK, fall_back(self.check, problem, self.free_latents)
 
     def _by_margins(self) -> Iterator[_Tried]:
-        problem = self._problem
+        problem = self.problem
         margins = np.array(MARGINS) + self._margin
-        if self._options.solver != Solver.SQP:
+        if self.options.solver != Solver.SQP:
             reached, step = problem.target, Step.SOLVER
             for margin in margins:
                 outcome = self._solve(float(margin), reached)
@@ -147,15 +145,15 @@ class Ladder:
 
     def _by_restarts(self) -> Iterator[_Tried]:
         """Start between Z* and known free poses, and at random poses near Z*."""
-        problem = self._problem
-        known = np.where(problem.movable, self._free_latents, problem.target)
+        problem = self.problem
+        known = np.where(problem.movable, self.free_latents, problem.target)
         order = np.argsort(problem.search_distance(known), kind="stable")[:_KNOWN_STARTS]
-        generator = np.random.default_rng(self._options.seed)
+        generator = np.random.default_rng(self.options.seed)
         span = problem.high - problem.low
         moves = generator.uniform(-_SPREAD, _SPREAD, (_RANDOM_STARTS, len(span))) * span
         starts = np.concatenate([0.5 * (problem.target + known[order]), problem.target + moves])
         margin = START_MARGIN + self._margin
-        if self._options.solver == Solver.SQP:
+        if self.options.solver == Solver.SQP:
             batch = SqpBatch(problem, starts, np.full(len(starts), margin))
             outcomes = batch.run(START_ITERATIONS)
             yield Step.RESTART, self._first_free([outcome.latent for outcome in outcomes])
@@ -165,36 +163,36 @@ class Ladder:
 
     def _by_polish(self) -> Iterator[_Tried]:
         """Polish the poses that the steps before left in the shallowest contact."""
-        poses = np.unique(np.stack([self._problem.target, *self._candidates]), axis=0)
-        decoded = self._check.exported(self._check.decode(poses))
-        energies = [self._check.find(vertices).energy for vertices in decoded]
+        poses = np.unique(np.stack([self.problem.target, *self._candidates]), axis=0)
+        decoded = self.check.exported(self.check.decode(poses))
+        energies = [self.check.find(vertices).energy for vertices in decoded]
         for place in np.argsort(energies, kind="stable")[:_POLISHED]:
-            yield Step.POLISH, polish(self._check, self._problem, poses[place])
+            yield Step.POLISH, polish(self.check, self.problem, poses[place])
 
     def _solve(self, margin: float, start: FloatArray) -> SolverOutcome:
-        if self._options.solver == Solver.SQP:
-            batch = SqpBatch(self._problem, start[None], np.array([margin]))
+        if self.options.solver == Solver.SQP:
+            batch = SqpBatch(self.problem, start[None], np.array([margin]))
             return batch.run(_ITERATIONS_ALONE)[0]
         from lcollision_core.resolve.nlopt_solvers import solve_nlopt
 
-        return solve_nlopt(self._problem, Solver(self._options.solver), start, margin)
+        return solve_nlopt(self.problem, Solver(self.options.solver), start, margin)
 
     def _first_free(self, latents: Sequence[FloatArray]) -> FloatArray | None:
         """Return the nearest of some poses that is free; remember those that are not."""
-        for latent in sorted(latents, key=self._problem.distance):
-            self._problem.deadline.poll()
-            if self._check.is_free(latent):
+        for latent in sorted(latents, key=self.problem.distance):
+            self.problem.deadline.poll()
+            if self.check.is_free(latent):
                 return latent
             self._candidates.append(latent)
         return None
 
     def _why_not(self) -> str:
-        if len(self._free_latents) == 0:
+        if len(self.free_latents) == 0:
             return (
                 "the model has no known collision-free pose to fall back to, so the pose still "
                 "collides"
             )
-        if self._problem.movable.all():
+        if self.problem.movable.all():
             return "the poses that the model knows as free collide, so the pose still collides"
         return "no free pose was found that keeps the locked body parts; unlock one"
 
@@ -205,7 +203,7 @@ class Ladder:
         before: SelfCollisions | None,
         note: str | None = None,
     ) -> ResolveResult:
-        problem, check = self._problem, self._check
+        problem, check = self.problem, self.check
         decoded = check.decode(np.stack([problem.target, latent]))
         moved = np.linalg.norm(decoded[1] - decoded[0], axis=1)
         vertices = check.exported(decoded[1])
@@ -231,5 +229,5 @@ class Ladder:
             iterations=self._outcome.iterations,
             evaluations=problem.evaluations,
             seconds=problem.deadline.seconds,
-            note="; ".join(filter(None, (self._remark, note))) or None,
+            note="; ".join(filter(None, (self.remark, note))) or None,
         )

@@ -12,8 +12,6 @@ from threading import Lock
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector
-from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.meshes import RigidTransform
@@ -31,30 +29,23 @@ class PoseResolver:
 
     Parameters
     ----------
-    embedding : decodes latent poses
+    check : the exact check of the model's poses
     predictor : says how a latent pose collides, smoothly: a `CollisionPredictor`
-    detector : the exact check, in the data's unit
-    height : the body size, in the data's unit
     free_latents : (F, D) array of poses known to be collision-free: see `find_free_poses`. Without
         any, a pose that the other steps do not resolve stays colliding.
-    bounds : (low, high), two (D,) arrays: the latent box in which to look
     """
 
     def __init__(
         self,
-        embedding: Embedding,
+        check: ExactCheck,
         predictor: CollisionModel,
-        detector: CollisionDetector,
-        height: float,
         free_latents: npt.ArrayLike,
-        bounds: tuple[npt.ArrayLike, npt.ArrayLike],
     ) -> None:
-        self._embedding = embedding
-        self._predictor = predictor
-        self._check = ExactCheck(embedding, detector, height)
-        size = embedding.latent_size
+        self._check, self._embedding, self._predictor = check, check.embedding, predictor
+        size = check.embedding.latent_size
         self._free_latents: FloatArray = np.array(free_latents, np.float64).reshape(-1, size)
-        self._low, self._high = (np.array(bound, np.float64) for bound in bounds)
+        box = check.embedding.box
+        self._low, self._high = box.low, box.high
 
     def resolve(
         self,

@@ -28,7 +28,7 @@ def single_torch_thread() -> Iterator[None]:
         if _inside == 0:
             _before = torch.get_num_threads()
         _inside += 1
-        # For each calling thread anew: torch keeps the number thread by thread.
+        # In each calling thread: torch keeps the number thread by thread.
         torch.set_num_threads(1)
     try:
         yield

@@ -26,21 +26,21 @@ BARS = {
         ("Labelling", "30/200", "3/s, 0:01:01 left, 50.0 % collide"),
     ),
     "embedding": (
-        "from app.cli.train import _training_bar as bar\n"
+        "from app.cli.train import _embedding_bar as bar\n"
         "from lcollision_core.embedding.training import TrainingStatus\n"
         "status = TrainingStatus('held out', 'level 2', 1, 4, 40, 100, 0.04, 0.01)\n"
         "made = bar()",
         ("held out: learning level 2", "40%", "error level 1 4.00 %, both levels 1.00 %"),
     ),
     "predictor": (
-        "from app.cli.train_predictor import _training_bar as bar\n"
+        "from app.cli.train import _predictor_bar as bar\n"
         "from lcollision_core.predictor import PredictorStatus\n"
         "status = PredictorStatus(1, 30, 20, 100, 0.5, 0.875, None)\n"
         "made = bar(True)",
-        ("epoch 2 of 30", "20%", "loss 0.500, 87.5 % right"),
+        ("epoch 2 of 30", "20%", "loss 0.500, 87.5 % accuracy"),
     ),
     "patches": (
-        "from app.cli.train_predictor import _training_bar as bar\n"
+        "from app.cli.train import _predictor_bar as bar\n"
         "from lcollision_core.predictor import PredictorStatus\n"
         "status = PredictorStatus(0, 30, 0, 100, None, None, 0.25)\n"
         "made = bar(True)",

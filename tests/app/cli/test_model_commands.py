@@ -20,7 +20,8 @@ from typer.testing import CliRunner
 
 from app.cli.main import app
 from lcollision_core.bundled import bundled_file
-from lcollision_core.meshes import locked, read_mesh, write_mesh, write_pose_set
+from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.meshes import PoseSet, locked, read_mesh, write_mesh, write_pose_set
 from lcollision_core.model import (
     NamedPose,
     PoseModel,
@@ -183,9 +184,10 @@ def test_a_model_renamed_while_another_is_trained_to_its_file_stays(
 
     train = training.train_embedding
 
-    def rename_then_train(*arguments: Any, **options: Any) -> Any:
+    def rename_then_train(poses: PoseSet, config: EmbeddingConfig, **options: Any) -> Any:
         change_model(tube, lambda model: model.edit_domains({0: "neck"}))
-        return train(*arguments, **options)
+        quick = replace(config, level1_epochs=10, level2_epochs=5, held_out_stride=0)
+        return train(poses, quick, **options)
 
     monkeypatch.setattr(training, "train_embedding", rename_then_train)
     result = lcollision("train", "embedding", dataset, "-o", tube, "--domains", 1, "--seed", 2)
@@ -215,7 +217,7 @@ def test_bundled_models_are_not_renamed(
     lcollision: Lcollision, tube: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = tube.read_bytes()
-    monkeypatch.setattr("lcollision_core.model.library.bundled_folder", lambda _: tube.parent)
+    monkeypatch.setattr("lcollision_core.model.model_store.bundled_folder", lambda _: tube.parent)
     assert "part 1" in lcollision("domains", "tube").stdout
     assert "bundled model" in _refusal(lcollision, "domains", "tube", "--name", "1=neck")
     assert tube.read_bytes() == before
@@ -261,7 +263,7 @@ def test_a_damaged_model_is_named_and_the_others_are_listed(
 def test_no_models_are_no_error(
     lcollision: Lcollision, user_models: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lcollision_core.model.library.bundled_folder", lambda _: user_models)
+    monkeypatch.setattr("lcollision_core.model.model_store.bundled_folder", lambda _: user_models)
     result = lcollision("models")
     assert result.exit_code == 0
     assert str(user_models) in result.stdout

@@ -173,7 +173,7 @@ def test_all_rows_of_another_store_count(
     assert text.startswith("trained, preset paper: ")
     assert " on 200 unseen samples" in text
     share = 100.0 * rows.colliding[:200].mean()
-    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion"
+    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 domains, no near exclusion"
     assert f"\n  {sizes}; {share:.1f} % of these 200 samples collide\n" in text
 
 
@@ -209,7 +209,7 @@ def test_a_killed_training_goes_on_to_the_same_model(
     wrote, measured = _without_progress(results[1].stderr).splitlines()[:2]
     assert wrote.startswith(f"lcollision: wrote {whole}: ")
     share = 100.0 * LabelStore.open(store).load(600).colliding.mean()
-    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion"
+    sizes = "|Z_0| = 2, |Z_k| = 3 for 2 domains, no near exclusion"
     assert measured == f"lcollision: {sizes}; {share:.1f} % of its box collides"
     assert not checkpoint.exists()
     assert killed.read_bytes() == whole.read_bytes()
@@ -377,7 +377,7 @@ def test_the_benchmark_times_the_predictor_beside_the_exact_check(
     detector = CollisionDetector(loaded.topology, loaded.reference)
     assert row["colliding_share"] == detector.are_colliding(vertices).mean()
     text = lcollision("benchmark", "predictor", "--model", trained, "-n", 20).stdout
-    assert text.startswith("trained: |Z_0| = 2, |Z_k| = 3 for 2 parts, no near exclusion\n")
+    assert text.startswith("trained: |Z_0| = 2, |Z_k| = 3 for 2 domains, no near exclusion\n")
     assert re.search(r"exact_poses +20\b", text, re.MULTILINE)
     assert "has no predictor" in _refusal(lcollision, "benchmark", "predictor", "--model", model)
 

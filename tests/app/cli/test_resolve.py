@@ -56,7 +56,7 @@ FIELDS = [
 
 @pytest.fixture(scope="module")
 def model(editor_model: PoseModel) -> PoseModel:
-    free = find_free_poses(editor_model.embedding, editor_model.detector, editor_model.height)
+    free = find_free_poses(editor_model.exact_check())
     return editor_model.with_free_poses(free)
 
 

@@ -20,7 +20,6 @@ from lcollision_core.model import (
     NamedPose,
     OtherModelError,
     PoseModel,
-    find_latent_space,
     name_of_file,
     read_pose_file,
     read_poses,
@@ -28,6 +27,7 @@ from lcollision_core.model import (
     user_models_folder,
     write_poses,
 )
+from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.pose_file import POSES_VERSION
 from tests.core.shapes import random_rotation
 

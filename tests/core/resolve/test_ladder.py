@@ -40,7 +40,7 @@ MEAN_ALONE = 1
 
 @pytest.fixture(scope="module")
 def free_latents(tube_model: PoseModel) -> FloatArray:
-    return find_free_poses(tube_model.embedding, tube_model.detector, tube_model.height)
+    return find_free_poses(tube_model.exact_check())
 
 
 @pytest.fixture(scope="module")
@@ -88,10 +88,7 @@ def around_the_mean(latent: FloatArray, radius: float, steepness: float = 100.0)
 def resolver_of(
     model: PoseModel, predictor: CollisionModel, free_latents: npt.ArrayLike
 ) -> PoseResolver:
-    box = model.embedding.box
-    return PoseResolver(
-        model.embedding, predictor, model.detector, model.height, free_latents, (box.low, box.high)
-    )
+    return PoseResolver(model.exact_check(), predictor, free_latents)
 
 
 def facts(result: ResolveResult) -> dict:
@@ -508,12 +505,9 @@ def test_cancelling_a_sequence_stops_its_first_check(
 ) -> None:
     detector, size = _CancellingDetector(tube_model), tube_model.latent_size
     resolver = PoseResolver(
-        tube_model.embedding,
+        replace(tube_model.exact_check(), detector=detector),
         useless(colliding[0]),
-        detector,  # type: ignore[arg-type]
-        tube_model.height,
         np.empty((0, size)),
-        (np.full(size, -1.0), np.full(size, 1.0)),
     )
     with pytest.raises(CancelledError):
         resolver.resolve_many(colliding, workers=1, cancel=detector.token, sequence=True)
@@ -571,10 +565,3 @@ def test_known_free_poses_are_free(tube_model: PoseModel, free_latents: FloatArr
     free = ~tube_model.detector.are_colliding(tube_model.decode(training).astype(np.float32))
     known = {row.tobytes() for row in free_latents}
     assert {row.tobytes() for row in training[free]} <= known
-
-
-def test_finding_free_poses_can_be_cancelled(tube_model: PoseModel) -> None:
-    token = CancelToken()
-    token.cancel()
-    with pytest.raises(CancelledError):
-        find_free_poses(tube_model.embedding, tube_model.detector, tube_model.height, cancel=token)
