@@ -90,7 +90,7 @@ class ModelCard:
             ),
             (
                 not order or sorted(order) == list(range(len(names))),
-                f"{list(order)} is not an order of its {len(names)} domains",
+                f"{list(order)} is not an order of the {len(names)} domains",
                 "name each once",
             ),
         ):
