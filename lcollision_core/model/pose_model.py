@@ -517,9 +517,7 @@ class PoseModel:
         """
         from lcollision_core.resolve import PoseResolver
 
-        return PoseResolver(
-            self.exact_check(), self.require_predictor(), self.free_latent
-        )
+        return PoseResolver(self.exact_check(), self.require_predictor(), self.free_latent)
 
     @cached_property
     def symmetry(self) -> Symmetry | None:
