@@ -157,7 +157,7 @@ def test_an_absurdly_large_pose_is_refused_rather_than_called_free(factor: float
 def test_a_unit_beyond_arithmetic_is_refused_rather_than_called_free(factor: float) -> None:
     mesh = figure_eight(0.2, 0.15)
     vertices = mesh.vertices / np.abs(mesh.vertices).max() * factor
-    with pytest.raises(ShapeError, match=r"(height|one point).*(scale it|extent)$"):
+    with pytest.raises(ShapeError, match=r"(body size|one point).*(scale it|extent)$"):
         CollisionDetector(mesh.topology, vertices)
 
 
@@ -185,7 +185,7 @@ def test_face_0_is_a_face(last: int) -> None:
         found = check_mesh(mesh)
         assert found.pairs.tolist() == [[0, last]]
         np.testing.assert_allclose(
-            found.penetration_depth * detector_for(mesh).height, 0.25, rtol=1e-12
+            found.penetration_depth * detector_for(mesh).body_size, 0.25, rtol=1e-12
         )
     alone = soup([floor, *aloof[: last - 1]])
     assert not check_mesh(alone).colliding
