@@ -80,7 +80,7 @@ class PoseSet:
         if len(self.names) != shape[0]:
             raise ShapeError.must_be("names", f"one for each of {shape[0]} poses", len(self.names))
         if self.up_axis not in (None, 0, 1, 2):
-            raise ShapeError.must_be("up_axis", "0, 1, 2 or None", self.up_axis)
+            raise ShapeError.must_be("up_axis", "0, 1 or 2", self.up_axis)
         if not 0.0 <= self.near_exclusion < 1.0:
             raise ShapeError.must_be("near_exclusion", "in [0, 1)", self.near_exclusion)
         if self.vertex_labels is not None:

@@ -177,7 +177,7 @@ def test_an_npz_size_that_the_file_cannot_hold_takes_no_memory(tmp_path: Path) -
     assert _peak(read) < 2 * 10**6
 
 
-N_ROWS = 60_000
+N_ROWS = 20_000
 POINTS = np.random.default_rng(0).normal(size=(N_ROWS, 3)).astype(np.float32)
 CORNERS = np.stack([np.arange(N_ROWS - 2) + i for i in range(3)], axis=1)
 
