@@ -1,4 +1,4 @@
-"""One editor that uses itself and prints what that cost: ``MODEL ACTIONS STARTED``.
+"""One editor that operates itself and prints the measurements: ``MODEL ACTIONS STARTED``.
 
 Started by `app.benchmarks.editor`, so that starting and memory are those of a fresh process.
 """
@@ -42,7 +42,7 @@ _MOST_KEPT = 20
 
 
 class Session(QObject):
-    """Uses a window as a hand would, and takes the time.
+    """Uses a window as a user would, and measures it.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class Session(QObject):
         return seconds
 
     def burst(self) -> float:
-        """Drag as fast as a hand can; return how long the last picture took to come."""
+        """Drag as fast as a user can; return how long the last picture took to come."""
         start = last = time.monotonic()
         done = 0
         self._window.sliders.begin_drag()

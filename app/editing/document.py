@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 REST_MILLISECONDS = 60
-"""How long a pose stays before it is checked exactly: a hand that pauses has come to rest."""
+"""How long a pose must be unchanged before it is checked exactly."""
 
 
 class PoseDocument(CodeEditing):
@@ -198,8 +198,8 @@ class PoseDocument(CodeEditing):
 
         Parameters
         ----------
-        model : may lack a predictor; `open_model` is kinder to the window, as it compiles and
-            loads in the long worker what a first drag needs
+        model : may lack a predictor; prefer `open_model`, which compiles and loads in the long
+            worker what a first drag needs
         """
         self._put_in(jobs.OpenedModel(model, model.name))
 
@@ -225,8 +225,8 @@ class PoseDocument(CodeEditing):
         self._live.follow(self.model, self.latent, self._predicts)
         self._load_predictor()
         self.undo_stack.clear()
-        # All of it is in before anyone is told: who looks finds poses of that model only, and
-        # may edit at once.
+        # All of it is in place before any signal: a slot sees poses of this model only, and may
+        # edit at once.
         self._tell_all()
 
     def _tell_all(self) -> None:

@@ -101,7 +101,7 @@ class Session:
 
 @dataclass(frozen=True, eq=False)
 class LostPose:
-    """What an editor that ended without a word was editing.
+    """What an editor that crashed was editing.
 
     Attributes
     ----------
@@ -170,7 +170,7 @@ class Autosave(QObject):
 
     Attributes
     ----------
-    failed : Failure, told once until writing works again
+    failed : Failure, emitted once until writing works again
     written : after each write
     """
 

@@ -1,4 +1,4 @@
-"""From where a body is looked at."""
+"""Cameras: presets, framing, zooming and what is between two of them."""
 
 from __future__ import annotations
 

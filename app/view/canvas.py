@@ -69,7 +69,7 @@ class Smoothness:
 
 
 class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
-    """Draws when told to, and as often as Qt paints, never twice for one event.
+    """Draws on request and whenever Qt paints, once for each event.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ _BORDER_WIDTH = 1.5
 
 @dataclass(frozen=True, eq=False)
 class PartShape:
-    """What a body part is on the mesh, in whatever pose.
+    """The region of the mesh that a body part is, whatever the pose.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class PartShape:
     def of(
         cls, attention_mask: npt.NDArray[Any], faces: npt.NDArray[Any], domain: int
     ) -> PartShape:
-        """Find the vertices that a domain leads, and the line along which it hands over.
+        """Find the vertices in which a domain has the largest weight, and their border.
 
         Parameters
         ----------
@@ -62,7 +62,7 @@ class PartShape:
         others = np.delete(attention_mask, domain, axis=0).max(axis=0, initial=0.0)
         lead = _smooth(own - others, faces)
         if not (lead > 0.0).any():
-            # It leads nowhere: what it moves most is its part.
+            # It has the largest weight nowhere: its region is where its weight is large.
             lead = own - 0.5 * own.max()
         inside = (lead > 0.0)[faces]
         count = inside.sum(axis=1)

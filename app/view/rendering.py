@@ -58,7 +58,7 @@ class PoseRenderer:
         """Draw the scene as it is, in RGBA where it is `transparent` and else in RGB."""
         from PIL import Image
 
-        # Or else pyvista hands out the last picture again.
+        # Otherwise pyvista returns the picture before.
         self._plotter.render()
         pixels = np.array(
             self._plotter.screenshot(return_img=True, transparent_background=self._transparent)

@@ -63,7 +63,7 @@ class Scene:
                 self._crossing, color=COLLIDING_FACE, opacity=_THROUGH_OPACITY, lighting=False
             ),
         )
-        # The same triangles are in the body: without an offset the two fight for each pixel.
+        # The same triangles are in the body: without an offset, rounding decides which is seen.
         for actor, offset in zip(
             self._crossing_actors, ((-2.0, -4.0), (0.0, _TO_THE_FRONT)), strict=True
         ):
@@ -199,7 +199,7 @@ class Scene:
         camera.position, camera.focal_point, camera.up = view.position, view.focus, view.up
         camera.view_angle = VIEW_ANGLE
         self._renderer.ResetCameraClippingRange()
-        # Or else pyvista turns the camera to a view of its own at the first picture.
+        # Otherwise pyvista turns the camera to a view of its own at the first picture.
         self._renderer.camera_set = True
 
     def turn_camera(self, degrees: float) -> None:
@@ -210,7 +210,7 @@ class Scene:
     def _fade_ghost(self) -> None:
         """Leave of the ghost what the body has moved away from.
 
-        Where both lie on each other they would be seen in patches, by which is a hair nearer.
+        Where both coincide, patches of one and of the other would be seen.
         """
         away = np.linalg.norm(self._ghost.vertices - self.surface.vertices, axis=1) / self._height
         visible = np.clip((away - _GHOST_NEAR) / (_GHOST_FAR - _GHOST_NEAR), 0.0, 1.0)

@@ -1,8 +1,8 @@
 """How the window looks: two palettes, one scale of distances, and the style made of them.
 
 Fusion with an explicit palette looks alike everywhere, and can be dark where the desktop's own
-style cannot. What means "free" and "colliding" differs in hue for colour-blind eyes too, and never
-goes without a word or a sign.
+style cannot. What means "free" and "colliding" differs in hue for colour-blind eyes too, and is
+never shown by colour alone.
 """
 
 from __future__ import annotations

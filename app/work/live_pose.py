@@ -64,7 +64,7 @@ class LiveWorker(QObject):
 
     @Slot(object)
     def answer(self, request: FrameRequest | VerdictRequest) -> None:
-        """Response one request, whatever happens."""
+        """Answer one request, whatever happens."""
         self._answer = guarded(request.request_id, "showing the pose", self._value, request)
         self._has_answered.set()
         self.answered.emit(request, self._answer)
@@ -95,7 +95,7 @@ class LivePose(QObject):
     Changes within one turn of the event loop are one request; while the worker is busy, only the
     newest pose waits. A quick frame is waited for, far shorter than a picture takes, so that the
     slider and the mesh are drawn together: drawing the window twice would cost more than all
-    else. A failure that repeats itself from pose to pose is told once.
+    else. A failure that repeats from pose to pose is reported once.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ class LivePose(QObject):
         self._asked: FrameRequest | VerdictRequest | None = None
         self._shown: tuple[FrameRequest, LiveFrame] | None = None
         self._last_id = 0
-        self._told: dict[type, str] = {}
+        self._reported: dict[type, str] = {}
         self._is_quick = False
         self._is_due = False
         # Sooner than a timer of 0 ms, which Qt fires after it has drawn the slider alone.
@@ -190,16 +190,16 @@ class LivePose(QObject):
         if request is None or request.model is not self._model:
             return
         if answer.failure is not None:
-            if answer.failure.headline != self._told.get(type(request)):
-                self._told[type(request)] = answer.failure.headline
+            if answer.failure.headline != self._reported.get(type(request)):
+                self._reported[type(request)] = answer.failure.headline
                 self.failed.emit(answer.failure)
         elif isinstance(request, FrameRequest) and answer.value is not None:
             if request.request_id == self._last_id:
                 self._shown = (request, answer.value)
                 self._rested.start()
-            self._told.pop(FrameRequest, None)
+            self._reported.pop(FrameRequest, None)
             self._is_quick = answer.value.seconds < _QUICK_SECONDS
             self.frame_computed.emit(answer.value)
         elif answer.value is not None and answer.request_id == self._last_id:
-            self._told.pop(VerdictRequest, None)
+            self._reported.pop(VerdictRequest, None)
             self.verdict_computed.emit(answer.value)

@@ -1,4 +1,4 @@
-"""Threads that outlive no window, and what every request to them is answered with."""
+"""The threads behind the window, and the response to each request to them."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ _unfinished: list[QThread] = []
 
 
 def any_unfinished() -> bool:
-    """Return whether a thread that was left behind by `end_thread` still runs."""
+    """Return whether a thread that did not end in time in `end_thread` still runs."""
     return any(not thread.isFinished() for thread in _unfinished)
 
 
