@@ -107,7 +107,7 @@ class Session(QObject):
         """Drag as fast as a user can; return how long the last picture took to come."""
         start = last = time.monotonic()
         done = 0
-        self._window.sliders.begin_drag()
+        self._document.begin_gesture("Move slider")
         while done < _BURST_EVENTS:
             due = int(_BURST_EVENTS * (time.monotonic() - start) / _BURST_SECONDS) + 1
             for event in range(done, min(due, _BURST_EVENTS)):

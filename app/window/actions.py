@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from PySide6.QtCore import QObject
@@ -16,7 +16,7 @@ from app.view.shading import Shading
 
 
 @dataclass(frozen=True)
-class ActionSpec:
+class Spec:
     """One action.
 
     Attributes
@@ -35,145 +35,120 @@ class ActionSpec:
     checkable: bool = False
 
 
-ACTIONS: dict[str, ActionSpec] = {
-    "new": ActionSpec(
-        "&New pose",
-        "Ctrl+N",
-        "Start again from the first training pose",
-        "new",
+ACTIONS: dict[str, Spec] = {
+    "new": Spec("&New pose", "Ctrl+N", "Start again from the first training pose", "new"),
+    "open": Spec("&Open…", "Ctrl+O", "Open poses, a mesh or a model", "open"),
+    "open_model": Spec("Open &model…", "Ctrl+Shift+O", "Open another model"),
+    "save": Spec("&Save", "Ctrl+S", "Save the pose to its file", "save"),
+    "save_as": Spec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
+    "import": Spec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),
+    "export": Spec("&Export mesh…", "Ctrl+E", "Save the current mesh to a file", "export"),
+    "upright": Spec(
+        "Turn &upright", "Ctrl+Shift+U", "Turn the model to its next axis, in its file"
     ),
-    "open": ActionSpec("&Open…", "Ctrl+O", "Open poses, a mesh or a model", "open"),
-    "open_model": ActionSpec("Open &model…", "Ctrl+Shift+O", "Choose another body"),
-    "save": ActionSpec("&Save", "Ctrl+S", "Save the pose to its file", "save"),
-    "save_as": ActionSpec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
-    "import": ActionSpec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),
-    "export": ActionSpec("&Export mesh…", "Ctrl+E", "Write the mesh on the screen", "export"),
-    "upright": ActionSpec(
-        "Turn &upright", "Ctrl+Shift+U", "Turn the body to its next axis, which its file keeps"
-    ),
-    "screenshot": ActionSpec("S&creenshot…", "Ctrl+P", "Save a picture of the view", "screenshot"),
-    "turntable": ActionSpec("&Turntable…", "Ctrl+T", "Save a video of one full turn", "turntable"),
-    "quit": ActionSpec("&Quit", "Ctrl+Q", "Close the editor"),
-    "undo": ActionSpec("&Undo", "Ctrl+Z", "Undo the last change", "undo"),
-    "redo": ActionSpec(
-        "&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Repeat the change that was undone", "redo"
-    ),
-    "reset": ActionSpec(
+    "screenshot": Spec("S&creenshot…", "Ctrl+P", "Save a picture of the view", "screenshot"),
+    "turntable": Spec("&Turntable…", "Ctrl+T", "Save a video of one full turn", "turntable"),
+    "quit": Spec("&Quit", "Ctrl+Q", "Close the editor"),
+    "undo": Spec("&Undo", "Ctrl+Z", "Undo the last change", "undo"),
+    "redo": Spec("&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Repeat the change that was undone", "redo"),
+    "reset": Spec(
         "Reset &all",
         "Ctrl+Backspace",
         "Set all sliders to zero: the average of the training poses",
         "reset",
     ),
-    "randomise": ActionSpec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),
-    "mirror": ActionSpec(
+    "randomise": Spec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),
+    "mirror": Spec(
         "&Mirror pose", "Ctrl+M", "Swap left and right, also of locked body parts", "mirror"
     ),
-    "filter": ActionSpec("&Find a slider", "Ctrl+F", "Type part of a slider's name", "search"),
-    "unlock": ActionSpec("Un&lock all", "Ctrl+L", "Unlock all body parts"),
-    "parts": ActionSpec(
-        "Body &parts…", "Ctrl+Alt+B", "Rename, recolour and reorder the body parts of the model"
-    ),
-    "resolve": ActionSpec(
-        "&Resolve", "Ctrl+R", "Find the nearest pose without collisions", "resolve"
-    ),
-    "cancel": ActionSpec("&Cancel", "Escape", "Stop what is being computed", "cancel"),
-    "resolve_options": ActionSpec("Resolve &options…", "Ctrl+Shift+R", "Choose how Resolve works"),
-    "keep": ActionSpec("Add &to library…", "Ctrl+K", "Add this pose to your library", "add"),
-    "update": ActionSpec(
-        "&Update pose", "Ctrl+U", "Replace the library's pose by this one, which began as it"
-    ),
-    "load": ActionSpec("&Load selected pose", "Ctrl+Return", "Edit the selected pose"),
-    "blend": ActionSpec(
+    "filter": Spec("&Find a slider", "Ctrl+F", "Type part of a slider's name", "search"),
+    "unlock": Spec("Un&lock all", "Ctrl+L", "Unlock all body parts"),
+    "parts": Spec("Body &parts…", "Ctrl+Alt+B", "Rename, recolour and reorder the body parts"),
+    "resolve": Spec("&Resolve", "Ctrl+R", "Find the nearest pose without collisions", "resolve"),
+    "cancel": Spec("&Cancel", "Escape", "Stop what is being computed", "cancel"),
+    "resolve_options": Spec("Resolve &options…", "Ctrl+Shift+R", "Choose how Resolve works"),
+    "keep": Spec("Add &to library…", "Ctrl+K", "Add this pose to your library", "add"),
+    "update": Spec("&Update pose", "Ctrl+U", "Replace the library's pose with this one"),
+    "load": Spec("&Load selected pose", "Ctrl+Return", "Edit the selected pose"),
+    "blend": Spec(
         "&Blend towards selected pose", "Ctrl+B", "Go to the slider that blends towards it"
     ),
-    "rename": ActionSpec("Re&name…", "F2", "Give the selected pose of your library another name"),
-    "tags": ActionSpec("Ta&gs…", "Ctrl+Shift+T", "Choose by which words a pose is found"),
-    "duplicate": ActionSpec("&Duplicate", "Ctrl+Shift+D", "Copy the selected poses in the library"),
-    "mirror_poses": ActionSpec(
-        "&Mirror into library",
-        "Ctrl+Shift+M",
-        "Add the selected poses with left and right exchanged to your library",
+    "rename": Spec("Re&name…", "F2", "Rename the selected pose of your library"),
+    "tags": Spec("Ta&gs…", "Ctrl+Shift+T", "Edit the tags of the selected poses"),
+    "duplicate": Spec("&Duplicate", "Ctrl+Shift+D", "Copy the selected poses in the library"),
+    "mirror_poses": Spec(
+        "&Mirror into library", "Ctrl+Shift+M", "Add the selected poses, mirrored, to your library"
     ),
-    "remove": ActionSpec(
+    "remove": Spec(
         "R&emove", "Ctrl+Delete", "Remove the selected poses from your library", "remove"
     ),
-    "add": ActionSpec(
+    "add": Spec(
         "Add &selected to library", "Ctrl+Shift+K", "Copy poses from here into your library"
     ),
-    "import_poses": ActionSpec(
+    "import_poses": Spec(
         "&Import into library…", "Ctrl+Shift+I", "Add the poses of a file to your library"
     ),
-    "export_poses": ActionSpec(
-        "E&xport selected poses…", "Ctrl+Shift+E", "Write the selected poses to a file"
+    "export_poses": Spec(
+        "E&xport selected poses…", "Ctrl+Shift+E", "Save the selected poses to a file"
     ),
-    "export_library": ActionSpec(
-        "Export libr&ary…", "Ctrl+Alt+E", "Write your whole library to a file, to share or to keep"
-    ),
-    "find_pose": ActionSpec("&Find a pose", "Ctrl+Shift+F", "Type what a pose is called"),
-    "ghost": ActionSpec(
+    "export_library": Spec("Export libr&ary…", "Ctrl+Alt+E", "Save your whole library to a file"),
+    "find_pose": Spec("&Find a pose", "Ctrl+Shift+F", "Search the poses by name or tag"),
+    "ghost": Spec(
         "&Ghost",
         "Ctrl+G",
         "Show the pose before Resolve as a transparent body",
         "ghost",
         checkable=True,
     ),
-    "reset_camera": ActionSpec(
-        "Show the &whole body", "Ctrl+Home", "Fit the whole body into the view"
-    ),
-    "full_screen": ActionSpec("&Full screen", "F11", "Use the whole screen", "", True),
-    "reset_layout": ActionSpec(
-        "Reset la&yout", "Ctrl+Alt+0", "Put all panels back in their places"
-    ),
-    "shortcuts": ActionSpec("&Keyboard and mouse", "F1", "All shortcuts", "info"),
-    "log": ActionSpec("Open &log file", "Ctrl+Shift+L", "Open the log with the details of errors"),
-    "about": ActionSpec("&About LCollision", "Shift+F1", "Version, licence and model"),
+    "reset_camera": Spec("Show the &whole body", "Ctrl+Home", "Fit the whole body into the view"),
+    "full_screen": Spec("&Full screen", "F11", "Use the whole screen", "", True),
+    "reset_layout": Spec("Reset la&yout", "Ctrl+Alt+0", "Put all panels back in their places"),
+    "shortcuts": Spec("&Keyboard and mouse", "F1", "All shortcuts", "info"),
+    "log": Spec("Open &log file", "Ctrl+Shift+L", "Open the log with the details of errors"),
+    "about": Spec("&About LCollision", "Shift+F1", "Version, licence and model"),
 }
 """All actions that stand alone, by key."""
 
-SHADINGS: dict[Shading, ActionSpec] = {
-    Shading.PLAIN: ActionSpec("&Plain", "Ctrl+1", "The body in one colour", "", True),
-    Shading.DOMAINS: ActionSpec(
+SHADINGS: dict[Shading, Spec] = {
+    Shading.PLAIN: Spec("&Plain", "Ctrl+1", "The body in one colour"),
+    Shading.DOMAINS: Spec(
         "&Body parts",
         "Ctrl+2",
         "Body parts in colour; stronger colour = only this part controls it",
-        "",
-        True,
     ),
-    Shading.PREDICTED: ActionSpec(
-        "&Estimate", "Ctrl+3", "Where the model estimates that it collides, and how deep", "", True
+    Shading.PREDICTED: Spec(
+        "&Estimate", "Ctrl+3", "Where the model estimates collisions, and how deep", "", True
     ),
-    Shading.EXACT: ActionSpec(
+    Shading.EXACT: Spec(
         "E&xact", "Ctrl+4", "Where the check finds collisions; crossing triangles in red", "", True
     ),
-    Shading.MOVEMENT: ActionSpec(
+    Shading.MOVEMENT: Spec(
         "Mo&vement", "Ctrl+5", "How far Resolve has moved each point of the body", "", True
     ),
 }
 """The ways to colour the body."""
 
-CAMERA_ACTIONS: dict[str, ActionSpec] = {
-    name: ActionSpec(
-        name, f"Alt+{number}", f"Camera view: {name.lower()}", f"camera-{name.lower()}"
-    )
+CAMERA_ACTIONS: dict[str, Spec] = {
+    name: Spec(name, f"Alt+{number}", f"Camera view: {name.lower()}", f"camera-{name.lower()}")
     for number, name in enumerate(CAMERAS, start=1)
 }
 
-THEMES: dict[str, ActionSpec] = {
-    "system": ActionSpec("Match &system", "F6", "Match the desktop's theme", "", True),
-    "light": ActionSpec("&Light", "F7", "Dark text on light", "", True),
-    "dark": ActionSpec("&Dark", "F8", "Light text on dark", "", True),
+THEMES: dict[str, Spec] = {
+    "system": Spec("Match &system", "F6", "Match the desktop's theme"),
+    "light": Spec("&Light", "F7", "Dark text on light"),
+    "dark": Spec("&Dark", "F8", "Light text on dark"),
 }
 
-DOCKS: dict[str, ActionSpec] = {
-    "sliders": ActionSpec("&Sliders", "Ctrl+Alt+1", "Show or hide the sliders", "", True),
-    "collision": ActionSpec(
+DOCKS: dict[str, Spec] = {
+    "sliders": Spec("&Sliders", "Ctrl+Alt+1", "Show or hide the sliders"),
+    "collision": Spec(
         "&Collisions", "Ctrl+Alt+2", "Show or hide the check, the estimate and Resolve", "", True
     ),
-    "library": ActionSpec("&Poses", "Ctrl+Alt+3", "Show or hide the pose library", "", True),
+    "library": Spec("&Poses", "Ctrl+Alt+3", "Show or hide the pose library"),
 }
 
 
-def make_action(spec: ActionSpec, parent: QObject) -> QAction:
+def make_action(spec: Spec, parent: QObject) -> QAction:
     """Make an action as its line says; its tool tip names the shortcut."""
     action = QAction(spec.text, parent)
     equip_action(action, spec)
@@ -181,10 +156,7 @@ def make_action(spec: ActionSpec, parent: QObject) -> QAction:
 
 
 def make_choices(
-    specs: Mapping[Any, ActionSpec],
-    chosen: Any,
-    slot: Callable[[QAction], None],
-    parent: QObject,
+    specs: Mapping[Any, Spec], chosen: Any, slot: Callable[[QAction], None], parent: QObject
 ) -> list[QAction]:
     """Make actions of which one is chosen; each carries its key as data.
 
@@ -196,7 +168,7 @@ def make_choices(
     """
     group = QActionGroup(parent)
     for key, spec in specs.items():
-        action = group.addAction(make_action(spec, parent))
+        action = group.addAction(make_action(replace(spec, checkable=chosen is not None), parent))
         action.setData(key)
         action.setChecked(key == chosen)
     group.triggered.connect(slot)
@@ -210,15 +182,19 @@ def make_menu(title: str, actions: Iterable[QAction], parent: QWidget) -> QMenu:
     return menu
 
 
-def equip_action(action: QAction, spec: ActionSpec) -> None:
+def equip_action(action: QAction, spec: Spec) -> None:
     """Give an action, perhaps one of Qt's own, what its line says."""
     action.setText(spec.text)
     keys = QKeySequence.listFromString(spec.shortcut.replace(", ", "; "))
     action.setShortcuts(keys)
     explain_action(action, spec.tip)
-    action.setCheckable(spec.checkable)
+    if spec.checkable:
+        action.setCheckable(True)
+    if spec.text.endswith("…"):
+        # What a button shows, which Qt would end before the dots.
+        action.setIconText(spec.text.replace("&", ""))
     # In a menu an icon would stand where the tick is.
-    action.setIconVisibleInMenu(not spec.checkable)
+    action.setIconVisibleInMenu(not action.isCheckable())
     if spec.icon:
         give_icon(action, spec.icon)
 

@@ -144,7 +144,7 @@ class EditActions(QObject):
         }
         for key in self.acts:
             self._actions[key].setEnabled(document.has_model and allowed.get(key, True))
-        waits = f"{document.incoming}: it replaces this pose"
+        waits = f"{document.incoming}, which replaces this pose"
         tip = waits if document.incoming else ACTIONS["resolve"].tip
         explain_action(self._actions["resolve"], tip)
         for key, step in (("undo", stack.undoText()), ("redo", stack.redoText())):

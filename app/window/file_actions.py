@@ -35,7 +35,7 @@ MODEL_SUFFIX = ".safetensors"
 """As in `lcollision_core.model`, which takes too long to import before the window is there."""
 
 _EXPORTS = {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
-_FILMS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png"}
+_VIDEOS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png"}
 
 
 def _kinds(*wanted: str) -> str:
@@ -224,52 +224,38 @@ class FileActions(QObject):
         return True
 
     def _export(self) -> None:
-        def write() -> None:
-            path = self.ask_save("Export mesh", self._name, _EXPORTS)
-            if path is not None:
-                settings = self._settings
-                self._document.export_mesh(path, settings["export_axes"], settings["export_scale"])
-
-        model = self._document.model
-        form = export_form(self._settings, self._window, model.up_axis, model.front)
-        self._after(form, write)
+        settings, model = self._settings, self._document.model
+        form = export_form(settings, self._window, model.up_axis, model.front)
+        path = self._ask_save_after(form, "Export mesh", _EXPORTS)
+        if path is not None:
+            self._document.export_mesh(path, settings["export_axes"], settings["export_scale"])
 
     def _screenshot(self) -> None:
-        def shoot() -> None:
-            path = self.ask_save("Save screenshot", self._name, {"PNG": ".png"})
-            if path is not None:
-                settings = self._settings
-                self._viewport.pictures.screenshot(
-                    path,
-                    settings["screenshot_width"],
-                    settings["screenshot_height"],
-                    settings["screenshot_transparent"],
-                )
-                self._document.message.emit(f"Saved {path.name}")
-
-        self._after(screenshot_form(self._settings, self._window), shoot)
+        form = screenshot_form(self._settings, self._window)
+        path = self._ask_save_after(form, "Save screenshot", {"PNG": ".png"})
+        if path is not None:
+            names = ("width", "height", "transparent")
+            values = (self._settings[f"screenshot_{name}"] for name in names)
+            self._viewport.pictures.screenshot(path, *values)
+            self._document.message.emit(f"Saved {path.name}")
 
     def _turntable(self) -> None:
         from app.view.turntable import TurntableStyle
 
-        def shoot() -> None:
-            settings = self._settings
-            # The chosen format first.
-            chosen = f".{settings['turntable_format']}"
-            kinds = dict(sorted(_FILMS.items(), key=lambda film: film[1] != chosen))
-            path = self.ask_save("Save turntable", self._name, kinds)
-            if path is not None:
-                style = TurntableStyle(
-                    settings["turntable_seconds"],
-                    settings["turntable_width"],
-                    settings["turntable_height"],
-                    settings["turntable_rate"],
-                    settings["turntable_background"],
-                    settings["turntable_colour"],
-                )
-                self._viewport.pictures.turntable(path, style)
+        form = turntable_form(self._settings, self._window)
+        path = self._ask_save_after(form, "Save turntable", _VIDEOS)
+        if path is not None:
+            names = ("seconds", "width", "height", "rate", "background", "colour")
+            style = TurntableStyle(*(self._settings[f"turntable_{name}"] for name in names))
+            self._viewport.pictures.turntable(path, style)
 
-        self._after(turntable_form(self._settings, self._window), shoot)
+    def _ask_save_after(self, form: QDialog, title: str, kinds: dict[str, str]) -> Path | None:
+        """Ask for a file to write once a form is accepted, a turntable's format first."""
+        accepted = form.exec() == QDialog.DialogCode.Accepted
+        form.deleteLater()
+        first = f".{self._settings['turntable_format']}"
+        kinds = dict(sorted(kinds.items(), key=lambda kind: kind[1] != first))
+        return self.ask_save(title, self._name, kinds) if accepted else None
 
     def may_lose_changes(self) -> bool:
         """Settle unsaved changes with the user; False where they want to go on editing."""
@@ -357,7 +343,6 @@ class FileActions(QObject):
 
     @Slot(object)
     def _remember(self, path: Path) -> None:
-        """Put a file that has opened first among the recent ones."""
         self._settings.remember_file(str(path.resolve()))
 
     @Slot(object)
@@ -424,13 +409,6 @@ class FileActions(QObject):
         if path is not None:
             self._settings["last_folder"] = str(path.resolve().parent)
         return path
-
-    @staticmethod
-    def _after(form: QDialog, act: Callable[[], None]) -> None:
-        accepted = form.exec() == QDialog.DialogCode.Accepted
-        form.deleteLater()
-        if accepted:
-            act()
 
 
 def _unused(folder: Path, name: str, suffix: str) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,19 +55,21 @@ class LibraryActions(QObject):
         self._window, self._document, self._panel = window, document, panel
         self._files, self._actions = files, actions
         self.acts: dict[str, Callable[[], object]] = {
-            "keep": self.keep,
+            "keep": self._keep,
             "update": document.update_library_pose,
             "load": panel.load_chosen,
-            "blend": self._blend,
+            "blend": lambda: panel.blend.setFocus(Qt.FocusReason.ShortcutFocusReason),
             "rename": self._rename,
             "tags": self._tag,
             "duplicate": lambda: document.duplicate_poses(panel.chosen_poses),
             "mirror_poses": self._mirror,
-            "remove": self._remove,
-            "add": self._add,
+            "remove": lambda: document.remove_poses_from_library(
+                [pose.name for pose in panel.chosen_poses]
+            ),
+            "add": lambda: self._tell_added(document.add_to_library(self._addable())),
             "import_poses": self._import,
-            "export_poses": self._export_chosen,
-            "export_library": self._export_library,
+            "export_poses": lambda: self._export(panel.chosen_poses, "Export poses"),
+            "export_library": lambda: self._export(document.poses, "Export library"),
             "find_pose": panel.find_pose,
         }
         panel.menu_wanted.connect(self._show_menu)
@@ -76,19 +79,18 @@ class LibraryActions(QObject):
             document.file_changed,
             document.model_changed,
         ):
-            changed.connect(self.update_actions)
-        self.update_actions()
+            changed.connect(self._update_actions)
+        self._update_actions()
 
     @Slot()
-    def update_actions(self) -> None:
-        """Let the actions say what they would do now, and choose only what can be done."""
+    def _update_actions(self) -> None:
         document, panel = self._document, self._panel
         has_model = document.has_model
         chosen = panel.chosen_poses
         own = bool(chosen) and panel.source is Source.LIBRARY
         one = panel.chosen is not None and len(chosen) == 1
+        addable = self._addable()
         allowed = {
-            "keep": True,
             "update": has_model and document.can_update,
             "load": one,
             "blend": one,
@@ -97,40 +99,35 @@ class LibraryActions(QObject):
             "duplicate": own,
             "mirror_poses": bool(chosen) and document.can_mirror,
             "remove": own,
-            "add": bool(self._addable()),
-            "import_poses": True,
+            "add": bool(addable),
             "export_poses": bool(chosen),
             "export_library": has_model and bool(document.poses),
-            "find_pose": True,
         }
-        for key, can in allowed.items():
-            self._actions[key].setEnabled(has_model and can)
+        for key in self.acts:
+            self._actions[key].setEnabled(has_model and allowed.get(key, True))
         kept = document.library_pose if has_model else None
         update, add = self._actions["update"], self._actions["add"]
         update.setText("&Update pose" if kept is None else f"&Update “{menu_text(kept.name)}”")
         tip = ACTIONS["update"].tip if kept else "Load a pose of your library to change it later"
         explain_action(update, tip)
-        addable = self._addable()
         what = "selected" if chosen or not addable else f"all {len(addable)}"
         add.setText(f"Add &{what} to library")
 
-    def keep(self) -> None:
-        """Ask for a name, and put the working pose into the library."""
+    def _keep(self) -> None:
         document = self._document
         replaced = ""
 
-        def refuse(name: str) -> str:
+        def refuse(name: str) -> object:
             nonlocal replaced
             replaced = document.name_taken_by(name)
-            reason = str(document.why_not_called(name, replaced) or "")
+            reason = document.why_not_called(name, replaced)
             if reason or not replaced or ask_to_replace(self._window, replaced):
                 return reason
             return f"your library has a pose “{replaced}” already; choose another name"
 
         proposed = document.free_name(document.pose_name)
-        name = ask_for_name(
-            self._window, "Add to library", "Name in your library:", proposed, refuse
-        )
+        label = "Name in your library:"
+        name = ask_for_name(self._window, "Add to library", label, proposed, refuse)
         if name is None:
             return
         if replaced:
@@ -150,21 +147,14 @@ class LibraryActions(QObject):
                 menu.addAction(self._actions[key])
         menu.popup(place)
 
-    def _blend(self) -> None:
-        self._panel.blend.setFocus(Qt.FocusReason.ShortcutFocusReason)
-
     def _rename(self) -> None:
         chosen, document = self._panel.chosen_own, self._document
         if chosen is None:
             return
         old = chosen.name
-        name = ask_for_name(
-            self._window,
-            "Rename a pose",
-            f"New name of “{old}”:",
-            old,
-            lambda name: str(document.why_not_called(name, old) or ""),
-        )
+        label = f"New name of “{old}”:"
+        why_not = partial(document.why_not_called, old=old)
+        name = ask_for_name(self._window, "Rename a pose", label, old, why_not)
         if name is not None:
             document.rename_pose(old, name)
             self._panel.choose_own(name)
@@ -172,12 +162,10 @@ class LibraryActions(QObject):
     def _tag(self) -> None:
         chosen = self._panel.chosen_poses
         shared = [tag for tag in chosen[0].tags if all(tag in pose.tags for pose in chosen)]
+        label = f"Tags of {_called(chosen)}, with commas between them:"
+        before = ", ".join(shared)
         text = ask_for_name(
-            self._window,
-            "Tags",
-            f"Tags of {_called(chosen)}, with commas between them:",
-            ", ".join(shared),
-            lambda text: _why_no_tags(_split(text)),
+            self._window, "Tags", label, before, lambda text: _why_no_tags(_split(text))
         )
         if text is not None:
             self._document.tag_poses([pose.name for pose in chosen], _split(text))
@@ -187,9 +175,6 @@ class LibraryActions(QObject):
         # Where they will be.
         self._panel.own.setChecked(True)
 
-    def _remove(self) -> None:
-        self._document.remove_poses_from_library([p.name for p in self._panel.chosen_poses])
-
     def _addable(self) -> tuple[NamedPose, ...]:
         """Return what Add would add: the chosen poses, or of a file all where none is chosen."""
         panel = self._panel
@@ -197,9 +182,6 @@ class LibraryActions(QObject):
             return ()
         everything = self._document.file_poses if panel.source is Source.FILE else ()
         return panel.chosen_poses or everything
-
-    def _add(self) -> None:
-        self._tell_added(self._document.add_to_library(self._addable()))
 
     def _import(self) -> None:
         from lcollision_core.model import read_poses
@@ -215,12 +197,6 @@ class LibraryActions(QObject):
             if added
             else "Your library has these poses already"
         )
-
-    def _export_chosen(self) -> None:
-        self._export(self._panel.chosen_poses, "Export poses")
-
-    def _export_library(self) -> None:
-        self._export(self._document.poses, "Export library")
 
     def _export(self, poses: tuple[NamedPose, ...], title: str) -> None:
         from lcollision_core.model import write_poses

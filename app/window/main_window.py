@@ -103,7 +103,7 @@ class MainWindow(QMainWindow):
         self.setCentralWidget(self.viewport)
         self.actions_by_key = act = {key: self._action(key) for key in ACTIONS}
         self.sliders = SlidersPanel(document)
-        self.randomise = RandomiseCard(act["randomise"], settings["randomise_amount"])
+        self.randomise = RandomiseCard(document, act["randomise"], settings["randomise_amount"])
         self.sliders.add_card(self.randomise)
         self.collision = CollisionPanel(document, act["resolve"], act["resolve_options"])
         self.library = LibraryPanel(document, act["keep"], act["update"], act["add"])
@@ -207,7 +207,6 @@ class MainWindow(QMainWindow):
         self.settings["theme"] = choice
         apply_theme(application, wanted_theme(choice))
         redraw_icons(self)
-        self.collision.refresh_icons()
         self.library.redraw()
 
     def reset_layout(self) -> None:
@@ -314,8 +313,6 @@ class MainWindow(QMainWindow):
         self.viewport.domain_hovered.connect(self.sliders.light_domain)
         self.viewport.domain_hovered.connect(self.collision.prediction.light_domain)
         self.viewport.waiting.open_wanted.connect(self.actions_by_key["open_model"].trigger)
-        self.randomise.wanted.connect(document.randomise)
-        self.randomise.refused.connect(self._status.tell)
         document.model_changed.connect(self._on_model)
         document.frame_changed.connect(self._on_frame)
         document.file_changed.connect(self._update_title)

@@ -39,10 +39,7 @@ MENUS: dict[str, tuple[str, ...]] = {
 }
 """Keys of actions, groups and submenus, in order."""
 
-_BAR = (
-    *("open", "save", SEPARATOR, "undo", "redo", SEPARATOR),
-    *("reset", "randomise", "mirror"),
-)
+_BAR = (*("open", "save", SEPARATOR, "undo", "redo", SEPARATOR), *("reset", "randomise", "mirror"))
 
 
 def fill_menus(

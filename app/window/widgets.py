@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from html import escape
+from typing import TypeVar
 
 from PySide6.QtCore import QEvent, QObject, QPoint, QPointF, QRectF, QSize, Qt, Signal
 from PySide6.QtGui import (
     QColor,
     QContextMenuEvent,
     QEnterEvent,
+    QIcon,
     QMouseEvent,
     QPainter,
     QPaintEvent,
     QPen,
+    QPixmap,
     QResizeEvent,
     QWheelEvent,
 )
@@ -22,6 +25,7 @@ from PySide6.QtWidgets import (
     QFrame,
     QHBoxLayout,
     QLabel,
+    QLayout,
     QScrollArea,
     QSizePolicy,
     QSlider,
@@ -29,10 +33,19 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, current_theme, visible_colour
+from app.view.icons import pixmap
+from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE, current_theme, visible_colour
 
 HANDLE = 7.0
 """Radius of a slider's handle, in device-independent pixels."""
+
+SWATCH = 12
+"""Side of a body part's square of colour, in device-independent pixels."""
+
+Margins = tuple[int, int, int, int]
+Box = TypeVar("Box", QHBoxLayout, QVBoxLayout)
+
+_NONE: Margins = (0, 0, 0, 0)
 
 NAME_SHARE = 9
 """Parts of a row's room to one of its slider or bar, as long as the longest name needs them."""
@@ -48,18 +61,14 @@ class Card(QFrame):
 
     Parameters
     ----------
-    title : above the group; "" for none
     kind : "card", or "truth" for what is exact, not predicted
     """
 
-    def __init__(self, title: str = "", kind: str = "card") -> None:
+    def __init__(self, kind: str = "card") -> None:
         super().__init__()
         self.setObjectName(kind)
-        self.column = QVBoxLayout(self)
-        self.column.setContentsMargins(NORMAL, NORMAL - 2, NORMAL, NORMAL - 2)
-        self.column.setSpacing(CLOSE)
-        if title:
-            self.column.addWidget(labelled(title, "title"))
+        self.column = vbox(margins=(NORMAL, NORMAL - 2, NORMAL, NORMAL - 2))
+        self.setLayout(self.column)
 
 
 class ElidedLabel(QLabel):
@@ -109,15 +118,80 @@ def longest_name(widget: QWidget, names: Iterable[str]) -> int:
     return max(widget.fontMetrics().horizontalAdvance(name) for name in names) + 1
 
 
+def hbox(
+    *items: QWidget | QLayout | None,
+    wide: QWidget | None = None,
+    spacing: int = CLOSE,
+    margins: Margins = _NONE,
+) -> QHBoxLayout:
+    """Return things side by side.
+
+    Parameters
+    ----------
+    items : from left to right; None takes the space that is left
+    wide : which of them takes it instead
+    spacing : between them, in device-independent pixels
+    margins : left, top, right and bottom
+    """
+    layout = _filled(QHBoxLayout(), items, spacing, margins)
+    if wide is not None:
+        layout.setStretchFactor(wide, 1)
+    return layout
+
+
+def vbox(
+    *items: QWidget | QLayout | None, spacing: int = CLOSE, margins: Margins = _NONE
+) -> QVBoxLayout:
+    """Return things one below the other; see `hbox`."""
+    return _filled(QVBoxLayout(), items, spacing, margins)
+
+
+def _filled(
+    layout: Box, items: Iterable[QWidget | QLayout | None], spacing: int, margins: Margins
+) -> Box:
+    layout.setSpacing(spacing)
+    layout.setContentsMargins(*margins)
+    for item in items:
+        if isinstance(item, QWidget):
+            layout.addWidget(item)
+        elif item is not None:
+            layout.addLayout(item)
+        else:
+            layout.addStretch()
+    return layout
+
+
+def dialog_vbox(*items: QWidget | QLayout | None) -> QVBoxLayout:
+    """Return what a dialog shows, one below the other."""
+    return vbox(*items, spacing=WIDE, margins=(WIDE + 4, WIDE + 4, WIDE + 4, WIDE))
+
+
 def title_row(title: str, source: ElidedLabel) -> QHBoxLayout:
     """Return a card's title, with where its facts come from at the other end."""
     source.setObjectName("caption")
     source.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
-    row = QHBoxLayout()
-    row.setSpacing(CLOSE)
-    row.addWidget(labelled(title, "title"))
-    row.addWidget(source, 1)
-    return row
+    return hbox(labelled(title, "title"), source, wide=source)
+
+
+def swatch(colour: str, side: int, sharpness: float = 1.0) -> QIcon:
+    """Return a square of a colour, edged so that white is seen on white.
+
+    Parameters
+    ----------
+    colour : "#rrggbb"
+    side : in device-independent pixels
+    sharpness : device pixels per pixel
+    """
+    picture = QPixmap(QSize(side, side) * sharpness)
+    picture.setDevicePixelRatio(sharpness)
+    picture.fill(Qt.GlobalColor.transparent)
+    painter = QPainter(picture)
+    painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+    painter.setPen(QColor(current_theme().muted))
+    painter.setBrush(QColor(colour))
+    painter.drawRoundedRect(QRectF(0.5, 0.5, side - 1, side - 1), 3, 3)
+    painter.end()
+    return QIcon(picture)
 
 
 class HoverRow(QWidget):
@@ -126,29 +200,99 @@ class HoverRow(QWidget):
     Signals
     -------
     hovered : int, the row's domain; None when the pointer leaves
-    menu_wanted : QPoint, where on the screen a menu of what can be done with the row is wanted
+    menu_wanted : what is in `menu_of`, and QPoint, where on the screen a menu is wanted
+
+    Parameters
+    ----------
+    domain : index from 0, None for the whole body
+    colour : "#rrggbb" of the swatch, "" for none
+    swatch_left : where the swatch is; None paints nothing, also under the pointer
+
+    Attributes
+    ----------
+    menu_of : domain and code, None for none, of which a menu is wanted
     """
 
     hovered = Signal(object)
-    menu_wanted = Signal(QPoint)
+    menu_wanted = Signal(object, object, QPoint)
 
-    def __init__(self, domain: int | None) -> None:
+    def __init__(
+        self, domain: int | None, colour: str = "", swatch_left: int | None = None
+    ) -> None:
         super().__init__()
         self.domain = domain
+        self.menu_of: tuple[int | None, int | None] = (domain, None)
+        self.is_lit = False
+        self._colour, self._swatch_left = colour, swatch_left
+
+    def set_lit(self, lit: bool) -> None:
+        """Show that the viewport's pointer is on this domain."""
+        if lit != self.is_lit:
+            self.is_lit = lit
+            self.update()
 
     def contextMenuEvent(self, event: QContextMenuEvent) -> None:  # noqa: N802
         """Ask for the menu."""
-        self.menu_wanted.emit(event.globalPos())
+        self.menu_wanted.emit(*self.menu_of, event.globalPos())
 
     def enterEvent(self, event: QEnterEvent) -> None:  # noqa: N802
         """Tell the domain."""
         self.hovered.emit(self.domain)
+        self.update()
         super().enterEvent(event)
 
     def leaveEvent(self, event: QEvent) -> None:  # noqa: N802
         """Tell that the pointer left."""
         self.hovered.emit(None)
+        self.update()
         super().leaveEvent(event)
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw the swatch, and a wash of its colour under the pointer."""
+        if self._swatch_left is None:
+            return
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(Qt.PenStyle.NoPen)
+        if self.is_lit or self.underMouse():
+            wash = QColor(self._colour or current_theme().accent)
+            wash.setAlpha(60 if self.is_lit else 36)
+            painter.setBrush(wash)
+            painter.drawRoundedRect(self.rect(), 5, 5)
+        if self._colour:
+            area = QRectF(self._swatch_left, self.height() / 2 - 6, SWATCH, SWATCH)
+            fill_with(painter, area, self._colour, 3)
+
+
+class Sign(QLabel):
+    """An icon that follows the theme.
+
+    Parameters
+    ----------
+    size : side in device-independent pixels
+    """
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.setFixedSize(size, size)
+        self._drawing = ("wait", "waiting")
+
+    @property
+    def name(self) -> str:
+        """Which icon is shown."""
+        return self._drawing[0]
+
+    def show_icon(self, name: str, ink: str) -> None:
+        """Show an icon in a colour of the theme."""
+        self._drawing = (name, ink)
+        colour = getattr(current_theme(), ink)
+        self.setPixmap(pixmap(name, colour, self.width(), self.devicePixelRatioF()))
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Draw it again in the theme that has come."""
+        super().changeEvent(event)
+        if event.type() is QEvent.Type.StyleChange:
+            self.show_icon(*self._drawing)
 
 
 class Slider(QSlider):
@@ -270,6 +414,16 @@ def fill_with(painter: QPainter, area: QRectF, colour: str, radius: float) -> No
     painter.setPen(Qt.PenStyle.NoPen)
 
 
+def bar_style(colour: str) -> str:
+    """Return the style of a progress bar that is filled with a body part's own colour."""
+    return f"""
+QProgressBar {{ min-height: 8px; max-height: 8px; border-radius: 4px; }}
+QProgressBar::chunk {{
+    background: {colour}; border-radius: 4px; border: 1px solid {visible_colour(colour).name()};
+}}
+"""
+
+
 def plain_tip(text: str) -> str:
     """Return a tool tip that shows a text to the letter, also one that looks like HTML."""
     return f"<span>{escape(text)}</span>" if "<" in text else text
@@ -286,12 +440,17 @@ def silent(*widgets: QObject) -> Iterator[None]:
             widget.blockSignals(blocked)
 
 
-def labelled(text: str, kind: str = "") -> QLabel:
-    """Return a label of a kind that the style knows: title, caption, verdict, headline, aside.
+def labelled(text: str, kind: str = "", wraps: bool = False) -> QLabel:
+    """Return a label that shows its text to the letter, as a name in it may look like HTML.
 
-    It shows its text to the letter, as a name in it may look like HTML.
+    Parameters
+    ----------
+    text : of the label
+    kind : that the style knows: title, caption, verdict, headline, aside, refusal
+    wraps : whether it takes as many lines as it needs
     """
     label = QLabel(text)
+    label.setWordWrap(wraps)
     label.setTextFormat(Qt.TextFormat.PlainText)
     label.setObjectName(kind)
     return label

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import PySide6
-from PySide6.QtCore import QEvent, QMimeData, QPoint, QPointF, QSettings, Qt, QTimer, QUrl
+from PySide6.QtCore import QEvent, QMimeData, QPoint, QPointF, QRect, QSettings, Qt, QTimer, QUrl
 from PySide6.QtGui import QDragEnterEvent, QDropEvent, QMouseEvent
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication, QDialog, QWidget
+from PySide6.QtWidgets import QApplication, QDialog, QDockWidget, QWidget
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
@@ -81,6 +81,17 @@ def rest(qtbot: QtBot, window: MainWindow) -> None:
     qtbot.waitUntil(
         lambda: document.exact is not None and window.viewport.is_at_rest, timeout=PATIENCE
     )
+
+
+def settle_layout(qtbot: QtBot, window: MainWindow) -> None:
+    """Wait until the window and its panels have the same places at two looks."""
+    looks: list[list[QRect]] = []
+
+    def rests() -> bool:
+        looks.append([held.geometry() for held in (window, *window.findChildren(QDockWidget))])
+        return len(looks) > 1 and looks[-1] == looks[-2]
+
+    qtbot.waitUntil(rests, timeout=PATIENCE)
 
 
 def is_open(window: MainWindow) -> bool:

@@ -6,23 +6,21 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QSize, Qt, Signal, Slot
-from PySide6.QtGui import QColor, QIcon, QKeyEvent, QPainter, QPixmap
+from PySide6.QtGui import QColor, QKeyEvent
 from PySide6.QtWidgets import (
     QAbstractItemView,
     QColorDialog,
     QDialog,
     QDialogButtonBox,
-    QHBoxLayout,
     QLineEdit,
     QListWidget,
     QListWidgetItem,
     QPushButton,
-    QVBoxLayout,
     QWidget,
 )
 
-from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE
-from app.window.widgets import labelled
+from app.view.theme import NORMAL, ROW_HEIGHT
+from app.window.widgets import dialog_vbox, hbox, labelled, swatch, vbox
 from app.work.jobs import PartEdits
 from lcollision_core.errors import ModelFileError
 
@@ -75,49 +73,34 @@ class BodyPartsDialog(QDialog):
             self.list.addItem(item)
             self._put_colour(item, model.domain_colours[domain])
         self.list.setCurrentRow(0)
-        sides = QVBoxLayout()
-        sides.setSpacing(CLOSE)
-        self.rename, self.colour, self.up, self.down = (
+        self.rename, self.colour, self.up, self.down = sides = [
             QPushButton(text) for text in ("Rename", "Colour…", "Move up", "Move down")
-        )
-        for button in (self.rename, self.colour, self.up, self.down):
+        ]
+        for button in sides:
             button.setAutoDefault(False)
-            sides.addWidget(button)
-        sides.addStretch()
-        middle = QHBoxLayout()
-        middle.setSpacing(NORMAL)
-        middle.addWidget(self.list, 1)
-        middle.addLayout(sides)
-        note = labelled("", "caption")
-        note.setWordWrap(True)
-        note.setText(
+        note = (
             f"“{model.name}” came with the program and stays as it is: the changes go to a copy "
             "among your models, which opens in its place with this pose."
             if copies
-            else "The changes are saved in the model's file. Undo does not take them back."
+            else "The changes are saved in the model's file. Undo does not revert them."
         )
         self.copy_name = QLineEdit(self._free_name())
         self.copy_name.setAccessibleName("Name of the copy")
-        copy_row = QHBoxLayout()
-        copy_row.addWidget(labelled("Name of the copy", "caption"))
-        copy_row.addWidget(self.copy_name, 1)
-        self.refusal = labelled("", "refusal")
-        self.refusal.setWordWrap(True)
+        copy_row = QWidget()
+        copy_row.setLayout(hbox(labelled("Name of the copy", "caption"), self.copy_name))
+        copy_row.setVisible(copies)
+        self.refusal = labelled("", "refusal", wraps=True)
         self.refusal.hide()
         self._copies = copies
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
         self.save = buttons.addButton(
             "Save as a copy" if copies else "Save", QDialogButtonBox.ButtonRole.AcceptRole
         )
-        column = QVBoxLayout(self)
-        column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
-        column.setSpacing(NORMAL)
-        column.addLayout(middle, 1)
-        column.addWidget(note)
-        if copies:
-            column.addLayout(copy_row)
-        column.addWidget(self.refusal)
-        column.addWidget(buttons)
+        middle = hbox(self.list, vbox(*sides, None), wide=self.list, spacing=NORMAL)
+        explained = labelled(note, "caption", wraps=True)
+        page = dialog_vbox(middle, explained, copy_row, self.refusal, buttons)
+        page.setStretchFactor(middle, 1)
+        self.setLayout(page)
         self.save.setDefault(True)
         buttons.accepted.connect(self.accept)
         buttons.rejected.connect(self.reject)
@@ -210,17 +193,7 @@ class BodyPartsDialog(QDialog):
 
     def _put_colour(self, item: QListWidgetItem, colour: str) -> None:
         item.setData(_COLOUR, colour)
-        sharpness = self.devicePixelRatioF()
-        picture = QPixmap(QSize(_SWATCH, _SWATCH) * sharpness)
-        picture.setDevicePixelRatio(sharpness)
-        picture.fill(Qt.GlobalColor.transparent)
-        painter = QPainter(picture)
-        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-        painter.setPen(Qt.PenStyle.NoPen)
-        painter.setBrush(QColor(colour))
-        painter.drawRoundedRect(0, 0, _SWATCH, _SWATCH, 4, 4)
-        painter.end()
-        item.setIcon(QIcon(picture))
+        item.setIcon(swatch(colour, _SWATCH, self.devicePixelRatioF()))
 
     def _move(self, by: int) -> None:
         row = self.list.currentRow()

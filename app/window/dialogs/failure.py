@@ -4,20 +4,10 @@ from __future__ import annotations
 
 from PySide6.QtCore import QUrl
 from PySide6.QtGui import QDesktopServices
-from PySide6.QtWidgets import (
-    QDialog,
-    QDialogButtonBox,
-    QHBoxLayout,
-    QLabel,
-    QPlainTextEdit,
-    QPushButton,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QDialog, QDialogButtonBox, QPlainTextEdit, QPushButton, QWidget
 
-from app.view.icons import pixmap
-from app.view.theme import NORMAL, WIDE, current_theme
-from app.window.widgets import labelled
+from app.view.theme import NORMAL, WIDE
+from app.window.widgets import Sign, dialog_vbox, hbox, labelled, vbox
 from app.wording import one_line, with_capital
 from app.work.log import log_file
 from app.work.threads import Failure
@@ -40,24 +30,16 @@ class FailureDialog(QDialog):
         what, advice = map(with_capital, map(one_line, (failure.headline, failure.next_step)))
         if advice and not advice.endswith((".", "?", "!")):
             advice += "."
-        sign = QLabel()
-        sign.setPixmap(pixmap("warning", current_theme().colliding, 36, self.devicePixelRatioF()))
-        self.what = labelled(what, "verdict")
-        self.what.setWordWrap(True)
-        self.advice = labelled(advice or "Nothing was changed.")
-        self.advice.setWordWrap(True)
+        sign = Sign(36)
+        sign.show_icon("warning", "colliding")
+        self.what = labelled(what, "verdict", wraps=True)
+        self.advice = labelled(advice or "Nothing was changed.", wraps=True)
         self.details = QPlainTextEdit(failure.details or failure.headline)
         self.details.setReadOnly(True)
         self.details.setMinimumHeight(200)
         self.details.hide()
-        words = QVBoxLayout()
-        words.setSpacing(NORMAL)
-        words.addWidget(self.what)
-        words.addWidget(self.advice)
-        top = QHBoxLayout()
-        top.setSpacing(WIDE)
-        top.addWidget(sign)
-        top.addLayout(words, 1)
+        words = vbox(self.what, self.advice, spacing=NORMAL)
+        top = hbox(sign, words, spacing=WIDE)
         self.unfold = QPushButton("Show details")
         self.unfold.setCheckable(True)
         log = QPushButton("Open log file")
@@ -67,12 +49,7 @@ class FailureDialog(QDialog):
         for button in (self.unfold, log):
             button.setAutoDefault(False)
         buttons.button(QDialogButtonBox.StandardButton.Close).setDefault(True)
-        column = QVBoxLayout(self)
-        column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
-        column.setSpacing(WIDE)
-        column.addLayout(top)
-        column.addWidget(self.details)
-        column.addWidget(buttons)
+        self.setLayout(dialog_vbox(top, self.details, buttons))
         self.unfold.toggled.connect(self._on_unfold)
         log.clicked.connect(open_log_file)
         buttons.rejected.connect(self.reject)

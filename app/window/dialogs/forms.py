@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from PySide6.QtCore import Qt, Slot
-from PySide6.QtGui import QColor, QIcon, QPainter, QPixmap
+from PySide6.QtGui import QColor
 from PySide6.QtWidgets import (
     QCheckBox,
     QColorDialog,
@@ -15,14 +16,13 @@ from PySide6.QtWidgets import (
     QFormLayout,
     QLabel,
     QPushButton,
-    QVBoxLayout,
     QWidget,
 )
 
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
-from app.window.number_box import QuietIntegerBox, QuietSpinBox
-from app.window.widgets import labelled
+from app.window.number_box import NumberBox
+from app.window.widgets import dialog_vbox, labelled, swatch
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,27 +59,14 @@ class ColourButton(QPushButton):
         self._show(QColor(colour) if QColor(colour).isValid() else QColor("#ffffff"))
         self.clicked.connect(self._ask)
 
-    @property
-    def colour(self) -> str:
-        """The colour, "#rrggbb"."""
-        return self._colour.name()
-
     @Slot()
     def _ask(self) -> None:
-        chosen = QColorDialog.getColor(self._colour, self, self._title)
+        chosen = QColorDialog.getColor(QColor(self.text()), self, self._title)
         if chosen.isValid():
             self._show(chosen)
 
     def _show(self, colour: QColor) -> None:
-        self._colour = colour
-        picture = QPixmap(self.iconSize())
-        picture.fill(colour)
-        painter = QPainter(picture)
-        # White on white is seen too.
-        painter.setPen(QColor("#888888"))
-        painter.drawRect(picture.rect().adjusted(0, 0, -1, -1))
-        painter.end()
-        self.setIcon(QIcon(picture))
+        self.setIcon(swatch(colour.name(), self.iconSize().height(), self.devicePixelRatioF()))
         self.setText(colour.name())
 
 
@@ -100,70 +87,51 @@ class Form(QDialog):
         self.setFixedWidth(_WIDTH)
         self._settings = settings
         self._refused = False
-        self._fields: dict[
-            str, QuietIntegerBox | QuietSpinBox | QCheckBox | QComboBox | ColourButton
-        ] = {}
+        self._fields: dict[str, QWidget] = {}
+        self._readers: dict[str, Callable[[], Any]] = {}
         self._form = QFormLayout()
         self._form.setHorizontalSpacing(WIDE)
         self._form.setVerticalSpacing(NORMAL)
-        self._buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
-        accept = self._buttons.addButton(action, QDialogButtonBox.ButtonRole.AcceptRole)
-        column = QVBoxLayout(self)
-        column.setContentsMargins(_BORDER, _BORDER, _BORDER, WIDE)
-        column.setSpacing(WIDE)
-        self._refusal = labelled("", "refusal")
-        self._refusal.setWordWrap(True)
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
+        accept = buttons.addButton(action, QDialogButtonBox.ButtonRole.AcceptRole)
+        self._refusal = labelled("", "refusal", wraps=True)
         self._refusal.hide()
-        column.addLayout(self._form)
-        column.addWidget(self._refusal)
-        column.addWidget(self._buttons)
-        self._buttons.accepted.connect(self.accept)
-        self._buttons.rejected.connect(self.reject)
+        self.setLayout(dialog_vbox(self._form, self._refusal, buttons))
+        buttons.accepted.connect(self.accept)
+        buttons.rejected.connect(self.reject)
         # Only now that it is the dialog's: or else Enter would cancel.
         accept.setDefault(True)
 
     def accept(self) -> None:
         """Remember what the fields say, and close, unless one has just been refused."""
         for field in self._fields.values():
-            if isinstance(field, QuietIntegerBox | QuietSpinBox):
+            if isinstance(field, NumberBox):
                 field.interpretText()
         if self._refused:
             self._refused = False
             return
-        for key, field in self._fields.items():
-            if isinstance(field, QCheckBox):
-                self._settings[key] = field.isChecked()
-            elif isinstance(field, QComboBox):
-                self._settings[key] = field.currentData()
-            elif isinstance(field, ColourButton):
-                self._settings[key] = field.colour
-            else:
-                self._settings[key] = field.value()
+        for key, read in self._readers.items():
+            self._settings[key] = read()
         super().accept()
 
-    def add_whole_number(self, key: str, label: str, suffix: str) -> QuietIntegerBox:
-        """Add a field for a whole number."""
-        field = QuietIntegerBox()
-        setting = SETTINGS[key]
-        field.setRange(int(setting.low or 0), int(setting.high or 0))
-        field.setSuffix(suffix)
-        field.setValue(self._settings[key])
-        self._add(key, label, field)
-        return field
-
     def add_number(
-        self, key: str, label: str, suffix: str, step: float, tip: str = "", decimals: int = 0
-    ) -> QuietSpinBox:
-        """Add a field for a number, with decimals that follow the step where none are given."""
-        field = QuietSpinBox()
+        self,
+        key: str,
+        label: str,
+        suffix: str = "",
+        step: float = 1.0,
+        tip: str = "",
+        decimals: int = 0,
+    ) -> NumberBox:
+        """Add a field for a number, by default a whole one."""
         setting = SETTINGS[key]
-        field.setDecimals(decimals or (2 if step < 0.1 else 1))
-        field.setRange(setting.low or 0.0, setting.high or 0.0)
+        field = NumberBox(decimals, setting.low or 0.0, setting.high or 0.0)
         field.setSingleStep(step)
         field.setSuffix(suffix)
         field.setValue(self._settings[key])
-        field.setToolTip(tip)
-        self._add(key, label, field)
+        field.refused.connect(lambda sentence: self._on_refused(label, sentence))
+        field.lineEdit().textEdited.connect(self._on_edited)
+        self._add(key, label, field, field.value, tip)
         return field
 
     def add_choice(self, key: str, label: str, names: dict[str, str], tip: str) -> QComboBox:
@@ -172,45 +140,41 @@ class Form(QDialog):
         for value, name in names.items():
             field.addItem(name, value)
         field.setCurrentIndex(list(names).index(self._settings[key]))
-        field.setToolTip(tip)
-        self._add(key, label, field)
+        self._add(key, label, field, field.currentData, tip)
         return field
 
     def add_check(self, key: str, label: str) -> None:
         """Add a box to tick."""
         field = QCheckBox(label)
         field.setChecked(self._settings[key])
-        self._fields[key] = field
-        self._form.addRow("", field)
+        self._add(key, "", field, field.isChecked)
 
     def add_colour(self, key: str, label: str) -> ColourButton:
         """Add a button that shows a colour and asks for another."""
         field = ColourButton(self._settings[key], label)
-        self._fields[key] = field
-        self._form.addRow(label, field)
+        self._add(key, label, field, field.text)
         return field
 
     def add_note(self, text: str) -> QLabel:
         """Add some lines of explanation."""
-        note = labelled("", "caption")
-        note.setWordWrap(True)
+        note = labelled("", "caption", wraps=True)
         self._form.addRow(note)
         self.explain(note, text)
         return note
 
     def explain(self, note: QLabel, text: str) -> None:
-        """Put another text into a note, and make room for it."""
+        """Put another text into a note, and leave space for it."""
         note.setText(text)
         # A form asks for one line of it, however narrow.
         note.setFixedHeight(note.heightForWidth(_WIDTH - 2 * _BORDER))
         self.adjustSize()
 
-    def _add(self, key: str, label: str, field: QuietIntegerBox | QuietSpinBox | QComboBox) -> None:
-        self._fields[key] = field
+    def _add(
+        self, key: str, label: str, field: QWidget, read: Callable[[], Any], tip: str = ""
+    ) -> None:
+        field.setToolTip(tip)
+        self._fields[key], self._readers[key] = field, read
         self._form.addRow(label, field)
-        if not isinstance(field, QComboBox):
-            field.refused.connect(lambda sentence: self._on_refused(label, sentence))
-            field.lineEdit().textEdited.connect(self._on_edited)
 
     def _on_refused(self, label: str, sentence: str) -> None:
         self._refused = True
@@ -226,8 +190,8 @@ class Form(QDialog):
 def screenshot_form(settings: Settings, parent: QWidget) -> Form:
     """Ask how large a screenshot is to be."""
     form = Form("Screenshot", "Choose file…", settings, parent)
-    form.add_whole_number("screenshot_width", "Width", " px")
-    form.add_whole_number("screenshot_height", "Height", " px")
+    form.add_number("screenshot_width", "Width", " px")
+    form.add_number("screenshot_height", "Height", " px")
     form.add_check("screenshot_transparent", "Transparent background")
     return form
 
@@ -262,7 +226,7 @@ def export_form(
         "export_scale", "Scale by", "", 1.0, "How many units of the file make one of the model", 6
     )
     # Six decimals are for those who type them.
-    scale.setStepType(QuietSpinBox.StepType.AdaptiveDecimalStepType)
+    scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
     meaning = form.add_note(meanings[axes.currentData()])
     form.add_note("A GLB file is always y up and not scaled, as its standard fixes both.")
 
@@ -281,10 +245,10 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
     form = Form("Turntable", "Choose file…", settings, parent)
     formats = {"gif": "GIF", "webp": "WebP", "png": "PNG sequence"}
     kind = form.add_choice("turntable_format", "Format", formats, "What is written")
-    form.add_number("turntable_seconds", "Duration", " s", 0.5)
-    rate = form.add_whole_number("turntable_rate", "Frames per second", "")
-    form.add_whole_number("turntable_width", "Width", " px")
-    form.add_whole_number("turntable_height", "Height", " px")
+    form.add_number("turntable_seconds", "Duration", " s", 0.5, decimals=1)
+    rate = form.add_number("turntable_rate", "Frames per second")
+    form.add_number("turntable_width", "Width", " px")
+    form.add_number("turntable_height", "Height", " px")
     backgrounds = {"shown": "As shown", "plain": "One colour", "transparent": "Transparent"}
     behind = form.add_choice(
         "turntable_background", "Background", backgrounds, "What stands behind the body"
@@ -300,7 +264,7 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
 
     def follow() -> None:
         is_gif = kind.currentData() == "gif"
-        rate.setMaximum(min(most, FASTEST_GIF) if is_gif else most)
+        rate.setMaximum(FASTEST_GIF if is_gif else most)
         place = list(backgrounds).index("transparent")
         behind.setItemData(place, 0 if is_gif else None, Qt.ItemDataRole.UserRole - 1)
         if is_gif and behind.currentIndex() == place:
@@ -320,25 +284,13 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
 def resolve_form(settings: Settings, parent: QWidget) -> Form:
     """Ask how Resolve is to work."""
     form = Form("Resolve options", "OK", settings, parent)
-    form.add_choice(
-        "resolve_metric",
-        "Keep close to",
-        {"eye": "the look of the pose", "latent": "the slider values"},
-        "What Resolve tries to change as little as possible",
-    )
-    form.add_number(
-        "resolve_threshold",
-        "Decision threshold of the estimate",
-        "",
-        0.05,
-        "Below it the estimate calls a pose clear; lower is safer but moves the pose more",
-    )
-    form.add_number(
-        "resolve_time_budget",
-        "Time limit",
-        " s",
-        1.0,
-        "After this time Resolve falls back to a known pose without collisions",
-    )
+    metrics = {"eye": "the look of the pose", "latent": "the slider values"}
+    tip = "What Resolve tries to change as little as possible"
+    form.add_choice("resolve_metric", "Keep close to", metrics, tip)
+    tip = "Below it the estimate calls a pose clear; lower is safer but moves the pose more"
+    label = "Decision threshold"
+    form.add_number("resolve_threshold", label, "", 0.05, tip, decimals=2)
+    tip = "After this time Resolve falls back to a known pose without collisions"
+    form.add_number("resolve_time_budget", "Time limit", " s", 1.0, tip, decimals=1)
     form.add_note("The exact check decides in any case.")
     return form

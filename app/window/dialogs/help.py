@@ -15,7 +15,6 @@ from PySide6.QtWidgets import (
     QLabel,
     QMenu,
     QMessageBox,
-    QVBoxLayout,
     QWidget,
 )
 
@@ -23,7 +22,7 @@ from app.view.icons import program_icon
 from app.view.theme import CLOSE, NORMAL, WIDE
 from app.window.actions import ACTIONS
 from app.window.dialogs.questions import message_box, widen
-from app.window.widgets import labelled, scrolling
+from app.window.widgets import dialog_vbox, labelled, scrolling
 
 if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
@@ -76,11 +75,11 @@ class ShortcutsDialog(QDialog):
     _ELSEWHERE = (
         ("Drag in the view", "rotate the camera"),
         ("Middle-drag or Shift-drag", "move the camera"),
-        ("Wheel or pinch in the view", "come nearer, go away, at the pointer"),
-        ("Right-drag in the view", "zoom"),
+        ("Wheel or pinch in the view", "zoom in and out at the pointer"),
+        ("Right-drag in the view", "zoom in and out"),
         ("Right-click in the view", "menu of the body part under the pointer"),
-        ("Arrow keys on a slider", "a hundredth of its range"),
-        ("Page keys on a slider", "a tenth of its range"),
+        ("Arrow keys on a slider", "move by a hundredth of its range"),
+        ("Page keys on a slider", "move by a tenth of its range"),
         ("Home, End on a slider", "lowest and highest value"),
         ("Delete or double-click on a slider", "reset it"),
         ("Ctrl or Shift while dragging a slider", "ten times finer steps"),
@@ -109,16 +108,12 @@ class ShortcutsDialog(QDialog):
                 name = text.replace("&", "").removesuffix("…")
                 form.addRow(QLabel(name), labelled(keys, "caption"))
             form.addRow(labelled(""))
-        form.addRow(labelled("Elsewhere", "title"))
+        form.addRow(labelled("Mouse and sliders", "title"))
         for name, effect in self._ELSEWHERE:
             form.addRow(QLabel(name), labelled(effect, "caption"))
-        column = QVBoxLayout(self)
-        column.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
-        column.setSpacing(WIDE)
-        column.addWidget(scrolling(page))
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         buttons.rejected.connect(self.reject)
-        column.addWidget(buttons)
+        self.setLayout(dialog_vbox(scrolling(page), buttons))
 
 
 def _with_shortcuts(menu: QMenu) -> list[QAction]:

@@ -22,7 +22,7 @@ class NameDialog(QInputDialog):
     parent : the window that it belongs to
     title, label : of the dialog and of its field
     proposed : in the field at first
-    refuse : called with what was typed; says in a sentence why it cannot be, or "" where it can
+    refuse : called with what was typed; says in a sentence why it cannot be, nothing where it can
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class NameDialog(QInputDialog):
         title: str,
         label: str,
         proposed: str,
-        refuse: Callable[[str], str],
+        refuse: Callable[[str], object],
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle(title)
@@ -45,8 +45,7 @@ class NameDialog(QInputDialog):
             held.setTextFormat(Qt.TextFormat.PlainText)
         self.setTextValue(proposed)
         self._refuse = refuse
-        self.reason = labelled("", "refusal")
-        self.reason.setWordWrap(True)
+        self.reason = labelled("", "refusal", wraps=True)
         self.reason.hide()
         self.textValueChanged.connect(self.reason.hide)
         self.resize(_WIDTH, self.sizeHint().height())
@@ -65,7 +64,7 @@ class NameDialog(QInputDialog):
         if not reason:
             super().accept()
             return
-        self.reason.setText(f"{heading(reason)}.")
+        self.reason.setText(f"{heading(str(reason))}.")
         self.reason.show()
         field = self.findChild(QLineEdit)
         if isinstance(field, QLineEdit):
@@ -78,7 +77,7 @@ def ask_for_name(
     title: str,
     label: str,
     proposed: str,
-    refuse: Callable[[str], str] = lambda _: "",
+    refuse: Callable[[str], object] = lambda _: None,
 ) -> str | None:
     """Ask what something is to be called; None where the user gives up."""
     dialog = NameDialog(parent, title, label, proposed, refuse)

@@ -39,7 +39,7 @@ def ask_about_changes(parent: QWidget, pose_name: str, file_name: str = "") -> C
     text = f"Save the pose “{pose_name}” to a file?"
     if file_name:
         text = f"Save the changes to “{file_name}”?"
-    note = "They are lost if you do not save them."
+    note = "They will be lost if you don't save them."
     return _ask(parent, "Unsaved changes", text, note, ("Save", "Discard", "Cancel"))
 
 
@@ -55,7 +55,7 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Choice:
         parent,
         "Recover a pose",
         f"The editor closed unexpectedly while “{lost.pose_name}” was not saved.",
-        f"It was kept on {moment.day} {moment:%B at %H:%M}. Recover it?",
+        f"It was saved automatically on {moment.day} {moment:%B at %H:%M}. Recover it?",
         ("Recover", "Delete it", "Ask later"),
     )
 

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QKeyEvent, QMouseEvent
-from PySide6.QtWidgets import QHBoxLayout, QWidget
 
-from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT
-from app.window.number_box import QuietSpinBox
+from app.view.theme import ROW_HEIGHT, TIGHT
+from app.window.number_box import NumberBox
 from app.window.widgets import (
     NAME_SHARE,
     ElidedLabel,
     HoverRow,
     Slider,
+    hbox,
     plain_tip,
     show_verdict,
     silent,
 )
+from app.wording import heading
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
 
 _STEPS = 1000
 
@@ -105,50 +111,34 @@ class CodeSlider(Slider):
 class CodeRow(HoverRow):
     """Name, slider and number of one code.
 
-    Signals
-    -------
-    number_changed : int and float, the code and its number, by the slider or in the field
-    reset_wanted : int, the code
-    refused : str, why a number that was typed is not taken
-
     Parameters
     ----------
+    document : changed
     code : index from 0 in the latent
-    name : what it does
-    number : what it is called by its place, in the tool tip
-    domain : that it moves
-    low, high : range of the slider
-    colour : of the bar
+    place : index from 0 in its group
+    domain : of its group, None for the whole body's
     name_width : room that the name takes before the slider gets any but the least
     """
 
-    number_changed = Signal(int, float)
-    reset_wanted = Signal(int)
-    refused = Signal(str)
-
     def __init__(
-        self,
-        code: int,
-        name: str,
-        number: str,
-        domain: int,
-        low: float,
-        high: float,
-        colour: str | None,
-        name_width: int,
+        self, document: PoseDocument, code: int, place: int, domain: int | None, name_width: int
     ) -> None:
-        super().__init__(domain)
+        model = document.model
+        moved = model.code_effects[code].domain if domain is None else domain
+        super().__init__(moved)
+        self.menu_of = (domain, code)
         self.code = code
+        self._name = name = heading(model.code_names[code])
+        space = model.latent_space
+        self._trained = low, high = float(space.low[code]), float(space.high[code])
         # Its end tells what the part does.
         label = ElidedLabel(name, Qt.TextElideMode.ElideMiddle)
         label.setMaximumWidth(name_width)
-        self.slider = CodeSlider(low, high, colour)
-        self.field = QuietSpinBox()
-        self.field.setObjectName("code")
-        self.field.setDecimals(3)
+        self.slider = CodeSlider(low, high, model.domain_colours[moved])
         beyond = _BEYOND * (high - low)
         self._limits = low - beyond, high + beyond
-        self.field.setRange(*self._limits)
+        self.field = NumberBox(3, *self._limits)
+        self.field.setObjectName("code")
         self.field.setSingleStep((high - low) / 100)
         self.field.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.field.setFixedWidth(_FIELD_WIDTH)
@@ -156,24 +146,23 @@ class CodeRow(HoverRow):
         self.field.setAccessibleName(f"{name}, number")
         self.slider.setToolTip(
             plain_tip(
-                f"{name} ({number}): drag to move, hold Ctrl to move ten times finer, double-click "
-                f"to reset"
+                f"{name} (motion {place + 1}): drag to move, hold Ctrl to move ten times finer, "
+                "double-click to reset"
             )
         )
-        self._name = name
-        self._trained = low, high
-        self._explain(0.0)
-        row = QHBoxLayout(self)
-        row.setContentsMargins(TIGHT, 0, TIGHT, 0)
-        row.setSpacing(CLOSE)
-        row.addWidget(label, NAME_SHARE)
-        row.addWidget(self.slider, 1)
-        row.addWidget(self.field)
+        line = hbox(label, self.slider, self.field, wide=self.slider, margins=(TIGHT, 0, TIGHT, 0))
+        line.setStretchFactor(label, NAME_SHARE)
+        self.setLayout(line)
         self.setFixedHeight(ROW_HEIGHT)
-        self.slider.valueChanged.connect(self._on_slider)
-        self.slider.reset_wanted.connect(self._on_reset)
-        self.field.valueChanged.connect(self._on_field)
-        self.field.refused.connect(self._on_refused)
+        self.show_number(float(document.latent[code]))
+        gesture = f"Move {document.code_name(code)}"
+        self.slider.drag_started.connect(lambda: document.begin_gesture(gesture))
+        self.slider.drag_ended.connect(document.end_gesture)
+        self.slider.drag_abandoned.connect(document.cancel_gesture)
+        self.slider.valueChanged.connect(lambda: document.set_code(code, self.slider.number))
+        self.slider.reset_wanted.connect(lambda: document.reset_code(code))
+        self.field.valueChanged.connect(lambda number: document.set_code(code, number))
+        self.field.refused.connect(lambda told: document.message.emit(f"{name}: {told}"))
 
     def show_number(self, number: float) -> None:
         """Follow the document, also beyond what can be typed."""
@@ -208,24 +197,3 @@ class CodeRow(HoverRow):
         """Give the field the keyboard, to type a number."""
         self.field.setFocus(Qt.FocusReason.OtherFocusReason)
         self.field.selectAll()
-
-    def _on_slider(self) -> None:
-        self.number_changed.emit(self.code, self.slider.number)
-
-    def _on_field(self, number: float) -> None:
-        self.number_changed.emit(self.code, number)
-
-    def _on_refused(self, sentence: str) -> None:
-        self.refused.emit(f"{self._name}: {sentence}")
-
-    def _on_reset(self) -> None:
-        self.reset_wanted.emit(self.code)
-
-
-def tab_order(rows: list[CodeRow], before: QWidget) -> QWidget:
-    """Put rows behind a widget in the order of the Tab key; return the last widget."""
-    for row in rows:
-        QWidget.setTabOrder(before, row.slider)
-        QWidget.setTabOrder(row.slider, row.field)
-        before = row.field
-    return before

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QTimer, Signal, Slot
 from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QVBoxLayout, QWidget
+from PySide6.QtWidgets import QWidget
 
 from app.view.theme import CLOSE, NORMAL, TIGHT
 from app.window.panels.exact import ExactCard
 from app.window.panels.prediction import PredictionCard
 from app.window.panels.resolve import ResolveCard
-from app.window.widgets import scrolling
+from app.window.widgets import scrolling, vbox
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -46,28 +46,13 @@ class CollisionPanel(QWidget):
         self.prediction = PredictionCard(document)
         self.resolve = ResolveCard(document, resolve_action, options_action)
         page = QWidget()
-        cards = QVBoxLayout(page)
-        cards.setContentsMargins(NORMAL, 0, NORMAL, CLOSE)
-        cards.setSpacing(CLOSE)
-        for card in (self.prediction, self.resolve):
-            cards.addWidget(card)
-        cards.addStretch()
-        headline = QVBoxLayout()
-        headline.setContentsMargins(NORMAL, TIGHT, NORMAL, 0)
-        headline.addWidget(self.exact)
-        column = QVBoxLayout(self)
-        column.setContentsMargins(0, 0, 0, 0)
-        column.setSpacing(CLOSE)
-        column.addLayout(headline)
+        margins = (NORMAL, 0, NORMAL, CLOSE)
+        page.setLayout(vbox(self.prediction, self.resolve, None, margins=margins))
         self._area = scrolling(page)
-        column.addWidget(self._area)
+        headline = vbox(self.exact, margins=(NORMAL, TIGHT, NORMAL, 0))
+        self.setLayout(vbox(headline, self._area))
         self.prediction.domain_hovered.connect(self.domain_hovered)
         document.outcome_changed.connect(self._on_outcome)
-
-    def refresh_icons(self) -> None:
-        """Draw all signs in the theme that has come."""
-        for card in (self.exact, self.prediction, self.resolve):
-            card.refresh_icons()
 
     @Slot()
     def _on_outcome(self) -> None:

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtWidgets import QHBoxLayout, QLabel
-
-from app.view.icons import pixmap
-from app.view.theme import CLOSE, current_theme
-from app.window.widgets import Card, ElidedLabel, labelled, show_verdict, title_row
+from app.window.widgets import Card, ElidedLabel, Sign, hbox, labelled, show_verdict, title_row
 from app.wording import counted, overlap_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.work.frames import ExactVerdict
 
-_SIGNS = {"free": "check", "colliding": "warning", "waiting": "wait"}
+_SIGNS = {"free": "check", "colliding": "warning"}
 _SIGN_SIZE = 24
 _SOURCE = "computed on the mesh"
-_BEFORE = "of the pose before"
+_BEFORE = "previous pose"
 
 
 class ExactCard(Card):
@@ -33,23 +29,14 @@ class ExactCard(Card):
     """
 
     def __init__(self, document: PoseDocument) -> None:
-        super().__init__("", "truth")
+        super().__init__("truth")
         self._document = document
-        self._sign_name = "wait"
-        self._kind = "waiting"
-        self._sign = QLabel()
-        self._sign.setFixedSize(_SIGN_SIZE, _SIGN_SIZE)
-        self.verdict = labelled("", "headline")
-        self.verdict.setWordWrap(True)
-        self.details = labelled("", "caption")
-        self.details.setWordWrap(True)
+        self._sign = Sign(_SIGN_SIZE)
+        self.verdict = labelled("", "headline", wraps=True)
+        self.details = labelled("", "caption", wraps=True)
         self.source = ElidedLabel(_SOURCE)
-        line = QHBoxLayout()
-        line.setSpacing(CLOSE)
-        line.addWidget(self._sign)
-        line.addWidget(self.verdict, 1)
         self.column.addLayout(title_row("Exact check", self.source))
-        self.column.addLayout(line)
+        self.column.addLayout(hbox(self._sign, self.verdict, wide=self.verdict))
         self.column.addWidget(self.details)
         document.exact_changed.connect(self._on_exact)
         document.model_changed.connect(self._on_model)
@@ -58,18 +45,12 @@ class ExactCard(Card):
     @property
     def is_of_the_pose_before(self) -> bool:
         """Whether what is said waits for the check of a pose that has changed since."""
-        return self._kind == "waiting" and self._sign_name != "wait"
-
-    def refresh_icons(self) -> None:
-        """Draw the sign in the theme that has come."""
-        ink = getattr(current_theme(), self._kind)
-        sharpness = self.devicePixelRatioF()
-        self._sign.setPixmap(pixmap(self._sign_name, ink, _SIGN_SIZE, sharpness))
+        return self._kind == "waiting" and self._sign.name != "wait"
 
     def _on_model(self) -> None:
         """Forget the verdict of another model's pose."""
         has_model = self._document.has_model
-        self._sign_name = "wait"
+        self._sign.show_icon("wait", "waiting")
         self.verdict.setText("Checking…" if has_model else "No pose yet")
         self.details.setText("Follows a moment after the pose rests")
         if has_model:
@@ -83,12 +64,11 @@ class ExactCard(Card):
         self._kind = "waiting"
         if verdict is not None:
             self._kind = "colliding" if verdict.colliding else "free"
-            self._sign_name = _SIGNS[self._kind]
             self._say(verdict)
         self.source.setText(_BEFORE if self.is_of_the_pose_before else _SOURCE)
         show_verdict(self.verdict, self._kind)
         show_verdict(self, self._kind)
-        self.refresh_icons()
+        self._sign.show_icon(_SIGNS[self._kind] if verdict else self._sign.name, self._kind)
 
     def _say(self, verdict: ExactVerdict) -> None:
         folds = ""
@@ -101,7 +81,7 @@ class ExactCard(Card):
                 f"{pairs} of triangles, overlap {overlap_text(verdict.energy)}{folds}"
             )
             self.details.setToolTip(
-                "How deep all crossing triangles lie in each other, taken together, in per cent "
+                "How deep all crossing triangles penetrate each other, combined, in per cent "
                 "of the body size"
             )
         else:

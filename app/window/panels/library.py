@@ -7,26 +7,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QItemSelectionModel, QPoint, QSize, Qt, QTimer, Signal, Slot
-from PySide6.QtGui import QAction, QIcon, QImage, QPixmap, QShowEvent
+from PySide6.QtGui import QAction, QIcon, QImage, QPixmap
 from PySide6.QtWidgets import (
     QButtonGroup,
-    QHBoxLayout,
     QLineEdit,
     QListWidgetItem,
     QMenu,
+    QSizePolicy,
     QToolButton,
-    QVBoxLayout,
     QWidget,
 )
 
 from app.editing.commands import Source
 from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
-from app.window.panels.action_button import ActionButton
 from app.window.panels.dock import bring_up
 from app.window.panels.pose_grid import THUMBNAIL, PoseGrid
 from app.window.panels.thumbnail import draw_pose
-from app.window.widgets import ElidedLabel, Slider, labelled, plain_tip, silent
+from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, silent, vbox
 from app.wording import menu_text, one_line
 
 if TYPE_CHECKING:
@@ -41,6 +39,7 @@ _HEIGHT_OF_A_ROW = 480
 """Of the window, so that most of it stays the body's."""
 
 _BLEND_STEPS = 100
+_ONLY = QItemSelectionModel.SelectionFlag.ClearAndSelect
 _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
 """By whether the theme is dark."""
 
@@ -73,6 +72,7 @@ class LibraryPanel(QWidget):
         self._poses: list[NamedPose] = []
         self._tag = ""
         self._pictures: dict[bytes, QIcon] = {}
+        self._wanted: list[NamedPose] = []
         self._evaluator: FrameEvaluator | None = None
         self._may_draw = False
         self._due = QTimer(self)
@@ -82,7 +82,7 @@ class LibraryPanel(QWidget):
         self.list.setAccessibleName("Poses")
         self._sources = QButtonGroup(self)
         self.training = self._source_button("Training", "The poses that the model learned from")
-        self.own = self._source_button("Library", "Your own poses of this model, kept for good")
+        self.own = self._source_button("Library", "Your own poses of this model")
         self.of_file = self._source_button("This file", "The poses of the file that is open")
         self.search = QLineEdit()
         self.search.setPlaceholderText("Find a pose")
@@ -96,9 +96,7 @@ class LibraryPanel(QWidget):
         self.tags.setToolTip("Show the poses with one tag only")
         self._tag_menu = QMenu(self.tags)
         self.tags.setMenu(self._tag_menu)
-        self.keep = ActionButton(keep)
-        self.update_button = ActionButton(update)
-        self.add_button = ActionButton(add)
+        self.keep, self.update_button, self.add_button = map(_action_button, (keep, update, add))
         self._target = ElidedLabel("Select a pose to blend")
         self._target.setObjectName("caption")
         self._share = labelled("", "caption")
@@ -115,12 +113,11 @@ class LibraryPanel(QWidget):
         self._sources.buttonToggled.connect(self._on_source)
         self.search.textChanged.connect(self._filter)
         self._tag_menu.triggered.connect(self._on_tag)
-        self.list.itemDoubleClicked.connect(self._on_double_click)
         self.list.itemActivated.connect(self.load_chosen)
         self.list.itemSelectionChanged.connect(self._on_chosen)
         self.list.currentRowChanged.connect(self._on_chosen)
         self.list.customContextMenuRequested.connect(self._on_menu)
-        self.list.verticalScrollBar().valueChanged.connect(self._draw_soon)
+        self.list.picture_wanted.connect(self._on_picture_wanted)
         self.blend.sliderPressed.connect(self._on_blend_pressed)
         self.blend.valueChanged.connect(self._on_blend)
         self.blend.sliderReleased.connect(self._on_blend_released)
@@ -131,40 +128,17 @@ class LibraryPanel(QWidget):
             self._on_model()
 
     def _lay_out(self) -> None:
-        sources = QHBoxLayout()
-        sources.setSpacing(0)
-        for button in self._sources.buttons():
-            sources.addWidget(button)
-        bar = QHBoxLayout()
-        bar.setSpacing(CLOSE)
-        bar.addLayout(sources)
-        bar.addWidget(self.search, 1)
-        bar.addWidget(self.tags)
-        bar.addStretch()
+        bar = hbox(hbox(*self._sources.buttons(), spacing=0), self.search, self.tags, None)
+        bar.setStretchFactor(self.search, 1)
+        target = hbox(self._target, self._share, wide=self._target)
+        rows = (self.keep, self.update_button, self.add_button, self.blend)
         side = QWidget()
         side.setFixedWidth(182)
-        column = QVBoxLayout(side)
-        column.setContentsMargins(0, 0, 0, 0)
-        column.setSpacing(TIGHT)
-        column.addWidget(self.keep)
-        column.addWidget(self.update_button)
-        column.addWidget(self.add_button)
-        column.addStretch()
-        line = QHBoxLayout()
-        line.addWidget(self._target, 1)
-        line.addWidget(self._share)
-        column.addLayout(line)
-        column.addWidget(self.blend)
-        row = QHBoxLayout()
-        row.setSpacing(NORMAL)
-        row.addWidget(side)
-        row.addWidget(self.list, 1)
-        page = QVBoxLayout(self)
-        page.setContentsMargins(NORMAL, TIGHT, NORMAL, CLOSE)
-        page.setSpacing(CLOSE)
-        page.addLayout(bar)
-        page.addLayout(row, 1)
-        rows = (self.keep, self.update_button, self.add_button, self.blend)
+        side.setLayout(vbox(*rows[:3], None, target, self.blend, spacing=TIGHT))
+        poses = hbox(side, self.list, wide=self.list, spacing=NORMAL)
+        page = vbox(bar, poses, margins=(NORMAL, TIGHT, NORMAL, CLOSE))
+        page.setStretchFactor(poses, 1)
+        self.setLayout(page)
         order = (*self._sources.buttons(), self.search, self.tags, self.list, *rows)
         for before, after in pairwise(order):
             QWidget.setTabOrder(before, after)
@@ -198,7 +172,7 @@ class LibraryPanel(QWidget):
     def allow_pictures(self) -> None:
         """Start drawing pictures: everything else is on the screen."""
         self._may_draw = True
-        self._draw_soon()
+        self._due.start()
 
     def redraw(self) -> None:
         """Draw all pictures again, as for another theme."""
@@ -228,7 +202,7 @@ class LibraryPanel(QWidget):
             self._tag = ""
             self.search.clear()
             self._filter()
-        self._choose(row)
+        self.list.setCurrentRow(row, _ONLY)
         self.list.scrollToItem(self.list.item(row))
 
     def find_pose(self) -> None:
@@ -244,24 +218,23 @@ class LibraryPanel(QWidget):
         if not document.has_model:
             return
         current, chosen = self.chosen, {pose.name for pose in self.chosen_poses}
-        if self.source is Source.LIBRARY:
-            self._poses = list(document.poses)
-        elif self.source is Source.FILE:
-            self._poses = list(document.file_poses)
+        if self.source is Source.TRAINING:
+            numbers = range(len(document.model.pose_names))
+            self._poses = [document.training_pose(number) for number in numbers]
         else:
-            self._poses = [
-                document.training_pose(number) for number in range(len(document.model.pose_names))
-            ]
+            own = self.source is Source.LIBRARY
+            self._poses = list(document.poses if own else document.file_poses)
+        self._wanted.clear()
         with silent(self.list):
             self.list.clear()
             for pose in self._poses:
                 item = QListWidgetItem(one_line(pose.name))
                 tags = f" ({', '.join(pose.tags)})" if pose.tags else ""
                 item.setToolTip(plain_tip(f"{one_line(pose.name + tags)}: double-click to load"))
-                item.setIcon(self._pictures.get(pose.latent.tobytes(), self._blank()))
+                item.setIcon(self._pictures.get(pose.latent.tobytes(), QIcon()))
                 self.list.addItem(item)
             if current is not None and current.name in self._names():
-                self._choose(self._names().index(current.name))
+                self.list.setCurrentRow(self._names().index(current.name), _ONLY)
             for row, pose in enumerate(self._poses):
                 self.list.item(row).setSelected(pose.name in chosen)
         for button, text, poses in (
@@ -301,25 +274,19 @@ class LibraryPanel(QWidget):
             n_shown += shown
             if not shown:
                 self.list.item(row).setSelected(False)
-        hint = "The poses that you keep are shown here" if not self._poses else "No pose matches"
+        hint = (
+            "Poses that you add to your library appear here"
+            if not self._poses
+            else "No pose matches"
+        )
         self.list.hint.setText(hint)
         self.list.hint.setVisible(not n_shown)
         self._on_chosen()
-        self._draw_soon()
 
     def sizeHint(self) -> QSize:  # noqa: N802
         """Ask for one row of pictures, and in a tall window for more."""
         one, rows = super().sizeHint(), max(self.window().height() // _HEIGHT_OF_A_ROW, 1)
         return one + QSize(0, (rows - 1) * self.list.gridSize().height())
-
-    def showEvent(self, event: QShowEvent) -> None:  # noqa: N802
-        """Go on with the pictures: none is drawn while nobody sees them."""
-        super().showEvent(event)
-        self._draw_soon()
-
-    def _choose(self, row: int) -> None:
-        only = QItemSelectionModel.SelectionFlag.ClearAndSelect
-        self.list.setCurrentItem(self.list.item(row), only)
 
     def _names(self) -> list[str]:
         return [pose.name for pose in self._poses]
@@ -334,12 +301,6 @@ class LibraryPanel(QWidget):
         button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self._sources.addButton(button)
         return button
-
-    @staticmethod
-    def _blank() -> QIcon:
-        blank = QPixmap(THUMBNAIL, THUMBNAIL)
-        blank.fill(Qt.GlobalColor.transparent)
-        return QIcon(blank)
 
     @Slot()
     def _on_model(self) -> None:
@@ -369,8 +330,7 @@ class LibraryPanel(QWidget):
     @Slot(QAction)
     def _on_tag(self, action: QAction) -> None:
         self._tag = action.data()
-        self._list_tags()
-        self._filter()
+        self.refresh()
 
     @Slot(QPoint)
     def _on_menu(self, place: QPoint) -> None:
@@ -378,41 +338,25 @@ class LibraryPanel(QWidget):
             self.list.clearSelection()
         self.menu_wanted.emit(self.list.viewport().mapToGlobal(place))
 
-    @Slot()
-    def _draw_soon(self) -> None:
-        if self._may_draw and not self._due.isActive():
+    @Slot(int)
+    def _on_picture_wanted(self, row: int) -> None:
+        self._wanted.append(self._poses[row])
+        if self._may_draw:
             self._due.start()
 
     @Slot()
     def _draw_next(self) -> None:
-        """Draw one picture, of those in sight first."""
-        if not self.isVisible():
+        """Draw one picture of those in sight."""
+        if not self._wanted:
             return
-        missing = [
-            place
-            for place, pose in enumerate(self._poses)
-            if pose.latent.tobytes() not in self._pictures
-        ]
-        if not missing:
-            return
-        seen = self.list.viewport().rect()
-        in_sight = (
-            place
-            for place in missing
-            if not self.list.isRowHidden(place)
-            and self.list.visualItemRect(self.list.item(place)).intersects(seen)
-        )
-        drawn = self._poses[next(in_sight, missing[0])]
-        key = drawn.latent.tobytes()
-        picture = self._pictures[key] = self._picture(drawn)
+        key = self._wanted[0].latent.tobytes()
+        if key not in self._pictures:
+            self._pictures[key] = self._picture(self._wanted[0])
         # A pose may be there under several names.
-        for place in missing:
-            if self._poses[place].latent.tobytes() == key:
-                self.list.item(place).setIcon(picture)
-                if self.list.isRowHidden(place):
-                    # Qt gives a hidden item whose picture changes a place again, on top of those
-                    # shown.
-                    self.list.scheduleDelayedItemsLayout()
+        self._wanted = [pose for pose in self._wanted if pose.latent.tobytes() != key]
+        for row, pose in enumerate(self._poses):
+            if pose.latent.tobytes() == key and not self.list.isRowHidden(row):
+                self.list.item(row).setIcon(self._pictures[key])
         self._due.start()
 
     def _picture(self, pose: NamedPose) -> QIcon:
@@ -440,10 +384,6 @@ class LibraryPanel(QWidget):
         for mode in (QIcon.Mode.Normal, QIcon.Mode.Selected):
             picture.addPixmap(drawn, mode)
         return picture
-
-    @Slot(QListWidgetItem)
-    def _on_double_click(self, item: QListWidgetItem) -> None:
-        self._document.load_pose(self._poses[self.list.row(item)])
 
     @Slot()
     def _on_chosen(self) -> None:
@@ -481,3 +421,14 @@ class LibraryPanel(QWidget):
         with silent(self.blend):
             self.blend.setValue(0)
         self._share.setText("")
+
+
+def _action_button(action: QAction) -> QToolButton:
+    """Return a button that does what an action does, and says so as that does now."""
+    button = QToolButton()
+    button.setObjectName("action")
+    button.setDefaultAction(action)
+    button.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextOnly)
+    button.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
+    button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+    return button

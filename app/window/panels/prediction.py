@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QPoint, QPointF, QRectF, QSize, Qt, Signal, Slot
+from PySide6.QtCore import QEvent, QPoint, QPointF, QRectF, QSize, Qt, Signal
 from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPolygonF
-from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy, QToolButton, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QProgressBar, QSizePolicy, QToolButton, QWidget
 
-from app.view.icons import icon
+from app.view.icons import give_icon
 from app.view.shading import FULL_PREDICTED
 from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme
 from app.window.widgets import (
     NAME_SHARE,
+    SWATCH,
     Card,
     ElidedLabel,
     HoverRow,
-    fill_with,
+    bar_style,
+    hbox,
     labelled,
     longest_name,
     plain_tip,
     show_verdict,
     silent,
     title_row,
+    vbox,
 )
 from app.wording import heading, overlap_text
 
@@ -33,8 +37,12 @@ if TYPE_CHECKING:
 EVEN_ODDS = 0.5
 """Probability above which a pose counts as predicted to collide."""
 
-_BAR_WIDTH = 40
+_BAR_WIDTH, _BAR_STEPS = 40, 1000
 _TIP = "The model's instant estimate of how likely this pose collides with itself"
+_MISSING = (
+    "This model can't estimate collisions, so Resolve is off. Open another model, or train one "
+    "with “lcollision train predictor” in a terminal."
+)
 
 
 class ProbabilityMeter(QWidget):
@@ -99,102 +107,61 @@ class ProbabilityMeter(QWidget):
             painter.drawText(scale, side, text)
 
 
-class EnergyBar(QWidget):
-    """A bar as long as the predicted depth of a domain's collisions.
-
-    Parameters
-    ----------
-    colour : "#rrggbb" of the domain
-    """
-
-    def __init__(self, colour: str) -> None:
-        super().__init__()
-        self._colour = colour
-        self._share = 0.0
-        self.setMinimumWidth(_BAR_WIDTH)
-        # Or else the locks of a model that does not predict would follow the names.
-        policy = self.sizePolicy()
-        policy.setRetainSizeWhenHidden(True)
-        self.setSizePolicy(policy)
-
-    @property
-    def share(self) -> float:
-        """Filled, from 0 to 1."""
-        return self._share
-
-    def show_energy(self, energy: float) -> None:
-        """Fill the bar by the root of an energy in squared heights: that is a depth."""
-        share = min(math.sqrt(max(energy, 0.0)) / FULL_PREDICTED, 1.0)
-        if share != self._share:
-            self._share = share
-            self.update()
-
-    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
-        """Draw the track and what is filled of it."""
-        painter = QPainter(self)
-        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-        painter.setPen(Qt.PenStyle.NoPen)
-        bar = QRectF(0, self.height() / 2 - 4, self.width(), 8)
-        painter.setBrush(QColor(current_theme().track))
-        painter.drawRoundedRect(bar, 4, 4)
-        if self._share > 0.0:
-            painter.setClipRect(QRectF(0, 0, self._share * self.width(), self.height()))
-            fill_with(painter, bar, self._colour, 4)
-
-
 class DomainRow(HoverRow):
     """Swatch, name, predicted energy and lock of one domain.
 
-    Signals
-    -------
-    lock_toggled : int and bool, the domain and whether it is to be locked
-
     Parameters
     ----------
+    document : has the lock
     domain : index from 0
-    name : of the domain
-    colour : "#rrggbb"
     name_width : room that the name takes before the bar gets any but the least
     """
 
-    lock_toggled = Signal(int, bool)
-
-    def __init__(self, domain: int, name: str, colour: str, name_width: int) -> None:
-        super().__init__(domain)
-        self._index = domain
-        self._name = heading(name)
-        self._colour = colour
-        self._lit = False
-        self.bar = EnergyBar(colour)
+    def __init__(self, document: PoseDocument, domain: int, name_width: int) -> None:
+        colour = document.model.domain_colours[domain]
+        super().__init__(domain, colour, TIGHT)
+        self._name = heading(document.model.domain_names[domain])
+        self.bar = QProgressBar()
+        self.bar.setTextVisible(False)
+        self.bar.setRange(0, _BAR_STEPS)
+        self.bar.setMinimumWidth(_BAR_WIDTH)
+        self.bar.setStyleSheet(bar_style(colour))
+        # Or else the locks of a model that does not predict would follow the names.
+        policy = self.bar.sizePolicy()
+        policy.setRetainSizeWhenHidden(True)
+        self.bar.setSizePolicy(policy)
         self.lock = QToolButton()
         self.lock.setCheckable(True)
         self.lock.setFixedSize(24, 22)
         self.lock.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.lock.setAccessibleName(f"Lock {self._name}")
-        row = QHBoxLayout(self)
-        row.setContentsMargins(TIGHT + 12 + CLOSE, 0, 0, 0)
-        row.setSpacing(CLOSE)
         label = ElidedLabel(self._name)
         label.setMaximumWidth(name_width)
-        row.addWidget(label, NAME_SHARE)
-        row.addWidget(self.bar, 1)
-        row.addWidget(self.lock)
+        margins = (TIGHT + SWATCH + CLOSE, 0, 0, 0)
+        line = hbox(label, self.bar, self.lock, wide=self.bar, margins=margins)
+        line.setStretchFactor(label, NAME_SHARE)
+        self.setLayout(line)
         self.setFixedHeight(ROW_HEIGHT - 3)
-        self.lock.toggled.connect(self._on_lock)
+        self.lock.toggled.connect(lambda locked: document.set_locked(domain, locked))
         self.show_lock(False)
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Edge the bar as the theme that has come needs it."""
+        super().changeEvent(event)
+        if event.type() is QEvent.Type.StyleChange:
+            self.bar.setStyleSheet(bar_style(self._colour))
 
     def show_lock(self, locked: bool) -> None:
         """Follow the document."""
         with silent(self.lock):
             self.lock.setChecked(locked)
-        theme = current_theme()
-        self.lock.setIcon(icon("lock" if locked else "unlock", None if locked else theme.muted))
+        give_icon(self.lock, "lock" if locked else "unlock", "text" if locked else "muted")
         self.lock.setToolTip(
             plain_tip(
                 f"{self._name} is locked: click to unlock it"
                 if locked
-                else f"Lock {self._name}: Resolve, Randomise, Reset all and blending leave its "
-                "numbers alone"
+                else f"Lock {self._name}: Resolve, Randomise, Reset all and blending leave it "
+                "unchanged"
             )
         )
 
@@ -202,34 +169,10 @@ class DomainRow(HoverRow):
         """Show a predicted energy in squared heights; None hides the bar."""
         self.bar.setVisible(energy is not None)
         if energy is not None:
-            self.bar.show_energy(energy)
+            # The root of an energy is a depth.
+            share = math.sqrt(max(energy, 0.0)) / FULL_PREDICTED
+            self.bar.setValue(round(_BAR_STEPS * min(share, 1.0)))
             self.setToolTip(plain_tip(f"{self._name}: predicted overlap {overlap_text(energy)}"))
-
-    @property
-    def is_lit(self) -> bool:
-        """Whether the viewport's pointer is on this domain."""
-        return self._lit
-
-    def set_lit(self, lit: bool) -> None:
-        """Show that the viewport's pointer is on this domain."""
-        if lit != self._lit:
-            self._lit = lit
-            self.update()
-
-    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
-        """Draw the swatch, and a wash of its colour under the pointer."""
-        painter = QPainter(self)
-        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-        painter.setPen(Qt.PenStyle.NoPen)
-        if self._lit or self.underMouse():
-            wash = QColor(self._colour)
-            wash.setAlpha(60 if self._lit else 36)
-            painter.setBrush(wash)
-            painter.drawRoundedRect(self.rect(), 5, 5)
-        fill_with(painter, QRectF(TIGHT, self.height() / 2 - 6, 12, 12), self._colour, 3)
-
-    def _on_lock(self, locked: bool) -> None:
-        self.lock_toggled.emit(self._index, locked)
 
 
 class PredictionCard(Card):
@@ -258,22 +201,12 @@ class PredictionCard(Card):
         self.meter = ProbabilityMeter()
         for widget in (self.percent, self.meter):
             widget.setToolTip(_TIP)
-        self._missing = QLabel(
-            "This model can't estimate collisions, so Resolve is off. Open another "
-            "model, or train one with “lcollision train predictor” in a terminal."
-        )
-        self._missing.setObjectName("caption")
-        self._missing.setWordWrap(True)
+        self._missing = labelled(_MISSING, "caption", wraps=True)
         head = title_row("Estimate", self.verdict)
         self.verdict.setObjectName("aside")
         head.addWidget(self.percent)
-        self._rows = QVBoxLayout()
-        self._rows.setSpacing(0)
-        self.column.addLayout(head)
-        self.column.addWidget(self.meter)
-        self.column.addWidget(self._missing)
-        self.column.addSpacing(TIGHT)
-        self.column.addLayout(self._rows)
+        self._rows = vbox(spacing=0, margins=(0, TIGHT, 0, 0))
+        self.column.addLayout(vbox(head, self.meter, self._missing, self._rows))
         document.model_changed.connect(self._on_model)
         document.frame_changed.connect(self._on_frame)
         document.exact_changed.connect(self._on_frame)
@@ -288,10 +221,6 @@ class PredictionCard(Card):
         for row in self.rows:
             row.set_lit(row.domain == domain)
 
-    def refresh_icons(self) -> None:
-        """Draw the locks in the theme that has come."""
-        self._on_locks()
-
     def _on_model(self) -> None:
         for row in self.rows:
             self._rows.removeWidget(row)
@@ -299,21 +228,16 @@ class PredictionCard(Card):
         model = self._document.model
         self.rows = []
         name_width = longest_name(self, map(heading, model.domain_names))
-        for domain, (name, colour) in enumerate(
-            zip(model.domain_names, model.domain_colours, strict=True)
-        ):
-            row = DomainRow(domain, name, colour, name_width)
+        for domain in range(len(model.domain_names)):
+            row = DomainRow(self._document, domain, name_width)
             row.hovered.connect(self.domain_hovered)
-            row.menu_wanted.connect(self._on_menu)
-            row.lock_toggled.connect(self._document.set_locked)
+            row.menu_wanted.connect(self.menu_wanted)
             self.rows.append(row)
-        before: QWidget | None = None
-        for domain in model.domain_order:
-            row = self.rows[domain]
+        shown = [self.rows[domain] for domain in model.domain_order]
+        for row in shown:
             self._rows.addWidget(row)
-            if before is not None:
-                QWidget.setTabOrder(before, row.lock)
-            before = row.lock
+        for before, after in pairwise(shown):
+            QWidget.setTabOrder(before.lock, after.lock)
         predicts = self._document.can_resolve
         for widget in (self.meter, self.verdict, self.percent):
             widget.setVisible(predicts)
@@ -345,12 +269,6 @@ class PredictionCard(Card):
             show_verdict(label, word if exact is None else "aside")
         for row, energy in zip(self.rows, prediction.domain_energy, strict=True):
             row.show_energy(float(energy))
-
-    @Slot(QPoint)
-    def _on_menu(self, place: QPoint) -> None:
-        row = self.sender()
-        if isinstance(row, DomainRow):
-            self.menu_wanted.emit(row.domain, None, place)
 
     def _on_locks(self) -> None:
         for row in self.rows:

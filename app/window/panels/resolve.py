@@ -8,20 +8,17 @@ from PySide6.QtCore import Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import (
     QApplication,
-    QGridLayout,
-    QHBoxLayout,
-    QLabel,
+    QFormLayout,
     QProgressBar,
     QPushButton,
     QSizePolicy,
     QStackedWidget,
-    QVBoxLayout,
     QWidget,
 )
 
-from app.view.icons import icon, pixmap
-from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
-from app.window.widgets import Card, ElidedLabel, labelled, show_verdict
+from app.view.icons import give_icon
+from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.window.widgets import Card, ElidedLabel, Sign, hbox, labelled, show_verdict, vbox
 from app.wording import heading, height_text, overlap_text, seconds_text
 
 if TYPE_CHECKING:
@@ -31,8 +28,8 @@ if TYPE_CHECKING:
 _WAITED = 0.5
 """Seconds of waiting before the search that are worth telling."""
 
-_SIGNS = {True: "check", False: "error", None: "info"}
-_INKS = {"check": "free", "error": "colliding", "info": "muted"}
+_SIGNS = {True: ("check", "free"), False: ("error", "colliding"), None: ("info", "muted")}
+"""Icon and colour for yes, no and not known."""
 
 
 class Fact(QWidget):
@@ -40,53 +37,39 @@ class Fact(QWidget):
 
     Parameters
     ----------
-    sentences : for each of the three
+    sentences : for yes, no and not known
     tip : what the fact means
     is_aside : small and grey, whatever it says
     """
 
-    def __init__(self, sentences: dict[bool | None, str], tip: str, is_aside: bool = False) -> None:
+    def __init__(self, sentences: tuple[str, str, str], tip: str, is_aside: bool = False) -> None:
         super().__init__()
         self._is_aside = is_aside
-        self._sentences = sentences
-        self._truth: bool | None = None
-        self._sign = "info"
-        self._picture = QLabel()
-        self._picture.setFixedSize(18, 18)
-        self._text = labelled("", "aside" if is_aside else "")
-        self._text.setWordWrap(True)
+        self._sentences = dict(zip((True, False, None), sentences, strict=True))
+        self.truth: bool | None = None
+        self._sign = Sign(18)
+        self._text = labelled("", "aside" if is_aside else "", wraps=True)
         if is_aside:
             show_verdict(self._text, "aside")
         self.setToolTip(tip)
-        row = QHBoxLayout(self)
-        row.setContentsMargins(0, 0, 0, 0)
-        row.setSpacing(CLOSE)
-        row.addWidget(self._picture)
-        row.addWidget(self._text, 1)
-
-    @property
-    def truth(self) -> bool | None:
-        """What is known."""
-        return self._truth
+        self.setLayout(hbox(self._sign, self._text, wide=self._text))
 
     @property
     def sign(self) -> str:
         """The icon that is shown: "check", "error" or "info"."""
-        return self._sign
+        return self._sign.name
 
-    def show_truth(self, truth: bool | None, instead: str = "", sign: str = "info") -> None:
+    def show_truth(self, truth: bool | None, instead: str = "", looks: bool | None = None) -> None:
         """Say yes, no, or that it is not known.
 
         Parameters
         ----------
         truth : what is known
         instead : said in place of the fact's own sentence, where another fact outweighs this one
-        sign : beside `instead`
+        looks : as which of the three `instead` looks
         """
-        self._truth = truth
-        self._sign = "info" if self._is_aside else sign if instead else _SIGNS[truth]
-        ink = getattr(current_theme(), _INKS[self._sign])
-        self._picture.setPixmap(pixmap(self._sign, ink, 18, self.devicePixelRatioF()))
+        self.truth = truth
+        self._sign.show_icon(*_SIGNS[None if self._is_aside else looks if instead else truth])
         self._text.setText(instead or self._sentences[truth])
 
 
@@ -107,6 +90,7 @@ class ResolveCard(Card):
         self._action = resolve_action
         self.button = QPushButton("Resolve")
         self.button.setObjectName("primary")
+        give_icon(self.button, "resolve", "on_accent")
         self.options = QPushButton("Options…")
         self.options.setToolTip("Choose how Resolve works")
         self.cancel = QPushButton("Cancel")
@@ -114,32 +98,21 @@ class ResolveCard(Card):
         self.bar = QProgressBar()
         self.bar.setTextVisible(False)
         self.working = QWidget()
-        working = QGridLayout(self.working)
-        working.setContentsMargins(0, 0, 0, 0)
-        working.setHorizontalSpacing(NORMAL)
-        working.setVerticalSpacing(TIGHT)
-        working.addWidget(ElidedLabel("Searching for a pose…"), 0, 0)
-        working.addWidget(self.bar, 1, 0)
-        working.addWidget(self.cancel, 0, 1, 2, 1)
-        working.setColumnStretch(0, 1)
+        progress = vbox(ElidedLabel("Searching for a pose…"), self.bar, spacing=TIGHT)
+        self.working.setLayout(hbox(progress, self.cancel, spacing=NORMAL))
         self.outcome = QWidget()
         self._make_outcome()
         self.resting = QWidget()
-        resting = QHBoxLayout(self.resting)
-        resting.setContentsMargins(0, 0, 0, 0)
-        resting.setSpacing(CLOSE)
-        resting.addWidget(self.button, 1)
-        resting.addWidget(self.options)
+        self.resting.setLayout(hbox(self.button, self.options, wide=self.button))
         # One takes the other's place, so that nothing jumps.
         self.stack = QStackedWidget()
         self.stack.addWidget(self.resting)
         self.stack.addWidget(self.working)
-        self._locked = labelled("All body parts are locked: unlock one to resolve", "caption")
-        self._locked.setWordWrap(True)
+        locked = "All body parts are locked: unlock one to resolve"
+        self._locked = labelled(locked, "caption", wraps=True)
         self.stack.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
-        self.column.addWidget(self.stack)
-        self.column.addWidget(self._locked)
-        self.column.addWidget(self.outcome)
+        for widget in (self.stack, self._locked, self.outcome):
+            self.column.addWidget(widget)
         self.button.clicked.connect(resolve_action.trigger)
         self.cancel.clicked.connect(document.cancel_resolve)
         self.options.clicked.connect(options_action.trigger)
@@ -153,71 +126,44 @@ class ResolveCard(Card):
         self._on_locks()
         self._on_outcome()
 
-    def refresh_icons(self) -> None:
-        """Draw the signs in the theme that has come."""
-        self._on_action()
-        self._on_outcome()
-
     def _make_outcome(self) -> None:
         self.converged = Fact(
-            {
-                True: "The search finished",
-                False: "The search stopped early",
-                None: "No search was needed",
-            },
+            ("The search finished", "The search stopped early", "No search was needed"),
             "Whether the search ended by itself; the exact check alone decides whether the pose "
             "collides",
         )
         self.predicted_free = Fact(
-            {
-                True: "Estimate: probably clear",
-                False: "Estimate: probably colliding",
-                None: "No estimate",
-            },
+            ("Estimate: probably clear", "Estimate: probably colliding", "No estimate"),
             "The model's instant estimate of the pose: where the exact check finds otherwise, the "
             "check is right",
             is_aside=True,
         )
         self.exactly_free = Fact(
-            {True: "No collisions (checked)", False: "Still colliding", None: "Not checked"},
+            ("No collisions (checked)", "Still colliding", "Not checked"),
             "The exact check of the mesh: this alone tells whether the pose collides",
         )
-        self._energy, self._moved, self._took = (QLabel() for _ in range(3))
+        self._energy, self._moved, self._took = (labelled("", wraps=True) for _ in range(3))
         self._took.setToolTip(
             "The search, and the wait before it: what it needs is loaded and compiled once"
         )
-        self._note = labelled("", "caption")
-        self._note.setWordWrap(True)
-        column = QVBoxLayout(self.outcome)
-        column.setContentsMargins(0, TIGHT, 0, 0)
-        column.setSpacing(TIGHT)
-        for fact in (self.exactly_free, self.converged, self.predicted_free):
-            column.addWidget(fact)
-        numbers = QGridLayout()
+        self._note = labelled("", "caption", wraps=True)
+        numbers = QFormLayout()
         numbers.setContentsMargins(0, TIGHT, 0, TIGHT)
         numbers.setHorizontalSpacing(CLOSE)
         numbers.setVerticalSpacing(2)
-        for place, (name, value) in enumerate(
-            (
-                ("Overlap", self._energy),
-                ("Moved", self._moved),
-                ("Took", self._took),
-            )
-        ):
-            value.setWordWrap(True)
-            numbers.addWidget(labelled(name, "caption"), place, 0, Qt.AlignmentFlag.AlignTop)
-            numbers.addWidget(value, place, 1)
-        numbers.setColumnStretch(1, 1)
-        column.addLayout(numbers)
-        column.addWidget(self._note)
+        numbers.setLabelAlignment(Qt.AlignmentFlag.AlignTop)
+        numbers.addRow(labelled("Overlap", "caption"), self._energy)
+        numbers.addRow(labelled("Moved", "caption"), self._moved)
+        numbers.addRow(labelled("Took", "caption"), self._took)
+        facts = (self.exactly_free, self.converged, self.predicted_free)
+        margins = (0, TIGHT, 0, 0)
+        self.outcome.setLayout(vbox(*facts, numbers, self._note, spacing=TIGHT, margins=margins))
 
     @Slot()
     def _on_action(self) -> None:
         # Hidden while it works, it keeps ready to have the keyboard again.
         self.button.setEnabled(self._action.isEnabled() or self._document.solving)
         self.button.setToolTip(self._action.toolTip())
-        theme = current_theme()
-        self.button.setIcon(icon("resolve", theme.on_accent))
 
     @Slot()
     def _on_started(self) -> None:
@@ -266,14 +212,14 @@ class ResolveCard(Card):
         exactly_free, predicted_free = result.exactly_free, result.predicted_free
         self.exactly_free.show_truth(exactly_free)
         # A search that was cut short has done its work where its pose is free.
-        instead, sign = "", "info"
+        instead, looks = "", None
         if ran and exactly_free:
-            instead, sign = "The search found a pose without collisions", "check"
+            instead, looks = "The search found a pose without collisions", True
         elif not ran and ALL_LOCKED in (result.note or ""):
             instead = "No search: all body parts are locked"
         elif not ran and result.step != Step.UNCHANGED:
             instead = "No search: the time limit came first"
-        self.converged.show_truth(result.converged if ran else None, instead, sign)
+        self.converged.show_truth(result.converged if ran else None, instead, looks)
         overruled = exactly_free is not None and exactly_free != predicted_free
         word = "clear" if predicted_free else "colliding"
         self.predicted_free.show_truth(

@@ -21,10 +21,10 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
+from app.view.theme import CLOSE, TIGHT
 from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.names import NameDialog
 from app.window.main_window import MainWindow
-from app.window.panels.pose_grid import THUMBNAIL, lines_of
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import NamedPose, read_pose_file, read_poses, write_poses
 from tests.app.editor_model import another_model
@@ -301,21 +301,34 @@ def test_a_tall_window_begins_with_two_rows(
     close_window(window)
 
 
-def test_names_are_not_cut_but_broken(window: MainWindow) -> None:
+@pytest.mark.parametrize(
+    ("name", "n_lines"),
+    [
+        ("kick", 1),
+        ("kicking with the left", 2),
+        ("kicking_with_the_left", 2),
+        ("a name that is longer than any name of a pose", 2),
+    ],
+)
+def test_names_are_not_cut_but_broken(window: MainWindow, name: str, n_lines: int) -> None:
     held = window.library.list
-    metrics, width = held.fontMetrics(), THUMBNAIL
-    assert lines_of("kick", metrics, width) == ["kick"]
-    assert lines_of("kicking with the left", metrics, width) == ["kicking with", "the left"]
-    name = "kicking_with_the_left"
-    assert "".join(lines_of(name, metrics, width)) == name
-    first, second = lines_of("a name that is longer than any name of a pose", metrics, width)
-    assert second.endswith("…")
-    assert metrics.horizontalAdvance(first) <= width >= metrics.horizontalAdvance(second)
-    assert lines_of("W" * 9, metrics, 1) != []
-    long = "a name that is longer than any name of a pose"
-    window.document.add_pose_to_library(long)
-    window.library.choose_own(long)
-    assert long in held.item(0).toolTip()
+    window.document.add_pose_to_library(name)
+    window.library.choose_own(name)
+    assert name in held.item(0).toolTip()
+    cell = held.visualItemRect(held.item(0))
+    picture = held.viewport().grab(cell).toImage()
+    height = held.fontMetrics().lineSpacing()
+    top = cell.height() - TIGHT - 2 * height - CLOSE
+
+    def is_written(line: int) -> bool:
+        shades = [
+            picture.pixelColor(x, y).lightness()
+            for x in range(8, cell.width() - 8)
+            for y in range(top + line * height + 3, top + (line + 1) * height)
+        ]
+        return max(shades) - min(shades) > 100
+
+    assert [is_written(line) for line in range(2)] == [True, n_lines == 2]
 
 
 def test_search_and_tags_find_poses(window: MainWindow) -> None:

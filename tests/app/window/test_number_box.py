@@ -15,13 +15,13 @@ from app.editing.settings import SETTINGS, Settings
 from app.view.theme import current_theme
 from app.window.dialogs.forms import Form, resolve_form, screenshot_form, turntable_form
 from app.window.main_window import MainWindow
-from app.window.number_box import QuietIntegerBox, QuietSpinBox
+from app.window.number_box import NumberBox
 from tests.app.windows import settings_in
 
 LEFT = Qt.MouseButton.LeftButton
 
 
-def type_in(field: QuietSpinBox | QuietIntegerBox, text: str) -> None:
+def type_in(field: NumberBox, text: str) -> None:
     field.setFocus()
     field.selectAll()
     QTest.keyClicks(field, text)
@@ -55,7 +55,7 @@ def test_a_number_that_is_too_far_is_refused_in_a_sentence(window: MainWindow, t
     assert document.latent is before
     assert row.field.value() == 0.125
     told = window.statusBar().currentMessage()
-    assert f"{text} is outside what can be typed here: type a number from" in told
+    assert f"{text} is out of range: type a number from" in told
     assert told.startswith(row.slider.accessibleName())
     assert QToolTip.text() in told
     # By leaving the field too.
@@ -94,11 +94,7 @@ def test_a_form_refuses_a_number_visibly_and_stays(
     form.show()
     boxes = form.findChild(QDialogButtonBox)
     accept = next(b for b in boxes.buttons() if b.isDefault())
-    fields = {
-        key: field
-        for key, field in form._fields.items()
-        if isinstance(field, QuietSpinBox | QuietIntegerBox)
-    }
+    fields = {key: field for key, field in form._fields.items() if isinstance(field, NumberBox)}
     assert fields
     for field in fields.values():
         before = field.value()
@@ -112,7 +108,7 @@ def test_a_form_refuses_a_number_visibly_and_stays(
         assert form.isVisible()
         assert field.value() == before
         told = [label.text() for label in form.findChildren(QLabel) if label.isVisible()]
-        assert any("99999 is outside what can be typed here" in text for text in told)
+        assert any("99999 is out of range" in text for text in told)
     QApplication.processEvents()
     QTest.mouseClick(accept, LEFT)
     if form.isVisible():

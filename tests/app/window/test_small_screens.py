@@ -26,7 +26,7 @@ from app.window.dialogs.forms import resolve_form, screenshot_form, turntable_fo
 from app.window.main_window import MainWindow
 from app.window.panels.dock import beside
 from app.work.threads import Failure
-from tests.app.windows import close_window, open_window, rest, settings_in
+from tests.app.windows import close_window, open_window, rest, settings_in, settle_layout
 
 SMALL = QSize(800, 600)
 
@@ -36,7 +36,7 @@ def small(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> MainWindow:
     held = open_window(qtbot, document, settings_in(tmp_path), (SMALL.width(), SMALL.height()))
     # Below a width the poses get the corner, which makes still narrower possible.
     held.resize(SMALL)
-    qtbot.wait(50)
+    settle_layout(qtbot, held)
     return held
 
 
@@ -60,7 +60,7 @@ def test_everything_is_reached_at_800_by_600(qtbot: QtBot, small: MainWindow) ->
     assert lies_in(card.button, small)
     group = small.sliders.groups[-1]
     group.set_open(True)
-    qtbot.wait(50)
+    settle_layout(qtbot, small)
     for row in group.rows:
         area = _area_of(row)
         area.ensureWidgetVisible(row)
@@ -91,7 +91,7 @@ def test_what_a_narrow_tool_bar_leaves_out_is_behind_its_arrow(
     for dock in small.docks.values():
         dock.hide()
     more = bar.findChild(QToolButton, "qt_toolbar_ext_button")
-    qtbot.wait(50)
+    settle_layout(qtbot, small)
     small.resize(420, 600)
     qtbot.waitUntil(more.isVisible)
     for theme in ("light", "dark"):
@@ -141,7 +141,7 @@ def test_tracks_of_sliders_grow_with_their_panel(qtbot: QtBot, window: MainWindo
     widths = []
     for width in (330, 430, 530):
         window.resizeDocks([dock], [width], Qt.Orientation.Horizontal)
-        qtbot.wait(50)
+        settle_layout(qtbot, window)
         widths.append((dock.width(), row.slider.width(), window.randomise.amount.width()))
     for (before, *tracks), (after, *others) in pairwise(widths):
         assert after - before >= 90

@@ -20,7 +20,7 @@ from app.window.main_window import MainWindow
 from app.work.frames import FrameEvaluator, PosePrediction
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult
-from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
+from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in, settle_layout
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def test_the_panel_keeps_the_width_that_its_cards_need_also_where_a_layout_says_
     assert has_room(before)
     # As it was remembered while the panel could be made as narrow as one liked.
     before.collision.setMinimumWidth(0)
-    qtbot.wait(100)
+    settle_layout(qtbot, before)
     shrink_and_grow(qtbot, before)
     assert not has_room(before)
     close_window(before)
@@ -92,7 +92,7 @@ def test_the_panel_keeps_the_width_that_its_cards_need_also_where_a_layout_says_
 def shrink_and_grow(qtbot: QtBot, window: MainWindow) -> None:
     for size in ((300, 300), (1280, 720)):
         window.resize(*size)
-        qtbot.wait(100)
+        settle_layout(qtbot, window)
 
 
 def has_room(window: MainWindow) -> bool:
@@ -172,7 +172,7 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
         document.set_code(0, float(colliding[0] + value))
         qtbot.wait(5)
         if document.exact is None:
-            before = [text.replace("computed on the mesh", "of the pose before") for text in told]
+            before = [text.replace("computed on the mesh", "previous pose") for text in told]
             assert texts(card) == before != told
             assert card.is_of_the_pose_before
             assert ink(card.verdict) == current_theme().waiting
@@ -181,7 +181,7 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     document.end_gesture()
     rest(qtbot, window)
     assert not card.is_of_the_pose_before
-    assert "of the pose before" not in texts(card)
+    assert "previous pose" not in texts(card)
     # From one verdict to the other nothing moves either.
     document.blend_towards(np.zeros_like(colliding), 1.0)
     rest(qtbot, window)
@@ -283,5 +283,5 @@ def test_a_result_says_of_what_the_body_has_moved_its_shares(
     (moved,) = (text for text in texts(window.collision.resolve) if "at most" in text)
     assert re.fullmatch(r"[\d.]+ % of the body size,\nat most [\d.]+ %", moved)
     window.resizeDocks([window.docks["collision"]], [1], Qt.Orientation.Horizontal)
-    qtbot.wait(100)
+    settle_layout(qtbot, window)
     assert has_room(window)

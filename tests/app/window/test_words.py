@@ -13,7 +13,7 @@ from app.window.dialogs.forms import resolve_form
 from app.window.main_window import MainWindow
 from lcollision_core.errors import LCollisionError
 from lcollision_core.model import sample_poses
-from tests.app.test_editor_window import words_on_the_screen
+from tests.app.window.test_main_window import words_on_the_screen
 from tests.app.windows import PATIENCE, rest
 
 OUR_OWN = re.compile(

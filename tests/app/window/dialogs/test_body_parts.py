@@ -53,7 +53,7 @@ def headings(window: MainWindow) -> list[str]:
     """Return the parts' names in the left panel, from top to bottom."""
     headers = [group.header for group in window.sliders.groups[1:]]
     headers.sort(key=lambda header: header.mapTo(window, QPoint(0, 0)).y())
-    return [header.accessibleName() for header in headers]
+    return [header.button.accessibleName() for header in headers]
 
 
 def rows(window: MainWindow) -> list[str]:
@@ -105,7 +105,7 @@ def test_parts_of_an_own_model_are_edited_in_its_file_and_the_pose_stays(
     assert document.undo_stack.count() == steps
     assert document.locked_domains == {1}
     assert own.collision.prediction.rows[1].lock.isChecked()
-    assert own.sliders.groups[2].header.isChecked()
+    assert own.sliders.groups[2].header.button.isChecked()
     assert own.viewport.scene.view is not None
     assert view is not None
     assert own.viewport.scene.view.position == pytest.approx(view.position)
@@ -258,8 +258,8 @@ def test_the_menu_of_a_body_part(qtbot: QtBot, window: MainWindow, where: str) -
     window.docks["sliders"].hide()
     choose(menu_at(window.collision.prediction.rows[1]), "Show in sliders")
     assert header.isVisible()
-    assert header.isChecked()
-    qtbot.waitUntil(lambda: QApplication.focusWidget() is header)
+    assert header.button.isChecked()
+    qtbot.waitUntil(lambda: QApplication.focusWidget() is header.button)
     choose(menu_at(part), f"Rename {name}")
     (dialog,) = [d for d in window.findChildren(BodyPartsDialog) if d.isVisible()]
     assert dialog.list.currentItem().text() == document.model.domain_names[1]

@@ -53,7 +53,7 @@ from tests.app.windows import (
 
 pytestmark = pytest.mark.usefixtures("compiled_body")
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 N_ACTIONS = int(os.environ.get("LCOLLISION_RANDOM_ACTIONS", "300"))
 THEMES = pytest.mark.parametrize("theme", [LIGHT, DARK], ids=lambda theme: theme.name)
 
@@ -435,10 +435,10 @@ def test_tab_goes_through_everything_once_and_row_by_row(window: MainWindow) -> 
     assert QApplication.focusWidget() is filter_field
     assert all(widget.isVisible() and widget.isEnabled() for widget in visited)
     opened = window.sliders.groups[0]
-    expected: list[QWidget] = [filter_field, opened.header]
+    expected: list[QWidget] = [filter_field, opened.header.button]
     for row in opened.rows:
         expected += [row.slider, row.field]
-    expected += [group.header for group in window.sliders.groups[1:]]
+    expected += [group.header.button for group in window.sliders.groups[1:]]
     assert visited[: len(expected)] == expected
     assert window.collision.resolve.button in visited
     locks = [row.lock for row in window.collision.prediction.rows]
