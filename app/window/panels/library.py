@@ -347,7 +347,8 @@ class LibraryPanel(QWidget):
     @Slot()
     def _draw_next(self) -> None:
         """Draw one picture of those in sight."""
-        if not self._wanted:
+        # What was wanted before the panel was hidden is wanted again once it is seen.
+        if not (self._wanted and self.isVisible()):
             return
         key = self._wanted[0].latent.tobytes()
         if key not in self._pictures:
