@@ -159,11 +159,11 @@ def test_the_form_offers_what_the_format_can_hold(qtbot: QtBot, window: MainWind
     asked = answer(pick)
     colour.click()
     assert not asked.isActive()
-    assert colour.colour == "#336699"
+    assert colour.text() == "#336699"
     form.accept()
     again = turntable_form(window.settings, window)
     qtbot.addWidget(again)
-    assert field(again, "colour").colour == "#336699"
+    assert field(again, "colour").text() == "#336699"
     assert field(again, "background").currentData() == "plain"
 
 
