@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from lcollision_core.errors import ModelFileError
-from lcollision_core.json_values import from_json
+from lcollision_core.json_values import from_json, quoted
 from lcollision_core.model.naming import MAX_NAME_LENGTH
 
 _LEAST_HEIGHT = 1e-12
@@ -83,14 +83,14 @@ class ModelCard:
             *(
                 (
                     bool(re.fullmatch("#[0-9a-f]{6}", colour)),
-                    f"{colour!r} is not a colour",
+                    f"{quoted(colour)} is not a colour",
                     "write it as in #0077bb",
                 )
                 for colour in colours
             ),
             (
                 not order or sorted(order) == list(range(len(names))),
-                f"{list(order)} is not an order of the {len(names)} domains",
+                f"{quoted(list(order))} is not an order of the {len(names)} domains",
                 "name each once",
             ),
         ):
