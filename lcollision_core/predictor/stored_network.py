@@ -15,7 +15,7 @@ import numpy.typing as npt
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
 from lcollision_core.model_file import required_array
-from lcollision_core.predictor.inference.field_kernels import REACHES, SUMS_A_REACH
+from lcollision_core.predictor.inference.field_kernels import UNITS
 
 ENCODER_SIZES = (512, 256, 256)
 PREDICTOR_SIZES = (512, 256, 256, 128)
@@ -131,7 +131,7 @@ def _require_default(reader: _Reader, embedding: Embedding) -> None:
     )
     bound = 1.0
     for name, n, n_in in (
-        ("patch", n_points, SUMS_A_REACH * len(REACHES)),
+        ("patch", n_points, UNITS.size),
         ("fold", len(sites), N_FEATURES * sites.shape[1]),
     ):
         mean = reader.array(f"{name}.mean", n, 1, n_in)

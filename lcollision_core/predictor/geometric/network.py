@@ -24,11 +24,11 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, silu, smooth_l1_loss
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.predictor.geometric.field import contact_field, fold_view, normalised
+from lcollision_core.predictor.geometric.field import ContactField
 from lcollision_core.predictor.geometric.folds import N_MEMBERS, find_fold_sites
 from lcollision_core.predictor.geometric.reduced_body import ReducedBody
-from lcollision_core.predictor.inference.field_kernels import FULL, REACHES, SOME, SUMS_A_REACH
-from lcollision_core.predictor.inference.network_kernels import SQUASHED
+from lcollision_core.predictor.inference.field_kernels import UNITS
+from lcollision_core.predictor.inference.network import SQUASHED
 from lcollision_core.predictor.inference.points import N_POINTS, skin_cells
 from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
 from lcollision_core.predictor.network import (
@@ -95,11 +95,7 @@ class GeometricNetwork(PredictorNetwork):
     skin : what it looks at
     """
 
-    order: torch.Tensor
-    apart: torch.Tensor
-    reach: torch.Tensor
     site_vertices: torch.Tensor
-    members: torch.Tensor
 
     def __init__(
         self,
@@ -113,14 +109,10 @@ class GeometricNetwork(PredictorNetwork):
         generator = torch.Generator().manual_seed(seed)
         self.skin = skin = SkinGeometry.of(embedding, sites, n_points)
         self.body = ReducedBody(skin)
-        self.register_buffer("order", torch.tensor(skin.order), persistent=False)
-        self.register_buffer("apart", torch.tensor(skin.apart), persistent=False)
-        self.register_buffer("reach", torch.tensor(REACHES), persistent=False)
+        self.field = ContactField(skin)
         # Of the model file: found in labelled poses.
         self.register_buffer("site_vertices", torch.tensor(sites, dtype=torch.int32))
-        self.register_buffer("members", torch.tensor(skin.members), persistent=False)
-        n_sums = SUMS_A_REACH * len(REACHES)
-        self.patch = _PatchNetworks(skin.n_points, n_sums, width, generator)
+        self.patch = _PatchNetworks(skin.n_points, UNITS.size, width, generator)
         self.fold = _PatchNetworks(len(sites), 9 * N_MEMBERS, width, generator)
         sizes = (2 * (skin.n_points + len(sites)), *HEAD_SIZES)
         self.head = nn.ModuleList(
@@ -200,9 +192,8 @@ class GeometricNetwork(PredictorNetwork):
 
     def _inputs(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (P, B, n) what each point feels, and (S, B, n) how each site is deformed."""
-        frame, rows, places = self.body(latent)
-        sums = contact_field(frame, places, self.order, self.apart, self.reach)
-        return normalised(sums, self.reach, FULL, SOME), fold_view(frame, rows, self.members)
+        frame, gradients, positions = self.body(latent)
+        return self.field(frame, positions).flatten(2), self.body.fold_view(frame, gradients)
 
     def forward(self, latent: torch.Tensor) -> NetworkOutput:
         """Predict from (B, D) latent codes."""

@@ -11,9 +11,6 @@ from lcollision_core.compiled import compiled, compiled_sums
 
 Array = npt.NDArray[np.float32]
 
-SQUASHED = 4.0
-"""A patch's logit is divided by this and squashed before the head sees it."""
-
 _LOG2_E = np.float32(1.0 / math.log(2.0))
 _POWER = tuple(np.float32(math.log(2.0) ** n / math.factorial(n)) for n in range(6, -1, -1))
 """Taylor's coefficients of 2^r, the highest first: enough for single precision up to 1/2."""
@@ -21,42 +18,59 @@ _POWER = tuple(np.float32(math.log(2.0) ** n / math.factorial(n)) for n in range
 _AT_ONCE = 4
 """Inputs whose products are summed up before the outputs are touched again."""
 
+_SMALL = 2**15
+"""Numbers of an array that new memory is cheap for."""
+
 _FEW_ROWS = 8
 """Up to so many, reading the weights takes the time, and a library's threads would take more."""
 
 
-def multiply(inputs: Array, weight: Array, outputs: Array) -> None:
-    """Fill in n products: (n, B, n_in) inputs times (n, n_in, n_out) weights.
+class Workspace:
+    """Large arrays that the next pass fills again: new memory costs as much as filling it."""
 
-    Inputs and outputs may be wider; what is beyond is left alone.
-    """
+    def __init__(self) -> None:
+        self._memory: dict[str, Array] = {}
+
+    def empty(self, name: str, *shape: int) -> Array:
+        """Return an array whose values nobody needs any more."""
+        size = math.prod(shape)
+        if size < _SMALL:
+            return np.empty(shape, dtype=np.float32)
+        if name not in self._memory or self._memory[name].size < size:
+            self._memory[name] = np.empty(size, dtype=np.float32)
+        return self._memory[name][:size].reshape(shape)
+
+
+def multiply(inputs: Array, weight: Array, outputs: Array) -> Array:
+    """Fill in and return n products: (n, B, n_in) inputs times (n, n_in, n_out) weights."""
     if inputs.shape[1] <= _FEW_ROWS:
         _multiply_few(inputs, weight, outputs)
     else:
-        _, n_in, n_out = weight.shape
-        np.matmul(inputs[..., :n_in], weight, out=outputs[..., :n_out])
+        np.matmul(inputs, weight, out=outputs)
+    return outputs
+
+
+def multiply_back(grad_outputs: Array, weight: Array) -> Array:
+    """Pull derivatives by the outputs of `multiply` back to its inputs."""
+    n, n_rows, _ = grad_outputs.shape
+    grad_inputs = np.empty((n, n_rows, weight.shape[1]), dtype=np.float32)
+    if n_rows > _FEW_ROWS:
+        np.matmul(grad_outputs, weight.transpose(0, 2, 1), out=grad_inputs)
+    else:
+        _multiply_few_back(grad_outputs, weight, grad_inputs)
+    return grad_inputs
 
 
 @compiled
 def _multiply_few(inputs: Array, weight: Array, outputs: Array) -> None:
-    n_rows, n_in, n_out = inputs.shape[1], weight.shape[1], weight.shape[2]
+    n_in, n_out = weight.shape[1:]
     whole = n_in - n_in % _AT_ONCE
     for n in range(weight.shape[0]):
-        for b in range(n_rows):
+        for b in range(inputs.shape[1]):
             for j in range(n_out):
                 outputs[n, b, j] = np.float32(0.0)
         for i in range(0, whole, _AT_ONCE):
-            for b in range(0, n_rows - 1, 2):
-                x0, x1 = inputs[n, b, i], inputs[n, b, i + 1]
-                x2, x3 = inputs[n, b, i + 2], inputs[n, b, i + 3]
-                y0, y1 = inputs[n, b + 1, i], inputs[n, b + 1, i + 1]
-                y2, y3 = inputs[n, b + 1, i + 2], inputs[n, b + 1, i + 3]
-                for j in range(n_out):
-                    w0, w1 = weight[n, i, j], weight[n, i + 1, j]
-                    w2, w3 = weight[n, i + 2, j], weight[n, i + 3, j]
-                    outputs[n, b, j] += x0 * w0 + x1 * w1 + x2 * w2 + x3 * w3
-                    outputs[n, b + 1, j] += y0 * w0 + y1 * w1 + y2 * w2 + y3 * w3
-            for b in range(n_rows - n_rows % 2, n_rows):
+            for b in range(inputs.shape[1]):
                 x0, x1 = inputs[n, b, i], inputs[n, b, i + 1]
                 x2, x3 = inputs[n, b, i + 2], inputs[n, b, i + 3]
                 for j in range(n_out):
@@ -64,10 +78,20 @@ def _multiply_few(inputs: Array, weight: Array, outputs: Array) -> None:
                     w2, w3 = weight[n, i + 2, j], weight[n, i + 3, j]
                     outputs[n, b, j] += x0 * w0 + x1 * w1 + x2 * w2 + x3 * w3
         for i in range(whole, n_in):
-            for b in range(n_rows):
-                x = inputs[n, b, i]
+            for b in range(inputs.shape[1]):
                 for j in range(n_out):
-                    outputs[n, b, j] += x * weight[n, i, j]
+                    outputs[n, b, j] += inputs[n, b, i] * weight[n, i, j]
+
+
+@compiled_sums
+def _multiply_few_back(grad_outputs: Array, weight: Array, grad_inputs: Array) -> None:
+    for n in range(weight.shape[0]):
+        for i in range(weight.shape[1]):
+            for b in range(grad_outputs.shape[1]):
+                total = np.float32(0.0)
+                for j in range(weight.shape[2]):
+                    total += grad_outputs[n, b, j] * weight[n, i, j]
+                grad_inputs[n, b, i] = total
 
 
 @compiled_sums
@@ -83,13 +107,13 @@ def add_and_silu(values: Array, bias: Array, outputs: Array) -> None:
 
 
 @compiled_sums
-def silu_backward(values: Array, by: Array) -> None:
+def silu_backward(values: Array, grad: Array) -> None:
     """Turn derivatives by the outputs x sigmoid(x) into those by flat values x, in place."""
     one = np.float32(1.0)
     for n in range(len(values)):
         x = values[n]
         sigmoid = one / (one + _exponential(-x))
-        by[n] *= sigmoid * (one + x * (one - sigmoid))
+        grad[n] *= sigmoid * (one + x * (one - sigmoid))
 
 
 @compiled_sums

@@ -25,93 +25,34 @@ def body_points(embedding: Embedding, n_points: int = N_POINTS) -> npt.NDArray[n
     """
     rest, topology = embedding.rest_vertices, embedding.topology
     used = np.setdiff1d(np.arange(len(rest)), topology.unused_vertices)
-    places = rest[used]
-    outermost = int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())
-    return np.sort(used[farthest_points(places, outermost, min(n_points, len(used)))])
+    positions = rest[used]
+    outermost = int(np.linalg.norm(positions - positions.mean(axis=0), axis=1).argmax())
+    return np.sort(used[farthest_points(positions, outermost, min(n_points, len(used)))])
 
 
-def farthest_points(places: FloatArray, first: int, n_points: int) -> npt.NDArray[np.int64]:
-    """Choose some of (n, 3) places, each farthest from those before it.
+def farthest_points(positions: FloatArray, first: int, n_points: int) -> npt.NDArray[np.int64]:
+    """Choose some of (n, 3) positions, each farthest from those before it.
 
     When all are chosen, the first is repeated.
     """
     chosen = [first]
-    nearest = np.linalg.norm(places - places[first], axis=1)
+    nearest = np.linalg.norm(positions - positions[first], axis=1)
     while len(chosen) < n_points:
         best = int(nearest.argmax())
         chosen.append(best)
-        nearest = np.minimum(nearest, np.linalg.norm(places - places[best], axis=1))
+        nearest = np.minimum(nearest, np.linalg.norm(positions - positions[best], axis=1))
     return np.array(chosen)
 
 
-def neighbour_order(places: FloatArray, block: int) -> npt.NDArray[np.int32]:
-    """Order (n, 3) places so that each block of so many in turn lies close together.
-
-    They are halved across their longest extent, and the halves likewise. The last place is there
-    again as often as fills its block.
-    """
-
-    def ordered(index: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:
-        n_blocks = -(-len(index) // block)
-        if n_blocks < 2:
-            return [index]
-        own = places[index]
-        along = own[:, np.ptp(own, axis=0).argmax()].argsort(kind="stable")
-        half = n_blocks // 2 * block
-        return ordered(index[along[:half]]) + ordered(index[along[half:]])
-
-    order = np.concatenate(ordered(np.arange(len(places))))
-    return np.append(order, np.repeat(order[-1], -len(order) % block)).astype(np.int32)
-
-
-def with_tighter_blocks(
-    order: npt.NDArray[np.int32], between: FloatArray, block: int
-) -> npt.NDArray[np.int32]:
-    """Exchange places between blocks until no exchange brings those of a block closer together.
-
-    Neighbours in one pose, as two thighs, are none in others; neighbours along the surface stay so.
-
-    Parameters
-    ----------
-    order : as `neighbour_order` returns it, of n places
-    between : (n, n) distances along the surface, infinite where they are not known; longer ones
-        are taken for the shortest way from place to place
-    block : places in one
-    """
-    distance = csgraph.shortest_path(between, directed=False)
-    known = np.isfinite(distance)
-    squared = np.where(known, distance, 2.0 * distance[known].max()) ** 2
-    n_places = len(squared)
-    block_of = np.empty(n_places, dtype=np.int64)
-    block_of[order[:n_places]] = np.arange(n_places) // block
-    n_blocks = int(block_of.max()) + 1
-    # Of each place to all of each block.
-    total = squared @ np.eye(n_blocks)[block_of]
-    least = -1e-9 * squared.max()
-    while True:
-        to = total[:, block_of]
-        gain = to + to.T - 2.0 * squared - (np.diag(to)[:, None] + np.diag(to))
-        gain[block_of[:, None] == block_of] = 0.0
-        i, j = np.unravel_index(gain.argmin(), gain.shape)
-        if gain[i, j] >= least:
-            break
-        change = squared[:, j] - squared[:, i]
-        total[:, block_of[i]] += change
-        total[:, block_of[j]] -= change
-        block_of[i], block_of[j] = block_of[j], block_of[i]
-    better = block_of.argsort(kind="stable")
-    return np.append(better, np.repeat(better[-1], len(order) - n_places)).astype(np.int32)
-
-
 def skin_graph(embedding: Embedding) -> sparse.csr_matrix:
-    """Return the (V, V) lengths of the reference's edges, in heights."""
+    """Return the (V, V) lengths of the reference's edges, in normalised length."""
     return length_graph(embedding.topology.edges, embedding.rest_vertices)
 
 
 def skin_distances(
     graph: sparse.csr_matrix, vertex: npt.NDArray[np.integer], limit: float = np.inf
 ) -> FloatArray:
-    """Return (n, V) lengths of the shortest edge paths from some vertices, in heights.
+    """Return (n, V) lengths of the shortest edge paths from some vertices, in normalised length.
 
     They are infinite between components, and beyond the limit.
     """

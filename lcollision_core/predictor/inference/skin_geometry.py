@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
-from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.predictor.inference.field_kernels import BLOCK
+from lcollision_core.predictor.inference.field_kernels import BLOCK, in_blocks
 from lcollision_core.predictor.inference.points import (
     N_POINTS,
     body_points,
-    neighbour_order,
     skin_distances,
     skin_graph,
     tangent_frames,
-    with_tighter_blocks,
 )
 
 DISTANT = 0.10
-"""Heights along the surface beyond which two points feel each other."""
+"""Normalised length along the surface beyond which two points count in each other's field."""
 
 Float32Array = npt.NDArray[np.float32]
+
+
+class CodeGroup(NamedTuple):
+    """What a group of codes moves.
+
+    Attributes
+    ----------
+    codes : which of the D codes
+    table : (codes, 9 n) float32 array, to the outputs of the n points that it moves
+    """
+
+    codes: slice
+    table: Float32Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,17 +47,15 @@ class SkinGeometry:
     ----------
     point_vertices : (P,) int64 array, ascending, the vertices that are points of the body
     members : (S, M) int32 array, each site's vertices as numbers of the skin
+    geodesic_neighbours : (P, P) float32 array, added to squared distances: 1 for pairs so near
+        along the surface that they do not count in each other's field, else 0
     order : (O,) int32 array, all points of the body, neighbours near each other, and the last
         again until O is a multiple of `BLOCK`
-    apart : (P, O) float32 array, added to squared distances to the points in that order: 1 for
-        pairs so near along the surface that they do not feel each other and for those that are
-        there again, else 0
-    rest_frame : (N, 3, 3) array: of the first N points of the skin, on the reference, as columns,
-        the outer normal first; the skin is the P points, then the sites' centres that are none,
-        and last their other vertices, which need no frame
-    blocks : (G, 4) int64 array: of each group of codes its first and past its last, and likewise
-        of the outputs that they make, nine for each point that they move
-    tables : the groups' (codes, outputs) matrices one after the other, flat float32
+    neighbour_blocks : `geodesic_neighbours` in that order, see `in_blocks`
+    rest_frame : (N, 3, 3) float32 array: of the first N points of the skin, on the reference, as
+        columns, the outer normal first; the skin is the P points, then the sites' centres that are
+        none, and last their other vertices, which need no frame
+    groups : of codes; their outputs follow each other, nine for each point that they move
     target : (T,) int32 array, the point of the skin that nine outputs belong to
     offset : (Q, 9) float32 array, deformation features of codes 0
     scale : (9,) float32 array, of the outputs
@@ -53,11 +63,11 @@ class SkinGeometry:
 
     point_vertices: npt.NDArray[np.int64]
     members: npt.NDArray[np.int32]
+    geodesic_neighbours: Float32Array
     order: npt.NDArray[np.int32]
-    apart: Float32Array
-    rest_frame: FloatArray
-    blocks: npt.NDArray[np.int64]
-    tables: Float32Array
+    neighbour_blocks: Float32Array
+    rest_frame: Float32Array
+    groups: list[CodeGroup]
     target: npt.NDArray[np.int32]
     offset: Float32Array
     scale: Float32Array
@@ -76,7 +86,7 @@ class SkinGeometry:
         Parameters
         ----------
         embedding : of the body
-        sites : (S, M) vertices about each place where the skin folds, see `find_fold_sites`
+        sites : (S, M) vertices about each fold site, see `find_fold_sites`
         n_points : P, unless the mesh has fewer vertices
 
         Raises
@@ -90,34 +100,30 @@ class SkinGeometry:
         vertex = body_points(embedding, n_points)
         framed = np.append(vertex, np.setdiff1d(sites[:, 0], vertex))
         skin = np.append(framed, np.setdiff1d(sites, framed))
-        between = skin_distances(skin_graph(embedding), vertex, limit=DISTANT)[:, vertex]
-        order = neighbour_order(embedding.rest_vertices[vertex], BLOCK)
-        order = with_tighter_blocks(order, between, BLOCK)
-        apart = np.isfinite(between)[:, order]
-        apart[:, len(vertex) :] = True
+        distance = skin_distances(skin_graph(embedding), vertex, limit=DISTANT)[:, vertex]
+        neighbours = np.isfinite(distance).astype(np.float32)
+        order = cKDTree(embedding.rest_vertices[vertex], leafsize=BLOCK).indices.astype(np.int32)
+        order = np.append(order, np.repeat(order[-1:], -len(order) % BLOCK))
         place = np.zeros(n_vertices, dtype=np.int32)
         place[skin] = np.arange(len(skin))
-        decoder = embedding.decoder
-        blocks, tables, targets = [], [], []
-        code = output = 0
-        for group in decoder.groups:
+        groups, targets, code = [], [], 0
+        for group in embedding.decoder.groups:
             n_codes = len(group.weights)
             _, moved, own = np.intersect1d(skin, group.support, return_indices=True)
             weights = group.weights.reshape(n_codes, -1, N_FEATURES)[:, own]
-            n_outputs = N_FEATURES * len(own)
-            blocks.append((code, code + n_codes, output, output + n_outputs))
-            tables.append(weights.reshape(-1))
+            table = np.ascontiguousarray(weights.reshape(n_codes, -1), dtype=np.float32)
+            groups.append(CodeGroup(slice(code, code + n_codes), table))
             targets.append(moved)
-            code, output = code + n_codes, output + n_outputs
+            code += n_codes
         return cls(
             point_vertices=vertex,
             members=place[sites],
+            geodesic_neighbours=neighbours,
             order=order,
-            apart=np.ascontiguousarray(apart, dtype=np.float32),
-            rest_frame=tangent_frames(embedding, framed),
-            blocks=np.array(blocks),
-            tables=np.concatenate(tables),
+            neighbour_blocks=in_blocks(neighbours, order),
+            rest_frame=tangent_frames(embedding, framed).astype(np.float32),
+            groups=groups,
             target=np.concatenate(targets).astype(np.int32),
-            offset=decoder.offset[skin].astype(np.float32),
-            scale=decoder.scale.astype(np.float32),
+            offset=embedding.decoder.offset[skin].astype(np.float32),
+            scale=embedding.decoder.scale.astype(np.float32),
         )

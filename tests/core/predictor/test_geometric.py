@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
+from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS
-from lcollision_core.predictor.geometric.field import (
-    Decoding,
-    contact_field,
-    decode_features,
-    deform,
-    fold_view,
-    normalised,
-)
+from lcollision_core.predictor.geometric.field import ContactField
 from lcollision_core.predictor.geometric.folds import (
     _MEMBER_REACH,
     FOLD_REACH,
@@ -29,15 +24,13 @@ from lcollision_core.predictor.geometric.folds import (
     find_fold_sites,
 )
 from lcollision_core.predictor.geometric.network import GeometricNetwork, _Auxiliary
-from lcollision_core.predictor.inference.field_kernels import BLOCK, REACHES
+from lcollision_core.predictor.inference.field_kernels import BLOCK, FULL, RADII, SOME, in_blocks
 from lcollision_core.predictor.inference.points import (
     body_points,
-    neighbour_order,
     skin_cells,
     skin_distances,
     skin_graph,
     tangent_frames,
-    with_tighter_blocks,
 )
 from lcollision_core.predictor.network import NetworkOutput, SkinCells, Targets
 from lcollision_core.predictor.training import patch_labels
@@ -63,11 +56,11 @@ def test_points_are_spread_and_every_vertex_belongs_to_the_nearest(tube_model: P
     points = body_points(embedding, 20)
     assert len(np.unique(points)) == 20
     assert np.array_equal(skin_cells(embedding, points)[points], np.arange(20))
-    places = embedding.rest_vertices[points]
-    apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.eye(20)
-    covered = np.linalg.norm(embedding.rest_vertices[:, None] - places[None], axis=2).min(axis=1)
+    positions = embedding.rest_vertices[points]
+    between = np.linalg.norm(positions[:, None] - positions[None], axis=2) + np.eye(20)
+    covered = np.linalg.norm(embedding.rest_vertices[:, None] - positions[None], axis=2).min(axis=1)
     # Farthest-point sampling: no vertex is farther from the points than they are from each other.
-    assert covered.max() <= apart.min() + 1e-12
+    assert covered.max() <= between.min() + 1e-12
 
 
 def test_frames_are_rotations_whose_first_axis_points_out(tube_model: PoseModel) -> None:
@@ -88,9 +81,9 @@ def test_reduced_body_lies_where_the_decoder_puts_it(
 ) -> None:
     latent = _some_latent(tube_model, 20)
     with torch.no_grad():
-        _, _, places = network.body(torch.tensor(latent, dtype=torch.float32))
+        _, _, positions = network.body(torch.tensor(latent, dtype=torch.float32))
     truth = tube_model.embedding.decode(latent)[:, network.skin.point_vertices]
-    errors = np.linalg.norm(places.numpy().transpose(0, 2, 1) - truth, axis=2)
+    errors = np.linalg.norm(positions.numpy().transpose(0, 2, 1) - truth, axis=2)
     assert errors.mean() < 2e-3
     moved = truth - truth[:1]
     assert np.abs(moved).max() > 0.05
@@ -108,211 +101,83 @@ def test_frames_and_gradients_are_those_of_the_embedding(
     assert found[:, : len(network.skin.point_vertices)].numpy() == pytest.approx(exact, abs=1e-5)
 
 
-@pytest.fixture
-def made_up() -> tuple[torch.Tensor, ...]:
-    """Features, rest frames, places, an order, which are apart, reaches; in double precision."""
-    generator = torch.Generator().manual_seed(1)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-    features = normal(2, 7, 9)
-    features[0, 0, :3] = 0.0
-    # The last place of the block is the first one's once more, which nothing feels.
-    order = torch.tensor([3, 1, 0, 2, 6, 5, 4, 3], dtype=torch.int32)
-    apart = torch.eye(7, dtype=torch.float64)
-    apart[0, 1] = apart[1, 0] = 1.0
-    apart = apart[:, order.long()]
-    apart[:, 7] = 1.0
-    reach = torch.tensor(REACHES, dtype=torch.float64)
-    return (
-        features,
-        torch.linalg.qr(normal(7, 3, 3))[0],
-        0.05 * normal(2, 3, 7),
-        order,
-        apart,
-        reach,
+def _field(near: np.ndarray, order: np.ndarray) -> ContactField:
+    """Return the field of made-up points, of which some are neighbours along the surface."""
+    near = near.astype(np.float32)
+    skin = SimpleNamespace(
+        geodesic_neighbours=near, order=order, neighbour_blocks=in_blocks(near, order)
     )
+    return ContactField(skin)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def made_up() -> tuple[ContactField, torch.Tensor, torch.Tensor]:
+    """Return the field of 45 points in two heaps, their frames and positions."""
+    rng = np.random.default_rng(4)
+    positions = 0.05 * rng.standard_normal((2, 3, 45))
+    positions[1, 0, 20:] += 0.6
+    order = cKDTree(positions[1].T, leafsize=BLOCK).indices.astype(np.int32)
+    half = np.triu(rng.random((45, 45)))
+    near = half + np.triu(half, 1).T < 0.2
+    frame = np.linalg.qr(rng.standard_normal((2, 45, 3, 3)))[0]
+    field = _field(near, np.append(order, [order[-1]] * 3))
+    return field, torch.tensor(frame), torch.tensor(positions)
 
 
 def test_field_by_hand() -> None:
     """Two points face each other across 0.05; a third behind the first one's skin is not seen."""
     frame = torch.eye(3, dtype=torch.float64).repeat(1, 3, 1, 1)
     frame[0, 1] = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
-    places = torch.zeros((1, 3, 3), dtype=torch.float64)
-    places[0, :, 1] = torch.tensor([0.05, 0.01, 0.0], dtype=torch.float64)
-    places[0, 0, 2] = -0.08
-    order = torch.tensor([2, 1, 0, 0, 0, 0, 0, 0], dtype=torch.int32)
-    apart = torch.eye(3, dtype=torch.float64)[:, order.long()]
-    apart[:, 3:] = 1.0
-    reach = torch.tensor([0.06, 0.1], dtype=torch.float64)
-    (first, second, _) = contact_field(frame, places, order, apart, reach)[:, 0].numpy()
-    for k in range(2):
-        weight = (1.0 - (0.05**2 + 0.01**2) / reach[k].item() ** 2) ** 3
+    positions = torch.zeros((1, 3, 3), dtype=torch.float64)
+    positions[0, :, 1] = torch.tensor([0.05, 0.01, 0.0], dtype=torch.float64)
+    positions[0, 0, 2] = -0.1
+    field = _field(np.eye(3), np.array([2, 1, 0, 0, 0, 0, 0, 0], dtype=np.int32))
+    (first, second, _) = field(frame, positions)[:, 0].numpy()
+    for k, radius in enumerate(RADII):
+        weight = (1.0 - (0.05**2 + 0.01**2) / radius**2) ** 3
+        share, mean = weight / (weight + FULL), weight / (weight + SOME)
         # The first is 0.05 above the second's plane, whose normal points back at it.
-        assert first[k] == pytest.approx(
-            weight * np.array([1.0, 0.05, 0.05, 0.01, 0.0, -1.0, 0.0, 0.0]), abs=1e-12
-        )
+        means = np.array([0.05 / radius, 0.05 / radius, 0.01 / radius, 0.0, -1.0, 0.0, 0.0])
+        assert first[k] == pytest.approx(np.array([share, *(mean * means)]), abs=1e-12)
         # The second's own frame turns what it sees: ahead is -x of the world.
-        assert second[k] == pytest.approx(
-            weight * np.array([1.0, 0.05, 0.05, -0.01, 0.0, -1.0, 0.0, 0.0]), abs=1e-12
-        )
+        means[2] *= -1.0
+        assert second[k] == pytest.approx(np.array([share, *(mean * means)]), abs=1e-12)
 
 
-def test_pairs_that_are_apart_do_not_feel_each_other(made_up: tuple[torch.Tensor, ...]) -> None:
-    features, rest_frame, places, order, apart, reach = made_up
-    frame, _ = deform(features, rest_frame)
-    blind = torch.ones_like(apart)
-    assert contact_field(frame, places, order, blind, reach).abs().max() == 0.0
-    one = blind.clone()
-    # Of points 2 and 3.
-    one[2, 0] = one[3, 3] = 0.0
-    felt = contact_field(frame, 0.3 * places, order, one, reach)
-    assert felt[[0, 1, 4, 5, 6]].abs().max() == 0.0
-    assert felt[[2, 3]].abs().max() > 0.0
+def test_only_points_far_along_the_surface_count() -> None:
+    rng = np.random.default_rng(1)
+    frame = torch.tensor(np.linalg.qr(rng.standard_normal((2, 7, 3, 3)))[0])
+    positions = torch.tensor(0.02 * rng.standard_normal((2, 3, 7)))
+    order = np.array([3, 1, 0, 2, 6, 5, 4, 4], dtype=np.int32)
+    near = np.ones((7, 7))
+    assert _field(near, order)(frame, positions).abs().max() == 0.0
+    near[2, 3] = near[3, 2] = 0.0
+    found = _field(near, order)(frame, positions)
+    assert found[[0, 1, 4, 5, 6]].abs().max() == 0.0
+    assert found[[2, 3]].abs().max() > 0.0
 
 
-def test_compiled_and_torch_paths_agree(made_up: tuple[torch.Tensor, ...]) -> None:
-    """On a GPU torch does what the compiled loops do on the CPU; `meta` hides where it runs."""
-    features, rest_frame, places, order, apart, reach = made_up
-    frame, rows = deform(features, rest_frame)
-    frame_torch, rows_torch = deform(_elsewhere(features), rest_frame)
-    assert torch.allclose(frame, frame_torch, atol=1e-12)
-    for some in (deform(features, rest_frame[:4]), deform(_elsewhere(features), rest_frame[:4])):
-        assert torch.allclose(some[0], frame[:, :4], atol=1e-12)
-        assert torch.allclose(some[1], rows, atol=1e-12)
-    assert torch.allclose(rows, rows_torch, atol=1e-12)
-    sums = contact_field(frame, places, order, apart, reach)
-    sums_torch = contact_field(_elsewhere(frame), places, order, apart, reach)
-    assert torch.allclose(sums, sums_torch, atol=1e-12)
-    assert sums.abs().max() > 0.1
-    inputs = normalised(sums, reach, 0.3, 0.05)
-    assert torch.allclose(inputs, normalised(_elsewhere(sums), reach, 0.3, 0.05), atol=1e-12)
-    members = torch.tensor([[0, 1, 2], [6, 0, 3]], dtype=torch.int32)
-    view = fold_view(frame, rows, members)
-    assert torch.allclose(view, fold_view(_elsewhere(frame), rows, members), atol=1e-12)
+def test_the_compiled_field_is_that_of_torch(
+    made_up: tuple[ContactField, torch.Tensor, torch.Tensor],
+) -> None:
+    """On a GPU torch does what the compiled loops do on the CPU, where far blocks are left out."""
+    field, frame, positions = made_up
+    found = field(frame, positions)
+    assert found.abs().max() > 0.1
+    assert torch.allclose(found, field.by_torch(frame, positions), atol=1e-12)
+    more = torch.cat([frame, frame[:, :4]], dim=1)
+    assert torch.equal(found, field(more, positions))
+    assert torch.autograd.gradcheck(field, (frame.requires_grad_(), positions.requires_grad_()))
 
 
-def test_what_is_left_out_as_too_far_would_have_weighed_nothing() -> None:
-    """Two heaps of points farther from each other than any reach, one pose."""
-    generator = torch.Generator().manual_seed(4)
-    places = 0.1 * torch.randn((1, 3, 45), generator=generator, dtype=torch.float64)
-    places[:, 0, 20:] += 0.6
-    order = torch.tensor(neighbour_order(places[0].T.numpy(), BLOCK))
-    half = torch.rand((45, 45), generator=generator).triu()
-    apart = (half + half.triu(1).T < 0.2).double()[:, order.long()]
-    apart[:, 45:] = 1.0
-    blocks = places[0][:, order.long()].T.reshape(6, BLOCK, 3)
-    low, high = blocks.amin(dim=1), blocks.amax(dim=1)
-    gap = torch.maximum(low[:, None] - high[None], low[None] - high[:, None]).clamp_min(0.0)
-    is_far = gap.norm(dim=2) > REACHES[-1]
-    assert 6 <= is_far.sum() <= 24
-    frame = torch.linalg.qr(torch.randn((1, 45, 3, 3), generator=generator, dtype=torch.float64))[0]
-    reach = torch.tensor(REACHES, dtype=torch.float64)
-    sums = contact_field(frame, places, order, apart, reach)
-    assert sums.abs().max() > 0.1
-    without = contact_field(_elsewhere(frame), places, order, apart, reach)
-    assert torch.allclose(sums, without, atol=1e-12)
-    assert torch.autograd.gradcheck(
-        lambda turned, placed: contact_field(turned, placed, order, apart, reach),
-        (frame.requires_grad_(), places.requires_grad_()),
-    )
-
-
-def test_an_order_of_another_size_is_refused(made_up: tuple[torch.Tensor, ...]) -> None:
-    features, rest_frame, places, order, apart, reach = made_up
-    frame, _ = deform(features, rest_frame)
-    for wrong in ((order[:7], apart[:, :7]), (order, apart[:, :7]), (order[:0], apart[:, :0])):
-        with pytest.raises(ShapeError, match="in blocks of 8"):
-            contact_field(frame, places, *wrong, reach)
-
-
-def test_neighbours_are_in_one_block() -> None:
-    """Two clusters of 8 and one of 3 places, in any order, come out as three blocks."""
-    rng = np.random.default_rng(3)
-    cluster = rng.permutation(np.repeat([0, 1, 2], [8, 8, 3]))
-    places = 10.0 * cluster[:, None] + rng.random((19, 3))
-    order = neighbour_order(places, 8)
-    assert order.dtype == np.int32
-    assert np.array_equal(np.sort(order[:19]), np.arange(19))
-    assert np.array_equal(cluster[order[:19]], np.repeat([0, 1, 2], [8, 8, 3]))
-    assert np.array_equal(cluster[order[19:]], [2] * 5)
-    assert len(neighbour_order(places[:3], 8)) == 8
-
-
-def test_blocks_gather_what_lies_together_along_the_surface() -> None:
-    """Two lines side by side, as two thighs; one is shorter, and its block is not full."""
-    line = np.repeat([0, 1], [16, 11])
-    along = np.concatenate([np.arange(16.0), np.arange(11.0)])
-    places = np.stack([along, 0.2 * line, np.zeros(27)], axis=1)
-    steps = np.abs(along[:, None] - along)
-    between = np.where((line[:, None] == line) & (steps <= 1.0), steps, np.inf)
-    before = neighbour_order(places, 8)
-    assert len({tuple(line[block]) for block in before.reshape(4, 8)} - {(0,) * 8, (1,) * 8}) > 1
-    order = with_tighter_blocks(before, between, 8)
-    assert order.dtype == np.int32
-    assert np.array_equal(np.sort(order[:27]), np.arange(27))
-    assert np.array_equal(order[27:], np.repeat(order[26], 5))
-    blocks = order.reshape(4, 8)
-    assert sorted(tuple(line[block]) for block in blocks) == [(0,) * 8] * 2 + [(1,) * 8] * 2
-    assert max(np.ptp(along[block]) for block in blocks) <= 8.0
-    # What is known of nothing stays as it was.
-    unknown = np.where(np.eye(27) > 0.0, 0.0, np.inf)
-    assert np.array_equal(np.sort(with_tighter_blocks(before, unknown, 8)[:8]), np.sort(before[:8]))
-
-
-def _elsewhere(values: torch.Tensor) -> torch.Tensor:
-    """Return a tensor that says it is on another device, so that the torch path is taken."""
-    return torch.Tensor._make_subclass(_Elsewhere, values)
-
-
-class _Elsewhere(torch.Tensor):
-    @property
-    def device(self) -> torch.device:  # type: ignore[override]
-        return torch.device("meta")
-
-    @classmethod
-    def __torch_function__(cls, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
-        return super().__torch_function__(func, types, args, kwargs or {})  # type: ignore[no-untyped-call]
-
-
-def test_derivatives_are_those_of_finite_differences(made_up: tuple[torch.Tensor, ...]) -> None:
-    features, rest_frame, places, order, apart, reach = made_up
-    moving = features.clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda values: deform(values, rest_frame), moving)
-    assert torch.autograd.gradcheck(lambda values: deform(values, rest_frame[:4]), moving)
-    frame, rows = (values.requires_grad_() for values in deform(features, rest_frame))
-    places.requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda turned, placed: contact_field(turned, placed, order, apart, reach), (frame, places)
-    )
-    sums = contact_field(frame, places, order, apart, reach).detach().requires_grad_()
-    assert torch.autograd.gradcheck(lambda values: normalised(values, reach, 0.3, 0.05), sums)
-    members = torch.tensor([[0, 1, 2], [6, 0, 3]], dtype=torch.int32)
-    assert torch.autograd.gradcheck(
-        lambda turned, given: fold_view(turned, given, members), (frame, rows)
-    )
-
-
-def test_features_are_differentiable() -> None:
-    generator = torch.Generator().manual_seed(2)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-    # Two groups of 3 and 2 codes; both move point 1.
-    blocks = torch.tensor([[0, 3, 0, 18], [3, 5, 18, 27]])
-    tables = torch.cat([normal(54), normal(18)])
-    target = torch.tensor([0, 1, 1], dtype=torch.int32)
-    decoding = Decoding(blocks, tables, target, normal(2, 9), normal(9).abs())
-    latent = normal(4, 5).requires_grad_()
-    assert torch.autograd.gradcheck(lambda codes: decode_features(codes, decoding), latent)
-    (features,) = decode_features(latent[:1], decoding).detach()
-    own = torch.tanh(latent[0, :3].detach() @ tables[:54].reshape(3, 18)).reshape(2, 9)
-    other = torch.tanh(latent[0, 3:].detach() @ tables[54:].reshape(2, 9))
-    assert torch.allclose(features[0], decoding.offset[0] + own[0] * decoding.scale)
-    both = own[1] + other
-    assert torch.allclose(features[1], decoding.offset[1] + both * decoding.scale)
+def test_each_block_of_points_lies_together(network: GeometricNetwork) -> None:
+    skin = network.skin
+    n_points = skin.n_points
+    assert np.array_equal(np.sort(skin.order[:n_points]), np.arange(n_points))
+    assert len(skin.order) % BLOCK == 0
+    assert set(skin.order[n_points:]) <= {skin.order[n_points - 1]}
+    assert (skin.geodesic_neighbours == skin.geodesic_neighbours.T).all()
+    assert (np.diag(skin.geodesic_neighbours) == 1.0).all()
 
 
 def test_folds_are_looked_for_where_the_skin_folds(

@@ -12,6 +12,7 @@ import torch
 from lcollision_core.model import PoseModel
 from lcollision_core.predictor.geometric.network import GeometricNetwork
 from lcollision_core.predictor.inference.network import CompiledNetwork
+from lcollision_core.predictor.stored_network import require_network
 
 
 @pytest.fixture(scope="module", params=["folds", "no folds"])
@@ -74,27 +75,19 @@ def test_a_pose_gets_the_same_alone_and_with_others_but_for_rounding(
 def test_arrays_of_another_network_are_refused(
     tube_model: PoseModel, network: GeometricNetwork
 ) -> None:
-    arrays = _arrays(network)
+    embedding, arrays = tube_model.embedding, _arrays(network)
+    require_network(arrays, embedding, "default", True)
     for name in arrays:
         wrong = {**arrays, name: np.concatenate([arrays[name], arrays[name]], axis=-1)}
         if name == "site_vertices":
             wrong[name] = arrays[name] + 10**6
             if not arrays[name].size:
                 continue
-        with pytest.raises(ValueError, match=r"shape|sites"):
-            CompiledNetwork(tube_model.embedding, wrong)
-        with pytest.raises((KeyError, ValueError)):
-            CompiledNetwork(
-                tube_model.embedding, {key: array for key, array in arrays.items() if key != name}
-            )
-
-
-def test_sites_without_vertices_are_refused(
-    tube_model: PoseModel, network: GeometricNetwork
-) -> None:
-    arrays = {**_arrays(network), "site_vertices": np.zeros((3, 0), dtype=np.int32)}
-    with pytest.raises(ValueError, match="fold sites"):
-        CompiledNetwork(tube_model.embedding, arrays)
+        with pytest.raises(ValueError, match=rf"array {name}|shape|sites"):
+            require_network(wrong, embedding, "default", True)
+        fewer = {key: array for key, array in arrays.items() if key != name}
+        with pytest.raises(ValueError, match=name):
+            require_network(fewer, embedding, "default", True)
 
 
 def test_predicting_and_resolving_a_pose_need_no_torch() -> None:

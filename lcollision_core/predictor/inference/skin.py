@@ -1,0 +1,109 @@
+"""From latent codes to the positions, frames and folds of the skin, by compiled loops."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.acap.features import N_FEATURES
+from lcollision_core.predictor.inference import skin_kernels
+from lcollision_core.predictor.inference.network_kernels import Workspace, multiply, multiply_back
+from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
+
+Float32Array = npt.NDArray[np.float32]
+
+
+class PosedSkin(NamedTuple):
+    """The skin of B poses.
+
+    Attributes
+    ----------
+    frame : (B, N, 3, 3) of the first N points of the skin, as columns
+    positions : (B, 3, P) of the points of the body, in normalised length
+    folds : (S, B, 9 M) the deformation about the fold sites
+    outputs, features, turns, rows : what the derivatives need: (B, T, 9) tanh of each group's
+        outputs, (B, Q, 9) deformation features, those of `skin_kernels.rodrigues`, and
+        (B, 3, Q, 3) rows of the deformation gradients
+    """
+
+    frame: Float32Array
+    positions: Float32Array
+    folds: Float32Array
+    outputs: Float32Array
+    features: Float32Array
+    turns: Float32Array
+    rows: Float32Array
+
+
+class CompiledSkin:
+    """What a reduced body makes of latent codes.
+
+    Parameters
+    ----------
+    geometry : where the body is looked at
+    weight : (3 P, P) float32 array, from the points' deformation gradients to their positions
+    origin : (3, P) of the positions, in normalised length
+    """
+
+    def __init__(self, geometry: SkinGeometry, weight: Float32Array, origin: Float32Array) -> None:
+        self._geometry, self._weight, self._origin = geometry, weight[None], origin
+
+    def forward(self, codes: Float32Array, workspace: Workspace) -> PosedSkin:
+        """Pose the skin by (B, D) codes, in a workspace's memory."""
+        geometry, n_rows, empty = self._geometry, len(codes), workspace.empty
+        (n_skin, _), (n_sites, n_members) = geometry.offset.shape, geometry.members.shape
+        products = []
+        for number, group in enumerate(geometry.groups):
+            own = np.ascontiguousarray(codes[None, :, group.codes])
+            out = empty(f"group {number}", 1, n_rows, group.table.shape[1])
+            products.append(multiply(own, group.table[None], out)[0])
+        outputs = empty("outputs", n_rows, N_FEATURES * len(geometry.target))
+        np.tanh(np.concatenate(products, axis=1, out=outputs), out=outputs)
+        outputs = outputs.reshape(n_rows, -1, N_FEATURES)
+        features = empty("features", n_rows, n_skin, N_FEATURES)
+        skin_kernels.add_features(
+            outputs, geometry.target, geometry.offset, geometry.scale, features
+        )
+        turns = skin_kernels.rodrigues(features)
+        frame = empty("frame", n_rows, *geometry.rest_frame.shape)
+        rows = empty("rows", n_rows, 3, n_skin, 3)
+        skin_kernels.deform(features, turns, geometry.rest_frame, frame, rows)
+        own = rows[:, :, : geometry.n_points].reshape(1, 3 * n_rows, -1)
+        moved = multiply(own, self._weight, empty("moved", 1, 3 * n_rows, geometry.n_points))
+        positions = moved.reshape(n_rows, 3, -1) + self._origin
+        folds = empty("folds", n_sites, n_rows, N_FEATURES * n_members)
+        skin_kernels.fold_view(frame, rows, geometry.members, folds)
+        return PosedSkin(frame, positions, folds, outputs, features, turns, rows)
+
+    def backward(
+        self,
+        skin: PosedSkin,
+        grad_frame: Float32Array,
+        grad_positions: Float32Array,
+        grad_folds: Float32Array,
+    ) -> Float32Array:
+        """Pull derivatives by frames, positions and folds back to (B, D) codes; adds to frames."""
+        geometry, n_rows = self._geometry, len(skin.frame)
+        grad_rows = np.zeros_like(skin.rows)
+        grad_own = multiply_back(grad_positions.reshape(1, 3 * n_rows, -1), self._weight)
+        grad_rows[:, :, : geometry.n_points] = grad_own.reshape(n_rows, 3, -1, 3)
+        skin_kernels.fold_view_backward(
+            skin.frame, skin.rows, geometry.members, grad_folds, grad_frame, grad_rows
+        )
+        grad_features = np.empty_like(skin.features)
+        skin_kernels.deform_backward(
+            skin.features, skin.turns, geometry.rest_frame, grad_frame, grad_rows, grad_features
+        )
+        grad_products = np.empty((n_rows, skin.outputs[0].size), dtype=np.float32)
+        skin_kernels.add_features_backward(
+            skin.outputs, geometry.target, geometry.scale, grad_features, grad_products
+        )
+        grad_codes, start = [], 0
+        for group in geometry.groups:
+            stop = start + group.table.shape[1]
+            own = np.ascontiguousarray(grad_products[None, :, start:stop])
+            grad_codes.append(multiply_back(own, group.table[None])[0])
+            start = stop
+        return np.concatenate(grad_codes, axis=1)
