@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -59,7 +60,7 @@ def evaluate(
         )
     if as_json:
         share = {"colliding_share": float(rows.colliding.mean())}
-        print_json(measured_model(model) | share | {"threshold": threshold} | metrics.to_metadata())
+        print_json(measured_model(model) | share | {"threshold": threshold} | asdict(metrics))
         return
     called = "" if threshold == 0.5 else f", decision threshold {threshold:g}"
     tell(f"{model.name}, preset {trained.preset}{called}: {scores_sentence(metrics)}")

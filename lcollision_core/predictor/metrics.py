@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.json_values import from_json
 from lcollision_core.meshes.topology import FloatArray
 
 CALIBRATION_BINS = 10
@@ -30,8 +27,8 @@ class CalibrationBin:
     """
 
     samples: int
-    probability: float | None
-    colliding_share: float | None
+    probability: float | None = None
+    colliding_share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -78,25 +75,6 @@ class PredictorMetrics:
         if self.samples < 1 or len(self.calibration) != CALIBRATION_BINS:
             raise ValueError(f"samples must be over 0, and calibration {CALIBRATION_BINS} entries")
 
-    def to_metadata(self) -> dict[str, Any]:
-        """Return the metrics as JSON values."""
-        values = asdict(self)
-        values["calibration"] = list(values["calibration"])
-        return values
-
-    @classmethod
-    def from_metadata(cls, metadata: Mapping[str, Any]) -> PredictorMetrics:
-        """Rebuild metrics from JSON values; ValueError if it cannot."""
-        return from_json(cls, metadata, "metrics")
-
-
-@dataclass(frozen=True)
-class EnergyScores:
-    """Which scores of the energies mean anything: those whose losses were trained on."""
-
-    depth: bool
-    rank: bool
-
 
 def measure(
     probability: FloatArray,
@@ -104,8 +82,10 @@ def measure(
     colliding: npt.NDArray[np.bool_],
     energy: FloatArray,
     margin: float,
-    scores: EnergyScores,
     threshold: float = 0.5,
+    *,
+    depth: bool = True,
+    rank: bool = True,
 ) -> PredictorMetrics:
     """Score predictions against exact labels.
 
@@ -116,13 +96,12 @@ def measure(
     colliding : (B,) the truth
     energy : (B,) PDe-sum, scaled
     margin : alpha, scaled
-    scores : of the energies that are wanted
     threshold : probability above which a pose is called colliding
+    depth, rank : whether L_PD and L_rank were trained: without, what they teach is not scored
     """
-    called = probability > threshold
+    called, ranked = probability > threshold, depth or rank
     n_colliding = int(colliding.sum())
     n_free = len(colliding) - n_colliding
-    both = scores.depth or scores.rank
     bins, calibration_error = _calibration(probability, colliding)
     return PredictorMetrics(
         samples=len(colliding),
@@ -130,9 +109,11 @@ def measure(
         false_positive_rate=_ratio(int((called & ~colliding).sum()), n_free),
         false_negative_rate=_ratio(int((~called & colliding).sum()), n_colliding),
         majority_rate=max(n_free, n_colliding) / len(colliding),
-        energy_mse=float(((predicted_energy - energy) ** 2).mean()) if scores.depth else None,
-        ranking_margin=_ranking_margin(predicted_energy, energy, margin) if both else None,
-        spearman=_spearman(predicted_energy[colliding], energy[colliding]) if both else None,
+        energy_mse=float(((predicted_energy - energy) ** 2).mean()) if depth else None,
+        ranking_margin=_ranking_margin(predicted_energy, energy, margin) if ranked else None,
+        spearman=_spearman(predicted_energy[colliding], energy[colliding])
+        if depth or rank
+        else None,
         calibration_error=calibration_error,
         calibration=bins,
     )
@@ -159,26 +140,22 @@ def _ranking_margin(predicted: FloatArray, energy: FloatArray, margin: float) ->
 
 
 def _spearman(predicted: FloatArray, energy: FloatArray) -> float | None:
-    from scipy.stats import rankdata
+    from scipy.stats import spearmanr
 
-    ranks = rankdata(predicted), rankdata(energy)
-    if len(energy) < 2 or any(np.ptp(rank) == 0.0 for rank in ranks):
+    if len(energy) < 2 or np.ptp(predicted) == 0.0 or np.ptp(energy) == 0.0:
         return None
-    return float(np.corrcoef(*ranks)[0, 1])
+    return float(spearmanr(predicted, energy).statistic)
 
 
 def _calibration(
     probability: FloatArray, colliding: npt.NDArray[np.bool_]
 ) -> tuple[tuple[CalibrationBin, ...], float]:
-    place = np.minimum((probability * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
-    bins, error = [], 0.0
-    for number in range(CALIBRATION_BINS):
-        chosen = place == number
-        count = int(chosen.sum())
-        if not count:
-            bins.append(CalibrationBin(0, None, None))
-            continue
-        mean, share = float(probability[chosen].mean()), float(colliding[chosen].mean())
-        bins.append(CalibrationBin(count, mean, share))
-        error += abs(mean - share) * count / len(colliding)
-    return tuple(bins), error
+    number = np.minimum((probability * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
+    counts, expected, found = (
+        np.bincount(number, weights, CALIBRATION_BINS) for weights in (None, probability, colliding)
+    )
+    bins = [
+        CalibrationBin(int(n), float(mean / n), float(share / n)) if n else CalibrationBin(0)
+        for n, mean, share in zip(counts, expected, found, strict=True)
+    ]
+    return tuple(bins), float(np.abs(expected - found).sum()) / len(colliding)

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import expit
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.json_values import from_json, quoted
 from lcollision_core.labels import LabelRows, StoreIdentity
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.inference.network import CompiledNetwork
-from lcollision_core.predictor.metrics import EnergyScores, PredictorMetrics, measure
+from lcollision_core.predictor.metrics import PredictorMetrics, measure
 from lcollision_core.predictor.stored_network import require_network
 
 if TYPE_CHECKING:
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 BATCH_ROWS = 500
 """Rows that are predicted at a time: their hidden layers stay in the caches."""
-
-_ROWS_A_THREAD = 64
-"""Fewer poses than this are not worth a thread."""
 
 _ROWS_A_REPORT = 50 * BATCH_ROWS
 
@@ -140,7 +137,7 @@ class PredictorRecord:
             return cls(
                 config,
                 TrainingFacts.from_metadata(metadata.get("facts", {})),
-                None if measured is None else PredictorMetrics.from_metadata(measured),
+                None if measured is None else from_json(PredictorMetrics, measured, "metrics"),
             )
         except (ValueError, LCollisionError) as error:
             raise _misfit(error) from error
@@ -237,7 +234,7 @@ class CollisionPredictor:
         domain_energy = np.maximum(scaled, 0.0) * self.facts.energy_scale
         if domain_energy.shape[1] != self.n_domains:
             domain_energy = np.repeat(domain_energy / self.n_domains, self.n_domains, axis=1)
-        results = (domain_energy, domain_energy.sum(axis=1), logit, _sigmoid(logit))
+        results = (domain_energy, domain_energy.sum(axis=1), logit, expit(logit))
         for array in results:
             array.flags.writeable = False
         return Prediction(*results)
@@ -259,27 +256,9 @@ class CollisionPredictor:
         ShapeError : another shape, or a number that is not finite.
         """
         self._require(latent)
-        codes = np.ascontiguousarray(latent, dtype=np.float32)
-        n_outputs = self.n_domains if self.config.by_domain else 1
-        domain_energy, logit = np.empty((len(codes), n_outputs)), np.empty(len(codes))
-        compiled = self._compiled
-        # Torch shares out its work by itself.
-        compute = self._torch_outputs if compiled is None else compiled.outputs
-        most_threads = 1 if compiled is None else available_cores()
-
-        def fill(start: int, stop: int) -> None:
-            domain_energy[start:stop], logit[start:stop] = compute(codes[start:stop])
-
-        n_threads = max(1, min(most_threads, len(codes) // _ROWS_A_THREAD))
-        cuts = np.linspace(0, len(codes), n_threads + 1).astype(int).tolist()
-        if n_threads == 1:
-            fill(0, len(codes))
-        else:
-            with ThreadPoolExecutor(n_threads, "predict") as pool:
-                for _ in pool.map(fill, cuts[:-1], cuts[1:]):
-                    pass
-        logit += self.facts.logit_shift
-        return domain_energy, logit
+        compute = self._torch_outputs if self._compiled is None else self._compiled.outputs
+        domain_energy, logit = compute(np.ascontiguousarray(latent, dtype=np.float32))
+        return domain_energy, logit + self.facts.logit_shift
 
     def _torch_outputs(self, codes: npt.NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
         """Return the network's own scaled energies and logits, by torch."""
@@ -359,7 +338,7 @@ class CollisionPredictor:
             "preset": self.preset,
             "config": asdict(self.config),
             "facts": asdict(self.facts),
-            "metrics": self.metrics and self.metrics.to_metadata(),
+            "metrics": self.metrics and asdict(self.metrics),
         }
         return Section(self._arrays, metadata)
 
@@ -445,13 +424,12 @@ def evaluate_predictor(
             "there are no rows to evaluate on", "label more with `lcollision label`"
         )
     probability, predicted = np.empty(len(rows)), np.empty(len(rows))
-    for start in range(0, len(rows), _ROWS_A_REPORT):
-        if cancel is not None:
-            cancel.raise_if_cancelled()
-        part = slice(start, start + _ROWS_A_REPORT)
-        scaled, logit = predictor.scaled_outputs(rows.latent[part])
-        probability[part], predicted[part] = _sigmoid(logit), scaled.sum(axis=1)
-        progress(min(start + _ROWS_A_REPORT, len(rows)), len(rows))
+
+    def score(start: int, stop: int) -> None:
+        scaled, logit = predictor.scaled_outputs(rows.latent[start:stop])
+        probability[start:stop], predicted[start:stop] = expit(logit), scaled.sum(axis=1)
+
+    for_blocks(score, len(rows), _ROWS_A_REPORT, 1, progress, cancel)
     scale = predictor.facts.energy_scale
     config = predictor.config
     return measure(
@@ -460,14 +438,10 @@ def evaluate_predictor(
         rows.colliding,
         rows.energy / scale,
         predictor.facts.margin,
-        EnergyScores(depth=config.depth_weight > 0.0, rank=config.rank_weight > 0.0),
         threshold,
+        depth=config.depth_weight > 0.0,
+        rank=config.rank_weight > 0.0,
     )
-
-
-def _sigmoid(logit: FloatArray) -> FloatArray:
-    probability: FloatArray = np.exp(-np.logaddexp(0.0, -logit))
-    return probability
 
 
 def require_model(rows: LabelRows, embedding: Embedding) -> None:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping
-from itertools import pairwise, starmap
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
+from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.inference import field_kernels, network_kernels
 from lcollision_core.predictor.inference.field_kernels import UNITS
@@ -59,29 +60,35 @@ class CompiledNetwork:
     def outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Return (B, K) scaled energies of the domains, and (B,) logits, of (B, D) poses."""
         root, logit = np.empty((len(latent), self._head.n_out - 2)), np.empty(len(latent))
-        for rows, codes, workspace in self._parts(latent):
-            trace = self._forward(codes, workspace)
-            root[rows], logit[rows] = trace.head[-1][0, :, 1:-1], trace.logit
+
+        def fill(start: int, stop: int) -> None:
+            with self._workspace() as workspace:
+                trace = self._forward(latent[start:stop].astype(np.float32), workspace)
+                root[start:stop], logit[start:stop] = trace.head[-1][0, :, 1:-1], trace.logit
+
+        for_blocks(fill, len(latent), _ROWS_AT_ONCE)
         return np.square(np.maximum(root, 0.0)), logit
 
     def logit_and_gradient(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (B,) logits of (B, D) poses, and each one's (B, D) derivative by its codes."""
         logit, gradient = np.empty(len(latent)), np.empty(latent.shape)
-        for rows, codes, workspace in self._parts(latent):
-            trace = self._forward(codes, workspace)
-            logit[rows], gradient[rows] = trace.logit, self._backward(trace)
+
+        def fill(start: int, stop: int) -> None:
+            with self._workspace() as workspace:
+                trace = self._forward(latent[start:stop].astype(np.float32), workspace)
+                logit[start:stop], gradient[start:stop] = trace.logit, self._backward(trace)
+
+        for_blocks(fill, len(latent), _ROWS_AT_ONCE)
         return logit, gradient
 
-    def _parts(self, latent: npt.NDArray[Any]) -> Iterator[tuple[slice, Array, Workspace]]:
-        """Yield rows of about one number, their codes, and the workspace of an earlier call."""
-        codes, n_parts = latent.astype(np.float32), -(-len(latent) // _ROWS_AT_ONCE)
-        cuts = np.linspace(0, len(latent), n_parts + 1).astype(int).tolist()
+    @contextmanager
+    def _workspace(self) -> Iterator[Workspace]:
+        """Lend the workspace of an earlier call, or a new one."""
         try:
             workspace = self._spare.pop()
         except IndexError:
             workspace = Workspace()
-        for rows in starmap(slice, pairwise(cuts)):
-            yield rows, codes[rows], workspace
+        yield workspace
         self._spare.append(workspace)
 
     def _forward(self, codes: Array, workspace: Workspace) -> _Trace:

@@ -44,6 +44,26 @@ def farthest_points(positions: FloatArray, first: int, n_points: int) -> npt.NDA
     return np.array(chosen)
 
 
+def neighbour_order(positions: FloatArray, block: int) -> npt.NDArray[np.int32]:
+    """Order (n, 3) positions so that each block of so many in turn lies close together.
+
+    They are halved across their longest extent, and the halves likewise. The last one is there
+    again as often as fills its block.
+    """
+
+    def ordered(index: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:
+        n_blocks = -(-len(index) // block)
+        if n_blocks < 2:
+            return [index]
+        own = positions[index]
+        along = own[:, np.ptp(own, axis=0).argmax()].argsort(kind="stable")
+        half = n_blocks // 2 * block
+        return ordered(index[along[:half]]) + ordered(index[along[half:]])
+
+    order = np.concatenate(ordered(np.arange(len(positions))))
+    return np.append(order, np.repeat(order[-1], -len(order) % block)).astype(np.int32)
+
+
 def skin_graph(embedding: Embedding) -> sparse.csr_matrix:
     """Return the (V, V) lengths of the reference's edges, in normalised length."""
     return length_graph(embedding.topology.edges, embedding.rest_vertices)

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
@@ -15,6 +14,7 @@ from lcollision_core.predictor.inference.field_kernels import BLOCK, in_blocks
 from lcollision_core.predictor.inference.points import (
     N_POINTS,
     body_points,
+    neighbour_order,
     skin_distances,
     skin_graph,
     tangent_frames,
@@ -102,8 +102,7 @@ class SkinGeometry:
         skin = np.append(framed, np.setdiff1d(sites, framed))
         distance = skin_distances(skin_graph(embedding), vertex, limit=DISTANT)[:, vertex]
         neighbours = np.isfinite(distance).astype(np.float32)
-        order = cKDTree(embedding.rest_vertices[vertex], leafsize=BLOCK).indices.astype(np.int32)
-        order = np.append(order, np.repeat(order[-1:], -len(order) % BLOCK))
+        order = neighbour_order(embedding.rest_vertices[vertex], BLOCK)
         place = np.zeros(n_vertices, dtype=np.int32)
         place[skin] = np.arange(len(skin))
         groups, targets, code = [], [], 0

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial import cKDTree
 
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import CancelledError, LCollisionError
@@ -27,6 +26,7 @@ from lcollision_core.predictor.geometric.network import GeometricNetwork, _Auxil
 from lcollision_core.predictor.inference.field_kernels import BLOCK, FULL, RADII, SOME, in_blocks
 from lcollision_core.predictor.inference.points import (
     body_points,
+    neighbour_order,
     skin_cells,
     skin_distances,
     skin_graph,
@@ -116,11 +116,10 @@ def made_up() -> tuple[ContactField, torch.Tensor, torch.Tensor]:
     rng = np.random.default_rng(4)
     positions = 0.05 * rng.standard_normal((2, 3, 45))
     positions[1, 0, 20:] += 0.6
-    order = cKDTree(positions[1].T, leafsize=BLOCK).indices.astype(np.int32)
     half = np.triu(rng.random((45, 45)))
     near = half + np.triu(half, 1).T < 0.2
     frame = np.linalg.qr(rng.standard_normal((2, 45, 3, 3)))[0]
-    field = _field(near, np.append(order, [order[-1]] * 3))
+    field = _field(near, neighbour_order(positions[1].T, BLOCK))
     return field, torch.tensor(frame), torch.tensor(positions)
 
 
@@ -170,14 +169,17 @@ def test_the_compiled_field_is_that_of_torch(
     assert torch.autograd.gradcheck(field, (frame.requires_grad_(), positions.requires_grad_()))
 
 
-def test_each_block_of_points_lies_together(network: GeometricNetwork) -> None:
-    skin = network.skin
-    n_points = skin.n_points
-    assert np.array_equal(np.sort(skin.order[:n_points]), np.arange(n_points))
-    assert len(skin.order) % BLOCK == 0
-    assert set(skin.order[n_points:]) <= {skin.order[n_points - 1]}
-    assert (skin.geodesic_neighbours == skin.geodesic_neighbours.T).all()
-    assert (np.diag(skin.geodesic_neighbours) == 1.0).all()
+def test_neighbours_are_in_one_block() -> None:
+    """Two clusters of 8 and one of 3 points, in any order, come out as three blocks."""
+    rng = np.random.default_rng(3)
+    cluster = rng.permutation(np.repeat([0, 1, 2], [8, 8, 3]))
+    positions = 10.0 * cluster[:, None] + rng.random((19, 3))
+    order = neighbour_order(positions, 8)
+    assert order.dtype == np.int32
+    assert np.array_equal(np.sort(order[:19]), np.arange(19))
+    assert np.array_equal(cluster[order[:19]], np.repeat([0, 1, 2], [8, 8, 3]))
+    assert np.array_equal(cluster[order[19:]], [2] * 5)
+    assert len(neighbour_order(positions[:3], 8)) == 8
 
 
 def test_folds_are_looked_for_where_the_skin_folds(

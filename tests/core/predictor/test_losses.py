@@ -10,12 +10,10 @@ import pytest
 import torch
 
 from lcollision_core.predictor import PRESETS
-from lcollision_core.predictor.metrics import EnergyScores, mean_difference, measure
+from lcollision_core.predictor.metrics import mean_difference, measure
 from lcollision_core.predictor.network import NetworkOutput, Targets
 from lcollision_core.predictor.paper.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
 from lcollision_core.predictor.paper.network import PaperNetwork
-
-BOTH = EnergyScores(depth=True, rank=True)
 
 
 def _double(*values: object) -> torch.Tensor:
@@ -107,7 +105,7 @@ def test_scores_of_eight_poses_worked_by_hand() -> None:
     colliding = np.array([False, False, False, True, True, True, True, True])
     energy = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
     predicted = np.array([0.0, 0.5, 0.0, 1.0, 2.0, 4.0, 3.0, 5.0])
-    scores = measure(probability, predicted, colliding, energy, 0.25, BOTH)
+    scores = measure(probability, predicted, colliding, energy, 0.25)
     assert scores.samples == 8
     assert scores.accuracy == 5 / 8
     assert scores.false_positive_rate == 1 / 3
@@ -123,7 +121,7 @@ def test_scores_of_eight_poses_worked_by_hand() -> None:
     assert bins[5].colliding_share == 0.5
     errors = 0.05 + 0.15 + (1.0 - 0.45) + 2 * abs(0.525 - 0.5) + 3 * (1.0 - 2.9 / 3)
     assert scores.calibration_error == pytest.approx(errors / 8)
-    later = measure(probability, predicted, colliding, energy, 0.25, BOTH, threshold=0.6)
+    later = measure(probability, predicted, colliding, energy, 0.25, threshold=0.6)
     assert (later.accuracy, later.false_positive_rate) == (6 / 8, 0.0)
     assert later.false_negative_rate == 2 / 5
     assert later.calibration == scores.calibration
@@ -132,20 +130,20 @@ def test_scores_of_eight_poses_worked_by_hand() -> None:
 def test_ranking_score_is_the_mean_shortfall_over_random_pairs() -> None:
     energy = np.arange(400.0)
     truth = np.ones(400, dtype=bool)
-    right = measure(np.ones(400), energy, truth, energy, 0.5, BOTH)
+    right = measure(np.ones(400), energy, truth, energy, 0.5)
     assert right.ranking_margin == 0.0
-    silent = measure(np.ones(400), 0.0 * energy, truth, energy, 0.5, BOTH)
+    silent = measure(np.ones(400), 0.0 * energy, truth, energy, 0.5)
     assert silent.ranking_margin == 0.5
     # The other way round each pair falls short by its difference and the margin.
-    reverse = measure(np.ones(400), -energy, truth, energy, 0.5, BOTH)
+    reverse = measure(np.ones(400), -energy, truth, energy, 0.5)
     assert reverse.ranking_margin == pytest.approx(0.5 + 400 / 3, rel=0.1)
 
 
 def test_undefined_scores_are_none() -> None:
     none = np.zeros(3, dtype=bool)
-    scores = measure(np.zeros(3), np.zeros(3), none, np.zeros(3), 1.0, BOTH)
+    scores = measure(np.zeros(3), np.zeros(3), none, np.zeros(3), 1.0)
     assert (scores.false_negative_rate, scores.spearman, scores.ranking_margin) == (None,) * 3
-    untrained = measure(np.zeros(3), np.zeros(3), none, np.zeros(3), 1.0, EnergyScores(False, True))
+    untrained = measure(np.zeros(3), np.zeros(3), none, np.zeros(3), 1.0, depth=False)
     assert untrained.energy_mse is None
 
 
