@@ -36,8 +36,8 @@ class PredictorConfig:
     shown_rows : where not None, passes over many rows end when so many have been shown
     average_passes : time constant, in passes, of the exponential mean of the weights that is
         watched and kept in their place; 0 takes them as they are
-    balanced : whether the logit is shifted to where free and colliding poses are mistaken equally
-        often, see `balanced_logit`
+    balanced : whether the logit is shifted so that false positive and false negative rates are
+        about equal, see `balanced_logit`
 
     Raises
     ------

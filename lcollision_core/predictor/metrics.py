@@ -40,7 +40,7 @@ class PredictorMetrics:
     Attributes
     ----------
     samples : how many
-    accuracy : CLASSIFY, verdicts at probability 0.5 that are right
+    accuracy : CLASSIFY, share of right calls at probability 0.5
     false_positive_rate : free poses called colliding
     false_negative_rate : colliding poses called free
     majority_rate : accuracy of always saying what most samples are
@@ -120,7 +120,7 @@ def measure(
 
 
 def mean_difference(values: FloatArray) -> float:
-    """Return the mean of |a - b| over all pairs of different places, 0 for fewer than two."""
+    """Return the mean of |a - b| over all pairs of different indices, 0 for fewer than two."""
     n_values = len(values)
     if n_values < 2:
         return 0.0

@@ -33,7 +33,7 @@ class NetworkOutput(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """The truth of B poses.
+    """The labels of B poses.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Targets(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SkinCells:
-    """How the skin is divided, twice.
+    """How the skin is divided, into patches and into folds.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class PredictorNetwork(nn.Module, ABC):
         rows : some of those to train on, as they are in the store; None where a state dict will be
             loaded
         seed : of the initial weights
-        near_exclusion : of the rows, in heights
+        near_exclusion : of the rows, in normalised length
         """
 
     @classmethod
@@ -142,7 +142,7 @@ class PredictorNetwork(nn.Module, ABC):
         Parameters
         ----------
         output : for the rows of `part`
-        batch : the truth of the whole batch
+        batch : the labels of the whole batch
         part : first and last + 1 of this process's rows in the batch; the first is even
         config : the terms' weights
         margin : of the ranking loss, scaled

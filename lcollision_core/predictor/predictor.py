@@ -41,8 +41,8 @@ class Prediction:
 
     Attributes
     ----------
-    domain_energy : (B, K) float64 array, S_k >= 0, in squared heights; a predictor without
-        domains spreads its sum over all alike
+    domain_energy : (B, K) float64 array, S_k >= 0, in normalised length squared; a predictor
+        without domains spreads its sum over all alike
     energy : (B,) float64 array, S_sum, their sum
     collision_logit : (B,) float64 array
     collision_probability : (B,) float64 array, its sigmoid; over 0.5 the pose is called colliding
@@ -64,11 +64,11 @@ class TrainingFacts:
     training_rows : of them, that trained
     colliding_share : of all rows
     seed : of the initial weights and the order
-    energy_scale : mean PDe-sum of the colliding training rows, in squared heights; energies are
-        divided by it
+    energy_scale : mean PDe-sum of the colliding training rows, in normalised length squared;
+        energies are divided by it
     margin : alpha of the ranking loss, scaled
     store : what the rows label, None if they came without a store
-    logit_shift : added to the network's logit, which makes 0 the place to call poses colliding
+    logit_shift : added to the network's logit, which makes 0 the decision threshold
     """
 
     rows: int
@@ -216,7 +216,7 @@ class CollisionPredictor:
 
     @property
     def preset(self) -> str:
-        """The network's kind: "default" or "paper"."""
+        """The network's name: "default" or "paper"."""
         return self.config.preset
 
     def predict(self, latent: npt.NDArray[Any]) -> Prediction:

@@ -1,7 +1,7 @@
 """What a model file must hold of a trained network: checked without building the network.
 
-Building one takes a look at the body's surface, and the paper's takes torch; both wait until
-somebody predicts. What is loaded must be sound before that.
+Building one needs geometry of the body's surface, and the paper's needs torch; both wait until the
+first prediction. What is loaded is checked before that.
 """
 
 from __future__ import annotations

@@ -82,16 +82,16 @@ class ContactField(torch.nn.Module):
 
 
 class _CompiledField(torch.autograd.Function):
-    """The compiled sums: in torch, a step of training on the CPU takes thirty times as long."""
+    """The compiled loops: in torch, a step of training on the CPU takes thirty times as long."""
 
     @staticmethod
     def forward(
         ctx: Any, frame: torch.Tensor, positions: torch.Tensor, order: Any, blocks: Any
     ) -> torch.Tensor:
-        frames, places = _arrays(frame, positions)
+        frames, points = _arrays(frame, positions)
         ctx.order, ctx.blocks = order, blocks.astype(frames.dtype, copy=False)
         field = np.empty((positions.shape[2], len(frame), *UNITS.shape), dtype=frames.dtype)
-        field_kernels.contact_field(frames, places, ctx.order, ctx.blocks, field)
+        field_kernels.contact_field(frames, points, ctx.order, ctx.blocks, field)
         result = torch.from_numpy(field)
         ctx.save_for_backward(frame, positions, result)
         return result

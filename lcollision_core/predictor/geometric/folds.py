@@ -1,4 +1,4 @@
-"""Where skin folds onto itself, and the few vertices about such a place that tell when it does."""
+"""Where skin folds onto itself, and the few vertices about such a site that tell when it does."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from lcollision_core.predictor.inference.points import (
     skin_graph,
 )
 
-FOLD_REACH = 0.045
-"""Heights along the surface within which colliding faces are a fold of the skin, not two parts.
+FOLD_RADIUS = 0.045
+"""Normalised length along the surface within which colliding faces are a fold of the skin.
 
 Counted from the near exclusion, within which they are no collision.
 """
@@ -24,11 +24,11 @@ Counted from the near exclusion, within which they are no collision.
 N_SITES = 128
 N_MEMBERS = 12
 
-_MEMBER_REACH = 0.03
+_MEMBER_RADIUS = 0.03
 """Likewise: how far a site's members spread."""
 
 _SPREAD, _REDUNDANCE = 0.02, 0.85
-"""Heights within which a chosen site makes its neighbours redundant, and how much."""
+"""Normalised length within which a chosen site makes its neighbours redundant, and how much."""
 
 _MASKED_FOLD = 0.2
 """What a fold is worth in a pose that collides elsewhere too."""
@@ -42,14 +42,14 @@ class FoldDetector:
 
     Parameters
     ----------
-    embedding : of the body; poses are in heights
-    near_exclusion : of pairs that do not count, in heights
+    embedding : of the body; poses are in normalised length
+    near_exclusion : of pairs that do not count, in normalised length
     """
 
     def __init__(self, embedding: Embedding, near_exclusion: float) -> None:
         topology, rest = embedding.topology, embedding.rest_vertices
-        reach = near_exclusion + FOLD_REACH
-        self._detector = CollisionDetector(topology, rest, near_exclusion=reach)
+        radius = near_exclusion + FOLD_RADIUS
+        self._detector = CollisionDetector(topology, rest, near_exclusion=radius)
         self._excluded = near_vertices(topology, rest, near_exclusion * self._detector.body_size)
 
     def detect(
@@ -65,13 +65,13 @@ class FoldDetector:
 def find_fold_sites(
     embedding: Embedding, latent: npt.NDArray[np.floating], near_exclusion: float = 0.0
 ) -> npt.NDArray[np.int64]:
-    """Search colliding poses for the places where the skin folds most often.
+    """Search colliding poses for the sites where the skin folds most often.
 
     Parameters
     ----------
     embedding : decodes
     latent : (n, D) poses that collide; some thousands are looked at
-    near_exclusion : of pairs that do not count, in heights
+    near_exclusion : of pairs that do not count, in normalised length
 
     Returns
     -------
@@ -79,13 +79,13 @@ def find_fold_sites(
         not fold
     """
     score = _fold_share(embedding, latent[:_SEARCHED_POSES], near_exclusion)
-    reach = _MEMBER_REACH + near_exclusion
+    radius = _MEMBER_RADIUS + near_exclusion
     graph = skin_graph(embedding)
     members: list[npt.NDArray[np.int64]] = []
     while len(members) < N_SITES and score.max(initial=0.0) > 0.0:
         centre = int(score.argmax())
         (distance,) = skin_distances(graph, np.array([centre]))
-        members.append(_spread_members(embedding, distance, reach))
+        members.append(_spread_members(embedding, distance, radius))
         score *= 1.0 - _REDUNDANCE * np.exp(-((distance / _SPREAD) ** 2))
         score[centre] = 0.0
     return np.array(members, dtype=np.int64).reshape(-1, N_MEMBERS)
@@ -106,12 +106,12 @@ def _fold_share(
 
 
 def _spread_members(
-    embedding: Embedding, distance: FloatArray, reach: float
+    embedding: Embedding, distance: FloatArray, radius: float
 ) -> npt.NDArray[np.int64]:
     """Choose `N_MEMBERS` vertices about the one at distance 0, each farthest from those before."""
     order = distance.argsort(kind="stable")
-    # A coarse mesh has too few within reach: the nearest then; a tiny one repeats its own.
-    n_near = max(int((distance <= reach).sum()), N_MEMBERS)
+    # A coarse mesh has too few within the radius: the nearest then; a tiny one repeats its own.
+    n_near = max(int((distance <= radius).sum()), N_MEMBERS)
     near = np.resize(order[:n_near], n_near)
     members: npt.NDArray[np.int64] = near[
         farthest_points(embedding.rest_vertices[near], 0, N_MEMBERS)

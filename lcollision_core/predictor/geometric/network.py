@@ -2,10 +2,10 @@
 
 A latent code is a poor coordinate for collision: whether a hand touches a thigh depends on where
 both are, and that on every joint between. So the codes are decoded to some hundred points of the
-skin first (`ReducedBody`), and each feels what distant skin comes near it (`contact_field`): how
+skin first (`ReducedBody`), and each has contact features (`ContactField`) of what comes near: how
 much, how far above that skin's surface, in what direction. Skin that folds onto itself, in an
 elbow, shows in the deformation of the few vertices about it (`fold_view`). Small networks, one for
-each point and each site, say whether the patch of skin round it is hit, and how deeply, and are
+each point and each site, say whether the patch of skin round it collides, and how deeply, and are
 taught that by its exact energy, which is worth hundreds of labels a pose. What follows joins them
 to the domains' energies and the logit.
 
@@ -65,7 +65,7 @@ class _Auxiliary(NamedTuple):
 
     Attributes
     ----------
-    patch_logit : (B, P + S) of each patch and each fold being hit
+    patch_logit : (B, P + S) of each patch and each fold colliding
     patch_root : (B, P + S) square roots of their energies
     root_energy : (B, K + 1) square roots of the domains' energies and of their sum
     """
@@ -76,13 +76,13 @@ class _Auxiliary(NamedTuple):
 
 
 class GeometricNetwork(PredictorNetwork):
-    """Patches of skin that feel what comes near.
+    """Patches of skin, each with a network that reads what comes near it.
 
     Parameters
     ----------
     embedding : of the body
     seed : of the initial weights
-    sites : (S, M) integer array, vertices about each place where the skin folds, see
+    sites : (S, M) integer array, vertices about each site where the skin folds, see
         `find_fold_sites`
     n_points, width : P, and the size of the patches' hidden layers
 
@@ -191,7 +191,7 @@ class GeometricNetwork(PredictorNetwork):
         )
 
     def _inputs(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (P, B, n) what each point feels, and (S, B, n) how each site is deformed."""
+        """Return (P, B, n) contact features, and (S, B, n) how each site is deformed."""
         frame, gradients, positions = self.body(latent)
         return self.field(frame, positions).flatten(2), self.body.fold_view(frame, gradients)
 
@@ -215,11 +215,13 @@ class GeometricNetwork(PredictorNetwork):
         for layer in self.head[:-1]:
             values = silu(layer(values))
         values = self.head[-1](values)
-        hit = torch.logsumexp(patch_logit, dim=1) * self.any_hit[0] + self.any_hit[1]
+        contact = torch.logsumexp(patch_logit, dim=1) * self.any_hit[0] + self.any_hit[1]
         root = values[:, 1:]
         # Energies are taught as square roots: their tail is long.
         energy = root[:, :-1].clamp_min(0.0).square()
-        return NetworkOutput(energy, values[:, 0] + hit, _Auxiliary(patch_logit, patch_root, root))
+        return NetworkOutput(
+            energy, values[:, 0] + contact, _Auxiliary(patch_logit, patch_root, root)
+        )
 
     def loss(
         self,
@@ -240,17 +242,19 @@ class GeometricNetwork(PredictorNetwork):
             output.logit, own.colliding
         )
         n_patches = self.skin.n_points
-        for kind, weight, depth_weight in (
+        for cells, weight, depth_weight in (
             (slice(0, n_patches), _PATCH_WEIGHT, _DEPTH_WEIGHT),
             (slice(n_patches, None), _FOLD_WEIGHT, _FOLD_DEPTH_WEIGHT),
         ):
-            taught = own.patch_root[:, kind]
+            taught = own.patch_root[:, cells]
             if taught.shape[1]:
-                hit = (taught > 0.0).to(patch_logit)
-                total = total + weight * binary_cross_entropy_with_logits(patch_logit[:, kind], hit)
-                total = total + depth_weight * smooth_l1_loss(patch_root[:, kind], taught)
-        truth = torch.cat([own.domain_energy, own.energy[:, None]], dim=1).sqrt()
-        total = total + config.depth_weight * smooth_l1_loss(root, truth)
+                colliding = (taught > 0.0).to(patch_logit)
+                total = total + weight * binary_cross_entropy_with_logits(
+                    patch_logit[:, cells], colliding
+                )
+                total = total + depth_weight * smooth_l1_loss(patch_root[:, cells], taught)
+        labelled = torch.cat([own.domain_energy, own.energy[:, None]], dim=1).sqrt()
+        total = total + config.depth_weight * smooth_l1_loss(root, labelled)
         return share * total
 
 

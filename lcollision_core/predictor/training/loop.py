@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -51,7 +51,7 @@ _TINY_MOMENT = 1e-30
 """What falls by 0.9 a step, as Adam's mean does, is still in normal form so many steps later."""
 
 _STEPS_BETWEEN_AVERAGES = 10
-"""The mean of the weights takes every so manieth in: each step's would cost a sixth of its time."""
+"""The mean of the weights takes in every n-th step: all of them would cost a sixth of the time."""
 
 _WARM_UP = 0.2
 _LEAST_RATE = 1e-2
@@ -61,6 +61,7 @@ _PART, _PATCHES = "training", "patches"
 _NETWORK, _AVERAGE, _OPTIMISER = "network:", "average:", "optimiser:"
 
 
+@dataclass(eq=False)
 class TrainingLoop:
     """Trains a preset's network.
 
@@ -74,29 +75,24 @@ class TrainingLoop:
     progress, cancel : see `training.train_predictor`
     """
 
-    def __init__(
-        self,
-        rows: LabelRows,
-        split: RowSplit,
-        embedding: Embedding,
-        config: PredictorConfig,
-        facts: TrainingFacts,
-        device: str,
-        checkpoint: Path | None,
-        progress: StatusCallback,
-        cancel: CancelToken,
-    ) -> None:
-        self._rows, self._embedding = rows, embedding
-        self._config, self._facts = config, facts
-        self._device_name, self._path = device, checkpoint
+    rows: LabelRows
+    split: RowSplit
+    embedding: Embedding
+    config: PredictorConfig
+    facts: TrainingFacts
+    device: str
+    checkpoint: Path | None
+    progress: StatusCallback
+    cancel: CancelToken
+
+    def __post_init__(self) -> None:
         # A file of its own, for it is large, and written before the first step.
-        self._patches_path = checkpoint and patches_path(checkpoint)
-        self._progress, self._cancel = progress, cancel
-        self._near_exclusion = 0.0 if facts.store is None else facts.store.near_exclusion
-        self._training_index = split.training
-        self._watched = rows.taken(split.held_out[:_WATCHED_ROWS])
-        self._steps_an_epoch = -(-len(self._training_index) // config.batch_rows)
-        self._epochs = config.passes(len(self._training_index))
+        self._patches_path = self.checkpoint and patches_path(self.checkpoint)
+        self._near_exclusion = 0.0 if self.facts.store is None else self.facts.store.near_exclusion
+        self._training_index = self.split.training
+        self._watched = self.rows.taken(self.split.held_out[:_WATCHED_ROWS])
+        self._steps_an_epoch = -(-len(self._training_index) // self.config.batch_rows)
+        self._epochs = self.config.passes(len(self._training_index))
         self._total = self._epochs * self._steps_an_epoch
         self._losses: list[float] = []
         self._accuracy: float | None = None
@@ -114,19 +110,19 @@ class TrainingLoop:
             training diverges.
         CancelledError : the cancel token was set; the checkpoint holds the last step.
         """
-        with joined_processes(self._device_name) as processes:
+        with joined_processes(self.device) as processes:
             network = self._run(processes)
         if self._patches_path is not None:
             self._patches_path.unlink(missing_ok=True)
         return self._judged(network)
 
     def _run(self, processes: Processes) -> PredictorNetwork:
-        config = self._config
+        config = self.config
         key = self._key()
-        checkpoint = Checkpoint(self._path, key)
-        some = self._rows.taken(self._training_index[:_BUILDING_ROWS])
+        checkpoint = Checkpoint(self.checkpoint, key)
+        some = self.rows.taken(self._training_index[:_BUILDING_ROWS])
         network = NETWORKS[config.preset].build(
-            self._embedding, config, some, self._facts.seed, self._near_exclusion
+            self.embedding, config, some, self.facts.seed, self._near_exclusion
         )
         network = network.to(processes.device)
         learnt = [values for values in network.parameters() if values.requires_grad]
@@ -140,10 +136,10 @@ class TrainingLoop:
         if processes.count > 1:
             shared = DistributedDataParallel(network)
         batches = _Batches(
-            self._rows,
+            self.rows,
             self._training_index,
             config,
-            self._facts,
+            self.facts,
             processes.device,
             self._patch_roots(network, key, processes),
         )
@@ -157,7 +153,7 @@ class TrainingLoop:
                 group["lr"] = rate_at(step, self._total, config)
             optimiser.zero_grad(set_to_none=True)
             output = shared(latent[part[0] : part[1]])
-            loss = network.loss(output, targets, part, config, self._facts.margin)
+            loss = network.loss(output, targets, part, config, self.facts.margin)
             # Processes average their gradients, but each holds a share of the sum; and they wait
             # for every parameter's, those among them that this loss leaves out.
             outputs = (output.domain_energy, output.logit, *output.auxiliary)
@@ -182,7 +178,7 @@ class TrainingLoop:
     ) -> npt.NDArray[np.float16]:
         """Label the patches, or go on from what an earlier run kept beside the checkpoint."""
         n_rows = len(self._training_index)
-        cells = network.skin_cells(self._embedding)
+        cells = network.skin_cells(self.embedding)
         if cells is None:
             return np.empty((n_rows, 0), dtype=np.float16)
         kept = Checkpoint(self._patches_path, key)
@@ -194,7 +190,7 @@ class TrainingLoop:
             return known
         roots[: len(known)] = known
         labeller = PatchLabeller(
-            self._embedding, self._rows, cells, self._near_exclusion, self._facts.energy_scale
+            self.embedding, self.rows, cells, self._near_exclusion, self.facts.energy_scale
         )
         step = max(-(-n_rows // _TIMES_PATCHES_KEPT), _LEAST_PATCHES_KEPT)
         for start in range(len(known), n_rows, step):
@@ -221,12 +217,12 @@ class TrainingLoop:
         mine = self._training_index[start + first : start + end]
         stopped = False
         try:
-            part[first:end] = labeller.roots(mine, report, self._cancel)
+            part[first:end] = labeller.roots(mine, report, self.cancel)
         except CancelledError:
             stopped = True
         if processes.any_of(stopped):
-            self._cancel.cancel()
-            self._cancel.raise_if_cancelled()
+            self.cancel.cancel()
+            self.cancel.raise_if_cancelled()
         processes.add_up(part)
 
     def _after_step(
@@ -237,7 +233,7 @@ class TrainingLoop:
         checkpoint: Checkpoint,
         processes: Processes,
     ) -> None:
-        stop, due = self._cancel.cancelled, checkpoint.due
+        stop, due = self.cancel.cancelled, checkpoint.due
         if processes.count > 1:
             talk = step % _STEPS_BETWEEN_TALKS == 0
             stop = talk and processes.any_of(stop)
@@ -247,8 +243,8 @@ class TrainingLoop:
             self._save(step, network, optimiser, checkpoint)
         if stop:
             processes.wait()
-            self._cancel.cancel()
-            self._cancel.raise_if_cancelled()
+            self.cancel.cancel()
+            self.cancel.raise_if_cancelled()
         if step % self._steps_an_epoch == 0:
             self._report(step)
             self._losses.clear()
@@ -257,7 +253,7 @@ class TrainingLoop:
 
     def _report(self, step: int) -> None:
         self._reported = time.monotonic()
-        self._progress(
+        self.progress(
             PredictorStatus(
                 epoch=step // self._steps_an_epoch,
                 epochs=self._epochs,
@@ -275,17 +271,17 @@ class TrainingLoop:
 
     def _key(self) -> str:
         """Return a digest of all that decides how this run ends."""
-        rows = self._rows
+        rows = self.rows
         digest = hashlib.sha256()
         for array in (rows.latent, rows.domain_energy, rows.energy, rows.n_pairs):
             digest.update(np.ascontiguousarray(array).data.cast("B"))
         options = {
             "version": _RUN_VERSION,
-            "config": asdict(self._config),
-            "seed": self._facts.seed,
+            "config": asdict(self.config),
+            "seed": self.facts.seed,
             "rows": digest.hexdigest(),
         }
-        return run_key({"mask": self._embedding.attention_mask}, options)
+        return run_key({"mask": self.embedding.attention_mask}, options)
 
     def _save(
         self,
@@ -310,67 +306,60 @@ class TrainingLoop:
     def _restore(
         self, checkpoint: Checkpoint, network: PredictorNetwork, optimiser: torch.optim.Optimizer
     ) -> int:
-        """Put a stored run's state into place and return the steps that it has done."""
+        """Load a stored run's state and return the steps that it has done."""
         stored = checkpoint.get(_PART)
         if stored is None:
             return 0
-        weights, average, state = {}, {}, optimiser.state_dict()
+        held: dict[str, dict[str, Tensor]] = {_NETWORK: {}, _AVERAGE: {}, _OPTIMISER: {}}
         for name, array in stored.arrays.items():
-            values = torch.tensor(array)
-            if name.startswith(_NETWORK):
-                weights[name.removeprefix(_NETWORK)] = values
-            elif name.startswith(_AVERAGE):
-                average[name.removeprefix(_AVERAGE)] = values
-            else:
-                _, number, what = name.split(":")
-                state["state"].setdefault(int(number), {})[what] = values
-        network.load_state_dict(weights)
+            prefix, own = name.split(":", 1)
+            held[f"{prefix}:"][own] = torch.tensor(array)
+        network.load_state_dict(held[_NETWORK])
         if self._average is not None:
-            self._average.load_state_dict(average)
+            self._average.load_state_dict(held[_AVERAGE])
+        state = optimiser.state_dict()
+        for name, values in held[_OPTIMISER].items():
+            number, what = name.split(":")
+            state["state"].setdefault(int(number), {})[what] = values
         optimiser.load_state_dict(state)
         self._losses = list(stored.metadata["losses"])
         self._accuracy = stored.metadata["accuracy"]
         return int(stored.metadata["step"])
 
 
+@dataclass(eq=False)
 class _Batches:
     """Cuts each epoch's order into batches; the order depends on seed and epoch alone."""
 
-    def __init__(
-        self,
-        rows: LabelRows,
-        training_index: npt.NDArray[np.int64],
-        config: PredictorConfig,
-        facts: TrainingFacts,
-        device: torch.device,
-        patch_root: npt.NDArray[np.float16],
-    ) -> None:
-        self._rows, self._training_index, self._patch_root = rows, training_index, patch_root
-        self._batch_rows, self._facts, self._device = config.batch_rows, facts, device
-        self._epoch = -1
-        self._order = np.arange(len(training_index))
+    rows: LabelRows
+    training_index: npt.NDArray[np.int64]
+    config: PredictorConfig
+    facts: TrainingFacts
+    device: torch.device
+    patch_root: npt.NDArray[np.float16]
+    epoch: int = -1
 
     def at(self, epoch: int, number: int) -> tuple[torch.Tensor, Targets]:
         """Return batch `number` of an epoch: codes and targets."""
-        if epoch != self._epoch:
-            self._epoch = epoch
-            rng = np.random.default_rng([self._facts.seed, epoch])
-            self._order = rng.permutation(len(self._training_index))
-        start = number * self._batch_rows
-        place = self._order[start : start + self._batch_rows]
-        index = self._training_index[place]
-        rows, scale = self._rows, self._facts.energy_scale
+        if epoch != self.epoch:
+            self.epoch = epoch
+            rng = np.random.default_rng([self.facts.seed, epoch])
+            self._order = rng.permutation(len(self.training_index))
+        start = number * self.config.batch_rows
+        row = self._order[start : start + self.config.batch_rows]
+        index = self.training_index[row]
+        rows, scale = self.rows, self.facts.energy_scale
         targets = (
             rows.domain_energy[index] / scale,
             rows.energy[index] / scale,
             rows.n_pairs[index] > 0,
-            self._patch_root[place],
+            self.patch_root[row],
         )
         return self._tensor(rows.latent[index]), Targets(*map(self._tensor, targets))
 
     def _tensor(self, values: npt.NDArray[Any]) -> torch.Tensor:
         tensor = torch.from_numpy(values.astype(np.float32, copy=False))
-        return tensor.to(self._device, non_blocking=True)
+        return tensor.to(self.device, non_blocking=True)
 
 
 def _accuracy(network: PredictorNetwork, rows: LabelRows) -> float:

@@ -1,4 +1,4 @@
-"""Where to call a pose colliding: free and colliding ones are to be mistaken equally often."""
+"""The decision threshold at which false positive and false negative rates are about equal."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _ERRORS_APART = 2.0
 
 
 def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float:
-    """Return the logit above which to call poses colliding, such that both kinds fare alike.
+    """Return the decision threshold: the logit above which poses are called colliding.
 
-    A classifier that is right as often as it can be mistakes the rarer kind more often. Where the
-    false positive and the false negative rate at even odds, logit 0, differ by more than chance,
-    this goes as far towards equal ones as is expected to make half as many mistakes again at most.
+    The most accurate classifier misjudges the rarer class more often. Where the false positive and
+    the false negative rate at logit 0 differ by more than chance, the threshold moves towards equal
+    rates as far as at most half as many errors again are expected.
     What is expected is a logistic curve's through all rows (Platt 1999): counting the few rows near
     a limit would go where these happen to be favourable. The bound counts mistakes and not calls,
     for a predictor that errs once in a thousand calls is not to err ten times.
@@ -31,7 +31,7 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
 
     Returns
     -------
-    limit : 0 where poses of one kind are missing
+    threshold : 0 where one class is missing
     """
     n_rows, n_colliding = len(logit), int(colliding.sum())
     n_free = n_rows - n_colliding
@@ -48,10 +48,10 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
     cuts = 1 + np.flatnonzero(ordered[1:] > ordered[:-1])
     limits = np.append(0.5 * (ordered[cuts] + ordered[cuts - 1]), 0.0)
     n_below = np.append(cuts, np.searchsorted(ordered, 0.0, side="right"))
-    missed = np.append(0.0, probability.cumsum())[n_below]
-    alarms = np.append(0.0, (1.0 - probability)[::-1].cumsum())[n_rows - n_below]
-    gap = np.abs(alarms / (1.0 - probability).sum() - missed / probability.sum())
-    wrong = missed + alarms
+    false_negatives = np.append(0.0, probability.cumsum())[n_below]
+    false_positives = np.append(0.0, (1.0 - probability)[::-1].cumsum())[n_rows - n_below]
+    gap = np.abs(false_positives / (1.0 - probability).sum() - false_negatives / probability.sum())
+    wrong = false_negatives + false_positives
     gap[wrong > wrong[-1] * (1.0 + _MISTAKES_ADDED)] = np.inf
     best = limits[gap == gap.min()]
     return float(best[np.abs(best).argmin()])

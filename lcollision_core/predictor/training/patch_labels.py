@@ -1,4 +1,4 @@
-"""What the default network is taught beside the rows' labels: which patches of skin are hit."""
+"""What the default network is taught beside the rows' labels: which patches of skin collide."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lcollision_core.predictor.network import SkinCells
 
 _ROWS_A_BLOCK = 32
 _PATCH_SHARE, _FOLD_SHARE = 0.05, 0.005
-"""A patch that is hit has about this share of its pose's energy; so has a fold."""
+"""Shares of its pose's energy that a colliding patch, and a colliding fold, typically has."""
 
 _LEAST_ROOT = 1e-3
 """So that the shallowest touch is still told from none in half precision."""
@@ -26,9 +26,9 @@ class PatchLabeller:
     ----------
     embedding : decodes
     rows : labelled poses
-    cells : pairs within `FOLD_REACH` of each other along the surface go to the folds, if any
-    near_exclusion : in heights
-    energy_scale : the mean energy of a colliding pose, in squared heights
+    cells : pairs within `FOLD_RADIUS` of each other along the surface go to the folds, if any
+    near_exclusion : in normalised length
+    energy_scale : the mean energy of a colliding pose, in normalised length squared
     """
 
     def __init__(
@@ -64,23 +64,23 @@ class PatchLabeller:
         Returns
         -------
         roots : (n, P + S) float16 array: square roots of the sums of PDe, in units that make them
-            about 1 where a patch or a fold is hit; 0 where it is not
+            about 1 where a patch or a fold collides; 0 where it does not
 
         Raises
         ------
         CancelledError : `cancel` was set.
         """
         roots = np.zeros((len(index), len(self._unit)), dtype=np.float16)
-        places = np.flatnonzero(self._rows.colliding[index])
+        colliding = np.flatnonzero(self._rows.colliding[index])
 
         def label(start: int, stop: int) -> None:
-            block = places[start:stop]
+            block = colliding[start:stop]
             latent = self._rows.latent[index[block]]
             poses = self._embedding.decode(latent, n_threads=1).astype(np.float32)
             for row, vertices in zip(block, poses, strict=True):
                 roots[row] = self._roots_of(vertices)
 
-        for_blocks(label, len(places), _ROWS_A_BLOCK, progress=progress, cancel=cancel)
+        for_blocks(label, len(colliding), _ROWS_A_BLOCK, progress=progress, cancel=cancel)
         return roots
 
     def _roots_of(self, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:

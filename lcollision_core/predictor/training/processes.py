@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,43 +39,38 @@ class Processes:
 
     def any_of(self, flag: bool) -> bool:
         """Tell all processes whether one of them says yes."""
-        if self.count == 1:
-            return flag
-        flags = torch.tensor(float(flag), device=self.device)
-        dist.all_reduce(flags, dist.ReduceOp.MAX)
-        return bool(flags)
+        return bool(self._reduced(torch.tensor(float(flag)), dist.ReduceOp.MAX))
 
     def sum_of(self, value: torch.Tensor) -> float:
         """Add up a number over all processes."""
-        total = value.detach().clone()
-        if self.count > 1:
-            dist.all_reduce(total)
-        return float(total)
+        return float(self._reduced(value.detach().clone()))
 
     def add_up(self, values: npt.NDArray[np.float16]) -> None:
-        """Put the sum over all processes into the place of an array's values."""
-        if self.count == 1:
-            return
-        total = torch.from_numpy(values.astype(np.float32)).to(self.device)
-        dist.all_reduce(total)
-        values[...] = total.cpu().numpy()
+        """Replace an array's values by their sums over all processes."""
+        if self.count > 1:
+            total = self._reduced(torch.from_numpy(values.astype(np.float32)))
+            values[...] = total.cpu().numpy()
 
     def require_same(self, number: int) -> None:
-        """Refuse to go on where the processes begin at different places.
+        """Refuse to go on where the processes begin at different steps.
 
         Raises
         ------
         LCollisionError : they do.
         """
-        if self.count == 1:
-            return
-        largest = torch.tensor([number, -number], device=self.device)
-        dist.all_reduce(largest, dist.ReduceOp.MAX)
-        if int(largest[0]) != -int(largest[1]):
+        least, largest = self._reduced(torch.tensor([-number, number]), dist.ReduceOp.MAX).tolist()
+        if -least != largest:
             raise LCollisionError(
                 "the processes do not see the same checkpoint",
                 "put it into a folder that all machines share, or delete it",
             )
+
+    def _reduced(self, values: torch.Tensor, operation: Any = dist.ReduceOp.SUM) -> torch.Tensor:
+        """Return what all processes' values come to."""
+        if self.count > 1:
+            values = values.to(self.device)
+            dist.all_reduce(values, operation)
+        return values
 
     def wait(self) -> None:
         """Wait until all processes are here."""
@@ -100,17 +96,19 @@ def joined_processes(device: str) -> Iterator[Processes]:
         raise LCollisionError(
             "this machine has no CUDA device that torch can use", "use auto or cpu"
         )
-    kind = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+    backend = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
-    chosen = torch.device(kind, local_rank % torch.cuda.device_count() if kind == "cuda" else 0)
+    chosen = torch.device(
+        backend, local_rank % torch.cuda.device_count() if backend == "cuda" else 0
+    )
     if not dist.is_torchelastic_launched():
-        yield Processes(0, 1, torch.device(kind))
+        yield Processes(0, 1, torch.device(backend))
         return
-    if kind == "cuda":
+    if backend == "cuda":
         torch.cuda.set_device(chosen)
     own_group = not dist.is_initialized()
     if own_group:
-        dist.init_process_group("nccl" if kind == "cuda" else "gloo")
+        dist.init_process_group("nccl" if backend == "cuda" else "gloo")
     try:
         yield Processes(dist.get_rank(), dist.get_world_size(), chosen)
     finally:

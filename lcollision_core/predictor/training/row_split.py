@@ -1,4 +1,4 @@
-"""Which labelled samples train, which choose where to call poses colliding, which measure."""
+"""Which labelled samples train, which choose the decision threshold, which measure."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.predictor.config import PredictorConfig
 
 _EVERY = 10
-"""So manieth of the held-out rows chooses."""
+"""Every n-th held-out row chooses the decision threshold."""
 
 LEAST_BALANCING = 5000
-"""Fewer rows do not say where to call poses colliding: their chance costs more than is gained."""
+"""Fewer rows do not choose a decision threshold: their noise costs more than is gained."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class RowSplit:
     Attributes
     ----------
     training : rows that are learnt from
-    validation : rows that choose where to call a pose colliding, or none
+    validation : rows that choose the decision threshold, or none
     held_out : rows that measure the result
     """
 
@@ -36,8 +36,7 @@ class RowSplit:
 def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
     """Share out the samples 0, 1, ... of a store.
 
-    Where to call a pose colliding is chosen by a tenth of the rows that would measure, if these
-    are many.
+    The decision threshold is chosen by a tenth of the rows that would measure, if these are many.
     """
     is_out = is_held_out(np.arange(n_rows))
     rest, held_out = np.flatnonzero(~is_out), np.flatnonzero(is_out)

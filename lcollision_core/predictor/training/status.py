@@ -33,7 +33,7 @@ StatusCallback = Callable[[PredictorStatus], None]
 
 
 def no_status(status: PredictorStatus) -> None:
-    """Report to nobody."""
+    """Ignore a status."""
 
 
 def patches_path(checkpoint: Path) -> Path:

@@ -229,7 +229,7 @@ def test_ctrl_c_keeps_a_checkpoint_and_says_so(
         "report = loop.TrainingLoop._report\n"
         "def interrupted(self, step):\n"
         "    report(self, step)\n"
-        "    if self._config.preset == 'paper' or self._patches_path.exists():\n"
+        "    if self.config.preset == 'paper' or self._patches_path.exists():\n"
         "        loop.TrainingLoop._report = report\n"
         "        os.kill(os.getpid(), signal.SIGINT)\n"
         "loop.TrainingLoop._report = interrupted\n"

@@ -16,8 +16,8 @@ from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS
 from lcollision_core.predictor.geometric.field import ContactField
 from lcollision_core.predictor.geometric.folds import (
-    _MEMBER_REACH,
-    FOLD_REACH,
+    _MEMBER_RADIUS,
+    FOLD_RADIUS,
     N_MEMBERS,
     N_SITES,
     find_fold_sites,
@@ -192,7 +192,7 @@ def test_folds_are_looked_for_where_the_skin_folds(
     centres = tube_folds[:, 0]
     assert len(np.unique(centres)) == len(centres)
     detector = CollisionDetector(
-        embedding.topology, embedding.rest_vertices, near_exclusion=FOLD_REACH
+        embedding.topology, embedding.rest_vertices, near_exclusion=FOLD_RADIUS
     )
     folded = [
         detector.detect(pose.astype(np.float32)).near_pairs
@@ -204,7 +204,7 @@ def test_folds_are_looked_for_where_the_skin_folds(
     distance = skin_distances(skin_graph(embedding), centres)
     for members, own in zip(tube_folds, distance, strict=True):
         nearest = np.sort(own)[:N_MEMBERS]
-        assert own[members].max() <= max(_MEMBER_REACH, nearest[-1])
+        assert own[members].max() <= max(_MEMBER_RADIUS, nearest[-1])
 
 
 def test_a_body_without_folds_has_no_sites(tube_model: PoseModel) -> None:
