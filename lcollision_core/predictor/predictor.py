@@ -80,22 +80,18 @@ class TrainingFacts:
     store: StoreIdentity | None
     logit_shift: float = 0.0
 
-    @classmethod
-    def from_metadata(cls, metadata: Mapping[str, Any]) -> TrainingFacts:
-        """Rebuild the facts from JSON values; ValueError if it cannot."""
-        facts = from_json(cls, metadata, "facts")
+    def __post_init__(self) -> None:
         for name, low, high in (
             ("rows", 1, np.inf),
-            ("training_rows", 0, facts.rows),
+            ("training_rows", 0, self.rows),
             ("colliding_share", 0.0, 1.0),
             ("seed", 0, np.inf),
             ("energy_scale", _LEAST_ENERGY, _LARGEST_FACT),
             ("margin", 0.0, _LARGEST_FACT),
             ("logit_shift", -_LARGEST_FACT, _LARGEST_FACT),
         ):
-            if not low <= getattr(facts, name) <= high:
+            if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name} must be from {low:g} to {high:g}")
-        return facts
 
 
 @dataclass(frozen=True)
@@ -114,14 +110,21 @@ class PredictorRecord:
     metrics: PredictorMetrics | None
 
     @classmethod
-    def from_metadata(cls, metadata: Mapping[str, Any]) -> PredictorRecord:
-        """Read the record of a section, without torch.
+    def of_section(cls, section: Section, embedding: Embedding) -> PredictorRecord:
+        """Read the record, and check the weights beside it, without torch.
+
+        Parameters
+        ----------
+        section : of the model file
+        embedding : of the same file
 
         Raises
         ------
-        ModelFileError : the preset is unknown, or a value is missing or wrong.
+        ModelFileError : the preset is unknown, a value is missing or wrong, or the weights do not
+            fit the embedding.
         """
-        preset = metadata.get("preset")
+        metadata = section.metadata
+        preset, measured = metadata.get("preset"), metadata.get("metrics")
         if not isinstance(preset, str) or preset not in PRESETS:
             raise ModelFileError(
                 "the model's predictor has an unknown preset",
@@ -133,41 +136,15 @@ class PredictorRecord:
             config = from_json(PredictorConfig, metadata.get("config"), "config")
             if config.preset != preset:
                 raise ValueError(f"config.preset must be {preset!r}, got {quoted(config.preset)}")
-            measured = metadata.get("metrics")
-            return cls(
-                config,
-                TrainingFacts.from_metadata(metadata.get("facts", {})),
-                None if measured is None else from_json(PredictorMetrics, measured, "metrics"),
-            )
+            facts = from_json(TrainingFacts, metadata.get("facts", {}), "facts")
+            metrics = None
+            if measured is not None:
+                metrics = from_json(PredictorMetrics, measured, "metrics")
+            require_network(section.arrays, embedding, preset, config.by_domain)
         except (ValueError, LCollisionError) as error:
-            raise _misfit(error) from error
-
-    @classmethod
-    def of_section(cls, section: Section, embedding: Embedding) -> PredictorRecord:
-        """Read the record, and check the weights beside it, without torch.
-
-        Parameters
-        ----------
-        section : of the model file
-        embedding : of the same file
-
-        Raises
-        ------
-        ModelFileError : as for `from_metadata`, or the weights do not fit the embedding.
-        """
-        record = cls.from_metadata(section.metadata)
-        try:
-            require_network(
-                section.arrays, embedding, record.config.preset, record.config.by_domain
-            )
-        except ValueError as error:
-            raise _misfit(error) from error
-        return record
-
-
-def _misfit(error: Exception) -> ModelFileError:
-    what, next_step = "does not fit its latent space", "train the predictor again"
-    return ModelFileError.because("the model's predictor", what, error, next_step)
+            what, next_step = "does not fit its latent space", "train the predictor again"
+            raise ModelFileError.because("the model's predictor", what, error, next_step) from error
+        return cls(config, facts, metrics)
 
 
 class CollisionPredictor:

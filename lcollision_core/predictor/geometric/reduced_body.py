@@ -78,8 +78,9 @@ class ReducedBody(nn.Module):
             latent[:, codes] @ self.get_buffer(f"table{number}")
             for number, codes in enumerate(self._codes)
         ]
-        outputs = torch.cat(products, dim=1).tanh().view(len(latent), *self.target.shape, -1)
-        offset = self.offset.repeat(len(latent), 1, 1)
+        n_rows, n_features = len(latent), self.offset.shape[1]
+        outputs = torch.cat(products, dim=1).tanh().view(n_rows, len(self.target), n_features)
+        offset = self.offset.repeat(n_rows, 1, 1)
         features: torch.Tensor = offset.index_add(1, self.target, outputs * self.scale)
         return features
 

@@ -352,7 +352,7 @@ def test_the_loss_teaches_patches_folds_energies_and_the_verdict(
     (gradient,) = torch.autograd.grad(loss(values.requires_grad_()), values)
     assert (gradient != 0.0).all()
     values, step = values.detach(), 1e-6
-    for place in np.ndindex(*values.shape):
+    for place in list(np.ndindex(*values.shape))[::5]:
         moved = torch.zeros_like(values)
         moved[place] = step
         slope = float(loss(values + moved) - loss(values - moved)) / (2 * step)
