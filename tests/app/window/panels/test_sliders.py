@@ -105,7 +105,7 @@ def _enter(dialog: object, text: str) -> None:
 
 def is_drawn(icon: QIcon) -> bool:
     picture = icon.pixmap(THUMBNAIL).toImage()
-    return picture.pixelColor(picture.rect().center()).alpha() > 0
+    return not picture.isNull() and picture.pixelColor(picture.rect().center()).alpha() > 0
 
 
 def test_the_poses_of_a_file_that_is_opened_are_shown_beside_the_library(
