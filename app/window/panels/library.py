@@ -224,7 +224,6 @@ class LibraryPanel(QWidget):
         else:
             own = self.source is Source.LIBRARY
             self._poses = list(document.poses if own else document.file_poses)
-        self._wanted.clear()
         with silent(self.list):
             self.list.clear()
             for pose in self._poses:
@@ -282,6 +281,9 @@ class LibraryPanel(QWidget):
         self.list.hint.setText(hint)
         self.list.hint.setVisible(not n_shown)
         self._on_chosen()
+        # What is seen now wants its pictures first.
+        self._wanted.clear()
+        self.list.viewport().update()
 
     def sizeHint(self) -> QSize:  # noqa: N802
         """Ask for one row of pictures, and in a tall window for more."""
