@@ -14,7 +14,7 @@ Progress = Callable[[int, int], None]
 
 
 def no_progress(done: int, total: int) -> None:
-    """Report to nobody: the default of functions that take a `Progress`."""
+    """Ignore the progress: the default of functions that take a `Progress`."""
 
 
 def available_cores() -> int:

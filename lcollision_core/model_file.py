@@ -1,7 +1,7 @@
 """The container of a model: one safetensors file of named sections, whole or refused.
 
-A section is a room's own: arrays and JSON metadata under one name. The file's tensors are called
-``section/array``; its one metadata entry, ``lcollision``, is a JSON document of the format
+A section belongs to one package: arrays and JSON metadata under one name. The file's tensors are
+called ``section/array``; its one metadata entry, ``lcollision``, is a JSON document of the format
 version, the sections' metadata and a SHA-256 of all of it.
 """
 
@@ -46,7 +46,7 @@ _DTYPES = {
 
 @dataclass(frozen=True)
 class Section:
-    """What one room keeps in a model file.
+    """What one package keeps in a model file.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ def required_array(
     shape: tuple[int | None, ...],
     largest: float = np.inf,
 ) -> npt.NDArray[Any]:
-    """Return an array of a section that has the type and shape which its room relies on.
+    """Return an array of a section that has the type and shape which its package relies on.
 
     Parameters
     ----------

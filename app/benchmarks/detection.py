@@ -38,7 +38,7 @@ COAL_TOLERANCE = 1e-9
 ROUNDS = 5
 """Batches of ours that are timed, for their median."""
 
-BATCH_POSES_A_THREAD = 32
+BATCH_POSES_PER_THREAD = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ def time_detection(
         )
 
     # Many poses a thread, so that its start and the last one's wait do not count.
-    repeats = -(-BATCH_POSES_A_THREAD * threads // len(vertices))
+    repeats = -(-BATCH_POSES_PER_THREAD * threads // len(vertices))
     batch = np.tile(vertices, (repeats, 1, 1))
     n_pairs = np.tile(n_expected, repeats)
     thread_counts = [1] if threads == 1 else [1, threads]

@@ -1,4 +1,4 @@
-"""The editor as its user feels it, model by model, each in a process of its own."""
+"""The editor as its user experiences it, model by model, each in a process of its own."""
 
 from __future__ import annotations
 

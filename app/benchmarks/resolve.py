@@ -155,7 +155,7 @@ def score_baseline(model: PoseModel, poses: CollidingPoses) -> ResolveScore:
         latent_distance=float(
             (np.linalg.norm(moved, axis=1) / np.linalg.norm(poses.latents, axis=1)).mean()
         ),
-        vertex_distance=float(np.mean(distances)) / model.height,
+        vertex_distance=float(np.mean(distances)) / model.body_size,
     )
 
 

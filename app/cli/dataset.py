@@ -27,7 +27,7 @@ def check(
             min=0.0,
             max=1.0,
             metavar="X",
-            help="Count pairs within X body sizes along the surface apart. "
+            help="Count pairs within X body sizes along the surface separately. "
             "Default: what the set says.",
         ),
     ] = None,

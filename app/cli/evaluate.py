@@ -88,7 +88,7 @@ def require_store_of(store: LabelStore, model: PoseModel) -> None:
     """
     from lcollision_core.labels import Labeller, StoreIdentity
 
-    labeller = Labeller(model.embedding, model.height, model.near_exclusion, model.fingerprint)
+    labeller = Labeller(model.embedding, model.body_size, model.near_exclusion, model.fingerprint)
     store.require(StoreIdentity.of(labeller, store.identity.seed))
 
 

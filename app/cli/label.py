@@ -71,7 +71,7 @@ def label(
     if count is None:
         _check(model, output, as_json)
         return
-    labeller = Labeller(model.embedding, model.height, model.near_exclusion, model.fingerprint)
+    labeller = Labeller(model.embedding, model.body_size, model.near_exclusion, model.fingerprint)
     started = time.monotonic()
     try:
         with cancel_on_interrupt() as cancel, _labelling_bar() as progress:

@@ -90,7 +90,9 @@ def info(
     tell(f"  {error_sentence(report)}")
     tell(f"  {_predictor_sentence(report)}")
     if report["near_exclusion"]:
-        tell(f"  pairs of faces within {report['near_exclusion']} body sizes count apart")
+        tell(
+            f"  pairs of faces within {report['near_exclusion']} body sizes are counted separately"
+        )
     _print_domains(report)
 
 
@@ -185,7 +187,7 @@ def describe(model: PoseModel) -> dict[str, Any]:
         "predictor": _describe_predictor(model),
         "near_exclusion": model.near_exclusion,
         "up_axis": "xyz"[model.up_axis],
-        "height": model.height,
+        "height": model.body_size,
         "licence": model.card.licence,
         "source": model.card.source,
         "provenance": dict(model.card.provenance),

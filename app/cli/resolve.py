@@ -305,7 +305,7 @@ def _depends_on(
         "locked_domains": sorted(options.locked_domains),
         "poses": [fingerprint_of_pose(pose.latent, pose.placement) for pose in poses],
         "predictor": dict(predictor.metadata),
-        "height": model.height,
+        "height": model.body_size,
         "near_exclusion": model.near_exclusion,
         "sequence": sequence,
     }

@@ -65,7 +65,7 @@ def embedding(
             min=0.0,
             max=0.99,
             metavar="X",
-            help="Count pairs within X body sizes along the surface apart. "
+            help="Count pairs within X body sizes along the surface separately. "
             "Default: what the set says.",
         ),
     ] = None,

@@ -133,7 +133,7 @@ def _needed_distances(
 
 
 def zoomed(
-    view: View, anchor: FloatArray, factor: float, vertices: npt.NDArray[Any], height: float
+    view: View, anchor: FloatArray, factor: float, vertices: npt.NDArray[Any], body_size: float
 ) -> View:
     """Bring the camera nearer to a point, or away from it; the point stays in its place on screen.
 
@@ -144,11 +144,11 @@ def zoomed(
         where the body is a dot
     vertices : (V, 3) array; turning goes round a point of the line of sight that is as deep in the
         scene as they are
-    height : the body size, in the data's unit
+    body_size : in the data's unit
     """
     arm = view.position - anchor
     distance = float(np.linalg.norm(arm))
-    near, far = _NEAREST * height, _FARTHEST * height
+    near, far = _NEAREST * body_size, _FARTHEST * body_size
     # Never past a limit, but one that is beyond it already may stay.
     factor = float(np.clip(factor, min(near / distance, 1.0), max(far / distance, 1.0)))
     position = anchor + factor * arm

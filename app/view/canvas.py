@@ -27,7 +27,7 @@ _REST_MILLISECONDS = 220
 _HOVER_MILLISECONDS = 30
 _SMOOTH_SAMPLES = 4
 _NOTCH = 120.0  # of a wheel, in eighths of a degree
-_ZOOM_A_NOTCH = 1.15
+_ZOOM_PER_NOTCH = 1.15
 
 _FOR_THE_WINDOW = (
     QEvent.Type.KeyPress,
@@ -256,7 +256,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         event.accept()
         notches = event.angleDelta().y() / _NOTCH
         if notches:
-            self.zoom_wanted.emit(event.position(), _ZOOM_A_NOTCH**-notches)
+            self.zoom_wanted.emit(event.position(), _ZOOM_PER_NOTCH**-notches)
 
     def event(self, event: QEvent) -> bool:
         """Zoom as two fingers on a touchpad are spread; leave keys and files to the window."""

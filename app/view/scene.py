@@ -40,7 +40,7 @@ class Scene:
         self._renderer = plotter.renderer
         self._renderer.RemoveAllViewProps()
         self._faces, self._mask = model.faces, model.attention_mask
-        self._up_axis, self._height = model.up_axis, model.height
+        self._up_axis, self._body_size = model.up_axis, model.body_size
         self.surface = Surface(model.faces, model.n_vertices)
         self.body = actor_of(
             self.surface.polydata, True, ambient=0.22, diffuse=0.92, specular=0.1, specular_power=18
@@ -73,13 +73,13 @@ class Scene:
 
         disc = pv.Disc(
             inner=0.0,
-            outer=_FLOOR_RADIUS * model.height,
+            outer=_FLOOR_RADIUS * model.body_size,
             normal=np.eye(3)[model.up_axis],
             c_res=96,
         )
         self._floor = actor_of(disc, lighting=False, culling="back")
         self._shadow = actor_of(self.surface.polydata, lighting=False)
-        self._lift = 2e-3 * model.height
+        self._lift = 2e-3 * model.body_size
         nearer, through = self._crossing_actors
         for actor in (self._floor, self._shadow, self.body, nearer, self._ghost_actor, through):
             self._renderer.AddActor(actor)
@@ -212,7 +212,8 @@ class Scene:
 
         Where both coincide, patches of one and of the other would be seen.
         """
-        away = np.linalg.norm(self._ghost.vertices - self.surface.vertices, axis=1) / self._height
+        away = np.linalg.norm(self._ghost.vertices - self.surface.vertices, axis=1)
+        away /= self._body_size
         visible = np.clip((away - _GHOST_NEAR) / (_GHOST_FAR - _GHOST_NEAR), 0.0, 1.0)
         self._ghost.colours[:, 3] = np.rint(255.0 * _GHOST_OPACITY * visible)
 

@@ -398,7 +398,7 @@ class Viewport(QWidget):
             moved = np.zeros(len(frame.vertices))
         elif before is not None and frame.latent is document.latent:
             away = frame.vertices.astype(np.float64) - before
-            moved = np.linalg.norm(away, axis=1) / document.model.height
+            moved = np.linalg.norm(away, axis=1) / document.model.body_size
         return Known(
             predicted.domain_energy if predicted is not None else None,
             exact.vertex_energy if exact is not None else None,
@@ -454,8 +454,8 @@ class Viewport(QWidget):
         else:
             point = anchor[1]
         self._zoom_anchor = (place, point, now)
-        vertices, height = self.scene.surface.vertices, self._document.model.height
-        self.scene.view = zoomed(view, point, factor, vertices, height)
+        vertices, body_size = self.scene.surface.vertices, self._document.model.body_size
+        self.scene.view = zoomed(view, point, factor, vertices, body_size)
         self.canvas.redraw()
 
     # The pointer.

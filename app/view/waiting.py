@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _SIDE = 38
 _TURN_MILLISECONDS = 33
-_DEGREES_A_TURN = 11
+_DEGREES_PER_STEP = 11
 _ARC = 100
 
 
@@ -118,7 +118,7 @@ class _Ring(QWidget):
 
     @Slot()
     def _on_turn(self) -> None:
-        self._angle = (self._angle + _DEGREES_A_TURN) % 360
+        self._angle = (self._angle + _DEGREES_PER_STEP) % 360
         self.update()
 
     def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802 - Qt's names

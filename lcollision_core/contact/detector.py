@@ -227,7 +227,7 @@ class CollisionDetector:
         ----------
         vertices : (V, 3) array in the unit of the reference
         n_deepest : the most pairs that are kept; of equally deep ones the first
-        progress : called with an estimate of (shares of the search done, all shares)
+        progress : called with an estimate of (units of the search done, all units)
         cancel : polled every few thousand pairs
 
         Raises
@@ -427,7 +427,7 @@ class _Searcher:
 
     @property
     def share_done(self) -> float:
-        """The share of the search that is guessed to be done."""
+        """The fraction of the search that is guessed to be done."""
         return 1.0 - float(self._work.share[: self._waiting].sum())
 
     def _refuse(self, number: int | None) -> NoReturn:

@@ -36,7 +36,7 @@ MAX_DISTANCE = 1e9
 products of coordinates stay far from overflow."""
 
 SMALL_SINE_SQUARED = 1e-6
-"""Below this squared sine of their angle, two edges' cross product is freed of rounding."""
+"""Below this squared sine of their angle, two edges' cross product is corrected for rounding."""
 
 _LEAF = np.uint64(LEAF_SIZE)
 _LEAF_CORNERS = np.uint64(3 * LEAF_SIZE)
@@ -458,7 +458,7 @@ def search_pose(
     n_found : how many pairs this call has put into `found`; -1 where a vertex is not finite or
         beyond `MAX_DISTANCE`
     n_waiting : how many pairs of nodes are still to be visited, 0 at the end; `work.share` says
-        what share of the search each of them is guessed to be
+        what fraction of the search each of them is guessed to be
     """
     boxes = work.node_boxes
     stack = work.stack

@@ -51,7 +51,7 @@ class Embedding:
     Attributes
     ----------
     topology : the connectivity
-    rest_vertices : (V, 3) float64 array, the reference, in heights
+    rest_vertices : (V, 3) float64 array, the reference, normalised
     alignment_weights : (V,) float64 array, how much each vertex leads when a mesh is aligned
     scaling : of the features
     mean_features : (V, 9) float32 array, mean of the scaled training features
@@ -131,7 +131,7 @@ class Embedding:
 
         Returns
         -------
-        vertices : (B, V, 3) float64 array, in heights, in the reference's frame; a pose gets the
+        vertices : (B, V, 3) float64 array, normalised, in the reference's frame; a pose gets the
             same bits in whichever batch it comes, on however many threads
 
         Raises
@@ -179,7 +179,7 @@ class Embedding:
 
         Parameters
         ----------
-        vertices : (B, V, 3) finite array, in heights
+        vertices : (B, V, 3) finite array, normalised
         max_steps : at most so many steps a mesh; 0 returns the guess
         progress : called with (meshes done, meshes in all)
         cancel : polled between meshes
@@ -292,10 +292,10 @@ class Embedding:
                     f"its array {name}_support is no ascending list of its {n_vertices} vertices"
                 )
             parts.append(_read_part(arrays, name, support))
-            share = required_array(arrays, f"{name}_mask", np.float32, support.shape)
-            if share.min() < 0.0:
-                raise ValueError(f"its array {name}_mask has a share below 0")
-            mask[domain, support] = share
+            weights = required_array(arrays, f"{name}_mask", np.float32, support.shape)
+            if weights.min() < 0.0:
+                raise ValueError(f"its array {name}_mask has a weight below 0")
+            mask[domain, support] = weights
         if np.abs(mask.sum(axis=0) - 1.0).max() > 1e-5:
             raise ValueError("its attention masks do not sum to 1")
         latent_size = sum(len(part.components) for part in parts)
@@ -337,12 +337,12 @@ class _Values:
 
 
 def _require_size(rest: FloatArray, topology: Topology) -> None:
-    """Refuse a reference that is not in heights, as far as its faces tell."""
+    """Refuse a reference that is not normalised, as far as its faces tell."""
     used = rest[topology.faces.reshape(-1)]
     size = float(np.ptp(used, axis=0).max())
     # A vertex in no face counted once, and may have made the others smaller.
     if not _LEAST_SIZE <= size <= 1.0 + _LEAST_SIZE:
-        raise ValueError(f"its array rest_vertices must be 1 height tall, got {size:.6g}")
+        raise ValueError(f"its array rest_vertices must have a body size of 1, got {size:.6g}")
 
 
 def _read_part(

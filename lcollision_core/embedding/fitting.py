@@ -45,10 +45,10 @@ class LatentFit:
     ----------
     latent : (B, D) float32 array
     rotations : (B, 3, 3) float64 array
-    translations : (B, 3) float64 array, in heights: the decoded mesh lies nearest to the aligned
+    translations : (B, 3) float64 array, normalised: the decoded mesh lies nearest to the aligned
         one, `vertices @ rotation.T + translation`
     mean_error, max_error : (B,) float64 arrays, distance of the decoded vertices from the aligned
-        ones, in heights
+        ones, normalised
     """
 
     latent: npt.NDArray[np.float32]
@@ -90,7 +90,7 @@ def fit_latent(
     ----------
     decoder : latent codes to features
     codec : features to vertices
-    vertices : (B, V, 3) array, in heights, in any rigid position; only vertices that a face uses
+    vertices : (B, V, 3) array, normalised, in any rigid position; only vertices that a face uses
         count
     guess : (B, D) array, where to start
     deviation : (D,) array > 0, of the training codes

@@ -88,7 +88,7 @@ def keep_one_patch(
         squared = (kept.astype(np.float64) ** 2).sum(axis=2)
         # As the masks will see them: each component of unit norm.
         squared /= squared.sum(axis=1, keepdims=True)
-        # Vertices that nobody touches belong to no patch: they follow their neighbours later.
+        # Vertices that no component touches belong to no patch: they follow their neighbours later.
         owner = np.where(squared.max(axis=0) > 0.0, squared.argmax(axis=0), -1)
         islands = owner[None] == np.arange(len(kept))[:, None]
         for domain, patch in enumerate(_largest_patches(owner, len(kept), edges)):

@@ -19,7 +19,7 @@ _LARGEST = 1e9
 
 @dataclass(frozen=True)
 class EmbeddingMetrics:
-    """What training measured; lengths in heights. Codes are fitted as `Embedding.encode` does.
+    """What training measured; lengths are normalised. Codes are fitted as `Embedding.encode` does.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class EmbeddingMetrics:
         as many numbers as the latent has or the poses span, codes fitted in the same way
     pca_size : how many numbers that is
     acap_mean, acap_max : of encoding poses as features and decoding them, without any code
-    connected_share : least share of a domain's vertices in its largest connected patch
+    connected_share : least fraction of a domain's vertices in its largest connected patch
     domains_per_vertex : effective number of domains of a vertex, 1 / Σ_k (M^{ki})², mean
 
     Raises

@@ -16,11 +16,11 @@ from lcollision_core.errors import PoseSetError, ShapeError
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
 
 POSITION_WEIGHT = 1.0
-"""Radians of relative rotation that weigh as much as one height of distance."""
+"""Radians of relative rotation that weigh as much as a normalised distance of 1."""
 
 _MOTION_DIRECTIONS = 30
 _LEAST_AREA_SHARE = 1e-12
-_LEAST_REACH = 1e-3
+_LEAST_RADIUS = 1e-3
 _BISECTIONS = 30
 
 
@@ -48,7 +48,7 @@ def bridged_edges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
 
 
 def vertex_areas(topology: Topology, rest_vertices: FloatArray) -> FloatArray:
-    """Return a third of the area of the triangles round each vertex, (V,), in squared heights.
+    """Return a third of the area of the triangles round each vertex, (V,), normalised.
 
     Never 0, so that a vertex in no face can be averaged too.
     """
@@ -76,7 +76,7 @@ def moving_parts(
     ----------
     features : (N, V, 9) array, unscaled deformation features
     topology : the connectivity
-    rest_vertices : (V, 3) float64 array, the reference, in heights
+    rest_vertices : (V, 3) float64 array, the reference, normalised
     n_parts : how many, at most V
 
     Returns
@@ -109,8 +109,8 @@ def moving_parts(
     # The leading directions hold all that tells parts apart; the rest is noise that costs time.
     spread = motion.T @ (motion * areas[:, None])
     directions = np.linalg.eigh(spread)[1][:, ::-1][:, :_MOTION_DIRECTIONS]
-    places = np.hstack([motion @ directions, POSITION_WEIGHT * rest_vertices])
-    part = _ward(places, areas, bridged_edges(topology, rest_vertices), n_parts)
+    points = np.hstack([motion @ directions, POSITION_WEIGHT * rest_vertices])
+    part = _ward(points, areas, bridged_edges(topology, rest_vertices), n_parts)
 
     up = rest_vertices[:, int(np.ptp(rest_vertices, axis=0).argmax())]
     levels = np.bincount(part, areas * up, n_parts) / np.bincount(part, areas, n_parts)
@@ -119,10 +119,10 @@ def moving_parts(
     return rank[part]
 
 
-def _ward(places: FloatArray, masses: FloatArray, edges: IntArray, n_parts: int) -> IntArray:
+def _ward(points: FloatArray, masses: FloatArray, edges: IntArray, n_parts: int) -> IntArray:
     """Merge neighbouring patches until `n_parts` are left; (V,) part of each vertex."""
-    n_vertices = len(places)
-    centre = dict(enumerate(places))
+    n_vertices = len(points)
+    centre = dict(enumerate(points))
     mass = dict(enumerate(masses.tolist()))
     neighbours: dict[int, set[int]] = {vertex: set() for vertex in range(n_vertices)}
     for a, b in edges.tolist():
@@ -130,8 +130,8 @@ def _ward(places: FloatArray, masses: FloatArray, edges: IntArray, n_parts: int)
         neighbours[b].add(a)
 
     def added_variance(a: int, b: int) -> float:
-        apart = centre[a] - centre[b]
-        return float(mass[a] * mass[b] / (mass[a] + mass[b]) * (apart @ apart))
+        offset = centre[a] - centre[b]
+        return float(mass[a] * mass[b] / (mass[a] + mass[b]) * (offset @ offset))
 
     queue = [(added_variance(a, b), a, b) for a, b in edges.tolist()]
     heapq.heapify(queue)
@@ -169,7 +169,7 @@ def part_distances(part: IntArray, topology: Topology, rest_vertices: FloatArray
 
     Returns
     -------
-    distances : (K, V) float64 array, 0 inside the part, as shares of the mesh's largest geodesic
+    distances : (K, V) float64 array, 0 inside the part, as fractions of the mesh's largest geodesic
         distance
     """
     edges = bridged_edges(topology, rest_vertices)
@@ -183,43 +183,44 @@ def part_distances(part: IntArray, topology: Topology, rest_vertices: FloatArray
     return distances / max(largest, 1e-12)
 
 
-def windows(distances: FloatArray, reach: float) -> FloatArray:
-    """Return (K, V) weights that fall from 1 in each part to 0 at a distance of `reach`."""
-    fading: FloatArray = np.clip(1.0 - distances / reach, 0.0, 1.0)
+def windows(distances: FloatArray, radius: float) -> FloatArray:
+    """Return (K, V) weights that fall from 1 in each part to 0 at a distance of `radius`."""
+    fading: FloatArray = np.clip(1.0 - distances / radius, 0.0, 1.0)
     return fading
 
 
-def reach_of_overlap(distances: FloatArray, overlap: float) -> float:
-    """Find how far windows reach that overlap as much as asked, whatever the size of the parts.
+def radius_of_overlap(distances: FloatArray, overlap: float) -> float:
+    """Find the radius of windows that overlap as much as asked, whatever the size of the parts.
 
     Parameters
     ----------
     distances : (K, V) float64 array, see `part_distances`
     overlap : effective domains per vertex of the windows, mean of 1 / Σ_k (M^{ki})² with M^{ki}
-        the windows' squared weights shared out; it counts as at most (K + 1) / 2
+        the windows' squared weights, each column scaled to sum to 1; it counts as at most
+        (K + 1) / 2
 
     Returns
     -------
-    reach : distance at which the windows have faded to 0
+    radius : distance at which the windows have faded to 0
     """
     wanted = min(overlap, 0.5 * (len(distances) + 1))
-    low, high = _LEAST_REACH, 2.0
+    low, high = _LEAST_RADIUS, 2.0
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         squared = windows(distances, middle) ** 2
-        shares = squared / squared.sum(axis=0)
-        found = float((1.0 / (shares**2).sum(axis=0)).mean())
+        fractions = squared / squared.sum(axis=0)
+        found = float((1.0 / (fractions**2).sum(axis=0)).mean())
         low, high = (middle, high) if found < wanted else (low, middle)
     return high
 
 
-def locality_weights(distances: FloatArray, reach: tuple[float, float]) -> FloatArray:
+def locality_weights(distances: FloatArray, band: tuple[float, float]) -> FloatArray:
     """Weigh vertices by their distance from the parts: Lambda of the locality loss.
 
     Parameters
     ----------
     distances : (K, V) float64 array, see `part_distances`
-    reach : at which distance the weight begins to rise from 0, and at which it is 1
+    band : at which distance the weight begins to rise from 0, and at which it is 1
 
     Returns
     -------
@@ -231,12 +232,12 @@ def locality_weights(distances: FloatArray, reach: tuple[float, float]) -> Float
     of one size; measured from the part, a torso may be large and a hand small, and a domain
     cannot drift over the body.
     """
-    weights: FloatArray = np.clip((distances - reach[0]) / (reach[1] - reach[0]), 0.0, 1.0)
+    weights: FloatArray = np.clip((distances - band[0]) / (band[1] - band[0]), 0.0, 1.0)
     return weights
 
 
 def initial_components(
-    features: npt.NDArray[np.float32], distances: FloatArray, areas: FloatArray, reach: float
+    features: npt.NDArray[np.float32], distances: FloatArray, areas: FloatArray, radius: float
 ) -> npt.NDArray[np.float32]:
     """Start each domain from the leading principal component of its part and surroundings.
 
@@ -245,7 +246,7 @@ def initial_components(
     features : (N, V, 9) float32 array, scaled and centred
     distances : (K, V) float64 array, see `part_distances`
     areas : (V,) float64 array, what each vertex counts
-    reach : distance from the part at which the component has faded to 0
+    radius : distance from the part at which the component has faded to 0
 
     Returns
     -------
@@ -253,10 +254,10 @@ def initial_components(
     """
     components = np.zeros((*distances.shape, N_FEATURES), dtype=np.float32)
     for domain, distance in enumerate(distances):
-        window = windows(distance, reach)
+        window = windows(distance, radius)
         inside = np.flatnonzero(window)
-        share = window[inside] * np.sqrt(areas[inside] / areas.mean())
-        weighed = (features[:, inside] * share[:, None]).reshape(len(features), -1)
+        weight = window[inside] * np.sqrt(areas[inside] / areas.mean())
+        weighed = (features[:, inside] * weight[:, None]).reshape(len(features), -1)
         leading = principal_components(weighed, 1)[0].reshape(-1, N_FEATURES)
         faded = leading * window[inside, None]
         components[domain, inside] = faded / np.linalg.norm(faded)

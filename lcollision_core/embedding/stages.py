@@ -29,7 +29,7 @@ from lcollision_core.embedding.seeding import (
     moving_parts,
     part_distances,
     principal_components,
-    reach_of_overlap,
+    radius_of_overlap,
     ring_average,
     vertex_areas,
 )
@@ -37,14 +37,14 @@ from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
 
 _LOCALITY_START = 0.25
-"""Share of the windows' reach from which the locality loss rises."""
+"""Fraction of the windows' radius from which the locality loss rises."""
 
 _SAMPLED_POSES = 16
 _EPOCHS_BETWEEN_SAMPLES = 10
 
 Report = Callable[[str, int, int, float | None, float | None], None]
 """Called with the stage, epochs done and in all, and the mean vertex errors of level 1 and of
-both levels, in heights, as far as known."""
+both levels, normalised, as far as known."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class BilevelTrainer:
     Parameters
     ----------
     codec : of the reference
-    vertices : (N, V, 3) float64 array, aligned poses, in heights
+    vertices : (N, V, 3) float64 array, aligned poses, normalised
     features : (N, V, 9) float64 array, their unscaled features
     config : the choices
     seed : of the order of level 2's batches
@@ -115,9 +115,9 @@ class BilevelTrainer:
         part = moving_parts(self._features, topology, self._rest, config.n_domains)
         areas = vertex_areas(topology, self._rest)
         distances = part_distances(part, topology, self._rest)
-        reach = reach_of_overlap(distances, config.window_overlap)
-        start = initial_components(self._centred, distances, areas, reach)
-        weights = locality_weights(distances, (_LOCALITY_START * reach, reach))
+        radius = radius_of_overlap(distances, config.window_overlap)
+        start = initial_components(self._centred, distances, areas, radius)
+        weights = locality_weights(distances, (_LOCALITY_START * radius, radius))
         locality = torch.from_numpy(weights.astype(np.float32))
         network = TiedAutoencoder(_of_mean_square_1(start), self._ring)
         features = torch.from_numpy(self._centred)
@@ -247,7 +247,7 @@ class BilevelTrainer:
             self._cancel.raise_if_cancelled()
 
     def _sampled_error(self, output: npt.NDArray[np.floating]) -> float:
-        """Return the mean vertex error, in heights, of a few poses rebuilt as `output`."""
+        """Return the mean vertex error, normalised, of a few poses rebuilt as `output`."""
         decoder = build_decoder((), self._scaling, self._mean, self._topology)
         features = decoder.offset + decoder.scale * output[self._sample]
         distance = self._codec.decode(features) - self._vertices[self._sample]

@@ -48,8 +48,8 @@ class TrainingStatus:
     stage : "level 1", "level 2" or "codes"
     stage_done, stage_total : epochs, or poses for "codes"
     done, total : the same over the whole run
-    level1_error : mean vertex error with level 1 alone, of a few training poses, in heights
-    both_error : mean vertex error with both levels, of the training poses, in heights; None
+    level1_error : mean vertex error with level 1 alone, of a few training poses, normalised
+    both_error : mean vertex error with both levels, of the training poses, normalised; None
         before level 2
     """
 
@@ -67,7 +67,7 @@ StatusCallback = Callable[[TrainingStatus], None]
 
 
 def no_status(status: TrainingStatus) -> None:
-    """Report to nobody."""
+    """Ignore the progress."""
 
 
 def train_embedding(

@@ -34,8 +34,8 @@ class StoreIdentity:
     model : fingerprint of the model
     seed : of the samples
     n_domains : K
-    height : one height in the data's unit, in which vertices are rounded
-    near_exclusion : in heights
+    height : the body size, in the data's unit, whose float32 values the vertices are rounded to
+    near_exclusion : normalised
     box_low, box_high : D numbers each
 
     Raises
@@ -62,7 +62,7 @@ class StoreIdentity:
             model=labeller.fingerprint,
             seed=seed,
             n_domains=labeller.embedding.n_domains,
-            height=labeller.height,
+            height=labeller.body_size,
             near_exclusion=labeller.near_exclusion,
             box_low=tuple(labeller.embedding.box.low.tolist()),
             box_high=tuple(labeller.embedding.box.high.tolist()),

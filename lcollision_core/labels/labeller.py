@@ -27,8 +27,8 @@ class LabelRows:
     Attributes
     ----------
     latent : (B, D) float32 array, Z_all
-    domain_energy : (B, K) float64 array, S_k, each row sums to `energy`, in squared heights
-    energy : (B,) float64 array, PDe-sum, in squared heights
+    domain_energy : (B, K) float64 array, S_k, each row sums to `energy`, normalised length squared
+    energy : (B,) float64 array, PDe-sum, normalised length squared
     n_pairs : (B,) int32 array, colliding pairs of faces
     n_near_pairs : (B,) int32 array, pairs within the near exclusion, which count for nothing else
     """
@@ -72,13 +72,13 @@ class Labeller:
     Attributes
     ----------
     embedding : decodes
-    height : one height in the data's unit
-    near_exclusion : pairs of faces this near along the surface, in heights, are counted apart
+    body_size : in the data's unit
+    near_exclusion : pairs of faces this near along the surface, normalised, are counted separately
     fingerprint : tells the model from others
     """
 
     embedding: Embedding
-    height: float
+    body_size: float
     near_exclusion: float
     fingerprint: str
 
@@ -87,7 +87,7 @@ class Labeller:
         """The exact check, in the data's unit."""
         return CollisionDetector(
             self.embedding.topology,
-            self.embedding.rest_vertices * self.height,
+            self.embedding.rest_vertices * self.body_size,
             near_exclusion=self.near_exclusion,
         )
 
@@ -126,7 +126,7 @@ class Labeller:
         """
         codes = np.ascontiguousarray(latent, dtype=np.float32)
         vertices = self.embedding.decode(codes, n_threads=1)
-        vertices *= self.height
+        vertices *= self.body_size
         found = self.detector.detect_batch(vertices.astype(np.float32), workers=1)
         mask = self.embedding.attention_mask
         domain_energy = np.zeros((len(codes), len(mask)))

@@ -50,7 +50,7 @@ class LabelStatus:
 
     @property
     def colliding_share(self) -> float | None:
-        """Share of the rows done that collide, None before the first."""
+        """Fraction of the rows done that collide, None before the first."""
         return self.n_colliding / self.done if self.done else None
 
 
@@ -58,7 +58,7 @@ StatusCallback = Callable[[LabelStatus], None]
 
 
 def no_status(status: LabelStatus) -> None:
-    """Report to nobody."""
+    """Ignore the progress."""
 
 
 def label_poses(

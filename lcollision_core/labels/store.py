@@ -153,7 +153,7 @@ class LabelStore:
             ("model", "the model of fingerprint {}"),
             ("seed", "samples of seed {}"),
             ("near_exclusion", "with a near exclusion of {}"),
-            ("height", "with a height of {}"),
+            ("height", "with a body size of {}"),
         ):
             ours, theirs = getattr(self.identity, name), getattr(identity, name)
             if ours != theirs:

@@ -111,15 +111,15 @@ def fit_rigid(
         raise ShapeError.must_be("reference", "a (V, 3) array with V > 0", target.shape)
     if poses.shape[-2:] != target.shape:
         raise ShapeError.must_be("vertices", f"(..., {len(target)}, 3)", poses.shape)
-    share = np.ones(len(target)) if weights is None else np.asarray(weights, dtype=np.float64)
-    if share.shape != (len(target),) or not (share >= 0.0).all() or not share.sum() > 0.0:
+    weight = np.ones(len(target)) if weights is None else np.asarray(weights, dtype=np.float64)
+    if weight.shape != (len(target),) or not (weight >= 0.0).all() or not weight.sum() > 0.0:
         raise ShapeError.must_be(
-            "weights", f"({len(target)},), non-negative and not all zero", share.shape
+            "weights", f"({len(target)},), non-negative and not all zero", weight.shape
         )
-    share = share / share.sum()
-    pose_centres = share @ poses
-    target_centre = share @ target
-    weighted = share[:, None] * (target - target_centre)
+    weight = weight / weight.sum()
+    pose_centres = weight @ poses
+    target_centre = weight @ target
+    weighted = weight[:, None] * (target - target_centre)
     # (3, V) @ (V, 3) for each pose: the covariance, reference by pose.
     covariance = weighted.T @ (poses - pose_centres[..., None, :])
     left, _, right = np.linalg.svd(covariance)

@@ -105,9 +105,9 @@ def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:
     """Say what a mesh has lost by being stored in float32 where it lies; None if nothing."""
     if can_hold(vertices, topology, np.float32):
         return None
-    step, share = rounding_step(vertices, topology, np.float32)
+    step, ratio = rounding_step(vertices, topology, np.float32)
     return (
-        f"so far from the origin its coordinates are stored in steps of {step:.2g}, {share:.0%} of "
+        f"so far from the origin its coordinates are stored in steps of {step:.2g}, {ratio:.0%} of "
         f"a short edge; export it nearer to the origin, or with double precision"
     )
 

@@ -107,7 +107,7 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
         ) from error
     try:
         lock_open_file(file)
-        # Its last holder may have removed it, and a lock on a removed file holds nobody off.
+        # Its last holder may have removed it, and a lock on a removed file excludes no one.
         if is_named(file, lock):
             return file
     except (BlockingIOError, PermissionError):

@@ -15,7 +15,7 @@ from lcollision_core.meshes.topology import Topology
 SINGLE_PRECISION = (".stl", ".glb")
 """Formats that hold float32 by their nature; the others hold what they are given."""
 
-LARGEST_SHARE = 0.01
+LARGEST_RATIO = 0.01
 """Of a short edge, that the rounding step of a coordinate may be: beyond it, faces lose their
 shape, and what was said of a mesh is not true of its file."""
 
@@ -26,7 +26,7 @@ _SHORT_EDGES = 10.0
 def rounding_step(
     vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLike
 ) -> tuple[float, float]:
-    """Return the largest rounding step of a mesh's coordinates, and its share of a short edge.
+    """Return the largest rounding step of a mesh's coordinates, and its ratio to a short edge.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def rounding_step(
     Returns
     -------
     step : in the mesh's unit
-    share : the step over the length that a tenth of the edges have at most, those without length
+    ratio : the step over the length that a tenth of the edges have at most, those without length
         aside; 0 where no edge has one
     """
     used = np.asarray(vertices, dtype=np.float64)[topology.picked]
@@ -45,7 +45,7 @@ def rounding_step(
     # Beyond the largest number there is none to step to.
     nearer = min(farthest, float(np.finfo(dtype).max) / 2.0)
     step = float(np.spacing(np.asarray(nearer, dtype=dtype)))
-    # Measured as shares of that, as no square of such a share overflows.
+    # Measured as fractions of that, as no square of such a fraction overflows.
     points = np.zeros((topology.n_vertices, 3))
     points[topology.picked] = used / (farthest or 1.0)
     lengths = topology.edge_lengths(points)
@@ -60,7 +60,7 @@ def can_hold(vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLik
 
     Parameters and terms are those of `rounding_step`.
     """
-    return rounding_step(vertices, topology, dtype)[1] <= LARGEST_SHARE
+    return rounding_step(vertices, topology, dtype)[1] <= LARGEST_RATIO
 
 
 def as_stored(
@@ -80,7 +80,7 @@ def as_stored(
 
     Raises
     ------
-    MeshFileError : the rounding steps exceed `LARGEST_SHARE` of a short edge, or a coordinate
+    MeshFileError : the rounding steps exceed `LARGEST_RATIO` of a short edge, or a coordinate
         exceeds the format.
     """
     suffix = Path(path).suffix.lower()
@@ -92,13 +92,13 @@ def as_stored(
     stored = np.asarray(vertices, dtype) if dtype is np.float32 else np.asarray(vertices)
     # What came rounded is not rounded again.
     if stored.dtype != vertices.dtype or stored.dtype == np.float64:
-        step, share = rounding_step(vertices, topology, dtype)
-        if share > LARGEST_SHARE:
+        step, ratio = rounding_step(vertices, topology, dtype)
+        if ratio > LARGEST_RATIO:
             advice = "write .obj, .ply or .off, or move" if dtype is np.float32 else "move"
             raise MeshFileError.unwritable(
                 path,
                 f"so far from the origin {suffix} rounds coordinates to "
-                f"steps of {step:.2g}, {share:.0%} of a short edge",
+                f"steps of {step:.2g}, {ratio:.0%} of a short edge",
                 f"{advice} the mesh nearer to the origin",
             )
     return stored

@@ -14,7 +14,7 @@ from lcollision_core.meshes.units import up_axis
 
 _MOST_POSES = 12
 _SUPPORT, _LEGS = 0.04, 0.12
-"""Shares of the extent along the axis: what stands on the floor, and where legs are looked for."""
+"""Fractions of the extent along the axis: what stands on the floor, and where legs are sought."""
 _CELLS = 24
 _SYMMETRIC = 0.01
 """Normalised: the mean distance of a symmetric body from its mirror image."""
@@ -81,7 +81,7 @@ def _standing(poses: list[FloatArray], axis: int) -> float:
 
 
 def _stands(pose: FloatArray, axis: int) -> float:
-    """Return 0 where a body would fall, else the share of its shadow that its legs leave free."""
+    """Return 0 where a body would fall, else the fraction of its shadow without legs."""
     level = pose[:, axis] - pose[:, axis].min()
     extent = max(float(level.max()), np.finfo(np.float64).tiny)
     flat = np.delete(pose, axis, axis=1)

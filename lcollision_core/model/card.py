@@ -11,7 +11,7 @@ from lcollision_core.errors import ModelFileError
 from lcollision_core.json_values import from_json, quoted
 from lcollision_core.model.naming import MAX_NAME_LENGTH
 
-_LEAST_HEIGHT = 1e-12
+_LEAST_BODY_SIZE = 1e-12
 """Of a body, in whatever unit; its inverse is the largest."""
 
 _MAX_TEXT_LENGTH = 1000
@@ -27,7 +27,7 @@ class ModelCard:
     ----------
     height : the body size, in the data's unit
     up_axis : 0, 1 or 2 for x, y or z
-    near_exclusion : pairs of faces this near along the surface, normalised, are counted apart
+    near_exclusion : pairs of faces this near along the surface, normalised, are counted separately
     domain_names : K different names
     domain_colours : K strings "#rrggbb"
     pose_names : N names of the training poses
@@ -59,8 +59,9 @@ class ModelCard:
         allowed = f"use 1 to {MAX_NAME_LENGTH} printable characters"
         for sound, problem, next_step in (
             (
-                _LEAST_HEIGHT <= self.height <= 1.0 / _LEAST_HEIGHT,
-                f"its height must be from {_LEAST_HEIGHT:g} to {1.0 / _LEAST_HEIGHT:g}",
+                _LEAST_BODY_SIZE <= self.height <= 1.0 / _LEAST_BODY_SIZE,
+                f"its body size (height) must be from {_LEAST_BODY_SIZE:g} to "
+                f"{1.0 / _LEAST_BODY_SIZE:g}",
                 "",
             ),
             (self.up_axis in (0, 1, 2), "its up_axis must be 0, 1 or 2", ""),

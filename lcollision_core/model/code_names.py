@@ -134,28 +134,28 @@ def _effect(
     domain = int(motion.argmax())
     if motion[own] >= least_share * motion[domain]:
         domain = int(own)
-    share = weights[domain]
-    total = float(share @ (moved**2).sum(axis=1))
-    if total <= _TINY * float(share @ (positions**2).sum(axis=1)):
+    weight = weights[domain]
+    total = float(weight @ (moved**2).sum(axis=1))
+    if total <= _TINY * float(weight @ (positions**2).sum(axis=1)):
         return CodeEffect(domain, "still")
-    shift = share @ moved
+    shift = weight @ moved
     if float(shift @ shift) >= _AIMLESS * total:
         return CodeEffect(domain, _way(axes @ shift))
-    arms = positions - share @ positions
-    spread = (share[:, None] * arms).T @ arms
+    arms = positions - weight @ positions
+    spread = (weight[:, None] * arms).T @ arms
     inertia = np.trace(spread) * np.eye(3) - spread
-    torque = share @ np.cross(arms, moved - shift)
+    torque = weight @ np.cross(arms, moved - shift)
     turn = np.linalg.lstsq(inertia, torque, rcond=1e-9)[0]
     long_axis = np.linalg.eigh(spread)[1][:, -1]
     twist = (turn @ long_axis) * long_axis
 
     def size(rotation: FloatArray) -> float:
-        return float(share @ (np.cross(rotation, arms) ** 2).sum(axis=1))
+        return float(weight @ (np.cross(rotation, arms) ** 2).sum(axis=1))
 
     if size(twist) > size(turn - twist):
         return CodeEffect(domain, "twist")
     # The far end of a limb points away from the body's middle, that of the trunk is its top.
-    away = long_axis @ (share @ positions - positions.mean(axis=0))
+    away = long_axis @ (weight @ positions - positions.mean(axis=0))
     half_length = np.sqrt(3.0 * long_axis @ spread @ long_axis)
     outward = long_axis * np.sign((away if abs(away) > half_length else axes[0] @ long_axis) or 1)
     return CodeEffect(domain, f"bend {_way(axes @ np.cross(turn, outward))}")

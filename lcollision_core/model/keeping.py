@@ -75,6 +75,6 @@ def _of_same_space(path: Path, model: PoseModel) -> PoseModel | None:
         return None
 
     def space(of: PoseModel) -> tuple[str, float, float]:
-        return of.fingerprint, of.near_exclusion, of.height
+        return of.fingerprint, of.near_exclusion, of.body_size
 
     return now if space(now) == space(model) else None

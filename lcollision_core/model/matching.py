@@ -130,7 +130,7 @@ def likely_factor(measured: float) -> float:
         sizes that bodies have
     """
     factors = np.array([one / other for one in _UNITS for other in _UNITS])
-    apart = np.abs(np.log(factors / measured))
-    if apart.min() > np.log(LARGEST_SIZE):
+    distances = np.abs(np.log(factors / measured))
+    if distances.min() > np.log(LARGEST_SIZE):
         return float(f"{measured:.3g}")
-    return float(f"{factors[apart.argmin()]:.6g}")
+    return float(f"{factors[distances.argmin()]:.6g}")

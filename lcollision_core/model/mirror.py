@@ -108,7 +108,7 @@ class MirroredPose:
 
 
 def pose_bytes(latent: npt.NDArray[Any], placement: RigidTransform | None) -> bytes:
-    """Return bytes that are equal for equal poses in equal places, and for no others.
+    """Return bytes that are equal for equal poses with equal placements, and for no others.
 
     Parameters
     ----------
@@ -173,11 +173,11 @@ class PoseMirror:
         ------
         ShapeError, LCollisionError, CancelledError : as of `PoseModel.resolve`.
         """
-        pose, height = np.array(latent, dtype=np.float64), self.check.height
+        pose, size = np.array(latent, dtype=np.float64), self.check.body_size
         check = replace(self.check, placement=placement)
         decoded = check.decode(pose)[0]
         pairs_before = len(check.find(check.exported(decoded)).pairs)
-        image = self.symmetry.image(decoded * height) / height
+        image = self.symmetry.image(decoded * size) / size
         place = None if placement is None else self.symmetry.image_of_placement(placement)
         restored = source is not None and source.is_of(pose, placement)
         if source is not None and restored:

@@ -141,7 +141,7 @@ def write_poses(
     path : a .json file in an existing folder
     model : whose latent space they are in
     poses : names all different
-    working : the pose that is being edited, kept apart from `poses`
+    working : the pose that is being edited, kept separately from `poses`
     extra : further JSON values by name, which `read_poses` leaves aside
 
     Raises

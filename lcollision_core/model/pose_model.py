@@ -238,7 +238,7 @@ class PoseModel:
         """Return what tests poses where they are exported to."""
         from lcollision_core.resolve import ExactCheck
 
-        return ExactCheck(self.embedding, self.detector, self.height, placement)
+        return ExactCheck(self.embedding, self.detector, self.body_size, placement)
 
     def predict(self, latent: npt.ArrayLike) -> Prediction:
         """Predict whether poses collide, and how deeply in which domain, without decoding them.
@@ -615,7 +615,7 @@ class PoseModel:
         return self.embedding.latent_size
 
     @property
-    def height(self) -> float:
+    def body_size(self) -> float:
         """The body size, by which lengths are normalised, in the data's unit."""
         return self.card.height
 

@@ -54,7 +54,7 @@ def sample_poses(
         if n_misses >= _MOST_MISSES:
             kind = "collides" if colliding else "is free"
             raise LCollisionError(
-                f"none of {n_misses} poses in a row {kind}", "ask for another kind of pose"
+                f"none of {n_misses} poses in a row {kind}", "ask for other poses"
             )
         progress(n_kept, n_poses)
     return kept

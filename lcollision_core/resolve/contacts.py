@@ -26,7 +26,7 @@ _TOLERANCE = 1e-9
 
 
 class Contacts:
-    """Half-spaces of latent poses in which the contacts seen so far are apart.
+    """Half-spaces of latent poses that separate the contacts seen so far.
 
     Parameters
     ----------

@@ -56,13 +56,13 @@ class ExactCheck:
     ----------
     embedding : decodes
     detector : in the data's unit
-    height : the body size, in the data's unit
+    body_size : in the data's unit
     placement : where a pose is exported to, None for the model's own coordinates
     """
 
     embedding: Embedding
     detector: CollisionDetector
-    height: float
+    body_size: float
     placement: RigidTransform | None = None
 
     def decode(self, latent: npt.ArrayLike) -> FloatArray:
@@ -71,7 +71,7 @@ class ExactCheck:
 
     def exported(self, decoded: FloatArray) -> npt.NDArray[np.floating]:
         """Return decoded (..., V, 3) vertices, normalised, as they are exported."""
-        return exported_vertices(decoded * self.height, self.placement)
+        return exported_vertices(decoded * self.body_size, self.placement)
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Tell which of (B, D) latent poses are collision-free: (B,) bool."""

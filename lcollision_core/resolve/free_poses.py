@@ -37,7 +37,7 @@ def find_free_poses(check: ExactCheck) -> FloatArray:
     chosen = np.unique(np.linspace(0, len(training) - 1, MOST_POSES - 1).round().astype(int))
     sources = chain(
         [np.concatenate([np.zeros((1, embedding.latent_size)), training[chosen]])],
-        (share * training[chosen] for share in _SHRINKINGS),
+        (factor * training[chosen] for factor in _SHRINKINGS),
         (embedding.box.draw(0, block).astype(np.float64) for block in range(SEARCHED_BLOCKS)),
     )
     found: list[FloatArray] = []

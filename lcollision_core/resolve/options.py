@@ -24,7 +24,7 @@ class Solver(StrEnum):
 class Metric(StrEnum):
     """What is kept small: the displacement of the vertices, or of the codes as in the paper."""
 
-    EYE = "eye"
+    DISPLACEMENT = "eye"
     LATENT = "latent"
 
 
@@ -70,7 +70,7 @@ class ResolveOptions:
     """
 
     solver: str = Solver.SQP
-    metric: str = Metric.EYE
+    metric: str = Metric.DISPLACEMENT
     threshold: float = 0.5
     margin: float | None = None
     locked_domains: frozenset[int] = field(default_factory=frozenset)
@@ -111,8 +111,8 @@ class ResolveOptions:
 class ResolveResult:
     """Where Resolve ended. Lengths are normalised, energies in squared normalised length.
 
-    Three facts are kept apart: that the solver converged, that the predictor calls the pose free,
-    and that it is free by the exact check.
+    Three facts are kept separately: that the solver converged, that the predictor calls the pose
+    free, and that it is free by the exact check.
 
     Attributes
     ----------

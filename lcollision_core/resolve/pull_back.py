@@ -14,7 +14,7 @@ FIRST_HALVINGS, FURTHER_HALVINGS = 3, 5
 SLIDES = 5
 _SLIDE_HALVINGS = 1
 _SETTLED = 0.01
-"""Share of the distance that a further slide must promise."""
+"""Fraction of the distance that a further slide must promise."""
 
 FALL_BACKS = 6
 """Known free poses that are tried, the nearest ones: the segment to the nearest of all often is

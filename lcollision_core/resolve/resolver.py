@@ -193,7 +193,7 @@ class PoseResolver:
     def _problem(
         self, target: FloatArray, options: ResolveOptions, cancel: CancelToken | None
     ) -> ResolveProblem:
-        is_displacement = options.metric == Metric.EYE
+        is_displacement = options.metric == Metric.DISPLACEMENT
         metric = self._displacement_metric if is_displacement else np.eye(len(target))
         sizes = self._embedding.group_sizes
         weights = options.group_weights or (1.0,) * len(sizes)

@@ -13,7 +13,7 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.problem import FEASIBLE, ResolveProblem, SolverOutcome, rank
 
 _SETTLED = 0.02
-"""A row has converged when its step is this share of its distance from Z*; the exact check and
+"""A row has converged when its step is this fraction of its distance from Z*; the exact check and
 pulling back follow, so more digits would be lost."""
 
 _PATIENCE = 20
@@ -143,7 +143,7 @@ def _minimiser(
     Codes that would leave the bounds stop there, and the others make up for it. Also returns the
     constraint's multiplier.
     """
-    goal, share = centre, 0.0
+    goal, multiplier = centre, 0.0
     direction = np.where(problem.movable, slope / problem.code_weights, 0.0)
     inside = np.ones(len(here), dtype=np.bool_)
     for _ in range(_BOUND_ROUNDS):
@@ -152,11 +152,11 @@ def _minimiser(
             break
         settled = float(slope[~inside] @ (goal - here)[~inside])
         missing = violation + settled + float(slope[inside] @ (centre - here)[inside])
-        share = max(0.0, missing / fall)
-        unbounded = centre - share * direction
+        multiplier = max(0.0, missing / fall)
+        unbounded = centre - multiplier * direction
         goal = np.clip(unbounded, problem.low, problem.high)
         stopped = inside & (goal != unbounded)
         if not stopped.any():
             break
         inside &= ~stopped
-    return goal, 2.0 * share
+    return goal, 2.0 * multiplier

@@ -10,7 +10,7 @@ from lcollision_core.model import PoseModel
 
 
 def labeller_of(model: PoseModel) -> Labeller:
-    return Labeller(model.embedding, model.height, model.near_exclusion, model.fingerprint)
+    return Labeller(model.embedding, model.body_size, model.near_exclusion, model.fingerprint)
 
 
 def as_bytes(rows: LabelRows) -> dict[str, bytes]:

@@ -26,7 +26,7 @@ from lcollision_core.embedding.seeding import (
     moving_parts,
     part_distances,
     principal_components,
-    reach_of_overlap,
+    radius_of_overlap,
     ring_average,
     vertex_areas,
 )
@@ -125,13 +125,13 @@ def test_reach_gives_the_overlap_asked_for() -> None:
     part = np.repeat(np.arange(4, dtype=np.int32), 20)
     distances = part_distances(part, mesh.topology, mesh.vertices)
     for overlap in (1.3, 2.0):
-        reach = reach_of_overlap(distances, overlap)
+        reach = radius_of_overlap(distances, overlap)
         squared = np.clip(1.0 - distances / reach, 0.0, 1.0) ** 2
         shares = squared / squared.sum(axis=0)
         assert (1.0 / (shares**2).sum(axis=0)).mean() == pytest.approx(overlap, abs=1e-3)
-    assert reach_of_overlap(distances, 9.0) == reach_of_overlap(distances, 2.5)
+    assert radius_of_overlap(distances, 9.0) == radius_of_overlap(distances, 2.5)
     alone = part_distances(np.zeros(80, dtype=np.int32), mesh.topology, mesh.vertices)
-    assert reach_of_overlap(alone, 3.0) > 0.0
+    assert radius_of_overlap(alone, 3.0) > 0.0
 
 
 def test_principal_components_are_orthonormal_and_ordered() -> None:

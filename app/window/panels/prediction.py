@@ -166,7 +166,7 @@ class DomainRow(HoverRow):
         )
 
     def show_energy(self, energy: float | None) -> None:
-        """Show a predicted energy in squared heights; None hides the bar."""
+        """Show a predicted energy, in normalised length squared; None hides the bar."""
         self.bar.setVisible(energy is not None)
         if energy is not None:
             # The root of an energy is a depth.

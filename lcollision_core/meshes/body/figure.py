@@ -21,7 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 
 
 STRAIGHT = 0.998
-"""Share of its full length to which a standing leg stretches: a knee bent by seven degrees."""
+"""Fraction of its full length to which a standing leg stretches: a knee bent by seven degrees."""
 
 
 @dataclass(frozen=True)

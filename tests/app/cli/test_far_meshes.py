@@ -38,7 +38,7 @@ def meshes_of(
     """Write four colliding meshes and a free one, with details of their own, as OBJ."""
     folder.mkdir()
     latents = [*sample_poses(model, 4, seed=5, colliding=True), np.zeros(model.latent_size)]
-    detail = 1e-3 * model.height * np.sin(np.arange(model.n_vertices))[:, None]
+    detail = 1e-3 * model.body_size * np.sin(np.arange(model.n_vertices))[:, None]
     made = []
     for place, latent in enumerate(latents):
         vertices = factor * ((model.decode(latent) + detail) @ TURN.T) + distance
@@ -71,7 +71,7 @@ def test_far_meshes_are_free_as_they_are_written(
         vertices, faces = read_obj(out / f"{place}.obj")
         assert len(np.unique(vertices, axis=0)) == model.n_vertices
         assert crossing_pairs(vertices - vertices.mean(axis=0), faces) == set()
-        size = factor * model.height
+        size = factor * model.body_size
         moved = np.linalg.norm(vertices - original, axis=1) / size
         # What is claimed, and what encoding loses of the detail.
         assert moved.max() < row["vertex_distance_max"] + 4e-3
@@ -115,7 +115,7 @@ def test_another_unit_is_named_and_helps(
     assert lcollision("decode", model_file, poses, "-o", out).exit_code == 0
     for place, original in enumerate(before):
         decoded = read_mesh(out / f"{place}.obj").vertices
-        assert np.abs(decoded - original).max() < 4e-3 * factor * model.height
+        assert np.abs(decoded - original).max() < 4e-3 * factor * model.body_size
     result = lcollision("encode", model_file, tmp_path / "in", "-o", poses, "--scale", 0)
     assert result.exit_code == 2
     assert "a number above 0" in result.stderr
@@ -130,7 +130,7 @@ def test_a_model_takes_the_unit_that_its_poses_are_scaled_to(
         "train", "embedding", path, "-o", out, "--domains", 2, "--domain-codes", 2, "--scale", 0.01
     )
     assert result.exit_code == 0, result.stderr
-    assert PoseModel.load(out).height == pytest.approx(1.7)
+    assert PoseModel.load(out).body_size == pytest.approx(1.7)
     assert read_pose_set(path).vertices.max() > 17.0
     result = lcollision("train", "embedding", path, "-o", out, "--scale", -1)
     assert result.exit_code == 2

@@ -496,4 +496,4 @@ def test_glb_is_upright_whatever_is_up_in_the_model(
     placed, again = tmp_path / "placed.json", tmp_path / "again.glb"
     assert lcollision("encode", turned, mesh, "-o", placed).exit_code == 0
     assert lcollision("decode", turned, placed, "-o", again).exit_code == 0
-    assert read_mesh(again).vertices == pytest.approx(written, abs=1e-3 * model.height)
+    assert read_mesh(again).vertices == pytest.approx(written, abs=1e-3 * model.body_size)

@@ -92,7 +92,7 @@ def poses(model: PoseModel, colliding: np.ndarray, tmp_path: Path) -> Path:
 def colliding_mesh(model: PoseModel, latent: np.ndarray, path: Path) -> np.ndarray:
     """Write a mesh that lies somewhere else and is not quite what the model decodes."""
     generator = np.random.default_rng(1)
-    detail = 2e-3 * model.height * np.sin(np.arange(model.n_vertices))[:, None]
+    detail = 2e-3 * model.body_size * np.sin(np.arange(model.n_vertices))[:, None]
     turned = (model.decode(latent) + detail) @ random_rotation(generator).T
     vertices = turned + 50.0
     write_mesh(path, vertices, model.faces)
@@ -101,7 +101,7 @@ def colliding_mesh(model: PoseModel, latent: np.ndarray, path: Path) -> np.ndarr
 
 def n_pairs(model: PoseModel, vertices: np.ndarray) -> int:
     """Count colliding pairs by brute force."""
-    return len(all_pairs(vertices, model.faces, DEPTH_TOLERANCE * model.height).pairs)
+    return len(all_pairs(vertices, model.faces, DEPTH_TOLERANCE * model.body_size).pairs)
 
 
 def test_poses_come_back_free_in_their_order(
@@ -158,7 +158,7 @@ def test_a_mesh_comes_back_in_its_place(
     assert n_pairs(model, fixed.vertices) == 0
     assert n_pairs(model, vertices) > 0
     # Nearer than a wrong place or another order of vertices would be.
-    assert np.linalg.norm(fixed.vertices - vertices, axis=1).mean() < 0.1 * model.height
+    assert np.linalg.norm(fixed.vertices - vertices, axis=1).mean() < 0.1 * model.body_size
 
 
 def test_detail_is_kept_where_it_stays_free(
@@ -184,8 +184,8 @@ def test_detail_is_kept_where_it_stays_free(
         n_kept += 1
         encoded = model.encode(read_mesh(source).vertices)
         residual = vertices - encoded.placement.apply(model.decode(encoded.latent))
-        np.testing.assert_allclose(fixed - bare, residual, atol=2e-4 * model.height)
-        assert np.abs(residual).max() > 1e-3 * model.height
+        np.testing.assert_allclose(fixed - bare, residual, atol=2e-4 * model.body_size)
+        assert np.abs(residual).max() > 1e-3 * model.body_size
     assert n_kept > 0
 
 
@@ -319,7 +319,7 @@ def test_the_mesh_written_is_the_one_that_was_proved_free(
 ) -> None:
     latent, turn = 0.3 * model.training_latent[4], random_rotation(np.random.default_rng(2))
     pose = NamedPose("placed", latent, RigidTransform(turn, np.array([1e4, -70.0, 3.0])))
-    check = ExactCheck(model.embedding, model.detector, model.height, pose.placement)
+    check = ExactCheck(model.embedding, model.detector, model.body_size, pose.placement)
     exported = check.exported(check.decode(latent)[0])
     path, out = tmp_path / "placed.json", tmp_path / f"placed{suffix}"
     write_poses(path, model, [pose])

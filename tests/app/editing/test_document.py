@@ -386,7 +386,7 @@ def test_resolve_checks_the_mesh_that_would_be_exported(
 ) -> None:
     model = document.model
     # So far away that rounding moves every vertex by much.
-    far = RigidTransform(QUARTER_TURN.rotation, np.full(3, 1e8 * model.height))
+    far = RigidTransform(QUARTER_TURN.rotation, np.full(3, 1e8 * model.body_size))
     document.load_pose(NamedPose("far", colliding, far))
     for domain in range(len(model.domain_names)):
         document.set_locked(domain, True)
@@ -439,7 +439,7 @@ def test_an_exported_mesh_comes_back_as_the_same_mesh(
     with qtbot.waitSignal(document.message):
         document.export_mesh(tmp_path / "again.obj")
     first, again = (read_mesh(tmp_path / name) for name in ("placed.obj", "again.obj"))
-    off = np.abs(first.vertices - again.vertices).max() / document.model.height
+    off = np.abs(first.vertices - again.vertices).max() / document.model.body_size
     assert off < 1e-3
     document.undo()
     assert np.array_equal(document.latent, document.model.training_latent[0])
@@ -456,7 +456,7 @@ def test_a_mesh_at_rest_imports_in_its_own_place(
         document.import_mesh(tmp_path / "rest.ply")
     assert document.placement is not None
     back = document.placement.apply(model.decode(document.latent))
-    assert np.abs(back - placed).max() / model.height < 0.05
+    assert np.abs(back - placed).max() / model.body_size < 0.05
 
 
 def test_an_import_says_how_far_off_it_is_and_doubts_another_body(

@@ -152,7 +152,7 @@ def test_zooming_beside_the_body_and_without_end_keeps_a_view_of_it(
     assert np.linalg.norm(scene.view.position - before.position) > 0.0
     roll(canvas, corner, -3.0)
     np.testing.assert_allclose(scene.view.position, before.position, atol=1e-6)
-    height = viewport._document.model.height
+    height = viewport._document.model.body_size
     place = place_of(viewport, seen_vertex(viewport, 0))
     for notches, nearest, farthest in ((100.0, 0.03, 1.0), (-200.0, 5.0, 40.0)):
         for _ in range(3):

@@ -307,7 +307,7 @@ def test_what_resolve_has_moved_is_drawn_and_explained(
     with qtbot.waitSignal(document.solve_finished, timeout=20_000):
         document.resolve()
     rest(qtbot, viewport)
-    moved = np.linalg.norm(scene.surface.vertices - before, axis=1) / document.model.height
+    moved = np.linalg.norm(scene.surface.vertices - before, axis=1) / document.model.body_size
     assert viewport.legend.ticks[-1][1] == f"{100 * moved.max():.2g}"
     brightness = scene.surface.colours.astype(int).sum(axis=1)
     assert brightness[moved.argmax()] == brightness.min()

@@ -159,7 +159,7 @@ def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
     assert document.pose_name == "bent"
     assert document.modified
     assert np.array_equal(shown(window), decoded(document))
-    assert np.abs(shown(window) - bent).max() < 2e-3 * editor_model.height
+    assert np.abs(shown(window) - bent).max() < 2e-3 * editor_model.body_size
     close_window(window)
     assert list(sessions_folder().iterdir()) == []
 

@@ -318,7 +318,7 @@ def test_the_window_closes_in_the_middle_of_resolve(
 def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
     document, model = window.document, window.document.model
     latent = 0.5 * model.latent_space.high
-    vertices = model.decode(latent) + np.array([3.0, -2.0, 1.0]) * model.height
+    vertices = model.decode(latent) + np.array([3.0, -2.0, 1.0]) * model.body_size
     write_mesh(tmp_path / "bent.obj", vertices, model.faces)
     with qtbot.waitSignal(document.latent_changed, timeout=PATIENCE):
         drop(window, tmp_path / "bent.obj")
@@ -327,7 +327,7 @@ def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_p
     assert document.undo_stack.undoText() == "Import bent"
     assert document.placement is not None
     back = document.placement.apply(shown(window).astype(np.float64))
-    assert np.abs(back - vertices).max() < 2e-3 * model.height
+    assert np.abs(back - vertices).max() < 2e-3 * model.body_size
     assert "of the body size" in window.statusBar().currentMessage()
 
 
@@ -401,7 +401,7 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     rest(qtbot, window)
     assert document.placement is not None
     back = document.placement.apply(shown(window).astype(np.float64))
-    assert np.abs(back - on_screen).max() < 2e-3 * model.height
+    assert np.abs(back - on_screen).max() < 2e-3 * model.body_size
 
 
 @pytest.mark.parametrize(

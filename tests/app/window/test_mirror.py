@@ -74,7 +74,7 @@ def test_mirroring_twice_is_the_pose_again_also_after_save_and_reopen(
     symmetry = body.symmetry
     assert symmetry is not None
     distance = np.linalg.norm(shown(window) - symmetry.image(before), axis=1)
-    assert distance.mean() / body.height < 0.008
+    assert distance.mean() / body.body_size < 0.008
     take_picture(window, "mirror_after")
 
     image = document.latent.tobytes()

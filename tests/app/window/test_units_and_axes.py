@@ -55,7 +55,7 @@ def test_a_mesh_in_millimetres_is_scaled_and_goes_back_to_its_size(
     document.export_mesh(tmp_path / "back.obj")
     qtbot.waitUntil((tmp_path / "back.obj").exists, timeout=20_000)
     back = read_mesh(tmp_path / "back.obj").vertices
-    assert np.abs(back - vertices).max() < 1000.0 * 0.02 * model.height
+    assert np.abs(back - vertices).max() < 1000.0 * 0.02 * model.body_size
 
 
 def test_the_window_turns_a_model_upright_in_its_file(

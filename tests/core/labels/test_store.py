@@ -201,7 +201,7 @@ def test_a_store_of_something_else_is_refused_and_left_alone(
         (replace(labeller, fingerprint="0123"), SEED, "not the model of fingerprint 0123"),
         (labeller, 1, "labels samples of seed 3, not samples of seed 1"),
         (replace(labeller, near_exclusion=0.02), SEED, "a near exclusion of 0.0, not .* of 0.02"),
-        (replace(labeller, height=2.0), SEED, "with a height of 170"),
+        (replace(labeller, body_size=2.0), SEED, "with a body size of 170"),
     ):
         with pytest.raises(LabelStoreError, match=difference) as excinfo:
             label_poses(other, path, N_ROWS + 5000, seed=seed)

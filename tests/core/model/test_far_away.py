@@ -113,7 +113,7 @@ def test_a_far_mesh_is_fitted_checked_and_given_back_as_a_near_one(
 ) -> None:
     colliding = sample_poses(tube_model, 2, seed=5, colliding=True)
     free = sample_poses(tube_model, 2, seed=5, colliding=False)
-    near = ExactCheck(tube_model.embedding, tube_model.detector, tube_model.height)
+    near = ExactCheck(tube_model.embedding, tube_model.detector, tube_model.body_size)
     far = replace(near, placement=placed(distance, turn))
     for latent in (*colliding, *free):
         decoded = far.decode(latent)[0]
@@ -121,13 +121,13 @@ def test_a_far_mesh_is_fitted_checked_and_given_back_as_a_near_one(
         assert exported.dtype == np.float64
         assert len(np.unique(exported, axis=0)) == tube_model.n_vertices
         back = far.placement.inverse().apply(exported)  # type: ignore[union-attr]
-        assert back == pytest.approx(decoded * tube_model.height, abs=1e-5 + 1e-15 * distance)
+        assert back == pytest.approx(decoded * tube_model.body_size, abs=1e-5 + 1e-15 * distance)
         expected, found = (one.find(one.exported(decoded)) for one in (near, far))
         assert len(found.pairs) == pytest.approx(len(expected.pairs), rel=0.2)
         assert far.is_free(latent) == (len(found.pairs) == 0) == near.is_free(latent)
         fit = tube_model.encode(exported)
         again = fit.placement.apply(tube_model.decode(fit.latent))
-        reported = np.linalg.norm(again - exported, axis=1).max() / tube_model.height
+        reported = np.linalg.norm(again - exported, axis=1).max() / tube_model.body_size
         assert reported == pytest.approx(fit.fit_error_max, rel=0.05, abs=1e-6)
         assert fit.fit_error_max < 1e-3
 
@@ -170,10 +170,12 @@ def test_a_mesh_in_another_unit_comes_back_in_its_own(
     assert refused.value.factor == pytest.approx(1.0 / factor, rel=1e-5)
     fit = tube_model.encode(mesh, scale=1.0 / factor)
     again = fit.placement.apply(tube_model.decode(fit.latent))
-    tolerance = 2.0 * factor * (fit.fit_error_max * tube_model.height + 1e-6 + 1e-15 * distance)
+    tolerance = 2.0 * factor * (fit.fit_error_max * tube_model.body_size + 1e-6 + 1e-15 * distance)
     assert np.abs(again - mesh).max() < tolerance
     assert fit.placement.scale == pytest.approx(factor)
-    check = ExactCheck(tube_model.embedding, tube_model.detector, tube_model.height, fit.placement)
+    check = ExactCheck(
+        tube_model.embedding, tube_model.detector, tube_model.body_size, fit.placement
+    )
     expected = tube_model.detector.detect(tube_model.decode(fit.latent))
     found = check.find(check.exported(check.decode(fit.latent)[0]))
     assert len(found.pairs) == pytest.approx(len(expected.pairs), rel=0.2)

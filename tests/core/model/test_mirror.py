@@ -105,7 +105,7 @@ def test_a_mirror_image_lies_where_the_mirror_shows_it(
     for latent in samples[[0, 2, 3]]:
         mirrored = body.mirror(latent)
         image = symmetry.image(body.decode(latent))
-        distance = np.linalg.norm(body.decode(mirrored.latent) - image, axis=1) / body.height
+        distance = np.linalg.norm(body.decode(mirrored.latent) - image, axis=1) / body.body_size
         assert mirrored.placement is None
         assert distance.mean() == pytest.approx(mirrored.fit_error_mean, rel=1e-6)
         assert distance.max() == pytest.approx(mirrored.fit_error_max, rel=1e-6)
@@ -114,7 +114,7 @@ def test_a_mirror_image_lies_where_the_mirror_shows_it(
         again = body.mirror(mirrored.latent)
         assert not again.restored
         back = np.linalg.norm(body.decode(again.latent) - body.decode(latent), axis=1)
-        assert back.mean() / body.height < 0.006
+        assert back.mean() / body.body_size < 0.006
 
 
 @pytest.mark.parametrize("name", ["right side lunge", "twist right", "rest"])
@@ -130,7 +130,7 @@ def test_mirrored_poses_are_as_near_as_unseen_ones(body: PoseModel, name: str) -
     assert mirrored.fit_error_max < metrics.held_out_max
     # Mirroring did something, unless the pose has two equal sides.
     moved = np.linalg.norm(body.decode(mirrored.latent) - body.decode(latent), axis=1)
-    assert (moved.mean() / body.height > 10.0 * metrics.held_out_mean) == (name != "rest")
+    assert (moved.mean() / body.body_size > 10.0 * metrics.held_out_mean) == (name != "rest")
 
 
 def test_mirroring_twice_gives_pose_and_place_back_to_the_bit(
@@ -144,7 +144,7 @@ def test_mirroring_twice_gives_pose_and_place_back_to_the_bit(
     assert symmetry is not None
     image = symmetry.image(placement.apply(body.decode(samples[0])))
     placed = once.placement.apply(body.decode(once.latent))
-    distance = np.linalg.norm(placed - image, axis=1) / body.height
+    distance = np.linalg.norm(placed - image, axis=1) / body.body_size
     assert distance.mean() == pytest.approx(once.fit_error_mean, rel=1e-6)
 
     twice = body.mirror(once.latent, once.placement, once.source)
@@ -178,7 +178,7 @@ def test_a_free_pose_that_collides_mirrored_is_resolved(
     assert symmetry is not None
     # The fit error is that of what comes back, resolved.
     image = symmetry.image(body.decode(resolved.source.latent))
-    distance = np.linalg.norm(body.decode(resolved.latent) - image, axis=1) / body.height
+    distance = np.linalg.norm(body.decode(resolved.latent) - image, axis=1) / body.body_size
     assert resolved.fit_error_mean == pytest.approx(distance.mean(), rel=1e-6)
     assert body.mirror(resolved.latent, None, resolved.source).restored
 

@@ -51,7 +51,7 @@ def test_a_pose_has_the_same_bits_alone_in_a_batch_and_in_a_thread(model: PoseMo
     assert np.array_equal(model.decode(latent, n_threads=1), alone)
     with ThreadPoolExecutor(4) as pool:
         assert np.array_equal(np.stack(list(pool.map(model.decode, latent))), alone)
-    assert np.ptp(batch, axis=0).max() > 0.1 * model.height
+    assert np.ptp(batch, axis=0).max() > 0.1 * model.body_size
 
 
 def test_no_pose_is_a_batch_too(model: PoseModel) -> None:
@@ -216,7 +216,7 @@ def test_file_holds_all_that_a_front_end_needs(model: PoseModel, path: Path) -> 
     assert loaded.topology == model.topology
     assert np.array_equal(loaded.attention_mask, model.attention_mask)
     assert np.array_equal(loaded.training_latent, model.training_latent)
-    assert (loaded.height, loaded.up_axis) == (pytest.approx(LENGTH_IN_FILES), 1)
+    assert (loaded.body_size, loaded.up_axis) == (pytest.approx(LENGTH_IN_FILES), 1)
     again = path.with_name("again.safetensors")
     loaded.save(again)
     assert again.read_bytes() == path.read_bytes()

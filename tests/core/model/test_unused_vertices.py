@@ -47,11 +47,11 @@ def test_height_and_up_are_of_the_vertices_in_use(tube_poses: PoseSet) -> None:
 def test_training_and_encoding_take_no_notice_of_strays(
     stray_model: PoseModel, tube_model: PoseModel, tube_poses: PoseSet
 ) -> None:
-    assert stray_model.height == tube_model.height
+    assert stray_model.body_size == tube_model.body_size
     assert stray_model.metrics is not None
     assert tube_model.metrics is not None
     assert stray_model.metrics.mean == pytest.approx(tube_model.metrics.mean, rel=0.2)
-    assert stray_model.detector.body_size == stray_model.height
+    assert stray_model.detector.body_size == stray_model.body_size
     mesh = with_strays(tube_poses).vertices[5].copy()
     encoded = stray_model.encode(mesh)
     mesh[[0, -1]] *= -3.0

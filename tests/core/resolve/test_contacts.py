@@ -71,7 +71,7 @@ def colliding(tube_model: PoseModel) -> FloatArray:
 
 
 def check_of(model: PoseModel) -> ExactCheck:
-    return ExactCheck(model.embedding, model.detector, model.height)
+    return ExactCheck(model.embedding, model.detector, model.body_size)
 
 
 def test_slopes_by_codes_are_those_of_differences(

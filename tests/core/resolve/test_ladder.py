@@ -50,7 +50,7 @@ def colliding(tube_model: PoseModel) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def check(tube_model: PoseModel) -> ExactCheck:
-    return ExactCheck(tube_model.embedding, tube_model.detector, tube_model.height)
+    return ExactCheck(tube_model.embedding, tube_model.detector, tube_model.body_size)
 
 
 @pytest.fixture(scope="module")
@@ -104,14 +104,14 @@ def assert_free_by_brute_force(model: PoseModel, result: ResolveResult) -> None:
     assert np.array_equal(result.vertices, model.exported_vertices(result.latent))
     assert result.vertices.dtype == np.float32
     vertices = result.vertices.astype(np.float64)
-    found = all_pairs(vertices, model.faces, DEPTH_TOLERANCE * model.height)
+    found = all_pairs(vertices, model.faces, DEPTH_TOLERANCE * model.body_size)
     assert len(found.pairs) == 0
     assert (result.pairs_after, result.energy_after) == (0, 0.0)
 
 
 def assert_measured(model: PoseModel, latent: FloatArray, result: ResolveResult) -> None:
     moved = np.linalg.norm(model.decode(result.latent) - model.decode(latent), axis=1)
-    moved /= model.height
+    moved /= model.body_size
     assert result.vertex_distance_mean == pytest.approx(moved.mean(), rel=1e-9)
     assert result.vertex_distance_max == pytest.approx(moved.max(), rel=1e-9)
     way = np.linalg.norm(result.latent - latent) / np.linalg.norm(latent)
@@ -375,11 +375,11 @@ def test_a_pose_that_came_as_a_mesh_is_checked_where_it_lies(
     tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     rotation = random_rotation(np.random.default_rng(0))
-    placement = RigidTransform(rotation, 3.0 * tube_model.height * np.ones(3))
+    placement = RigidTransform(rotation, 3.0 * tube_model.body_size * np.ones(3))
     for latent in colliding[:4]:
         resolver = resolver_of(tube_model, around_the_mean(latent, 0.5), free_latents)
         result = resolver.resolve(latent, placement=placement)
-        tolerance = DEPTH_TOLERANCE * tube_model.height
+        tolerance = DEPTH_TOLERANCE * tube_model.body_size
         assert len(all_pairs(result.vertices, tube_model.faces, tolerance).pairs) == 0
         assert result.vertices.dtype == np.float64
         assert result.exactly_free
@@ -435,7 +435,7 @@ def test_the_change_of_corrections_is_measured_in_heights(
         for result, frame in zip(results, frames, strict=True)
     ]
     changes = [
-        np.linalg.norm(after - before, axis=1).mean() / tube_model.height
+        np.linalg.norm(after - before, axis=1).mean() / tube_model.body_size
         for before, after in pairwise(moved)
     ]
     assert max(changes) > 0.0
