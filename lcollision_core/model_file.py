@@ -180,7 +180,7 @@ def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
 
     Returns
     -------
-    section : None where the file has none of this name
+    section : None if the file has none of this name
 
     Raises
     ------

@@ -338,7 +338,7 @@ def _results(model: PoseModel, unfinished: UnfinishedPoses) -> dict[int, Resolve
 def _detailed(
     model: PoseModel, requests: Sequence[_Request], results: Sequence[ResolveResult]
 ) -> list[npt.NDArray[np.float64] | None]:
-    """Return the resolved meshes with what encoding lost of them, None where that collides."""
+    """Return the resolved meshes with what encoding lost of them, None if that collides."""
     from lcollision_core.model import with_detail
 
     detailed: list[npt.NDArray[np.float64] | None] = []

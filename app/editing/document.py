@@ -70,8 +70,8 @@ class PoseDocument(CodeEditing):
     modified_changed : bool
     outcome_changed : `outcome` is new, or None as the pose has been changed since
     solve_started, solve_progressed(object), solve_finished(object) : around a Resolve; the last
-        carries its ResolveResult, or None where it was cancelled or failed
-    busy_changed : str, what the long work is, or "" where there is none
+        carries its ResolveResult, or None if it was cancelled or failed
+    busy_changed : str, what the long work is, or "" if there is none
     message : str, one sentence for the status bar
     failed : Failure, one sentence and its details, for a dialog
     opened : Path, the file of poses or of a model that is in now
@@ -135,12 +135,12 @@ class PoseDocument(CodeEditing):
 
     @property
     def busy(self) -> str:
-        """What the long work is, or "" where there is none."""
+        """What the long work is, or "" if there is none."""
         return self._long.busy
 
     @property
     def incoming(self) -> str:
-        """What brings another pose or model, or "" where nothing does."""
+        """What brings another pose or model, or "" if nothing does."""
         return self._long.label_of(self._incoming)
 
     @property

@@ -296,7 +296,7 @@ class PoseHistory(QObject):
         self._step(f"Rename {old}", [(pose, renamed)], state)
 
     def why_not_called(self, name: str, old: str = "") -> ModelFileError | None:
-        """Say why no pose of the library can get a name, or return None where one can.
+        """Say why no pose of the library can get a name, or return None if one can.
 
         Parameters
         ----------
@@ -347,7 +347,7 @@ class PoseHistory(QObject):
         return self._held
 
     def _source_pose(self) -> NamedPose | None:
-        """Return what the working pose came from, as it is there now; None where it is gone."""
+        """Return what the working pose came from, as it is there now; None if it is gone."""
         origin = self._state.origin
         if origin is None or origin.source is Source.LIBRARY:
             return self.library_pose
@@ -380,7 +380,7 @@ class PoseHistory(QObject):
 
         Parameters
         ----------
-        changes : pairs of a pose of the library and what comes in its place; None where one is
+        changes : pairs of a pose of the library and what comes in its place; None if one is
             added at the end, or removed
         """
         from lcollision_core.model import LibraryChange

@@ -63,7 +63,7 @@ class Session:
 
     @classmethod
     def new(cls, parent: Path) -> Session:
-        """Make a session; raises OSError where the folder cannot be made."""
+        """Make a session; raises OSError if the folder cannot be made."""
         folder = parent / uuid.uuid4().hex
         folder.mkdir(parents=True)
         session = cls.held(folder)
@@ -73,7 +73,7 @@ class Session:
 
     @classmethod
     def held(cls, folder: Path) -> Session | None:
-        """Take a session over, or return None where a living process holds it.
+        """Take a session over, or return None if a living process holds it.
 
         Nor is one taken whose lock is not a plain file: Qt would wait for a pipe for ever.
         """

@@ -111,7 +111,7 @@ def kept_in_view(
 
     Returns
     -------
-    wanted : None where the view may stay as it is
+    wanted : None if the view may stay as it is
     """
     if not sees_all(view, before, aspect) or sees_all(view, after, aspect):
         return None

@@ -28,7 +28,7 @@ class Pictures(QObject):
     Parameters
     ----------
     document : whose mesh the scene shows; tells the user what has been saved
-    scene_now : returns the scene as it is to be seen, or raises where there is none yet
+    scene_now : returns the scene as it is to be seen, or raises if there is none yet
     parent : of the object
 
     Signals
@@ -51,7 +51,7 @@ class Pictures(QObject):
 
     @property
     def busy(self) -> str:
-        """Which video is being drawn, or "" where none is."""
+        """Which video is being drawn, or "" if none is."""
         return f"Making {self._video.path.name}" if self._video is not None else ""
 
     def screenshot(

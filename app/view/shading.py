@@ -69,9 +69,9 @@ class Legend:
 
     Attributes
     ----------
-    title : one line; "" where there is nothing to explain
+    title : one line; "" if there is nothing to explain
     note : one line beneath it, or ""
-    crossing : what faces in the colour `COLLIDING_FACE` are, "" where there are none
+    crossing : what faces in the colour `COLLIDING_FACE` are, "" if there are none
     ramp : "#rrggbb" from none to most, evenly spread; empty without a scale
     ticks : (position from 0 to 1 along the ramp, text)
     """
@@ -136,7 +136,7 @@ class Shader:
 
         Parameters
         ----------
-        has_predictor : False where no estimate will ever come
+        has_predictor : False if no estimate will ever come
         """
         if shading is Shading.PLAIN:
             return Legend()

@@ -60,7 +60,7 @@ class TurntableStyle:
         return [int(unit * step) for step in np.diff(np.round(ends))]
 
     def refusal(self, path: Path) -> MeshFileError | None:
-        """Say why a video cannot be written so, or return None where it can."""
+        """Say why a video cannot be written so, or return None if it can."""
         suffix = path.suffix.lower()
         where: str | Path = path.name
         n_bytes = self.n_frames * self.width * self.height * (1 if suffix == ".gif" else 4)

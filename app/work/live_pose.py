@@ -74,7 +74,7 @@ class LiveWorker(QObject):
         self._has_answered.clear()
 
     def awaited(self, seconds: float) -> Response | None:
-        """Wait in another thread for the answer; None where it takes longer."""
+        """Wait in another thread for the answer; None if it takes longer."""
         return self._answer if self._has_answered.wait(seconds) else None
 
     def _value(self, request: FrameRequest | VerdictRequest) -> object:

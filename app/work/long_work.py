@@ -68,7 +68,7 @@ class LongWorker(QObject):
 class LongWork(QObject):
     """Does jobs one after the other in its own thread, and tells of them in the window's.
 
-    `busy_changed` carries the label of the oldest job that is not done, "" where there is none;
+    `busy_changed` carries the label of the oldest job that is not done, "" if there is none;
     `failed` a `Failure`; `progressed` the job's number and what its work told.
     """
 
@@ -94,7 +94,7 @@ class LongWork(QObject):
         return next((job.label for job in self._jobs.values()), "")
 
     def label_of(self, number: int) -> str:
-        """Return what a job does, or "" where it is done."""
+        """Return what a job does, or "" if it is done."""
         return self._jobs[number].label if number in self._jobs else ""
 
     def start(
@@ -125,7 +125,7 @@ class LongWork(QObject):
         return job.request_id
 
     def cancel(self, number: int) -> None:
-        """Stop a job; nothing more is heard of it. Does nothing where it is done."""
+        """Stop a job; nothing more is heard of it. Does nothing if it is done."""
         job = self._jobs.pop(number, None)
         if job is not None:
             job.cancel.cancel()
@@ -137,7 +137,7 @@ class LongWork(QObject):
             self.cancel(number)
 
     def finish(self, number: int) -> None:
-        """Do a job here and now, instead of in its turn; does nothing where it is done.
+        """Do a job here and now, instead of in its turn; does nothing if it is done.
 
         Raises whatever its work raises.
         """

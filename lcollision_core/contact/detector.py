@@ -41,10 +41,10 @@ _PAIRS_AT_ONCE = 1 << 14
 _SHARES = 1000
 """Of a search, in which `CollisionDetector.summarise` tells its progress."""
 
-_POSES_A_TASK = 8
+_POSES_PER_TASK = 8
 """The most poses that a thread takes at a time: a prompt cancel, and little waiting at the end."""
 
-_TASKS_A_THREAD = 4
+_TASKS_PER_THREAD = 4
 """What small batches are cut into at least, or a few threads would do the work of all."""
 
 
@@ -340,7 +340,7 @@ class CollisionDetector:
         cancel: CancelToken | None,
     ) -> None:
         n_threads = available_cores() if workers is None else workers
-        size = max(1, min(_POSES_A_TASK, n_poses // (_TASKS_A_THREAD * max(1, n_threads))))
+        size = max(1, min(_POSES_PER_TASK, n_poses // (_TASKS_PER_THREAD * max(1, n_threads))))
 
         def work(start: int, stop: int) -> None:
             with self._searcher() as searcher:

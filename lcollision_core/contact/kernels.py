@@ -153,7 +153,7 @@ def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArra
 
 @compiled
 def _refit(pose, scale, tree, work):
-    """Fill `work` for one pose and return True, or False where it is not within `MAX_DISTANCE`.
+    """Fill `work` for one pose and return True, or False if it is not within `MAX_DISTANCE`.
 
     Coordinates are taken from the middle of the pose's bounding box, so that a pose far from
     the origin loses no precision to its distance.

@@ -64,7 +64,7 @@ class Checkpoint:
             self._sections = stored
 
     def get(self, part: str) -> Section | None:
-        """Return the stored state of a part of the run, None where it has not begun."""
+        """Return the stored state of a part of the run, None if it has not begun."""
         return self._sections.get(part)
 
     def put(

@@ -27,7 +27,7 @@ class EmbeddingMetrics:
     guess_mean, guess_max : with both levels, codes straight from the encoders
     mean, max : with both levels, codes fitted
     held_out_mean, held_out_max : of poses that a second model was trained without, codes fitted;
-        None where none was trained, like the next two
+        None if none was trained, like the next two
     pca_held_out_mean : the same of plain principal components of the same training poses' features,
         as many numbers as the latent has or the poses span, codes fitted in the same way
     pca_size : how many numbers that is

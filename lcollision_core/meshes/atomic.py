@@ -141,7 +141,7 @@ def _remove_dead_folders(target: Path) -> None:
 
 
 def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
-    """Return what tells a file from any that replaces it; None where there is no file.
+    """Return what tells a file from any that replaces it; None if there is no file.
 
     Compared inside `locked`, it says whether the file is still the one that was read.
     """

@@ -104,7 +104,7 @@ class PoseSetInspection:
 
     Attributes
     ----------
-    pose_set : the poses that agree with the first readable one; None where none can be used
+    pose_set : the poses that agree with the first readable one; None if none can be used
     n_found : the poses that are there, usable or not
     same_topology : whether all readable poses share their vertex count and faces
     audit : the state of the reference, pose 0; None without poses

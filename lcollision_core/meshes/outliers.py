@@ -23,7 +23,7 @@ _COMPARED_POSES = 25
 
 
 def scale_of(lengths: FloatArray, known: FloatArray) -> float | None:
-    """Return the common scale of edges against known lengths, None where each has its own.
+    """Return the common scale of edges against known lengths, None if each has its own.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ class PoseSet:
     source : the folder or file that it was read from, if it was
     notes : sentences on what was done on reading
     near_exclusion : normalised length up to which pairs are near, not colliding
-    up_axis : 0, 1 or 2 for x, y or z; None where it is to be guessed
+    up_axis : 0, 1 or 2 for x, y or z; None if it is to be guessed
     vertex_labels : (V,) array of printable strings, the body part of each vertex, if known
 
     Raises
@@ -200,7 +200,7 @@ class Collected:
 
     Attributes
     ----------
-    pose_set : the poses that fit together, None where there are none
+    pose_set : the poses that fit together, None if there are none
     n_found : the poses that were there, usable or not
     same_topology : whether all that could be read share their faces
     """

@@ -99,7 +99,7 @@ def _stands(pose: FloatArray, axis: int) -> float:
 
 
 def _side(reference: FloatArray) -> int | None:
-    """Return the axis across which a body is symmetric, None where there is no one such."""
+    """Return the axis across which a body is symmetric, None if there is no one such."""
     extent = float(np.ptp(reference, axis=0).max())
     if extent == 0.0:
         return None

@@ -64,7 +64,7 @@ def with_detail(
 
     Returns
     -------
-    vertices : (V, 3) float64 array that the exact check found free; None where the moved mesh
+    vertices : (V, 3) float64 array that the exact check found free; None if the moved mesh
         would collide
     """
     # Where the pose did not move, the mesh stays as it is to the bit.

@@ -44,7 +44,7 @@ def find_latent_space(fingerprint: str, name: str = "") -> ListedModel | None:
 
     Returns
     -------
-    model : None where no listed model has that latent space; files that cannot be read are passed
+    model : None if no listed model has that latent space; files that cannot be read are passed
         over
     """
     for model in sorted(list_models(), key=lambda listed: listed.name != name):

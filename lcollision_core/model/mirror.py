@@ -86,7 +86,7 @@ class MirroredPose:
     pairs_before : colliding pairs of faces of the given pose, by the exact check
     pairs_mirrored : of the pose that is nearest to the mirror image
     pairs_after : of this pose
-    resolution : the Resolve of the collisions that mirroring brought, None where there was none
+    resolution : the Resolve of the collisions that mirroring brought, None if there was none
     source : of this pose: the given one
     """
 
@@ -223,7 +223,7 @@ def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int)
 
     Returns
     -------
-    symmetry : that maps faces onto faces; None where there is none
+    symmetry : that maps faces onto faces; None if there is none
     """
     from scipy.spatial import cKDTree
 

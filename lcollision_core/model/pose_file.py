@@ -115,7 +115,7 @@ class OtherModelError(ModelFileError):
 
     Attributes
     ----------
-    model : the model that the poses belong to, None where it is not among the listed ones
+    model : the model that the poses belong to, None if it is not among the listed ones
     """
 
     def __init__(
@@ -226,7 +226,7 @@ def read_pose_file(path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
 
 
 def why_no_name(name: str) -> str:
-    """Say why a pose cannot be called so, or return "" where it can."""
+    """Say why a pose cannot be called so, or return "" if it can."""
     if not 0 < len(name) <= MAX_NAME_LENGTH:
         return f"its name must be a text of 1 to {MAX_NAME_LENGTH} characters"
     if any("\ud800" <= character <= "\udfff" for character in name):

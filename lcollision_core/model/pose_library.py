@@ -42,8 +42,8 @@ class LibraryChange:
 
     Attributes
     ----------
-    old : None where a pose is added
-    new : None where a pose is removed
+    old : None if a pose is added
+    new : None if a pose is removed
     place : in the library, from 0, where a pose is added
     """
 
@@ -93,7 +93,7 @@ class PoseLibrary:
         return not self._unwritten
 
     def find(self, name: str) -> NamedPose | None:
-        """Return the pose of this name, None where there is none."""
+        """Return the pose of this name, None if there is none."""
         return next((pose for pose in self._poses if pose.name == name), None)
 
     def change(self, changes: Sequence[LibraryChange]) -> None:

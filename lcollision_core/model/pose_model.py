@@ -447,7 +447,7 @@ class PoseModel:
 
     @cached_property
     def predictor(self) -> CollisionPredictor | None:
-        """What predicts collisions; None where none was trained yet.
+        """What predicts collisions; None if none was trained yet.
 
         Raises
         ------
@@ -462,7 +462,7 @@ class PoseModel:
 
     @cached_property
     def predictor_record(self) -> PredictorRecord | None:
-        """How the predictor was trained and measured, without torch; None where there is none.
+        """How the predictor was trained and measured, without torch; None if there is none.
 
         Raises
         ------
@@ -521,7 +521,7 @@ class PoseModel:
 
     @cached_property
     def symmetry(self) -> Symmetry | None:
-        """Left and right of the mesh; None where its reference is not its own mirror image."""
+        """Left and right of the mesh; None if its reference is not its own mirror image."""
         return find_symmetry(self.reference, self.topology, self.up_axis)
 
     @cached_property

@@ -33,17 +33,17 @@ class CalibrationBin:
 
 @dataclass(frozen=True)
 class PredictorMetrics:
-    """Scores over samples that did not train the predictor; rates are shares from 0 to 1.
+    """Scores over samples that did not train the predictor; rates are fractions from 0 to 1.
 
     None stands for what the samples or the losses trained on leave undefined.
 
     Attributes
     ----------
     samples : how many
-    accuracy : CLASSIFY, share of right calls at probability 0.5
+    accuracy : CLASSIFY, fraction of correct decisions at probability 0.5
     false_positive_rate : free poses called colliding
     false_negative_rate : colliding poses called free
-    majority_rate : accuracy of always saying what most samples are
+    majority_rate : accuracy of always answering what is more frequent
     energy_mse : MSE of PDe-sum, in scaled energies
     ranking_margin : RANK, mean of max(0, alpha - sign dS_sum) over random pairs of unequal
         PDe-sum, in scaled energies
@@ -53,7 +53,7 @@ class PredictorMetrics:
 
     Raises
     ------
-    ValueError : a share or a count that cannot be.
+    ValueError : a rate or a count that cannot be.
     """
 
     samples: int
@@ -69,9 +69,9 @@ class PredictorMetrics:
 
     def __post_init__(self) -> None:
         for name in ("accuracy", "false_positive_rate", "false_negative_rate", "majority_rate"):
-            share = getattr(self, name)
-            if share is not None and not 0.0 <= share <= 1.0:
-                raise ValueError(f"{name} must be from 0 to 1, got {share:g}")
+            rate = getattr(self, name)
+            if rate is not None and not 0.0 <= rate <= 1.0:
+                raise ValueError(f"{name} must be from 0 to 1, got {rate:g}")
         if self.samples < 1 or len(self.calibration) != CALIBRATION_BINS:
             raise ValueError(f"samples must be over 0, and calibration {CALIBRATION_BINS} entries")
 
@@ -93,7 +93,7 @@ def measure(
     ----------
     probability : (B,) predicted, B >= 1
     predicted_energy : (B,) S_sum, scaled
-    colliding : (B,) the truth
+    colliding : (B,) bool array, ground truth
     energy : (B,) PDe-sum, scaled
     margin : alpha, scaled
     threshold : probability above which a pose is called colliding
@@ -155,7 +155,7 @@ def _calibration(
         np.bincount(number, weights, CALIBRATION_BINS) for weights in (None, probability, colliding)
     )
     bins = [
-        CalibrationBin(int(n), float(mean / n), float(share / n)) if n else CalibrationBin(0)
-        for n, mean, share in zip(counts, expected, found, strict=True)
+        CalibrationBin(int(n), float(mean / n), float(n_colliding / n)) if n else CalibrationBin(0)
+        for n, mean, n_colliding in zip(counts, expected, found, strict=True)
     ]
     return tuple(bins), float(np.abs(expected - found).sum()) / len(colliding)

@@ -100,7 +100,7 @@ class PredictorNetwork(nn.Module, ABC):
         ----------
         embedding : whose latent codes come in
         config : the choices
-        rows : some of those to train on, as they are in the store; None where a state dict will be
+        rows : some of those to train on, as they are in the store; None if a state dict will be
             loaded
         seed : of the initial weights
         near_exclusion : of the rows, in normalised length

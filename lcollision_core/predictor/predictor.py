@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 BATCH_ROWS = 500
 """Rows that are predicted at a time: their hidden layers stay in the caches."""
 
-_ROWS_A_REPORT = 50 * BATCH_ROWS
+_ROWS_PER_REPORT = 50 * BATCH_ROWS
 
 _LEAST_ENERGY, _LARGEST_FACT = 1e-18, 1e6
 """Of facts: far beyond what training finds, and far from what overflows."""
@@ -406,7 +406,7 @@ def evaluate_predictor(
         scaled, logit = predictor.scaled_outputs(rows.latent[start:stop])
         probability[start:stop], predicted[start:stop] = expit(logit), scaled.sum(axis=1)
 
-    for_blocks(score, len(rows), _ROWS_A_REPORT, 1, progress, cancel)
+    for_blocks(score, len(rows), _ROWS_PER_REPORT, 1, progress, cancel)
     scale = predictor.facts.energy_scale
     config = predictor.config
     return measure(
@@ -435,8 +435,8 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
             f"model has {embedding.latent_size} and {embedding.n_domains}",
             "label samples of this model",
         )
-    for start in range(0, len(rows), _ROWS_A_REPORT):
-        part = slice(start, start + _ROWS_A_REPORT)
+    for start in range(0, len(rows), _ROWS_PER_REPORT):
+        part = slice(start, start + _ROWS_PER_REPORT)
         finite = np.isfinite(rows.energy[part])
         for values in (rows.latent[part], rows.domain_energy[part]):
             finite &= np.isfinite(values).all(axis=1)

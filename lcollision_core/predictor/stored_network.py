@@ -29,7 +29,7 @@ _LARGEST_WEIGHT, _LEAST_DEVIATION = 1e4, 1e-6
 _LARGEST_OUTPUT = 1e18
 """What float32 can square."""
 
-_INPUTS_A_FEATURE = 10.0
+_INPUTS_PER_FEATURE = 10.0
 """A network's inputs are at most so many times the largest deformation feature."""
 
 
@@ -140,7 +140,7 @@ def _require_default(reader: _Reader, embedding: Embedding) -> None:
         if n:
             if deviation.min() < _LEAST_DEVIATION:
                 raise ValueError(f"its array {name}.deviation must be over {_LEAST_DEVIATION:g}")
-            inputs = _INPUTS_A_FEATURE * largest + float(np.abs(mean).max())
+            inputs = _INPUTS_PER_FEATURE * largest + float(np.abs(mean).max())
             standardised = inputs / float(deviation.min())
         names = [f"{name}.layers.{number}" for number in range(3)]
         bound = max(bound, reader.layers(names, (n_in, None, None, 2), n, standardised))

@@ -39,7 +39,7 @@ class Contacts:
         self._offsets = np.empty(0)
 
     def add(self, latent: FloatArray) -> bool:
-        """Add the contacts of a (D,) pose; False where it is free and has none."""
+        """Add the contacts of a (D,) pose; False if it is free and has none."""
         decoded = self._check.decode(latent)[0]
         found = self._check.find(self._check.exported(decoded))
         if not found.colliding:
@@ -55,7 +55,7 @@ class Contacts:
         self._normals, self._offsets = self._normals[kept], self._offsets[kept]
 
     def nearest(self, centre: FloatArray) -> FloatArray | None:
-        """Return the pose nearest to a (D,) pose in all half-spaces, None where there is none."""
+        """Return the pose nearest to a (D,) pose in all half-spaces, None if there is none."""
         return nearest_within(self._problem, centre, self._normals, self._offsets)
 
 
@@ -73,7 +73,7 @@ def nearest_within(
 
     Returns
     -------
-    latent : (D,) float64 array, or None where the half-spaces have no point in common
+    latent : (D,) float64 array, or None if the half-spaces have no point in common
 
     Notes
     -----

@@ -134,7 +134,7 @@ class ResolveResult:
         margins and restarts do not count
     evaluations : poses at which the predictor was asked
     seconds : spent
-    note : a sentence for the user, None where there is nothing to say
+    note : a sentence for the user, None if there is nothing to say
     """
 
     latent: npt.NDArray[np.float64]

@@ -27,7 +27,7 @@ class Deadline:
     Attributes
     ----------
     budget : seconds, None for no limit
-    cancel : None where the solve cannot be cancelled
+    cancel : None if the solve cannot be cancelled
     """
 
     budget: float | None = None

@@ -96,7 +96,7 @@ def fall_back(
 
     Returns
     -------
-    latent : (D,) float64 array, collision-free, or None where all known poses collide
+    latent : (D,) float64 array, collision-free, or None if all known poses collide
 
     Raises
     ------

@@ -154,7 +154,7 @@ COMPUTED_WITH = {
 
 
 def _works(path: Path, uses: tuple[Use, ...] = EVERY_USE) -> bool:
-    """Use a model as the commands and the editor do; False where it is refused as it should be."""
+    """Use a model as the commands and the editor do; False if it is refused as it should be."""
     try:
         model = PoseModel.load(path)
     except ModelFileError as error:

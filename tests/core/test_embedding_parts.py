@@ -125,8 +125,8 @@ def test_reach_gives_the_overlap_asked_for() -> None:
     part = np.repeat(np.arange(4, dtype=np.int32), 20)
     distances = part_distances(part, mesh.topology, mesh.vertices)
     for overlap in (1.3, 2.0):
-        reach = radius_of_overlap(distances, overlap)
-        squared = np.clip(1.0 - distances / reach, 0.0, 1.0) ** 2
+        radius = radius_of_overlap(distances, overlap)
+        squared = np.clip(1.0 - distances / radius, 0.0, 1.0) ** 2
         shares = squared / squared.sum(axis=0)
         assert (1.0 / (shares**2).sum(axis=0)).mean() == pytest.approx(overlap, abs=1e-3)
     assert radius_of_overlap(distances, 9.0) == radius_of_overlap(distances, 2.5)

@@ -137,7 +137,7 @@ def vertex_numbers(
 
 
 def _plain_decimals(text: bytes) -> npt.NDArray[np.float64] | None:
-    """Parse decimals, and the word `nan`, quickly; None where there is anything else."""
+    """Parse decimals, and the word `nan`, quickly; None if there is anything else."""
     if text.translate(None, b" \n0123456789+-.eEna"):
         return None
     blank = np.frombuffer(text, dtype=np.uint8) <= ord(" ")

@@ -78,7 +78,7 @@ def find_fold_sites(
     members : (S, M) vertices spread about each site, its centre first; S is 0 for a body that does
         not fold
     """
-    score = _fold_share(embedding, latent[:_SEARCHED_POSES], near_exclusion)
+    score = _fold_frequency(embedding, latent[:_SEARCHED_POSES], near_exclusion)
     radius = _MEMBER_RADIUS + near_exclusion
     graph = skin_graph(embedding)
     members: list[npt.NDArray[np.int64]] = []
@@ -91,18 +91,18 @@ def find_fold_sites(
     return np.array(members, dtype=np.int64).reshape(-1, N_MEMBERS)
 
 
-def _fold_share(
+def _fold_frequency(
     embedding: Embedding, latent: npt.NDArray[np.floating], near_exclusion: float
 ) -> FloatArray:
-    """Return (V,) in what share of the poses each vertex is part of a fold."""
+    """Return (V,) in what fraction of the poses each vertex is part of a fold."""
     faces = embedding.topology.faces
     detector = FoldDetector(embedding, near_exclusion)
-    share = np.zeros(len(embedding.rest_vertices))
+    frequency = np.zeros(len(embedding.rest_vertices))
     for start in range(0, len(latent), _POSES_AT_ONCE):
         for vertices in embedding.decode(latent[start : start + _POSES_AT_ONCE]):
             contacts, pairs, _ = detector.detect(vertices.astype(np.float32))
-            share[np.unique(faces[pairs])] += _MASKED_FOLD if len(contacts.pairs) else 1.0
-    return share / max(len(latent), 1)
+            frequency[np.unique(faces[pairs])] += _MASKED_FOLD if len(contacts.pairs) else 1.0
+    return frequency / max(len(latent), 1)
 
 
 def _spread_members(

@@ -236,7 +236,7 @@ class GeometricNetwork(PredictorNetwork):
         if not len(own.energy):
             # The mean of no row is not a number; their sum is 0, and depends on the parameters.
             return output.logit.sum()
-        share = len(own.energy) / len(batch.energy)
+        fraction = len(own.energy) / len(batch.energy)
         patch_logit, patch_root, root = output.auxiliary
         total = config.entropy_weight * binary_cross_entropy_with_logits(
             output.logit, own.colliding
@@ -255,7 +255,7 @@ class GeometricNetwork(PredictorNetwork):
                 total = total + depth_weight * smooth_l1_loss(patch_root[:, cells], taught)
         labelled = torch.cat([own.domain_energy, own.energy[:, None]], dim=1).sqrt()
         total = total + config.depth_weight * smooth_l1_loss(root, labelled)
-        return share * total
+        return fraction * total
 
 
 class _PatchNetworks(nn.Module):

@@ -97,15 +97,17 @@ def contact_field(
                 p = order[first + i]
                 for k in range(2):
                     sums = lanes[(6 + 8 * k) * BLOCK + i :: BLOCK]
-                    share = dtype(1.0) / (sums[0] + dtype(SOME))
+                    inverse = dtype(1.0) / (sums[0] + dtype(SOME))
                     field[p, b, k, 0] = sums[0] / (sums[0] + dtype(FULL))
-                    field[p, b, k, 1] = sums[1] * share * dtype(UNITS[k, 1])
+                    field[p, b, k, 1] = sums[1] * inverse * dtype(UNITS[k, 1])
                     for c in range(3):
                         # Offsets and normals in the point's frame.
                         f0, f1, f2 = frame[b, p, 0, c], frame[b, p, 1, c], frame[b, p, 2, c]
                         offset = f0 * sums[2] + f1 * sums[3] + f2 * sums[4]
-                        field[p, b, k, 2 + c] = offset * share * dtype(UNITS[k, 2])
-                        field[p, b, k, 5 + c] = (f0 * sums[5] + f1 * sums[6] + f2 * sums[7]) * share
+                        field[p, b, k, 2 + c] = offset * inverse * dtype(UNITS[k, 2])
+                        field[p, b, k, 5 + c] = (
+                            f0 * sums[5] + f1 * sums[6] + f2 * sums[7]
+                        ) * inverse
 
 
 @compiled

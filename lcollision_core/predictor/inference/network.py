@@ -102,23 +102,23 @@ class CompiledNetwork:
         contact, root = np.concatenate([patch[-1], fold[-1]]).transpose(2, 1, 0)
         squashed = np.tanh(contact / SQUASHED)
         head = self._head.forward(np.concatenate([squashed, root], axis=1)[None], workspace)
-        # The logarithm of the summed exponentials, and its derivative, the softmax.
+        # Log-sum-exp, and its derivative, the softmax.
         largest = contact.max(axis=1, keepdims=True)
-        share = np.exp(contact - largest)
-        total = share.sum(axis=1, keepdims=True)
-        share /= total
+        softmax = np.exp(contact - largest)
+        total = softmax.sum(axis=1, keepdims=True)
+        softmax /= total
         scale, offset = self._any_contact
         logit = head[-1][0, :, 0] + (largest + np.log(total))[:, 0] * scale + offset
-        return _Trace(body, field, patch, fold, squashed, share, head, logit)
+        return _Trace(body, field, patch, fold, squashed, softmax, head, logit)
 
     def _backward(self, trace: _Trace) -> Array:
         skin, body, field = self.skin, trace.body, trace.field
-        n_points, n_contacts = skin.n_points, trace.share.shape[1]
+        n_points, n_contacts = skin.n_points, trace.softmax.shape[1]
         grad_head = np.zeros_like(trace.head[-1])
         grad_head[..., 0] = 1.0
         grad_values = self._head.backward(trace.head, grad_head)[0]
         slope = (1.0 - np.square(trace.squashed)) / SQUASHED
-        grad_contact = grad_values[:, :n_contacts] * slope + self._any_contact[0] * trace.share
+        grad_contact = grad_values[:, :n_contacts] * slope + self._any_contact[0] * trace.softmax
         grad_both = np.stack([grad_contact, grad_values[:, n_contacts:]], axis=2)
         grad_patch, grad_fold = map(
             np.ascontiguousarray, np.split(grad_both.transpose(1, 0, 2), [n_points])
@@ -132,14 +132,14 @@ class CompiledNetwork:
 
 
 class _Trace(NamedTuple):
-    """What a forward pass of B poses makes, and the way back needs.
+    """What a forward pass of B poses makes, and the backward pass needs.
 
     Attributes
     ----------
     body : where the skin is and how it is deformed
     field : (P, B, 2, 8) contact features
     patch, fold, head : each layer's values in the small networks
-    squashed, share : (B, P + S) of the logits of contact at patches and folds, and their softmax
+    squashed, softmax : (B, P + S) of the contact logits of patches and folds
     logit : (B,)
     """
 
@@ -148,7 +148,7 @@ class _Trace(NamedTuple):
     patch: list[Array]
     fold: list[Array]
     squashed: Array
-    share: Array
+    softmax: Array
     head: list[Array]
     logit: Array
 

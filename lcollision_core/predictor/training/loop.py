@@ -372,14 +372,14 @@ def _accuracy(network: PredictorNetwork, rows: LabelRows) -> float:
     return float(((logit > 0.0).cpu().numpy() == rows.colliding).mean())
 
 
-def _averaged(network: PredictorNetwork, share: float) -> AveragedModel:
-    """Return a copy for the exponential mean of weights, in which the newest have this share.
+def _averaged(network: PredictorNetwork, weight: float) -> AveragedModel:
+    """Return a copy for the exponential moving average of the weights; `weight` is the newest's.
 
-    The first ones, of which there are few, count alike.
+    The first few count alike.
     """
 
     def mean(average: Tensor, newest: Tensor, n_averaged: Tensor | int) -> Tensor:
-        return average.lerp(newest, max(share, 1.0 / (int(n_averaged) + 1)))
+        return average.lerp(newest, max(weight, 1.0 / (int(n_averaged) + 1)))
 
     return AveragedModel(network, avg_fn=mean)
 
@@ -402,6 +402,6 @@ def rate_at(step: int, total: int, config: PredictorConfig) -> float:
         return config.rate
     peak = _WARM_UP * total
     if step < peak:
-        share = 0.5 * (1.0 - math.cos(math.pi * (step + 1) / (peak + 1)))
-        return config.rate * (_LEAST_RATE + (1.0 - _LEAST_RATE) * share)
+        fraction = 0.5 * (1.0 - math.cos(math.pi * (step + 1) / (peak + 1)))
+        return config.rate * (_LEAST_RATE + (1.0 - _LEAST_RATE) * fraction)
     return config.rate * 0.5 * (1.0 + math.cos(math.pi * (step - peak) / (total - peak)))

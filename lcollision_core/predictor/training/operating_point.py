@@ -8,7 +8,7 @@ import numpy.typing as npt
 from lcollision_core.meshes.topology import FloatArray
 
 _MISTAKES_ADDED = 0.5
-"""This share of the mistakes at even odds may be made beside them."""
+"""Further mistakes allowed, as a fraction of those at even odds."""
 
 _ERRORS_APART = 2.0
 """Rates that differ by fewer standard errors may be the same."""
@@ -27,7 +27,7 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
     Parameters
     ----------
     logit : (B,) of poses that did not train the predictor
-    colliding : (B,) the truth
+    colliding : (B,) bool array, ground truth
 
     Returns
     -------

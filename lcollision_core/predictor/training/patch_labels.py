@@ -11,9 +11,9 @@ from lcollision_core.labels import LabelRows
 from lcollision_core.predictor.geometric.folds import FoldDetector
 from lcollision_core.predictor.network import SkinCells
 
-_ROWS_A_BLOCK = 32
-_PATCH_SHARE, _FOLD_SHARE = 0.05, 0.005
-"""Shares of its pose's energy that a colliding patch, and a colliding fold, typically has."""
+_ROWS_PER_BLOCK = 32
+_PATCH_FRACTION, _FOLD_FRACTION = 0.05, 0.005
+"""Typical fractions of a pose's energy in a colliding patch, and in a colliding fold."""
 
 _LEAST_ROOT = 1e-3
 """So that the shallowest touch is still told from none in half precision."""
@@ -41,8 +41,8 @@ class PatchLabeller:
     ) -> None:
         self._embedding, self._rows, self._cells = embedding, rows, cells
         self._detector = FoldDetector(embedding, near_exclusion)
-        shares = np.repeat([_PATCH_SHARE, _FOLD_SHARE], [cells.n_patches, cells.n_folds])
-        self._unit = shares * energy_scale
+        fractions = np.repeat([_PATCH_FRACTION, _FOLD_FRACTION], [cells.n_patches, cells.n_folds])
+        self._unit = fractions * energy_scale
         _ = embedding.codec, embedding.decoder
 
     def roots(
@@ -80,7 +80,7 @@ class PatchLabeller:
             for row, vertices in zip(block, poses, strict=True):
                 roots[row] = self._roots_of(vertices)
 
-        for_blocks(label, len(colliding), _ROWS_A_BLOCK, progress=progress, cancel=cancel)
+        for_blocks(label, len(colliding), _ROWS_PER_BLOCK, progress=progress, cancel=cancel)
         return roots
 
     def _roots_of(self, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
@@ -90,8 +90,8 @@ class PatchLabeller:
         contacts, pairs, depth = self._detector.detect(vertices)
         energy = np.zeros(n_patches + n_folds)
         energy[:n_patches] = np.bincount(cells.patch, contacts.vertex_energy, n_patches)
-        corners, shares = faces[pairs].ravel(), np.repeat(depth**2 / 6.0, 6)
+        corners, energies = faces[pairs].ravel(), np.repeat(depth**2 / 6.0, 6)
         cell = n_patches + cells.fold[corners] if n_folds else cells.patch[corners]
-        np.add.at(energy, cell, shares)
+        np.add.at(energy, cell, energies)
         roots = np.sqrt(energy / self._unit)
         return np.where(energy > 0.0, np.maximum(roots, _LEAST_ROOT), 0.0)

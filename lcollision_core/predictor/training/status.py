@@ -17,7 +17,7 @@ class PredictorStatus:
     done, total : steps of the whole run
     loss : mean over the steps of this epoch so far, None before the first
     held_out_accuracy : of some held-out rows after the last epoch, None before that
-    preparing : share of the training rows whose patches are labelled; None once training began
+    preparing : fraction of the training rows whose patches are labelled; None once training began
     """
 
     epoch: int

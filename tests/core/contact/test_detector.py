@@ -1,4 +1,4 @@
-"""Self-collision of whole meshes: analytic truths and brute force over all pairs."""
+"""Self-collision of whole meshes: analytic results and brute force over all pairs."""
 
 from __future__ import annotations
 
@@ -306,13 +306,13 @@ def test_no_shallow_pair_slips_between_the_boxes(spread: float) -> None:
     floor = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     blade = np.array([[0.25, 0.25, 0], [0.25, 0.25, 1], [0.5, 0.25, 1]])
     depth = 10 ** rng.uniform(-8, -7, n) * spread
-    places = rng.uniform(0, spread, (n, 1, 3))
+    positions = rng.uniform(0, spread, (n, 1, 3))
     size = 1e-3 * spread
     lift = np.zeros((n, 1, 3))
     lift[:, 0, 2] = depth
     side = np.where(np.arange(n) % 2 == 0, 1.0, -1.0)[:, None, None]
     blades = (size * blade - lift) * np.concatenate([side**2, side**2, side], axis=2)
-    triangles = np.stack([size * floor + places, blades + places], axis=1).reshape(-1, 3, 3)
+    triangles = np.stack([size * floor + positions, blades + positions], axis=1).reshape(-1, 3, 3)
     mesh = soup(triangles)
     # The unit is that of a reference of body size 1, whatever the spread of the pose.
     reference = soup(triangles / spread)
@@ -326,9 +326,9 @@ def test_no_shallow_pair_slips_between_the_boxes(spread: float) -> None:
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_boxes_that_only_touch_in_single_precision(axis: int, up: float) -> None:
     # A leaf of 8 floors in one plane, a leaf of 8 blades whose tips are 1e-8 behind it.
-    places = np.arange(8)[:, None, None] * np.array([0.03, 0.0, 0.0])
-    floors = 0.02 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) + places
-    blades = np.array([[0.005, 0.005, -1e-8], [0.005, 0.005, 1], [0.006, 0.005, 1]]) + places
+    positions = np.arange(8)[:, None, None] * np.array([0.03, 0.0, 0.0])
+    floors = 0.02 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) + positions
+    blades = np.array([[0.005, 0.005, -1e-8], [0.005, 0.005, 1], [0.006, 0.005, 1]]) + positions
     triangles = np.roll(np.concatenate([floors, blades]) * [1, 1, up], axis + 1, axis=2)
     found = check_mesh(soup(triangles))
     assert found.pairs.tolist() == [[k, k + 8] for k in range(8)]

@@ -19,7 +19,7 @@ def labeller(tube_model: PoseModel) -> Labeller:
 
 
 @pytest.fixture(scope="session")
-def truth(labeller: Labeller) -> LabelRows:
+def ground_truth(labeller: Labeller) -> LabelRows:
     rows = labeller.label_rows(SEED, range(N_ROWS))
     assert 10 < rows.colliding.sum() < N_ROWS / 2
     return rows

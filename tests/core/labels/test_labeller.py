@@ -54,45 +54,49 @@ def test_blocks_and_seeds_differ() -> None:
 
 
 def test_labels_are_those_of_the_exact_check_of_the_exported_mesh(
-    truth: LabelRows, tube_model: PoseModel
+    ground_truth: LabelRows, tube_model: PoseModel
 ) -> None:
-    chosen = np.concatenate([np.flatnonzero(truth.colliding)[:8], np.arange(8)])
+    chosen = np.concatenate([np.flatnonzero(ground_truth.colliding)[:8], np.arange(8)])
     for row in chosen:
-        exported = tube_model.decode(truth.latent[row]).astype(np.float32)
+        exported = tube_model.decode(ground_truth.latent[row]).astype(np.float32)
         found = tube_model.detector.detect(exported)
-        assert truth.n_pairs[row] == len(found.pairs)
-        assert truth.n_near_pairs[row] == len(found.near_pairs) == 0
-        assert truth.energy[row] == pytest.approx(found.energy, rel=1e-12)
+        assert ground_truth.n_pairs[row] == len(found.pairs)
+        assert ground_truth.n_near_pairs[row] == len(found.near_pairs) == 0
+        assert ground_truth.energy[row] == pytest.approx(found.energy, rel=1e-12)
         by_domain = domain_energy(found.vertex_energy[None], tube_model.attention_mask)[0]
-        assert truth.domain_energy[row] == pytest.approx(by_domain, rel=1e-12)
+        assert ground_truth.domain_energy[row] == pytest.approx(by_domain, rel=1e-12)
 
 
-def test_domains_share_out_all_of_the_energy(truth: LabelRows) -> None:
-    assert truth.energy[truth.colliding].min() > 0.0
-    assert (truth.energy[~truth.colliding] == 0.0).all()
-    assert truth.domain_energy.sum(axis=1) == pytest.approx(truth.energy, rel=1e-6)
-    assert (truth.domain_energy[truth.colliding].max(axis=0) > 0.0).all()
+def test_domains_share_out_all_of_the_energy(ground_truth: LabelRows) -> None:
+    assert ground_truth.energy[ground_truth.colliding].min() > 0.0
+    assert (ground_truth.energy[~ground_truth.colliding] == 0.0).all()
+    assert ground_truth.domain_energy.sum(axis=1) == pytest.approx(ground_truth.energy, rel=1e-6)
+    assert (ground_truth.domain_energy[ground_truth.colliding].max(axis=0) > 0.0).all()
 
 
-def test_near_pairs_are_counted_apart(labeller: Labeller, truth: LabelRows) -> None:
-    every = np.flatnonzero(truth.colliding)[:20]
-    excluded = replace(labeller, near_exclusion=0.5).label(truth.latent[every])
+def test_near_pairs_are_counted_apart(labeller: Labeller, ground_truth: LabelRows) -> None:
+    every = np.flatnonzero(ground_truth.colliding)[:20]
+    excluded = replace(labeller, near_exclusion=0.5).label(ground_truth.latent[every])
     assert excluded.n_near_pairs.max() > 0
-    assert np.array_equal(excluded.n_pairs + excluded.n_near_pairs, truth.n_pairs[every])
-    assert (excluded.energy <= truth.energy[every] * (1.0 + 1e-12)).all()
-    assert excluded.energy.sum() < truth.energy[every].sum()
+    assert np.array_equal(excluded.n_pairs + excluded.n_near_pairs, ground_truth.n_pairs[every])
+    assert (excluded.energy <= ground_truth.energy[every] * (1.0 + 1e-12)).all()
+    assert excluded.energy.sum() < ground_truth.energy[every].sum()
 
 
-def test_a_row_has_the_same_bits_alone_and_in_a_batch(labeller: Labeller, truth: LabelRows) -> None:
-    alone = [labeller.label(truth.latent[row : row + 1]) for row in range(70)]
-    assert as_bytes(LabelRows.joined(alone)) == as_bytes(truth.taken(slice(70)))
+def test_a_row_has_the_same_bits_alone_and_in_a_batch(
+    labeller: Labeller, ground_truth: LabelRows
+) -> None:
+    alone = [labeller.label(ground_truth.latent[row : row + 1]) for row in range(70)]
+    assert as_bytes(LabelRows.joined(alone)) == as_bytes(ground_truth.taken(slice(70)))
 
 
-def test_a_labeller_that_travelled_says_the_same(labeller: Labeller, truth: LabelRows) -> None:
+def test_a_labeller_that_travelled_says_the_same(
+    labeller: Labeller, ground_truth: LabelRows
+) -> None:
     copy = pickle.loads(pickle.dumps(labeller))
     assert copy.fingerprint == labeller.fingerprint
     assert as_bytes(copy.label_rows(SEED, range(ROWS_PER_BLOCK))) == as_bytes(
-        truth.taken(slice(ROWS_PER_BLOCK))
+        ground_truth.taken(slice(ROWS_PER_BLOCK))
     )
 
 

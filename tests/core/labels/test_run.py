@@ -27,13 +27,13 @@ from tests.core.labels.conftest import N_ROWS, SEED
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
 def test_any_number_of_workers_gives_the_same_files(
-    workers: int, labeller: Labeller, truth: LabelRows, finished: Path, tmp_path: Path
+    workers: int, labeller: Labeller, ground_truth: LabelRows, finished: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "store"
     status = label_poses(labeller, path, N_ROWS, seed=SEED, workers=workers)
     assert (status.done, status.total, status.labelled) == (N_ROWS, N_ROWS, N_ROWS)
-    assert status.n_colliding == truth.colliding.sum()
-    assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+    assert status.n_colliding == ground_truth.colliding.sum()
+    assert as_bytes(LabelStore.open(path).load()) == as_bytes(ground_truth)
     assert files_of(path) == files_of(finished)
 
 
@@ -76,7 +76,7 @@ def test_no_more_than_two_blocks_a_thread_are_begun_beyond_the_chunk_in_work(
 
 
 def test_a_cancelled_run_keeps_its_chunks_and_goes_on(
-    labeller: Labeller, truth: LabelRows, tmp_path: Path
+    labeller: Labeller, ground_truth: LabelRows, tmp_path: Path
 ) -> None:
     path, token = tmp_path / "store", CancelToken()
 
@@ -90,16 +90,16 @@ def test_a_cancelled_run_keeps_its_chunks_and_goes_on(
         )
     kept = LabelStore.open(path)
     assert kept.n_rows == ROWS_PER_CHUNK
-    assert as_bytes(kept.load()) == as_bytes(truth.taken(slice(ROWS_PER_CHUNK)))
+    assert as_bytes(kept.load()) == as_bytes(ground_truth.taken(slice(ROWS_PER_CHUNK)))
     statuses: list[LabelStatus] = []
     label_poses(labeller, path, N_ROWS, seed=SEED, progress=statuses.append)
     assert statuses[0].done == ROWS_PER_CHUNK
-    assert statuses[0].n_colliding == truth.colliding[:ROWS_PER_CHUNK].sum()
-    assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+    assert statuses[0].n_colliding == ground_truth.colliding[:ROWS_PER_CHUNK].sum()
+    assert as_bytes(LabelStore.open(path).load()) == as_bytes(ground_truth)
 
 
 def test_a_store_grows_and_never_shrinks(
-    labeller: Labeller, truth: LabelRows, tmp_path: Path
+    labeller: Labeller, ground_truth: LabelRows, tmp_path: Path
 ) -> None:
     path = tmp_path / "store"
     for wanted, kept, labelled in (
@@ -112,11 +112,11 @@ def test_a_store_grows_and_never_shrinks(
         assert (status.done, status.labelled) == (kept, labelled)
         store = LabelStore.open(path)
         assert store.n_rows == kept
-        assert as_bytes(store.load()) == as_bytes(truth.taken(slice(kept)))
+        assert as_bytes(store.load()) == as_bytes(ground_truth.taken(slice(kept)))
 
 
 def test_progress_tells_rate_time_left_and_share(
-    labeller: Labeller, truth: LabelRows, tmp_path: Path
+    labeller: Labeller, ground_truth: LabelRows, tmp_path: Path
 ) -> None:
     statuses: list[LabelStatus] = []
     last = label_poses(labeller, tmp_path / "store", 500, seed=SEED, progress=statuses.append)
@@ -124,13 +124,13 @@ def test_progress_tells_rate_time_left_and_share(
     assert statuses[0].colliding_share is None
     assert statuses[0].rows_per_second is statuses[0].seconds_left is None
     for status in statuses[1:]:
-        assert status.n_colliding == truth.colliding[: status.done].sum()
+        assert status.n_colliding == ground_truth.colliding[: status.done].sum()
         assert status.rows_per_second is not None
         assert status.seconds_left == pytest.approx((500 - status.done) / status.rows_per_second)
     assert [status.done for status in statuses[:3]] == [0, ROWS_PER_BLOCK, 2 * ROWS_PER_BLOCK]
     assert statuses[-1] == last
     assert last.done == 500
-    assert last.colliding_share == pytest.approx(truth.colliding[:500].mean())
+    assert last.colliding_share == pytest.approx(ground_truth.colliding[:500].mean())
     assert 0.0 < last.rows_per_second < 1e6
 
 

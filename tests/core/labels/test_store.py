@@ -84,7 +84,7 @@ def _sentence(excinfo: pytest.ExceptionInfo[LCollisionError]) -> str:
     return message
 
 
-def test_rows_are_read_whole_and_in_part(finished: Path, truth: LabelRows) -> None:
+def test_rows_are_read_whole_and_in_part(finished: Path, ground_truth: LabelRows) -> None:
     opened = LabelStore.open(finished)
     rows = opened.load()
     assert (opened.n_rows, opened.end, len(rows), rows.latent.dtype) == (
@@ -95,17 +95,17 @@ def test_rows_are_read_whole_and_in_part(finished: Path, truth: LabelRows) -> No
     )
     assert rows.domain_energy.dtype == rows.energy.dtype == np.float64
     for n_rows in (0, 1, ROWS_PER_CHUNK, ROWS_PER_CHUNK + 1, N_ROWS):
-        assert as_bytes(opened.load(n_rows)) == as_bytes(truth.taken(slice(n_rows)))
+        assert as_bytes(opened.load(n_rows)) == as_bytes(ground_truth.taken(slice(n_rows)))
     with pytest.raises(LabelStoreError, match=f"has {N_ROWS} rows, not {N_ROWS + 1}"):
         opened.load(N_ROWS + 1)
 
 
-def test_anyone_can_read_it_with_numpy(finished: Path, truth: LabelRows) -> None:
+def test_anyone_can_read_it_with_numpy(finished: Path, ground_truth: LabelRows) -> None:
     assert sorted(files_of(finished)) == [FIRST, MIDDLE, LAST, MANIFEST]
     chunk = np.load(finished / MIDDLE)
     assert sorted(chunk) == ["domain_energy", "energy", "latent", "n_near_pairs", "n_pairs"]
-    assert np.array_equal(chunk["energy"], truth.energy[1024:2048])
-    assert np.array_equal(chunk["latent"], truth.latent[1024:2048])
+    assert np.array_equal(chunk["energy"], ground_truth.energy[1024:2048])
+    assert np.array_equal(chunk["latent"], ground_truth.latent[1024:2048])
     manifest = json.loads((finished / MANIFEST).read_text())
     assert (manifest["format_version"], manifest["rows_per_chunk"]) == (2, ROWS_PER_CHUNK)
     assert manifest["labels"]["seed"] == SEED
@@ -119,7 +119,7 @@ def test_anyone_can_read_it_with_numpy(finished: Path, truth: LabelRows) -> None
     ],
 )
 def test_a_chunk_that_is_not_whole_is_noticed_and_labelled_again(
-    damage: Callable[[Path], None], path: Path, labeller: Labeller, truth: LabelRows
+    damage: Callable[[Path], None], path: Path, labeller: Labeller, ground_truth: LabelRows
 ) -> None:
     damage(path / MIDDLE)
     opened = LabelStore.open(path)
@@ -128,7 +128,9 @@ def test_a_chunk_that_is_not_whole_is_noticed_and_labelled_again(
             opened.load(n_rows)
         assert f"rows {ROWS_PER_CHUNK} to " in _sentence(excinfo)
         assert f"run `lcollision label M -n {N_ROWS} -o {path} --seed 3`" in _sentence(excinfo)
-    assert as_bytes(opened.load(ROWS_PER_CHUNK)) == as_bytes(truth.taken(slice(ROWS_PER_CHUNK)))
+    assert as_bytes(opened.load(ROWS_PER_CHUNK)) == as_bytes(
+        ground_truth.taken(slice(ROWS_PER_CHUNK))
+    )
     assert opened.check() == (range(ROWS_PER_CHUNK, 2 * ROWS_PER_CHUNK),)
     if damage is _as_pipe:
         with pytest.raises(MeshFileError, match=f"{MIDDLE} cannot be written: it is not a plain"):
@@ -136,7 +138,7 @@ def test_a_chunk_that_is_not_whole_is_noticed_and_labelled_again(
         return
     # However few are asked for: what was there before is there again.
     assert label_poses(labeller, path, 5, seed=SEED).labelled == ROWS_PER_CHUNK
-    assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+    assert as_bytes(LabelStore.open(path).load()) == as_bytes(ground_truth)
     assert LabelStore.open(path).check() == ()
 
 
@@ -150,11 +152,11 @@ def test_stretches_of_damaged_rows_are_told_together(path: Path) -> None:
 
 
 def test_every_flipped_bit_is_noticed_or_harmless(
-    labeller: Labeller, truth: LabelRows, tmp_path: Path
+    labeller: Labeller, ground_truth: LabelRows, tmp_path: Path
 ) -> None:
     path, n_rows = tmp_path / "store", 40
     label_poses(labeller, path, n_rows, seed=SEED)
-    expected, noticed = as_bytes(truth.taken(slice(n_rows))), 0
+    expected, noticed = as_bytes(ground_truth.taken(slice(n_rows))), 0
     for file in path.iterdir():
         content = file.read_bytes()
         for place in range(0, len(content), 8):
@@ -174,7 +176,7 @@ def test_every_flipped_bit_is_noticed_or_harmless(
 
 
 def test_a_run_that_is_killed_while_it_writes_leaves_the_rows_before(
-    path: Path, labeller: Labeller, truth: LabelRows, monkeypatch: pytest.MonkeyPatch
+    path: Path, labeller: Labeller, ground_truth: LabelRows, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The chunk was there before, with fewer rows."""
 
@@ -188,9 +190,9 @@ def test_a_run_that_is_killed_while_it_writes_leaves_the_rows_before(
             label_poses(labeller, path, N_ROWS + 50, seed=SEED)
     assert files_of(path) == before
     (path / f".{LAST}.0123456789ab.part").write_bytes(b"what a killed process leaves")
-    assert as_bytes(LabelStore.open(path).load()) == as_bytes(truth)
+    assert as_bytes(LabelStore.open(path).load()) == as_bytes(ground_truth)
     assert label_poses(labeller, path, N_ROWS + 50, seed=SEED).labelled == 350
-    assert as_bytes(LabelStore.open(path).load(N_ROWS)) == as_bytes(truth)
+    assert as_bytes(LabelStore.open(path).load(N_ROWS)) == as_bytes(ground_truth)
 
 
 def test_a_store_of_something_else_is_refused_and_left_alone(
@@ -303,8 +305,8 @@ def test_what_is_no_store_is_refused(
         assert sorted(path.rglob("*")) == before
 
 
-def test_labels_that_are_not_finite_are_not_written(path: Path, truth: LabelRows) -> None:
-    rows, before = truth.taken(slice(ROWS_PER_CHUNK)), files_of(path)
+def test_labels_that_are_not_finite_are_not_written(path: Path, ground_truth: LabelRows) -> None:
+    rows, before = ground_truth.taken(slice(ROWS_PER_CHUNK)), files_of(path)
     energy = rows.energy.copy()
     energy[5] = np.nan
     with pytest.raises(LabelStoreError, match="the energy of a labelled pose is not finite"):

@@ -295,8 +295,8 @@ def test_patches_do_not_depend_on_what_is_labelled_beside_them(tube_model: PoseM
     told = list[tuple[int, int]]()
     whole = labeller.roots(np.arange(60), progress=lambda *step: told.append(step))
     n_colliding = np.count_nonzero(rows.colliding)
-    assert n_colliding > patch_labels._ROWS_A_BLOCK
-    assert told == [(patch_labels._ROWS_A_BLOCK, n_colliding), (n_colliding, n_colliding)]
+    assert n_colliding > patch_labels._ROWS_PER_BLOCK
+    assert told == [(patch_labels._ROWS_PER_BLOCK, n_colliding), (n_colliding, n_colliding)]
     assert whole.any()
     for part in (np.arange(7), np.arange(7, 60), np.array([50, 3])):
         assert np.array_equal(labeller.roots(part), whole[part])
@@ -323,7 +323,7 @@ def test_the_loss_teaches_patches_folds_energies_and_the_verdict(
     network = GeometricNetwork(tube_model.embedding, 0, tube_folds)
     n_points, n_folds, n_domains = len(network.skin.point_vertices), len(tube_folds), 2
     assert n_folds > 0
-    # Two rows. The first one's patches and folds are hit, with roots of 0.4 and 3.
+    # Two rows. The first one's patches and folds collide, with roots of 0.4 and 3.
     taught = torch.zeros((2, n_points + n_folds), dtype=torch.float64)
     taught[0, :n_points], taught[0, n_points:] = 0.4, 3.0
     energy = torch.tensor([[0.25, 0.0], [0.0, 0.0]], dtype=torch.float64)

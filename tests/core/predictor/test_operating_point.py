@@ -27,7 +27,7 @@ from tests.core.predictor_rows import config, made_up_rows
 def _calibrated(
     n_rows: int, shift: float, spread: float, seed: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw logits about a shift, and truths that collide as often as these say."""
+    """Draw logits about a shift, and labels that collide as often as these say."""
     rng = np.random.default_rng(seed)
     logit = shift + spread * rng.standard_normal(n_rows)
     return logit, rng.uniform(size=n_rows) < 1.0 / (1.0 + np.exp(-logit))

@@ -60,7 +60,7 @@ def deep(tube_model: PoseModel, colliding: FloatArray) -> FloatArray:
         alone = resolver_of(tube_model, useless(latent), np.empty((0, 8)))
         if alone.resolve(latent).step == Step.NONE:
             return latent
-    raise AssertionError("every pose was freed without a predictor")
+    raise AssertionError("every pose was resolved without a predictor")
 
 
 @pytest.fixture(scope="module")
@@ -71,12 +71,12 @@ def shallow(check: ExactCheck, colliding: FloatArray) -> FloatArray:
 
 
 def wide_problem(latent: FloatArray):
-    return toy_problem(useless(latent), latent, reach=1e3)
+    return toy_problem(useless(latent), latent, bound=1e3)
 
 
 def useless(latent: FloatArray) -> Ball:
     """Make a predictor that calls everything colliding and knows no way out."""
-    return Ball(np.zeros_like(latent), 0.0, sign=-1.0, reach=0.0)
+    return Ball(np.zeros_like(latent), 0.0, sign=-1.0, plateau=0.0)
 
 
 def around_the_mean(latent: FloatArray, radius: float, steepness: float = 100.0) -> Ball:
@@ -163,7 +163,7 @@ def test_a_raised_margin(tube_model: PoseModel, colliding: FloatArray, solver: S
 
 def test_another_start(tube_model: PoseModel, deep: FloatArray) -> None:
     predictor = around_the_mean(deep, 0.3)
-    predictor.reach = 0.7 * float(np.linalg.norm(deep))
+    predictor.plateau = 0.7 * float(np.linalg.norm(deep))
     resolver = resolver_of(tube_model, predictor, np.zeros((MEAN_ALONE, 8)))
     result = resolver.resolve(deep)
     assert result.step == Step.RESTART

@@ -52,8 +52,8 @@ def test_half_space(solver: Solver, margin: float) -> None:
 def test_out_of_a_ball(solver: Solver) -> None:
     problem = toy_problem(Ball(CENTRE, 1.0), TARGET)
     outcome = solve(solver, problem)
-    apart = TARGET - CENTRE
-    nearest = CENTRE + apart / np.linalg.norm(apart)
+    offset = TARGET - CENTRE
+    nearest = CENTRE + offset / np.linalg.norm(offset)
     assert outcome.feasible
     assert np.linalg.norm(outcome.latent - CENTRE) >= 1.0
     np.testing.assert_allclose(outcome.latent, nearest, atol=3e-2)
@@ -64,8 +64,8 @@ def test_into_a_ball(solver: Solver) -> None:
     centre = np.array([-1.0, 0.0, 1.0, 0.0])
     problem = toy_problem(Ball(centre, 0.5, sign=-1.0), TARGET)
     outcome = solve(solver, problem)
-    apart = TARGET - centre
-    nearest = centre + 0.5 * apart / np.linalg.norm(apart)
+    offset = TARGET - centre
+    nearest = centre + 0.5 * offset / np.linalg.norm(offset)
     assert outcome.feasible
     np.testing.assert_allclose(outcome.latent, nearest, atol=3e-2)
 
@@ -102,7 +102,7 @@ def test_dear_codes_move_less(solver: Solver) -> None:
 
 @pytest.mark.parametrize("solver", Solver)
 def test_what_cannot_be_reached_ends_with_a_status(solver: Solver) -> None:
-    problem = toy_problem(HalfSpace(NORMAL, -1e3), TARGET, reach=2.0)
+    problem = toy_problem(HalfSpace(NORMAL, -1e3), TARGET, bound=2.0)
     outcome = solve(solver, problem)
     assert not outcome.feasible
     assert (np.abs(outcome.latent) <= 2.0).all()
@@ -167,7 +167,7 @@ def test_a_model_that_breaks_leaves_the_best_pose_so_far(solver: Solver) -> None
 
 @pytest.mark.parametrize("solver", [Solver.AUGLAG, Solver.SLSQP, Solver.CCSAQ])
 def test_a_model_that_is_broken_leaves_the_start(solver: Solver) -> None:
-    outcome = solve(solver, toy_problem(HalfSpace(NORMAL, np.nan), TARGET, reach=1.5))
+    outcome = solve(solver, toy_problem(HalfSpace(NORMAL, np.nan), TARGET, bound=1.5))
     assert outcome.status == "prediction not finite"
     assert not outcome.converged
     assert not outcome.feasible

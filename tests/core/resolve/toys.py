@@ -28,7 +28,7 @@ class HalfSpace:
 class Ball:
     """Calls a pose free outside of a ball (sign 1) or inside of it (sign -1).
 
-    The logit is smooth but at the centre; beyond `reach` from the centre, where one is given, it
+    The logit is smooth but at the centre; beyond `plateau` from the centre, where one is given, it
     is a plateau without a slope, as far as a solver can tell.
     """
 
@@ -36,33 +36,33 @@ class Ball:
     radius: float
     sign: float = 1.0
     steepness: float = 10.0
-    reach: float = np.inf
+    plateau: float = np.inf
 
     def logit_and_gradient(self, latent: npt.NDArray) -> tuple[FloatArray, FloatArray]:
-        apart = latent - self.centre
-        distance = np.linalg.norm(apart, axis=1)
+        offset = latent - self.centre
+        distance = np.linalg.norm(offset, axis=1)
         logit = self.sign * self.steepness * (self.radius - distance)
-        away = apart / np.maximum(distance, 1e-12)[:, None]
+        away = offset / np.maximum(distance, 1e-12)[:, None]
         gradient = -self.sign * self.steepness * away
-        gradient[distance > self.reach] = 0.0
+        gradient[distance > self.plateau] = 0.0
         return logit, gradient
 
 
 def toy_problem(
     model: CollisionModel,
     target: FloatArray,
-    reach: float = 10.0,
+    bound: float = 10.0,
     deadline: Deadline | None = None,
     code_weights: FloatArray | None = None,
 ) -> ResolveProblem:
-    """Make the problem with the plain distance, within `reach` of 0."""
+    """Make the problem with the plain distance, within `bound` of 0."""
     size = len(target)
     return ResolveProblem(
         target=target,
         metric=np.eye(size),
         code_weights=np.ones(size) if code_weights is None else code_weights,
-        low=np.full(size, -reach),
-        high=np.full(size, reach),
+        low=np.full(size, -bound),
+        high=np.full(size, bound),
         limit=0.0,
         model=model,
         deadline=deadline or Deadline(),
