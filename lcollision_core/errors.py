@@ -14,9 +14,9 @@ class LCollisionError(Exception):
 
     Parameters
     ----------
-    what : what is wrong, said of `where`, as in "cannot be read"
+    what : what is wrong with `where`, as in "cannot be read"
     next_step : what the user can do, as in "export the mesh again"; empty if there is nothing
-    where : the file, the pose or the option that it is said of, as in "pose 12 (mesh012.obj)"
+    where : the file, the pose or the option concerned, as in "pose 12 (mesh012.obj)"
     expected, got : what was needed, and what is there instead
 
     Attributes
@@ -91,7 +91,7 @@ class LCollisionError(Exception):
         return f"{self.headline}; {self.next_step}" if self.next_step else self.headline
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # The fields are no positional arguments, by which exceptions are copied to other processes.
+        # Pickling copies an exception by its positional arguments; the fields are none.
         return copyreg.__newobj__, (type(self), self.what), self.__dict__  # type: ignore[attr-defined]
 
 

@@ -77,7 +77,7 @@ def required_array(
     arrays : of the section
     name : of the array
     dtype, shape : what it must have; None stands for any size but 0
-    largest : beyond which no number of it may lie, on either side of 0
+    largest : the largest magnitude that is allowed
 
     Raises
     ------

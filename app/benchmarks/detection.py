@@ -33,7 +33,7 @@ MAX_CONTACTS = 10_000_000
 """Far above the number of contacts of a mesh with itself, so that no peer's list is cut."""
 
 COAL_TOLERANCE = 1e-9
-"""Distance, in the mesh's unit, up to which coal takes two faces for touching."""
+"""Distance, in the mesh's unit, below which coal counts two faces as touching."""
 
 ROUNDS = 5
 """Batches of ours that are timed, for their median."""

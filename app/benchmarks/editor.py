@@ -42,7 +42,7 @@ class EditorTiming:
     memory_mb : the most that the process held at once
     actions : random actions done after that
     exceptions : that they raised, in the window or in a thread behind it
-    errors : what the first of them said
+    errors : the text of the first
     leak_mb : memory after them, less that after each kind once and the first tenth
     mesh_is_right : whether the mesh drawn at the end is, to the bit, the model's of that pose
     """
@@ -101,7 +101,7 @@ def time_editor(
 
 
 def _run(model: Path, n_actions: int) -> dict[str, Any]:
-    """Run one editor with settings, log, sessions and library of its own; -1 only starts it."""
+    """Run one editor with separate settings, log, sessions and library; -1 only starts it."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {
             **os.environ,

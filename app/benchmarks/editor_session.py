@@ -254,7 +254,7 @@ class Session(QObject):
         self.wait_for(self.is_settled)
 
     def wait_for(self, condition: Callable[[], bool]) -> None:
-        """Let the window live until something is so."""
+        """Process events until a condition holds."""
         deadline = time.monotonic() + _TIMEOUT_SECONDS
         while not condition():
             if time.monotonic() > deadline:
@@ -263,7 +263,7 @@ class Session(QObject):
             self.pause(0.001)
 
     def pause(self, seconds: float = 0.0) -> None:
-        """Let the window live for a while, or one turn; what is to be deleted later is deleted."""
+        """Process events for a while, or one turn, deferred deletions included."""
         loop = QEventLoop()
         QTimer.singleShot(int(1000 * seconds), loop.quit)
         loop.exec()
@@ -276,9 +276,11 @@ class Session(QObject):
     def _on_failed(self, failure: Failure) -> None:
         self._errors.append(failure.headline)
 
-    def _on_exception(self, kind: type[BaseException], error: BaseException, trace: Any) -> None:
-        self._errors.append(f"{kind.__name__}: {error}")
-        sys.__excepthook__(kind, error, trace)
+    def _on_exception(
+        self, error_type: type[BaseException], error: BaseException, trace: Any
+    ) -> None:
+        self._errors.append(f"{error_type.__name__}: {error}")
+        sys.__excepthook__(error_type, error, trace)
 
 
 def memory_mb(peak: bool = False) -> float:

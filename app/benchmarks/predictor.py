@@ -44,7 +44,7 @@ class PredictorTiming:
     device : "cpu" or "cuda"
     preset : of the predictor
     batch : poses predicted at a time
-    cores : that the CPU's times may use, all but `gradient_ms`
+    cores : that the CPU's times may use, except `gradient_ms`
     us_per_pose : prediction in such batches, microseconds, median of the rounds
     gradient_ms : logit and gradient of one pose, on one core or the GPU, median
     exact_ms_per_pose : exact verdict of a decoded pose, on all cores

@@ -23,7 +23,7 @@ from lcollision_core.resolve import ResolveOptions, ResolveResult, Solver, Step
 FloatArray = npt.NDArray[np.float64]
 
 BASELINE = "bisection"
-"""Halving the segment to the first pose that the model knows as free: no learning."""
+"""Halving the segment to the first pose that is stored as free: no learning."""
 
 HALVINGS = 12
 

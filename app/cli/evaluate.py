@@ -59,8 +59,8 @@ def evaluate(
             trained, rows, threshold=threshold, progress=progress, cancel=cancel
         )
     if as_json:
-        share = {"colliding_share": float(rows.colliding.mean())}
-        print_json(measured_model(model) | share | {"threshold": threshold} | asdict(metrics))
+        measured = {"colliding_share": float(rows.colliding.mean())}
+        print_json(measured_model(model) | measured | {"threshold": threshold} | asdict(metrics))
         return
     called = "" if threshold == 0.5 else f", decision threshold {threshold:g}"
     tell(f"{model.name}, preset {trained.preset}{called}: {scores_sentence(metrics)}")
@@ -73,7 +73,7 @@ def evaluate(
         f"Spearman {_number(metrics.spearman)}, calibration error "
         f"{_number(metrics.calibration_error)}"
     )
-    tell("  predicted probability: share that collides (samples)")
+    tell("  predicted probability: fraction that collides (samples)")
     for entry in metrics.calibration:
         if entry.probability is not None and entry.colliding_share is not None:
             tell(f"    {entry.probability:.2f}: {entry.colliding_share:.2f} ({entry.samples})")
@@ -118,8 +118,8 @@ def _unseen(store: LabelStore, rows: LabelRows, trained: CollisionPredictor) -> 
     return held_out
 
 
-def _percent(share: float | None) -> str:
-    return "none" if share is None else f"{100.0 * share:.1f} %"
+def _percent(fraction: float | None) -> str:
+    return "none" if fraction is None else f"{100.0 * fraction:.1f} %"
 
 
 def _number(value: float | None) -> str:

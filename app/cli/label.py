@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
 
 _LISTED = 5
-"""Stretches of damaged rows that are told one by one."""
+"""Ranges of damaged rows that are listed one by one."""
 
 
 def label(

@@ -155,7 +155,7 @@ def _refuse_bundled(path: Path) -> None:
 def describe(model: PoseModel) -> dict[str, Any]:
     """Return the fields of ``lcollision info --json``; lengths are normalised.
 
-    A domain's vertices are those of which it owns more than any other domain does.
+    A domain's vertices are those where its weight is the largest.
     """
     import numpy as np
 
@@ -281,8 +281,8 @@ def error_sentence(report: dict[str, Any]) -> str:
     return sentence
 
 
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.2f} %"
+def _percent(fraction: float) -> str:
+    return f"{100.0 * fraction:.2f} %"
 
 
 def _print_domains(report: dict[str, Any]) -> None:

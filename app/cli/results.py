@@ -171,7 +171,7 @@ def require_format_holds(
 
     Raises
     ------
-    MeshFileError : its rounding steps there exceed a small share of an edge.
+    MeshFileError : its rounding steps there exceed a small fraction of an edge.
     """
     from lcollision_core.meshes import as_stored
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 _SECONDS_BETWEEN_WRITES = 5.0
 _MAX_STEM_BYTES = 200
-_LARGEST_SHARE = 0.05
-"""Of a command's time, what writing may take when there are many poses."""
+_LARGEST_FRACTION = 0.05
+"""Of a command's time, for writing when there are many poses."""
 
 
 class UnfinishedPoses:
@@ -49,7 +49,7 @@ class UnfinishedPoses:
     def keep(self, place: int, pose: NamedPose, facts: Mapping[str, Any]) -> None:
         """Remember a pose that is done; write the file when the last time is long past."""
         self.finished[place] = (pose, facts)
-        pause = max(_SECONDS_BETWEEN_WRITES, self._seconds / _LARGEST_SHARE)
+        pause = max(_SECONDS_BETWEEN_WRITES, self._seconds / _LARGEST_FRACTION)
         if time.monotonic() - self._written > pause:
             self._write()
 
@@ -63,13 +63,13 @@ class UnfinishedPoses:
         from lcollision_core.model import write_poses
 
         started = time.monotonic()
-        places = sorted(self.finished)
+        indices = sorted(self.finished)
         record = {
             "key": self._key,
             "of": self._total,
-            "done": [{"place": place, **self.finished[place][1]} for place in places],
+            "done": [{"place": place, **self.finished[place][1]} for place in indices],
         }
-        poses = [self.finished[place][0] for place in places]
+        poses = [self.finished[place][0] for place in indices]
         failure = ""
         try:
             write_poses(self.path, self._model, poses, extra={"unfinished": record})

@@ -420,7 +420,7 @@ class PoseDocument(CodeEditing):
         self._closed = True
         self.retry_library()
         self.cancel_all()
-        # As it is deleted it would tell widgets that look at what is gone by then.
+        # Deleting it would signal widgets that look at deleted objects.
         self.undo_stack.blockSignals(True)
         deadline = time.monotonic() + timeout
         ended = [self._live.close(deadline), self._long.close(deadline)]
@@ -492,7 +492,7 @@ class PoseDocument(CodeEditing):
         self.recovered.emit(read.path)
 
     def _tell_of_library(self, error: LCollisionError) -> None:
-        # It was told before; by now no window can show it.
+        # It was reported before; by now no window can show it.
         if not self._closed:
             self.failed.emit(Failure.of(error))
 

@@ -498,7 +498,7 @@ def read_only(array: FloatArray) -> FloatArray:
 
 
 def _working(pose: NamedPose) -> NamedPose:
-    """Return a pose to be edited, of arrays of its own."""
+    """Return a copy of a pose, for editing."""
     return replace(pose, latent=read_only(np.array(pose.latent, dtype=np.float64)), tags=())
 
 

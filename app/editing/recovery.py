@@ -85,7 +85,7 @@ class Session:
             _log.warning("%s is no session: %s", folder, error)
             return None
         lock = QLockFile(str(folder / _LOCK))
-        # A lock never grows too old: only the death of its process frees it.
+        # A lock never grows too old: it is released only when its process ends.
         lock.setStaleLockTime(0)
         return cls(folder, lock) if lock.tryLock(0) else None
 
@@ -127,7 +127,7 @@ class LostPose:
 
 
 def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
-    """Find what editors that no longer live have left, the newest first, and hold it.
+    """Find the sessions of editors that no longer run, the newest first, and lock them.
 
     Sessions that kept nothing are deleted on the way.
 
@@ -192,7 +192,7 @@ class Autosave(QObject):
             self._session = Session.new(parent_folder or sessions_folder())
         except OSError as error:
             _log.warning("there is no autosave: %s", error)
-        # A thread of its own: a disk may take longer than a frame, and no Resolve is waited for.
+        # In another thread: a disk may take longer than a frame, and no Resolve is waited for.
         self._work = LongWork(self)
         self._work.failed.connect(self._on_failed)
         self._due = single_shot(self, int(1000 * seconds), self._write)

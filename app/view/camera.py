@@ -46,7 +46,7 @@ def preset_view(
     name : one of `CAMERAS`
     vertices : (V, 3) array
     up_axis : 0, 1 or 2
-    front : (3,) array of length 1, in which the body looks
+    front : (3,) array of length 1, the direction that the body faces
     aspect : the picture's width over its height
 
     Raises

@@ -63,7 +63,7 @@ class LegendStrip(QWidget):
         self.legend = legend
         self._title.setText(legend.title)
         self._note.setText(legend.note)
-        # As wide as with the unit: notes change with the pose, and no row is to come of that.
+        # As wide as with the unit: notes change with the pose and must not add a row.
         width = self._note.fontMetrics().horizontalAdvance
         self._note.setMinimumWidth(max(width(legend.note), width(UNIT)) + 1)
         self._ramp.set_legend(legend)

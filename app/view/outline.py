@@ -50,7 +50,7 @@ class PartShape:
     def of(
         cls, attention_mask: npt.NDArray[Any], faces: npt.NDArray[Any], domain: int
     ) -> PartShape:
-        """Find the vertices in which a domain has the largest weight, and their border.
+        """Find the vertices where a domain has the largest weight, and their border.
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ class PartShape:
 class Outline:
     """Draws a part's border on the body and the rim of its silhouette, in a constant width.
 
-    The rim is the part's own skin, a little larger, of which only the far side is drawn: where
+    The rim is the part's own skin, a little larger, with only its back faces drawn: where
     the body does not hide it, it stands out round the part. No colour of the mesh is touched.
 
     Parameters

@@ -21,7 +21,7 @@ class Theme:
     free, colliding, waiting : of the three verdicts
     sky_bottom, sky_top : behind the mesh
     floor, shadow : beneath it
-    skin, ghost : of a mesh about which nothing is said, and of the one before Resolve
+    skin, ghost : of a mesh without shading, and of the one before Resolve
     """
 
     name: str

@@ -17,7 +17,7 @@ _NOTHING = "#000000"
 """Behind a cut-out picture: adds nothing to the pixels that a rim covers in part."""
 
 _FINEST = 512 * 512
-"""Pixels up to which a picture is drawn 16 times as large and shrunk."""
+"""Pixels: up to this size a picture is drawn 16 times as large and shrunk."""
 
 
 class PoseRenderer:

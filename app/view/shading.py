@@ -25,7 +25,7 @@ COLLIDING_FACE = "#e0191f"
 
 _RAMP_STEPS = 256
 _PATH_STEPS = 16
-"""From one colour of a scale to the next, in which how different they look is measured."""
+"""Steps from one colour of a scale to the next, for measuring their perceived difference."""
 
 UNIT = "in % of the body size"
 
@@ -41,7 +41,7 @@ class Shading(Enum):
 
 
 _RAMPS = {
-    # Hues of their own, so that an estimate is not taken for a measurement.
+    # Separate hues, so that an estimate is not taken for a measurement.
     Shading.PREDICTED: ("#f2a93b", "#cf3f6f", "#5b1a78"),
     Shading.EXACT: ("#7fc4d6", "#2f7fb8", "#1d2c6b"),
     Shading.MOVEMENT: ("#afcb60", "#2f8f5c", "#0d3f3c"),
@@ -90,7 +90,7 @@ class Shader:
     ----------
     attention_mask : (K, V) array, each column sums to 1
     domain_colours : K strings "#rrggbb"
-    skin : "#rrggbb", of a mesh about which nothing is said
+    skin : "#rrggbb", of a mesh without shading
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class Shader:
         return int(self._leading[vertex])
 
     def colours(self, shading: Shading, known: Known) -> ColourArray:
-        """Colour each vertex: by nothing but what is shown, so that a scale means one thing.
+        """Colour each vertex: only by what is shown, so that a scale means one thing.
 
         Where its numbers are not known, a scale's lowest colour, the skin's, is everywhere.
 

@@ -11,7 +11,7 @@ from vtkmodules.vtkRenderingCore import vtkPolyDataMapper
 
 
 class Surface:
-    """A triangle mesh of which everything but its faces may change at every picture.
+    """A triangle mesh; everything but its faces may change with every picture.
 
     Parameters
     ----------

@@ -141,7 +141,7 @@ class TurntableVideo:
         self._unfinished.__exit__(CancelledError, incomplete, None)
 
     def pack(self, _: Progress, cancel: CancelToken) -> str:
-        """Write the video, all of which is drawn, and return what to say of it; a `Job`."""
+        """Write the video once all of it is drawn, and return what to say of it; a `Job`."""
         from lcollision_core.meshes import atomic_write
 
         if self._format != "PNG":

@@ -126,7 +126,7 @@ class Viewport(QWidget):
         self._turn = Animation(_TURN_MILLISECONDS, self)
         self._turn.moved.connect(self._on_turned)
         self.pictures = Pictures(document, self.scene_now, self)
-        # VTK takes a second to import: meanwhile the window is alive.
+        # VTK takes a second to import; the window responds meanwhile.
         self._importer = Thread(target=import_module, args=("app.view.canvas",), name="import VTK")
         self._importer.start()
 
@@ -169,7 +169,7 @@ class Viewport(QWidget):
         self.shading_changed.emit(shading)
 
     def highlight_domain(self, domain: int | None) -> None:
-        """Outline a domain, or none; the colours say what they said before.
+        """Outline a domain, or none; the colours keep their meaning.
 
         Parameters
         ----------
@@ -233,7 +233,7 @@ class Viewport(QWidget):
     # Qt's.
 
     def sizeHint(self) -> QSize:  # noqa: N802 - Qt's name
-        """Return a size at which a body is seen well."""
+        """Return a size that shows a body well."""
         return QSize(720, 720)
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name

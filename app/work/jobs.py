@@ -77,7 +77,7 @@ class PartEdits:
     Attributes
     ----------
     names, colours : of those domains that change, by index from 0
-    order : all domains in the order in which to list them, None if it stays
+    order : all domains in listing order, None if that stays
     copy_name : of the user's own model to make, None to change the model's file
     """
 

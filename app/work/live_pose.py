@@ -1,4 +1,4 @@
-"""The pose that is edited, computed in a thread of its own: its frame, then the exact check.
+"""The pose that is edited, computed in another thread: its frame, then the exact check.
 
 The worker is never given a second request while it works on a first: the newest request wins, and
 nothing queues up.

@@ -54,12 +54,12 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
         root.setLevel(logging.INFO)
 
     def on_exception(
-        kind: type[BaseException], error: BaseException, trace: TracebackType | None
+        error_type: type[BaseException], error: BaseException, trace: TracebackType | None
     ) -> None:
-        if not issubclass(kind, Exception):
-            sys.__excepthook__(kind, error, trace)
+        if not issubclass(error_type, Exception):
+            sys.__excepthook__(error_type, error, trace)
             return
-        _log.error("unhandled error", exc_info=(kind, error, trace))
+        _log.error("unhandled error", exc_info=(error_type, error, trace))
         # Qt's threads too tell here of what their slots raise.
         if tell is not None and threading.current_thread() is threading.main_thread():
             tell(unexpected(error))
@@ -99,7 +99,7 @@ def _handler(path: Path) -> logging.Handler:
     return handler
 
 
-def _on_qt_message(kind: QtMsgType, context: QMessageLogContext, text: str) -> None:
+def _on_qt_message(level: QtMsgType, context: QMessageLogContext, text: str) -> None:
     logging.getLogger("qt").log(
-        _QT_LEVELS.get(kind, logging.WARNING), "%s%s", f"{context.category}: ", text
+        _QT_LEVELS.get(level, logging.WARNING), "%s%s", f"{context.category}: ", text
     )

@@ -1,4 +1,4 @@
-"""All that takes longer than a frame: one job after the other, in a thread of their own."""
+"""All that takes longer than a frame: one job after the other, in another thread."""
 
 from __future__ import annotations
 

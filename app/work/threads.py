@@ -44,7 +44,7 @@ class Failure:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What came of a request: a value, a failure, or neither where it was cancelled."""
+    """The result of a request: a value, a failure, or neither where it was cancelled."""
 
     request_id: int
     value: Any = None
@@ -65,7 +65,7 @@ def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
 def end_thread(thread: QThread, deadline: float) -> bool:
     """Let a thread end after what it does now, and tell whether it has by the deadline.
 
-    One that has not, as in the first compiling, is kept from being destroyed, at which Qt aborts.
+    One that has not, as in the first compiling, is kept from being destroyed, as Qt would abort.
     """
     thread.quit()
     ended = thread.wait(max(1, int(1000 * (deadline - time.monotonic()))))

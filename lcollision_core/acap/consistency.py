@@ -119,7 +119,7 @@ def _choose_turn(q: FloatArray, near: FloatArray, log: FloatArray) -> None:
         angle += _TURN * math.floor((wanted - angle) / _TURN + 0.5)
         log[0], log[1], log[2] = angle * x, angle * y, angle * z
         return
-    # No axis to speak of: whole turns about that of `near`.
+    # No defined axis: whole turns about that of `near`.
     turns = math.floor(wanted / _TURN + 0.5)
     scale = turns * _TURN / wanted if turns > 0.0 else 0.0
     for a in range(3):

@@ -33,13 +33,13 @@ DEPTH_TOLERANCE = 1e-9
 
 MAX_BODY_SIZE = 1e150
 """The body size in its unit is at most this and at least its inverse: squared lengths
-then neither overflow nor vanish, either of which would call a colliding pose free."""
+then neither overflow nor vanish; either would call a colliding pose free."""
 
 _PAIRS_AT_ONCE = 1 << 14
 """Pairs that a thread's buffer holds; they are passed on whenever it is full."""
 
 _SHARES = 1000
-"""Of a search, in which `CollisionDetector.summarise` tells its progress."""
+"""Units of a search for the progress of `CollisionDetector.summarise`."""
 
 _POSES_PER_TASK = 8
 """The most poses that a thread takes at a time: a prompt cancel, and little waiting at the end."""
@@ -324,7 +324,7 @@ class CollisionDetector:
         return colliding
 
     def _checked(self, vertices: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[np.floating]:
-        """Refuse another shape, in which -1 stands for any number of poses."""
+        """Refuse another shape; -1 stands for any number of poses."""
         array = np.asarray(vertices)
         if array.ndim != len(shape) or array.shape[-2:] != shape[-2:]:
             wanted = ", ".join("B" if size < 0 else str(size) for size in shape)

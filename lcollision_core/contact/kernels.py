@@ -463,7 +463,7 @@ def search_pose(
     boxes = work.node_boxes
     stack = work.stack
     share = work.share
-    # Not a plain 0, for which the search of leaves would be compiled twice.
+    # Not a plain 0: the search of leaves would be compiled twice for it.
     n_found: int = int(np.int64(0))
     if n_waiting == 0:
         if not _refit(pose, scale, tree, work):

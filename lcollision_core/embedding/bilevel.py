@@ -216,7 +216,7 @@ class Embedding:
         )
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Return arrays and JSON metadata from which `from_arrays` builds the same embedding."""
+        """Return arrays and JSON metadata, for `from_arrays`."""
         arrays: dict[str, npt.NDArray[Any]] = {
             "faces": self.topology.faces,
             "rest_vertices": self.rest_vertices,

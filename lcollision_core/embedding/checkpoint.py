@@ -36,7 +36,7 @@ def run_key(arrays: Mapping[str, npt.NDArray[Any]], options: Mapping[str, Any]) 
 
 
 class Checkpoint:
-    """The state of a run, by part, kept in one file from which a killed run goes on.
+    """The state of a run, by part, kept in one file to resume a killed run from.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ class LatentBox:
         return cls(low, high)
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the arrays of a model file from which `from_arrays` builds the same box."""
+        """Return the arrays of a model file, for `from_arrays`."""
         return {"box_low": self.low, "box_high": self.high}
 
     def draw(self, seed: int, block: int) -> npt.NDArray[np.float32]:

@@ -135,7 +135,7 @@ class MaskQuality:
         does, the share in its largest connected patch; 0 for a domain that owns none
     n_owned : (K,) int64 array, those vertices
     domains_per_vertex : mean over vertices of 1 / Σ_k (M^{ki})², the effective number of domains
-    undivided_share : share of the vertices of which one domain owns at least half
+    undivided_share : fraction of the vertices that belong to one domain by at least half
     """
 
     connected_share: FloatArray

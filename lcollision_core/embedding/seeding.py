@@ -66,7 +66,7 @@ def moving_parts(
     rest_vertices: FloatArray,
     n_parts: int,
 ) -> IntArray:
-    """Split the body into connected parts, each of which turns as one over the poses.
+    """Split the body into connected parts that each move rigidly over the poses.
 
     Ward's clustering of the vertices by their rotations in all poses and their place on the
     reference, weighed by area and restricted to neighbours on the mesh: two patches merge when
@@ -201,7 +201,7 @@ def radius_of_overlap(distances: FloatArray, overlap: float) -> float:
 
     Returns
     -------
-    radius : distance at which the windows have faded to 0
+    radius : where the windows have faded to 0
     """
     wanted = min(overlap, 0.5 * (len(distances) + 1))
     low, high = _LEAST_RADIUS, 2.0
@@ -220,7 +220,7 @@ def locality_weights(distances: FloatArray, band: tuple[float, float]) -> FloatA
     Parameters
     ----------
     distances : (K, V) float64 array, see `part_distances`
-    band : at which distance the weight begins to rise from 0, and at which it is 1
+    band : the distances where the weight begins to rise from 0, and where it is 1
 
     Returns
     -------

@@ -108,7 +108,7 @@ class PoseSetInspection:
     n_found : the poses that are there, usable or not
     same_topology : whether all readable poses share their vertex count and faces
     audit : the state of the reference, pose 0; None without poses
-    defects : of the set and its poses, in the order in which they were found
+    defects : of the set and its poses, in the order found
     """
 
     pose_set: PoseSet | None

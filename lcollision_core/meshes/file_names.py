@@ -42,7 +42,7 @@ def file_stem(name: str) -> str:
 def file_stems(names: Iterable[str]) -> list[str]:
     """Return each name's `file_stem`, numbered where an earlier one is the same file: "a", "A 2".
 
-    Neither case nor the way in which an accent is encoded tells files apart everywhere.
+    Some file systems ignore case and the encoding of accents.
     """
     taken: set[str] = set()
     counts: Counter[str] = Counter()

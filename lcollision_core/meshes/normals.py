@@ -1,4 +1,4 @@
-"""The directions in which a surface faces."""
+"""Vertex normals."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def read_npz(
     Parameters
     ----------
     path : the archive
-    wanted : for each array its names, of which the first that is there counts
+    wanted : for each array its names; the first one found counts
 
     Returns
     -------

@@ -221,7 +221,7 @@ def collect_poses(
     Parameters
     ----------
     path : as for `read_pose_set`
-    report : told of each defect; when it raises, reading ends there
+    report : called with each defect; when it raises, reading ends there
     progress, cancel : as for `read_pose_set`
     """
     try:

@@ -17,7 +17,7 @@ SINGLE_PRECISION = (".stl", ".glb")
 
 LARGEST_RATIO = 0.01
 """Of a short edge, that the rounding step of a coordinate may be: beyond it, faces lose their
-shape, and what was said of a mesh is not true of its file."""
+shape, and results for a mesh do not hold for its file."""
 
 _SHORT_EDGES = 10.0
 """Per cent of the edges that are at most as long as a short edge."""

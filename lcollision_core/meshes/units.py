@@ -57,7 +57,7 @@ def up_axis(vertices: npt.NDArray[Any], topology: Topology | None = None) -> int
 
 
 def front_direction(vertices: npt.NDArray[Any], up_axis: int) -> npt.NDArray[np.float64]:
-    """Guess the direction in which a body looks: across its flat side, where its toes point.
+    """Guess the direction that a body faces: across its flat side, where its toes point.
 
     Parameters
     ----------

@@ -32,10 +32,9 @@ class ModelCard:
     domain_colours : K strings "#rrggbb"
     pose_names : N names of the training poses
     source : what the model was trained on
-    licence : under which the model may be used
+    licence : of the model
     provenance : how it was made, JSON values by name
-    domain_order : all K domains, indices from 0, in the order in which to list them; empty for the
-        latent's
+    domain_order : all K domains, indices from 0, in listing order; empty for the latent's
 
     Raises
     ------
@@ -99,7 +98,7 @@ class ModelCard:
                 raise ModelFileError(problem, next_step)
 
     def to_metadata(self) -> dict[str, Any]:
-        """Return JSON values from which `from_metadata` builds the same card."""
+        """Return JSON values for `from_metadata`."""
         values = asdict(self)
         if not self.domain_order:
             del values["domain_order"]

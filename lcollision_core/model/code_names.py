@@ -60,7 +60,7 @@ def code_effects(
     attention_mask : (K, V) array, each column sums to 1
     group_sizes : 1 + K sizes of the latent's groups, which sum to D
     up_axis : 0, 1 or 2
-    front : (3,) array, the direction in which the body looks, level
+    front : (3,) array, horizontal, the direction that the body faces
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Poses as mesh files: in which axes and unit, and what exactly is written."""
+"""Poses as mesh files: axes, unit, and what exactly is written."""
 
 from __future__ import annotations
 

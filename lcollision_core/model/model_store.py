@@ -1,4 +1,4 @@
-"""Where models live: bundled with the program, or in the user's own folder."""
+"""Where models are stored: bundled with the program, or in the user's own folder."""
 
 from __future__ import annotations
 

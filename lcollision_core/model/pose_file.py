@@ -51,7 +51,7 @@ class NamedPose:
         the model's coordinates
     fit_error_mean, fit_error_max : of one that was fitted to a mesh or a mirror image,
         normalised
-    tags : under which it is found in a library
+    tags : to find it by in a library
     mirror_of : of a mirror image the pose that it was made from, which mirroring it again, while
         it is unchanged, gives back to the bit
     """

@@ -133,7 +133,7 @@ class PoseLibrary:
         return True
 
     def _find_file(self) -> None:
-        """Take the file that a program which knows the model by another name has begun."""
+        """Adopt a library file made under another name of the same model."""
         if not self.path.exists():
             self.path = _path(self._model, self._folder)
 

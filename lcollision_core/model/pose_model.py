@@ -160,7 +160,7 @@ class PoseModel:
         pose_set : gives the units, the poses' names and, where its vertices are labelled, the
             domains' names
         source : what the poses are, by default the name of their file
-        licence : under which the model may be used
+        licence : of the model
         provenance : how it was made, JSON values by name
         """
         reference = pose_set.vertices[0]
@@ -319,7 +319,7 @@ class PoseModel:
 
         Parameters
         ----------
-        vertices : (V, 3) finite array, in a unit of its own, which its placement leads back to
+        vertices : (V, 3) finite array, in any unit; the placement converts back to it
         cancel : polled before the fit
         scale : brings `vertices` into the data's unit
 
@@ -366,7 +366,7 @@ class PoseModel:
         ----------
         names : new names by domain, an index from 0; two domains may swap theirs
         colours : new colours "#rrggbb" by domain
-        order : all domains in the order in which to list them; the latent's stays as it is
+        order : all domains in listing order; the order of the latent entries does not change
 
         Raises
         ------
@@ -616,7 +616,7 @@ class PoseModel:
 
     @property
     def body_size(self) -> float:
-        """The body size, by which lengths are normalised, in the data's unit."""
+        """The body size in the data's unit; lengths are normalised by it."""
         return self.card.height
 
     @property
@@ -626,7 +626,7 @@ class PoseModel:
 
     @cached_property
     def front(self) -> FloatArray:
-        """(3,) direction along an axis in which the reference looks, as far as its shape tells."""
+        """(3,) unit vector along an axis: where the reference faces, guessed from its shape."""
         return _read_only(front_direction(self.reference, self.up_axis))
 
     @property
@@ -646,7 +646,7 @@ class PoseModel:
 
     @property
     def domain_order(self) -> tuple[int, ...]:
-        """All K domains, indices from 0, in the order in which people want them listed."""
+        """All K domains, indices from 0, in listing order."""
         return self.card.domain_order or tuple(range(len(self.domain_names)))
 
     @property

@@ -110,7 +110,7 @@ PRESETS = {
         shown_rows=2_800_000,
         balanced=True,
     ),
-    # Its constant rate never lets the weights settle, and it knows its rows by heart long before
+    # Its constant rate never lets the weights settle, and it overfits long before
     # the last pass; a long mean helps against both. The paper does not say which weights it kept.
     "paper": PredictorConfig("paper", average_passes=8.0),
 }

@@ -75,7 +75,7 @@ class _Reader:
         return required_array(self._arrays, name, dtype, shape, largest)
 
     def sites(self) -> npt.NDArray[np.int32]:
-        """Take the fold sites, of which there may be none."""
+        """Take the fold sites, if any."""
         held = self._arrays.get("site_vertices", np.empty(()))
         n_sites = 0 if held.ndim == 2 and not len(held) else None
         return self.array("site_vertices", n_sites, None, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""The ladder: what is tried, in which order, until a pose is collision-free."""
+"""The ladder: the steps that Resolve tries in turn until a pose is collision-free."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Ladder:
     free_latents : (F, D) float64 array of poses known to be free
     correction : (D,) float64 array to try first, or None
     progress : called with (steps done, all steps), the last step being to pull back
-    remark : what there is to say of the request whatever comes of it, or None
+    remark : on the request, whatever its result, or None
     """
 
     problem: ResolveProblem

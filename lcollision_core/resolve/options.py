@@ -119,7 +119,7 @@ class ResolveResult:
     latent : (D,) float64 array, read-only
     vertices : (V, 3) array, read-only, in the data's unit: what the exact check saw, and what is to
         be written; float32 in the model's coordinates, or float64 where the pose is placed
-    solver_status : what the solver of the paper's problem said at its least margin, "not run"
+    solver_status : the status of the solver of the paper's problem at its least margin, "not run"
         where none ran
     converged : that it ended by its own tolerances
     predicted_free : the collision probability of `latent` is at most the threshold
@@ -132,7 +132,7 @@ class ResolveResult:
     vertex_distance_mean, vertex_distance_max : from the decoded pose as it was
     iterations : of the solver at its least margin, for those of NLopt its evaluations; further
         margins and restarts do not count
-    evaluations : poses at which the predictor was asked
+    evaluations : poses for which the predictor was evaluated
     seconds : spent
     note : a sentence for the user, None if there is nothing to say
     """

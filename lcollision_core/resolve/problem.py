@@ -123,7 +123,7 @@ class SolverOutcome:
     ----------
     latent : (D,) float64 array: of the poses that satisfy the constraint the nearest, else the
         one that violates it least
-    status : what the solver said, in a word or two
+    status : the solver's own, in a word or two
     converged : it ended by its tolerances
     feasible : the constraint holds, margin included
     iterations : of the solver

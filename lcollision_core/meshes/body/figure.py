@@ -163,7 +163,7 @@ def straight_rise(figure: Figure, skeleton: Skeleton) -> float:
 def _straight_height(
     skeleton: Skeleton, orientation: FloatArray, location: FloatArray, foot: Foot, side: str
 ) -> float:
-    """Height of the pelvis at which the leg to `foot` is all but straight."""
+    """Height of the pelvis at which the leg to `foot` is almost straight."""
     hip, ankle, length = _standing_leg(skeleton, orientation, location, foot, side)
     level = np.hypot(*(hip - ankle)[:2])
     rise = np.sqrt(max((STRAIGHT * length) ** 2 - level**2, (0.3 * length) ** 2))

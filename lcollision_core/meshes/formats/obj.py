@@ -72,7 +72,7 @@ def read(file: BinaryIO) -> Polygons:
 def _faces(
     text: bytes, n_before: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return sizes and corners of `f` lines, before each of which `n_before` vertices stand."""
+    """Return sizes and corners of `f` lines; `n_before` vertices precede each."""
     if b"/" in text:
         text = re.sub(rb"(?<=[0-9])/[^\s]*", b"", text)
     values, sizes = number_rows(text, "face", whole=True)

@@ -38,7 +38,7 @@ _POSES_AT_ONCE = 256
 
 
 class FoldDetector:
-    """The exact check, with folds told from contact between parts.
+    """The exact check, with folds distinguished from contact between parts.
 
     Parameters
     ----------

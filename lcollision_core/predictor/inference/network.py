@@ -154,7 +154,7 @@ class _Trace(NamedTuple):
 
 
 class _Networks:
-    """n networks of one size side by side, each with inputs of its own; silu between layers.
+    """n networks of one size side by side, each with separate inputs; silu between layers.
 
     Parameters
     ----------

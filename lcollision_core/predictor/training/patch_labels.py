@@ -16,7 +16,7 @@ _PATCH_FRACTION, _FOLD_FRACTION = 0.05, 0.005
 """Typical fractions of a pose's energy in a colliding patch, and in a colliding fold."""
 
 _LEAST_ROOT = 1e-3
-"""So that the shallowest touch is still told from none in half precision."""
+"""Keeps the shallowest contact distinct from none in half precision."""
 
 
 class PatchLabeller:

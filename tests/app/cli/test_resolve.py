@@ -487,7 +487,7 @@ _STOP_AFTER_TWO = """
 import os, signal, sys
 from app.cli import main, unfinished
 how = getattr(signal, sys.argv.pop(1))
-unfinished._SECONDS_BETWEEN_WRITES, unfinished._LARGEST_SHARE = 0.0, 1.0
+unfinished._SECONDS_BETWEEN_WRITES, unfinished._LARGEST_FRACTION = 0.0, 1.0
 keep = unfinished.UnfinishedPoses.keep
 def keep_two(self, *arguments):
     keep(self, *arguments)
