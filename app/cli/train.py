@@ -26,8 +26,8 @@ from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken
 
 if TYPE_CHECKING:
-    from lcollision_core.embedding import training
-    from lcollision_core.embedding.training import TrainingStatus
+    from lcollision_core.embedding import run
+    from lcollision_core.embedding.run import TrainingStatus
     from lcollision_core.predictor import PredictorStatus, StatusCallback
 
 app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
@@ -247,7 +247,7 @@ def _provenance(vertices: Any, seed: int) -> dict[str, Any]:
 
 
 @contextmanager
-def _embedding_bar() -> Iterator[training.StatusCallback]:
+def _embedding_bar() -> Iterator[run.StatusCallback]:
     """Give a callback that draws the stage and both levels' errors on a terminal."""
     with status_bar("reading features") as draw:
 

@@ -65,6 +65,7 @@ class AcapCodec:
         rest.flags.writeable = False
         self.topology = topology
         self.rest_vertices: FloatArray = rest
+        self.anchor_weights: FloatArray = np.asarray(anchor_weights, dtype=np.float64)
         weights = cotangent_weights(topology, rest, WEIGHT_FLOOR)
         bridges = component_bridges(topology, rest)
         self._roots = component_roots(topology, rest)
@@ -73,7 +74,7 @@ class AcapCodec:
             rest,
             np.concatenate([topology.edges, bridges]),
             np.concatenate([weights, np.ones(len(bridges))]),
-            np.asarray(anchor_weights, dtype=np.float64),
+            self.anchor_weights,
         )
 
     def encode(self, vertices: npt.NDArray[Any], n_threads: int | None = None) -> FloatArray:

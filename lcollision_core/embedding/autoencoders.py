@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
-from lcollision_core.acap.features import N_FEATURES, N_ROTATION
 from lcollision_core.acap.scaling import FeatureScaling
 from lcollision_core.embedding.decoder import DecoderGroup, FeatureDecoder, Float32Array
-from lcollision_core.embedding.seeding import ring_average
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
 CENTRED_SCALE = 0.5
@@ -36,27 +35,57 @@ class AutoencoderWeights:
     ring_weight: Float32Array
     support: IntArray
 
+    def encode(self, features: Float32Array, ring: sparse.csr_matrix) -> Float32Array:
+        """Return the (B, m) codes of (B, n, 9) features; `ring` (V, V) averages over one-rings."""
+        around = ring_mean(features, ring[self.support][:, self.support])
+        hidden = np.tanh(features @ self.self_weight + around @ self.ring_weight)
+        codes: Float32Array = (
+            hidden.reshape(len(hidden), -1) @ self.components.reshape(len(self.components), -1).T
+        )
+        return codes
+
+    def decoder_table(
+        self, ring: sparse.csr_matrix, dtype: npt.DTypeLike = np.float32
+    ) -> npt.NDArray[Any]:
+        """Return the (m, 9 n) table of which decoding is tanh of the codes' combination."""
+        components = self.components.astype(dtype)
+        around = ring_mean(components, ring[self.support][:, self.support])
+        table = components @ self.self_weight.T + around @ self.ring_weight.T
+        return table.reshape(len(table), -1)
+
+
+def ring_average(topology: Topology) -> sparse.csr_matrix:
+    """Return the (V, V) matrix that takes the mean over each one-ring; no ring gives 0."""
+    counts = np.maximum(np.diff(topology.adjacency.indptr), 1)
+    return sparse.csr_matrix(sparse.diags(1.0 / counts) @ topology.adjacency)
+
+
+def ring_mean(values: npt.NDArray[Any], ring: sparse.csr_matrix) -> npt.NDArray[Any]:
+    """Average (m, n, 9) values over one-rings by the (n, n) matrix `ring`, in the values' dtype."""
+    n_rows, n_vertices, width = values.shape
+    columns = values.transpose(1, 0, 2).reshape(n_vertices, n_rows * width)
+    product: npt.NDArray[Any] = ring.astype(values.dtype) @ columns
+    return product.reshape(n_vertices, n_rows, width).transpose(1, 0, 2)
+
 
 def centre_features(
     features: npt.NDArray[Any], scaling: FeatureScaling, mean_features: Float32Array
 ) -> Float32Array:
     """Return what the autoencoders see of (B, V, 9) unscaled features, float32."""
-    scaled = scaling.apply(np.asarray(features, dtype=np.float64))
-    centred: Float32Array = (CENTRED_SCALE * (scaled - mean_features)).astype(np.float32)
-    return centred
+    return (CENTRED_SCALE * (scaling.apply(features) - mean_features)).astype(np.float32)
 
 
 def build_decoder(
-    parts: Sequence[AutoencoderWeights],
+    autoencoders: Sequence[AutoencoderWeights],
     scaling: FeatureScaling,
     mean_features: Float32Array,
     topology: Topology,
 ) -> FeatureDecoder:
-    """Fold each autoencoder's decoder into one table: see `network`.
+    """Turn each autoencoder's decoder into one table: see `network`.
 
     Parameters
     ----------
-    parts : level 1, then level 2's in the order of the domains
+    autoencoders : level 1, then level 2's in the order of the domains
     scaling : of the features
     mean_features : (V, 9) float32 array, scaled
     topology : the connectivity
@@ -66,21 +95,15 @@ def build_decoder(
     decoder : FeatureDecoder
     """
     ring = ring_average(topology)
-    groups = []
-    for part in parts:
-        components = part.components.astype(np.float64)
-        around = _ring_mean(components, ring[part.support][:, part.support])
-        table = components @ part.self_weight.T + around @ part.ring_weight.T
-        # Never read-only, which a model file's arrays are: loops would be compiled for both.
-        support = np.array(part.support)
-        groups.append(DecoderGroup(table.reshape(len(table), -1).astype(np.float32), support))
-    numbers = np.where(
-        np.arange(N_FEATURES) < N_ROTATION, scaling.rotation_scale, scaling.stretch_scale
-    )
     return FeatureDecoder(
-        groups=tuple(groups),
+        groups=tuple(
+            # The support is copied: a model file's arrays are read-only, and the loops would be
+            # compiled for both kinds.
+            DecoderGroup(one.decoder_table(ring, np.float64).astype(np.float32), one.support.copy())
+            for one in autoencoders
+        ),
         offset=scaling.invert(mean_features.astype(np.float64)),
-        scale=1.0 / (CENTRED_SCALE * numbers),
+        scale=1.0 / (CENTRED_SCALE * scaling.scale),
     )
 
 
@@ -105,36 +128,16 @@ def run_encoders(
     latent : (B, D) float32 array
     """
     ring = ring_average(topology)
-    codes, residual = [], centred
-    for domain, part in enumerate((level1, *level2), start=-1):
-        inputs = residual[:, part.support]
-        if domain >= 0:
-            inputs = inputs * attention_mask[domain, part.support][:, None]
-        local_ring = ring[part.support][:, part.support]
-        around = _ring_mean(inputs, local_ring)
-        hidden = np.tanh(inputs @ part.self_weight + around @ part.ring_weight)
-        weights = part.components.reshape(len(part.components), -1)
-        codes.append(hidden.reshape(len(hidden), -1) @ weights.T)
-        if domain < 0:
-            back = _ring_mean(part.components, local_ring)
-            table = part.components @ part.self_weight.T + back @ part.ring_weight.T
-            output = np.tanh(codes[0] @ table.reshape(len(table), -1))
-            residual = centred - output.reshape(centred.shape)
-    latent: Float32Array = np.concatenate(codes, axis=1).astype(np.float32)
-    return latent
+    codes = [level1.encode(centred, ring)]
+    residual = centred - np.tanh(codes[0] @ level1.decoder_table(ring)).reshape(centred.shape)
+    for one, share in zip(level2, attention_mask, strict=True):
+        masked = residual[:, one.support] * share[one.support][:, None]
+        codes.append(one.encode(masked, ring))
+    return np.concatenate(codes, axis=1)
 
 
 def deviation_of(latent: npt.NDArray[Any]) -> FloatArray:
-    """Return the (D,) root mean square of (N, D) codes, floored so that no code is nailed to 0."""
+    """Return the (D,) root mean square of (N, D) codes, floored so that each code can move."""
     deviation = np.sqrt((np.asarray(latent, dtype=np.float64) ** 2).mean(axis=0))
     floored: FloatArray = np.maximum(deviation, max(1e-3 * float(deviation.max()), 1e-6))
     return floored
-
-
-def _ring_mean(values: npt.NDArray[Any], ring: Any) -> npt.NDArray[Any]:
-    """Average (m, n, 9) values over one-rings, (n, n), in the values' dtype."""
-    n_rows, n_vertices, width = values.shape
-    columns = values.transpose(1, 0, 2).reshape(n_vertices, n_rows * width)
-    product = ring.astype(values.dtype) @ columns
-    averaged: npt.NDArray[Any] = product.reshape(n_vertices, n_rows, width).transpose(1, 0, 2)
-    return averaged

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -24,18 +22,18 @@ from lcollision_core.embedding.autoencoders import (
     run_encoders,
 )
 from lcollision_core.embedding.decoder import FeatureDecoder, Float32Array
-from lcollision_core.embedding.fitting import MAX_STEPS, LatentFit, fit_latent
+from lcollision_core.embedding.fitting import LatentFit, fit_latent
 from lcollision_core.embedding.latent_box import LatentBox
 from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import CancelToken, for_blocks
 from lcollision_core.json_values import from_json
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.model_file import required_array
 
 _LARGEST_SHARE, _LARGEST_WEIGHT = 1.01, 1e4
-_LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e6
+_LARGEST_CODE, _LARGEST_COORDINATE = 1e6, 1e6
 _LEAST_LEADING, _LEAST_SIZE = 1e-6, 1e-3
 """What the arrays of a file may hold: weights of norm 1 and features within 1 of 0, the others far
 beyond what training finds, and far below what overflows."""
@@ -51,7 +49,7 @@ class Embedding:
     Attributes
     ----------
     topology : the connectivity
-    rest_vertices : (V, 3) float64 array, the reference, normalised
+    rest_vertices : (V, 3) float64 array, the reference, in normalised lengths
     alignment_weights : (V,) float64 array, how much each vertex leads when a mesh is aligned
     scaling : of the features
     mean_features : (V, 9) float32 array, mean of the scaled training features
@@ -100,7 +98,7 @@ class Embedding:
     @property
     def group_sizes(self) -> tuple[int, ...]:
         """(|Z_0|, |Z_1|, ..., |Z_K|)."""
-        return tuple(len(part.components) for part in (self.level1, *self.level2))
+        return tuple(len(one.components) for one in (self.level1, *self.level2))
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes belong to domains: (D,), true for Z_k and for Z_0's code of each.
@@ -127,12 +125,12 @@ class Embedding:
         Parameters
         ----------
         latent : (B, D) array
-        n_threads : to spread the poses over, numba's own number by default
+        n_threads : threads to spread the poses over, one for each core by default
 
         Returns
         -------
-        vertices : (B, V, 3) float64 array, normalised, in the reference's frame; a pose gets the
-            same bits in whichever batch it comes, on however many threads
+        vertices : (B, V, 3) float64 array, in normalised lengths, placed as the reference; a pose
+            gets the same bits in whichever batch it comes, on however many threads
 
         Raises
         ------
@@ -143,19 +141,13 @@ class Embedding:
             raise ShapeError.must_be("latent", f"of shape (B, {self.latent_size})", rows.shape)
         vertices = np.empty((len(rows), self.topology.n_vertices, 3))
 
-        def decode_block(start: int) -> None:
-            block = self.decoder.features(rows[start : start + BLOCK_POSES])
-            vertices[start : start + BLOCK_POSES] = self.codec.decode(block, n_threads=1)
+        # Both are made before threads ask for them.
+        decoder, codec = self.decoder, self.codec
 
-        starts = range(0, len(rows), BLOCK_POSES)
-        wanted = numba.config.NUMBA_NUM_THREADS if n_threads is None else n_threads
-        if min(wanted, len(starts)) <= 1:
-            for start in starts:
-                decode_block(start)
-        else:
-            _ = self.decoder, self.codec
-            with ThreadPoolExecutor(min(wanted, len(starts))) as pool:
-                list(pool.map(decode_block, starts))
+        def decode_block(start: int, stop: int) -> None:
+            vertices[start:stop] = codec.decode(decoder.features(rows[start:stop]), n_threads=1)
+
+        for_blocks(decode_block, len(rows), BLOCK_POSES, n_threads)
         return vertices
 
     def guess(self, features: npt.NDArray[Any]) -> Float32Array:
@@ -166,25 +158,21 @@ class Embedding:
     def encode(
         self,
         vertices: npt.NDArray[Any],
-        max_steps: int = MAX_STEPS,
-        progress: Progress = no_progress,
         cancel: CancelToken | None = None,
         *,
         in_place: bool = False,
     ) -> LatentFit:
-        """Find the latent codes of meshes in any rigid position.
+        """Find the latent codes of a mesh in any rigid position.
 
         The encoders guess from the features of the aligned mesh; a few Gauss-Newton steps on the
         vertex error then settle code and rigid motion together.
 
         Parameters
         ----------
-        vertices : (B, V, 3) finite array, normalised
-        max_steps : at most so many steps a mesh; 0 returns the guess
-        progress : called with (meshes done, meshes in all)
-        cancel : polled between meshes
-        in_place : the meshes lie in the reference's frame and stay there: the codes take up how a
-            mesh is turned against the training poses, as far as they can
+        vertices : (V, 3) finite array, in normalised lengths
+        cancel : polled before each step
+        in_place : the mesh lies as the reference does and stays there: the codes take up how it is
+            turned against the training poses, as far as they can
 
         Returns
         -------
@@ -200,17 +188,15 @@ class Embedding:
         if not in_place:
             weights = np.zeros(self.topology.n_vertices)
             weights[self.topology.picked] = self.alignment_weights[self.topology.picked]
-            rotations, translations = fit_rigid(vertices, self.rest_vertices, weights)
-            aligned = vertices @ np.swapaxes(rotations, 1, 2) + translations[:, None]
-        guess = self.guess(self.codec.encode(aligned))
+            rotation, translation = fit_rigid(vertices, self.rest_vertices, weights)
+            aligned = vertices @ rotation.T + translation
+        guess = self.guess(self.codec.encode(aligned[None]))[0]
         return fit_latent(
             self.decoder,
             self.codec,
             vertices,
             guess,
             self.latent_deviation,
-            max_steps,
-            progress,
             cancel,
             in_place=in_place,
         )
@@ -225,14 +211,14 @@ class Embedding:
             "training_latent": self.training_latent,
             **self.box.to_arrays(),
         }
-        for name, part in self._named_parts():
-            arrays[f"{name}_components"] = part.components
-            arrays[f"{name}_self_weight"] = part.self_weight
-            arrays[f"{name}_ring_weight"] = part.ring_weight
-            if name != "level1":
-                arrays[f"{name}_support"] = part.support
-                domain = int(name.removeprefix("level2_"))
-                arrays[f"{name}_mask"] = self.attention_mask[domain, part.support]
+        for domain, one in enumerate((self.level1, *self.level2), start=-1):
+            name = "level1" if domain < 0 else f"level2_{domain}"
+            arrays[f"{name}_components"] = one.components
+            arrays[f"{name}_self_weight"] = one.self_weight
+            arrays[f"{name}_ring_weight"] = one.ring_weight
+            if domain >= 0:
+                arrays[f"{name}_support"] = one.support
+                arrays[f"{name}_mask"] = self.attention_mask[domain, one.support]
         metadata = {
             "n_vertices": self.topology.n_vertices,
             "n_domains": self.n_domains,
@@ -264,64 +250,55 @@ class Embedding:
     @classmethod
     def _read(cls, arrays: Mapping[str, npt.NDArray[Any]], values: _Values) -> Embedding:
         # Sizes are the arrays' own: nothing is made of a size that is only announced.
-        rest = required_array(arrays, "rest_vertices", np.float64, (None, 3), _LARGEST_PLACE)
+        need = partial(required_array, arrays)
+        rest = need("rest_vertices", np.float64, (None, 3), _LARGEST_COORDINATE)
         n_vertices, n_domains = len(rest), values.n_domains
         if values.n_vertices != n_vertices:
             raise ValueError(f"it announces {values.n_vertices} vertices, but has {n_vertices}")
-        topology = Topology(required_array(arrays, "faces", np.int32, (None, 3)), n_vertices)
+        topology = Topology(need("faces", np.int32, (None, 3)), n_vertices)
         _require_size(rest, topology)
-        leading = required_array(
-            arrays, "alignment_weights", np.float64, (n_vertices,), _LARGEST_WEIGHT
-        )
+        leading = need("alignment_weights", np.float64, (n_vertices,), _LARGEST_WEIGHT)
         if leading.min() < 0.0 or leading.max() < _LEAST_LEADING:
             raise ValueError("its alignment_weights must be at least 0, and one of them more")
-        mean_features = required_array(
-            arrays, "mean_features", np.float32, (n_vertices, N_FEATURES), _LARGEST_SHARE
-        )
-        part = _read_part(arrays, "level1", np.arange(n_vertices, dtype=np.int32))
-        if len(part.components) != n_domains:
+        shape = (n_vertices, N_FEATURES)
+        mean_features = need("mean_features", np.float32, shape, _LARGEST_SHARE)
+        level1 = _read_autoencoder(arrays, "level1", np.arange(n_vertices, dtype=np.int32))
+        if len(level1.components) != n_domains:
             raise ValueError(
-                f"it announces {n_domains} domains, but its level 1 has {len(part.components)}"
+                f"it announces {n_domains} domains, but its level 1 has {len(level1.components)}"
             )
-        parts, mask = [part], np.zeros((n_domains, n_vertices), dtype=np.float32)
+        level2, mask = [], np.zeros((n_domains, n_vertices), dtype=np.float32)
         for domain in range(n_domains):
             name = f"level2_{domain}"
-            support = required_array(arrays, f"{name}_support", np.int32, (None,))
+            support = need(f"{name}_support", np.int32, (None,))
             if not 0 <= support[0] <= support[-1] < n_vertices or (np.diff(support) <= 0).any():
                 raise ValueError(
                     f"its array {name}_support is no ascending list of its {n_vertices} vertices"
                 )
-            parts.append(_read_part(arrays, name, support))
-            weights = required_array(arrays, f"{name}_mask", np.float32, support.shape)
-            if weights.min() < 0.0:
-                raise ValueError(f"its array {name}_mask has a weight below 0")
-            mask[domain, support] = weights
+            level2.append(_read_autoencoder(arrays, name, support))
+            share = need(f"{name}_mask", np.float32, support.shape)
+            if share.min() < 0.0:
+                raise ValueError(f"its array {name}_mask has a share below 0")
+            mask[domain, support] = share
         if np.abs(mask.sum(axis=0) - 1.0).max() > 1e-5:
             raise ValueError("its attention masks do not sum to 1")
-        latent_size = sum(len(part.components) for part in parts)
-        training_latent = required_array(
-            arrays, "training_latent", np.float32, (None, latent_size), _LARGEST_CODE
-        )
+        latent_size = n_domains + sum(len(one.components) for one in level2)
+        latent = need("training_latent", np.float32, (None, latent_size), _LARGEST_CODE)
         return cls(
             topology=topology,
             rest_vertices=rest,
             alignment_weights=leading,
             scaling=values.scaling,
             mean_features=mean_features,
-            level1=parts[0],
-            level2=tuple(parts[1:]),
+            level1=level1,
+            level2=tuple(level2),
             attention_mask=mask,
-            training_latent=training_latent,
-            box=LatentBox.from_arrays(arrays, training_latent),
+            training_latent=latent,
+            box=LatentBox.from_arrays(arrays, latent),
             metrics=values.metrics,
             config=dict(values.config),
             seed=values.seed,
         )
-
-    def _named_parts(self) -> Iterator[tuple[str, AutoencoderWeights]]:
-        yield "level1", self.level1
-        for domain, part in enumerate(self.level2):
-            yield f"level2_{domain}", part
 
 
 @dataclass(frozen=True)
@@ -337,7 +314,7 @@ class _Values:
 
 
 def _require_size(rest: FloatArray, topology: Topology) -> None:
-    """Refuse a reference that is not normalised, as far as its faces tell."""
+    """Refuse a reference that is not in normalised lengths, as far as its faces tell."""
     used = rest[topology.faces.reshape(-1)]
     size = float(np.ptp(used, axis=0).max())
     # A vertex in no face counted once, and may have made the others smaller.
@@ -345,17 +322,14 @@ def _require_size(rest: FloatArray, topology: Topology) -> None:
         raise ValueError(f"its array rest_vertices must have a body size of 1, got {size:.6g}")
 
 
-def _read_part(
+def _read_autoencoder(
     arrays: Mapping[str, npt.NDArray[Any]], name: str, support: npt.NDArray[np.int32]
 ) -> AutoencoderWeights:
+    need = partial(required_array, arrays)
     shape, square = (None, len(support), N_FEATURES), (N_FEATURES, N_FEATURES)
     return AutoencoderWeights(
-        components=required_array(arrays, f"{name}_components", np.float32, shape, _LARGEST_SHARE),
-        self_weight=required_array(
-            arrays, f"{name}_self_weight", np.float32, square, _LARGEST_WEIGHT
-        ),
-        ring_weight=required_array(
-            arrays, f"{name}_ring_weight", np.float32, square, _LARGEST_WEIGHT
-        ),
+        components=need(f"{name}_components", np.float32, shape, _LARGEST_SHARE),
+        self_weight=need(f"{name}_self_weight", np.float32, square, _LARGEST_WEIGHT),
+        ring_weight=need(f"{name}_ring_weight", np.float32, square, _LARGEST_WEIGHT),
         support=support,
     )

@@ -68,26 +68,16 @@ class Checkpoint:
         return self._sections.get(part)
 
     def put(
-        self,
-        part: str,
-        arrays: Mapping[str, npt.NDArray[Any]],
-        metadata: Mapping[str, Any],
-        *,
-        now: bool = False,
+        self, part: str, arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]
     ) -> None:
-        """Remember a part's state; write the file now, or when the last write is long past."""
+        """Write the file with the state of a part of the run, whole or not at all."""
         self._sections[part] = Section(arrays, metadata)
-        if now or time.monotonic() - self._written > _SECONDS_BETWEEN_WRITES:
-            self.write()
-
-    @property
-    def due(self) -> bool:
-        """Whether the next `put` will write; the state need not be gathered before."""
-        late = time.monotonic() - self._written > _SECONDS_BETWEEN_WRITES
-        return self._path is not None and late
-
-    def write(self) -> None:
-        """Write all parts to the file, whole or not at all."""
         if self._path is not None:
             write_model_file(self._path, self._sections)
         self._written = time.monotonic()
+
+    @property
+    def due(self) -> bool:
+        """Whether the last write is long past; the state need not be gathered before."""
+        late = time.monotonic() - self._written > _SECONDS_BETWEEN_WRITES
+        return self._path is not None and late

@@ -9,7 +9,7 @@ from lcollision_core.errors import LCollisionError
 
 @dataclass(frozen=True)
 class EmbeddingConfig:
-    """How a latent space is trained; what was tried stands in `training`.
+    """How a latent space is trained.
 
     Attributes
     ----------
@@ -24,9 +24,9 @@ class EmbeddingConfig:
         error per vertex
     window_overlap : effective domains per vertex of the windows in which level 1's components
         start, at most (K + 1) / 2; the distances of the locality loss follow the windows
-    vertex_weight : of the mean squared vertex distance, normalised, beside the squared
-        feature error per vertex, in level 2
-    held_out_stride : every so many poses one is left out of a second model that measures how
+    vertex_weight : of the mean squared vertex distance, in squared normalised lengths, beside the
+        squared feature error per vertex, in level 2
+    held_out_stride : every n-th pose is left out of a second model that measures how
         unseen poses fare; 0 trains no second model
 
     Raises

@@ -133,15 +133,11 @@ class MaskQuality:
     ----------
     connected_share : (K,) float64 array, of the vertices that a domain owns more than any other
         does, the share in its largest connected patch; 0 for a domain that owns none
-    n_owned : (K,) int64 array, those vertices
     domains_per_vertex : mean over vertices of 1 / Σ_k (M^{ki})², the effective number of domains
-    undivided_share : fraction of the vertices that belong to one domain by at least half
     """
 
     connected_share: FloatArray
-    n_owned: npt.NDArray[np.int64]
     domains_per_vertex: float
-    undivided_share: float
 
 
 def judge_masks(
@@ -167,7 +163,5 @@ def judge_masks(
     connected = np.array(in_patch) / np.maximum(n_owned, 1)
     return MaskQuality(
         connected_share=connected,
-        n_owned=n_owned.astype(np.int64),
         domains_per_vertex=float((1.0 / (mask**2).sum(axis=0)).mean()),
-        undivided_share=float((mask.max(axis=0) >= 0.5).mean()),
     )

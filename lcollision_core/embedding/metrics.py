@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.acap.features import N_FEATURES, N_ROTATION
 from lcollision_core.acap.scaling import FeatureScaling
+from lcollision_core.embedding.autoencoders import deviation_of
 from lcollision_core.embedding.seeding import principal_components
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray
@@ -19,7 +19,7 @@ _LARGEST = 1e9
 
 @dataclass(frozen=True)
 class EmbeddingMetrics:
-    """What training measured; lengths are normalised. Codes are fitted as `Embedding.encode` does.
+    """What training measured, in normalised lengths. Codes are fitted as `Embedding.encode` does.
 
     Attributes
     ----------
@@ -128,15 +128,10 @@ def feature_pca(
     projection : (V, 9, m) float64 array, codes are (features - offset) times it
     deviation : (m,) float64 array, root mean square of the training codes, > 0
     """
-    scaling = FeatureScaling.fit(features)
-    scale = np.where(
-        np.arange(N_FEATURES) < N_ROTATION, scaling.rotation_scale, scaling.stretch_scale
-    )
+    scale = FeatureScaling.fit(features).scale
     offset = features.mean(axis=0)
     rows = ((features - offset) * scale).reshape(len(features), -1)
     basis = principal_components(rows, max(1, min(n_numbers, len(features) - 1)))
-    deviation = np.sqrt(((rows @ basis.T) ** 2).mean(axis=0))
     shaped = basis.reshape(len(basis), *offset.shape)
-    floored = np.maximum(deviation, max(1e-3 * float(deviation.max()), 1e-6))
     projection = np.moveaxis(shaped * scale, 0, -1)
-    return LinearDecoder(shaped / scale, offset), projection, floored
+    return LinearDecoder(shaped / scale, offset), projection, deviation_of(rows @ basis.T)

@@ -17,28 +17,27 @@ from scipy import sparse
 from torch.autograd.function import once_differentiable
 
 from lcollision_core.acap.codec import AcapCodec
+from lcollision_core.embedding import autoencoders
 
 
 class _RingMean(torch.autograd.Function):
-    """A constant sparse matrix times a dense one; torch's own warns and differs by thread count."""
+    """`autoencoders.ring_mean`; torch's own sparse product warns and differs by thread count."""
 
     @staticmethod
-    def forward(ctx: Any, dense: torch.Tensor, ring: sparse.csr_matrix) -> torch.Tensor:
+    def forward(ctx: Any, values: torch.Tensor, ring: sparse.csr_matrix) -> torch.Tensor:
         ctx.ring = ring
-        return torch.from_numpy(ring @ dense.detach().numpy())
+        return torch.from_numpy(autoencoders.ring_mean(values.detach().numpy(), ring))
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_product: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return torch.from_numpy(ctx.ring.T @ by_product.numpy()), None
+    def backward(ctx: Any, grad_mean: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return torch.from_numpy(autoencoders.ring_mean(grad_mean.numpy(), ctx.ring.T)), None
 
 
 def ring_mean(values: torch.Tensor, ring: sparse.csr_matrix) -> torch.Tensor:
     """Average (m, n, 9) values over the one-rings, differentiably; `ring` is (n, n)."""
-    n_rows, n_vertices, width = values.shape
-    columns = values.permute(1, 0, 2).reshape(n_vertices, n_rows * width)
-    product: torch.Tensor = _RingMean.apply(columns, ring)  # type: ignore[no-untyped-call]
-    return product.reshape(n_vertices, n_rows, width).permute(1, 0, 2)
+    mean: torch.Tensor = _RingMean.apply(values, ring)  # type: ignore[no-untyped-call]
+    return mean
 
 
 class TiedAutoencoder(torch.nn.Module):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -17,45 +17,31 @@ from lcollision_core.embedding.autoencoders import (
     AutoencoderWeights,
     build_decoder,
     centre_features,
+    ring_average,
+    run_encoders,
 )
-from lcollision_core.embedding.checkpoint import Checkpoint
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.decoder import Float32Array
+from lcollision_core.embedding.latent_box import LatentBox
 from lcollision_core.embedding.masks import attention_mask, keep_one_patch
 from lcollision_core.embedding.network import TiedAutoencoder, decode_features, ring_mean
+from lcollision_core.embedding.run import Run
 from lcollision_core.embedding.seeding import (
+    domain_distances,
     initial_components,
-    locality_weights,
-    moving_parts,
-    part_distances,
+    moving_domains,
     principal_components,
     radius_of_overlap,
-    ring_average,
     vertex_areas,
 )
-from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
 
 _LOCALITY_START = 0.25
-"""Fraction of the windows' radius from which the locality loss rises."""
+"""Share of the windows' radius from which the locality loss rises."""
 
 _SAMPLED_POSES = 16
 _EPOCHS_BETWEEN_SAMPLES = 10
-
-Report = Callable[[str, int, int, float | None, float | None], None]
-"""Called with the stage, epochs done and in all, and the mean vertex errors of level 1 and of
-both levels, normalised, as far as known."""
-
-
-@dataclass(frozen=True)
-class BilevelWeights:
-    """What the stages learn; the attributes are those of `Embedding`."""
-
-    scaling: FeatureScaling
-    mean_features: Float32Array
-    level1: AutoencoderWeights
-    level2: tuple[AutoencoderWeights, ...]
-    attention_mask: Float32Array
 
 
 class BilevelTrainer:
@@ -64,14 +50,12 @@ class BilevelTrainer:
     Parameters
     ----------
     codec : of the reference
-    vertices : (N, V, 3) float64 array, aligned poses, normalised
+    vertices : (N, V, 3) float64 array, aligned poses, in normalised lengths
     features : (N, V, 9) float64 array, their unscaled features
     config : the choices
     seed : of the order of level 2's batches
-    name : of this trainer in the checkpoint
-    checkpoint : where to go on from and to save
-    report : called after each epoch
-    cancel : polled after each epoch; the checkpoint is written before the work stops
+    model : see `TrainingStatus`
+    run : whose stages these are
     """
 
     def __init__(
@@ -81,52 +65,69 @@ class BilevelTrainer:
         features: FloatArray,
         config: EmbeddingConfig,
         seed: int,
-        name: str,
-        checkpoint: Checkpoint,
-        report: Report,
-        cancel: CancelToken,
+        model: str,
+        run: Run,
     ) -> None:
-        self._codec, self._config, self._seed, self._name = codec, config, seed, name
-        self._checkpoint, self._report, self._cancel = checkpoint, report, cancel
+        self._codec, self._config, self._seed = codec, config, seed
+        self._model, self._run = model, run
         self._topology, self._rest = codec.topology, codec.rest_vertices
         self._vertices, self._features = vertices, features
         self._scaling = FeatureScaling.fit(features)
         self._mean = self._scaling.apply(features).mean(axis=0).astype(np.float32)
         self._centred = centre_features(features, self._scaling, self._mean)
         self._ring = ring_average(self._topology)
+        self._unscaling = build_decoder((), self._scaling, self._mean, self._topology)
         self._sample = np.unique(
             np.linspace(0, len(features) - 1, _SAMPLED_POSES).round().astype(np.int64)
         )
 
-    def train(self) -> BilevelWeights:
-        """Run both stages, or what is left of them.
+    def train(self) -> Embedding:
+        """Run both stages, or what is left of them; the codes are still the encoders' own.
 
         Raises
         ------
         CancelledError : the cancel token was set; the checkpoint holds the last epoch.
         """
-        level1, level1_output, level1_error = self._train_level1()
+        level1, output = self._train_level1()
         mask = attention_mask(level1.components, self._topology, self._rest)
-        level2 = self._train_level2(mask, level1_output, level1_error)
-        return BilevelWeights(self._scaling, self._mean, level1, level2, mask)
+        level2 = self._train_level2(mask, output)
+        latent = run_encoders(self._centred, level1, level2, mask, self._topology)
+        return Embedding(
+            topology=self._topology,
+            rest_vertices=self._rest,
+            alignment_weights=self._codec.anchor_weights,
+            scaling=self._scaling,
+            mean_features=self._mean,
+            level1=level1,
+            level2=level2,
+            attention_mask=mask,
+            training_latent=latent,
+            box=LatentBox.around(latent),
+            metrics=None,
+            config=asdict(self._config),
+            seed=self._seed,
+        )
 
-    def _train_level1(self) -> tuple[AutoencoderWeights, Float32Array, float]:
+    def _train_level1(self) -> tuple[AutoencoderWeights, Float32Array]:
         config, topology = self._config, self._topology
-        part = moving_parts(self._features, topology, self._rest, config.n_domains)
+        domain_of = moving_domains(self._features, topology, self._rest, config.n_domains)
         areas = vertex_areas(topology, self._rest)
-        distances = part_distances(part, topology, self._rest)
+        distances = domain_distances(domain_of, topology, self._rest)
         radius = radius_of_overlap(distances, config.window_overlap)
         start = initial_components(self._centred, distances, areas, radius)
-        weights = locality_weights(distances, (_LOCALITY_START * radius, radius))
-        locality = torch.from_numpy(weights.astype(np.float32))
+        # Measured from the domain, not from its strongest vertex as in the literature: a torso may
+        # be large and a hand small, and a domain cannot drift over the body.
+        rise_start = _LOCALITY_START * radius
+        rise = (distances - rise_start) / (radius - rise_start)
+        locality = torch.from_numpy(np.clip(rise, 0.0, 1.0).astype(np.float32))
         network = TiedAutoencoder(_of_mean_square_1(start), self._ring)
         features = torch.from_numpy(self._centred)
         around = ring_mean(features, network.ring)
         n_poses, n_vertices = self._centred.shape[:2]
-        error: float | None = None
-
-        def epoch(number: int, optimiser: torch.optim.Optimizer) -> None:
-            nonlocal error
+        self._run.level1_error = self._run.both_error = None
+        for number, optimiser in self._epochs(
+            "level 1", [network], config.level1_rate, 0.0, config.level1_epochs
+        ):
             optimiser.zero_grad()
             rebuilt = network(features, around)
             feature_loss = ((rebuilt - features) ** 2).sum() / (n_poses * n_vertices)
@@ -135,21 +136,19 @@ class BilevelTrainer:
             locality_loss = (locality * strength).sum() / n_vertices**0.5
             (feature_loss + config.locality_weight * locality_loss).backward()
             optimiser.step()
-            if error is None or number % _EPOCHS_BETWEEN_SAMPLES == 0:
-                error = self._sampled_error(rebuilt.detach().numpy())
-            self._report("level 1", number + 1, config.level1_epochs, error, None)
-
-        self._optimise("level1", [network], config.level1_rate, 0.0, config.level1_epochs, epoch)
+            if self._run.level1_error is None or number % _EPOCHS_BETWEEN_SAMPLES == 0:
+                self._run.level1_error = self._sampled_error(rebuilt.detach().numpy())
         with torch.no_grad():
             components = network.components.numpy()
             components[:] = keep_one_patch(components, topology, self._rest)
         trained = _weights_of(network, np.arange(n_vertices, dtype=np.int32))
         with torch.no_grad():
             output: Float32Array = network(features, around).numpy()
-        return trained, output, self._sampled_error(output)
+        self._run.level1_error = self._sampled_error(output)
+        return trained, output
 
     def _train_level2(
-        self, mask: Float32Array, level1_output: Float32Array, level1_error: float
+        self, mask: Float32Array, level1_output: Float32Array
     ) -> tuple[AutoencoderWeights, ...]:
         config = self._config
         n_poses, n_vertices = self._centred.shape[:2]
@@ -171,12 +170,13 @@ class BilevelTrainer:
             supports.append(support)
         indices = [torch.from_numpy(support.astype(np.int64)) for support in supports]
         base, wanted = torch.from_numpy(level1_output), torch.from_numpy(self._centred)
-        decoder = build_decoder((), self._scaling, self._mean, self._topology)
-        offset = torch.from_numpy(decoder.offset.astype(np.float32))
-        scale = torch.from_numpy(decoder.scale.astype(np.float32))
+        offset = torch.from_numpy(self._unscaling.offset.astype(np.float32))
+        scale = torch.from_numpy(self._unscaling.scale.astype(np.float32))
         targets = torch.from_numpy(self._vertices.astype(np.float32))
 
-        def epoch(number: int, optimiser: torch.optim.Optimizer) -> None:
+        for number, optimiser in self._epochs(
+            "level 2", networks, config.level2_rate, 1.0, config.level2_epochs
+        ):
             order = np.random.default_rng([self._seed, number]).permutation(n_poses)
             distance = 0.0
             for start in range(0, n_poses, config.batch_poses):
@@ -193,26 +193,24 @@ class BilevelTrainer:
                 (feature_loss + config.vertex_weight * squared.mean()).backward()
                 optimiser.step()
                 distance += float(squared.detach().sqrt().mean(dim=1).sum())
-            self._report(
-                "level 2", number + 1, config.level2_epochs, level1_error, distance / n_poses
-            )
-
-        self._optimise("level2", networks, config.level2_rate, 1.0, config.level2_epochs, epoch)
+            self._run.both_error = distance / n_poses
         return tuple(
             _weights_of(network, support)
             for network, support in zip(networks, supports, strict=True)
         )
 
-    def _optimise(
+    def _epochs(
         self,
         stage: str,
         networks: list[TiedAutoencoder],
         rate: float,
         decline: float,
         n_epochs: int,
-        epoch: Callable[[int, torch.optim.Optimizer], None],
-    ) -> None:
-        """Run the epochs that the checkpoint has not, and leave the networks trained."""
+    ) -> Iterator[tuple[int, torch.optim.Optimizer]]:
+        """Yield the epochs that the checkpoint has not, with the networks' optimiser.
+
+        The step sizes fall along a cosine, by the share `decline` until the end.
+        """
         layers = [network.components for network in networks]
         convolutions = [
             weight for network in networks for weight in (network.self_weight, network.ring_weight)
@@ -225,31 +223,33 @@ class BilevelTrainer:
         )
         parameters = layers + convolutions
         full_rates = [group["lr"] for group in optimiser.param_groups]
-        part = f"{self._name}/{stage}"
-        stored = self._checkpoint.get(part)
-        done = 0
-        if stored is not None:
-            done = int(stored.metadata["epochs"])
-            _load_state(stored.arrays, parameters, optimiser)
-        for number in range(done, n_epochs):
+
+        def save() -> dict[str, npt.NDArray[Any]]:
+            states = optimiser.state_dict()["state"]
+            return {
+                f"{number}_{key}": tensor.numpy().copy()
+                for number, parameter in enumerate(parameters)
+                for key, tensor in {"value": parameter.detach(), **states[number]}.items()
+            }
+
+        def load(arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+            for number, parameter in enumerate(parameters):
+                tensors = {
+                    key: torch.tensor(arrays[f"{number}_{key}"])
+                    for key in ("value", "exp_avg", "exp_avg_sq", "step")
+                }
+                parameter.data.copy_(tensors.pop("value"))
+                optimiser.state[parameter] = tensors
+
+        for number in self._run.steps(self._model, stage, n_epochs, load, save):
             fade = 1.0 - decline * 0.5 * (1.0 - np.cos(np.pi * number / n_epochs))
             for group, full_rate in zip(optimiser.param_groups, full_rates, strict=True):
                 group["lr"] = full_rate * fade
-            epoch(number, optimiser)
-            last = number + 1 == n_epochs
-            if last or self._cancel.cancelled or self._checkpoint.due:
-                self._checkpoint.put(
-                    part,
-                    _state_arrays(parameters, optimiser),
-                    {"epochs": number + 1},
-                    now=last or self._cancel.cancelled,
-                )
-            self._cancel.raise_if_cancelled()
+            yield number, optimiser
 
     def _sampled_error(self, output: npt.NDArray[np.floating]) -> float:
         """Return the mean vertex error, normalised, of a few poses rebuilt as `output`."""
-        decoder = build_decoder((), self._scaling, self._mean, self._topology)
-        features = decoder.offset + decoder.scale * output[self._sample]
+        features = self._unscaling.offset + self._unscaling.scale * output[self._sample]
         distance = self._codec.decode(features) - self._vertices[self._sample]
         return float(np.linalg.norm(distance, axis=2).mean())
 
@@ -270,27 +270,3 @@ def _weights_of(network: TiedAutoencoder, support: npt.NDArray[np.int32]) -> Aut
             ring_weight=network.ring_weight.numpy().copy(),
             support=support,
         )
-
-
-def _state_arrays(
-    parameters: Iterable[torch.nn.Parameter], optimiser: torch.optim.Optimizer
-) -> dict[str, npt.NDArray[Any]]:
-    arrays = {}
-    for number, parameter in enumerate(parameters):
-        state = optimiser.state[parameter]
-        arrays[f"{number}_value"] = parameter.detach().numpy().copy()
-        for key in ("exp_avg", "exp_avg_sq", "step"):
-            arrays[f"{number}_{key}"] = state[key].numpy().copy()
-    return arrays
-
-
-def _load_state(
-    arrays: Any, parameters: Iterable[torch.nn.Parameter], optimiser: torch.optim.Optimizer
-) -> None:
-    with torch.no_grad():
-        for number, parameter in enumerate(parameters):
-            parameter.copy_(torch.from_numpy(np.array(arrays[f"{number}_value"])))
-            optimiser.state[parameter] = {
-                key: torch.from_numpy(np.array(arrays[f"{number}_{key}"]))
-                for key in ("exp_avg", "exp_avg_sq", "step")
-            }

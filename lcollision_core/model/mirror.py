@@ -185,8 +185,8 @@ class PoseMirror:
         else:
             # In its place: a rigid motion left to the fit would be one more thing to undo, and
             # the codes hold it nearly as well.
-            fit = self.embedding.encode(image[None], cancel=cancel, in_place=True)
-            found = fit.latent[0].astype(np.float64)
+            fit = self.embedding.encode(image, cancel, in_place=True)
+            found = fit.latent.astype(np.float64)
         check = replace(check, placement=place)
         mirrored = check.decode(found)[0]
         pairs_mirrored = pairs_after = len(check.find(check.exported(mirrored)).pairs)

@@ -331,13 +331,13 @@ class PoseModel:
         CancelledError : `cancel` was set.
         """
         mesh = checked_mesh(vertices, self.reference, self.topology, self.name, scale)
-        fit = self.embedding.encode(mesh[None] / self.card.height, cancel=cancel)
-        aligning = RigidTransform(fit.rotations[0], fit.translations[0] * self.card.height, scale)
+        fit = self.embedding.encode(mesh / self.card.height, cancel)
+        aligning = RigidTransform(fit.rotation, fit.translation * self.card.height, scale)
         return EncodedPose(
-            latent=fit.latent[0].astype(np.float64),
+            latent=fit.latent.astype(np.float64),
             placement=aligning.inverse(),
-            fit_error_mean=float(fit.mean_error[0]),
-            fit_error_max=float(fit.max_error[0]),
+            fit_error_mean=fit.mean_error,
+            fit_error_max=fit.max_error,
         )
 
     def require_topology(self, topology: Topology, source: str) -> None:

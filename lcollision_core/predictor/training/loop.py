@@ -197,7 +197,7 @@ class TrainingLoop:
             part = roots[start : start + step]
             self._label_patches(labeller, start, part, processes)
             if processes.rank == 0:
-                kept.put(_PATCHES, {"root": roots[: start + len(part)]}, {}, now=True)
+                kept.put(_PATCHES, {"root": roots[: start + len(part)]}, {})
         return roots
 
     def _label_patches(
@@ -301,7 +301,7 @@ class TrainingLoop:
             for name, values in moments.items():
                 state[f"{_OPTIMISER}{number}:{name}"] = values.cpu().numpy()
         facts = {"step": step, "losses": self._losses, "accuracy": self._accuracy}
-        checkpoint.put(_PART, state, facts, now=True)
+        checkpoint.put(_PART, state, facts)
 
     def _restore(
         self, checkpoint: Checkpoint, network: PredictorNetwork, optimiser: torch.optim.Optimizer

@@ -27,8 +27,8 @@ BARS = {
     ),
     "embedding": (
         "from app.cli.train import _embedding_bar as bar\n"
-        "from lcollision_core.embedding.training import TrainingStatus\n"
-        "status = TrainingStatus('held out', 'level 2', 1, 4, 40, 100, 0.04, 0.01)\n"
+        "from lcollision_core.embedding.run import TrainingStatus\n"
+        "status = TrainingStatus('held out', 'level 2', 40, 100, 0.04, 0.01)\n"
         "made = bar()",
         ("held out: learning level 2", "40%", "error level 1 4.00 %, both levels 1.00 %"),
     ),

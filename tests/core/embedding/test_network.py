@@ -1,225 +1,24 @@
-"""Motion parts, attention masks, the networks and the tables made of them."""
+"""The networks of both levels, and the tables made of them."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from scipy import sparse
 
 from lcollision_core.acap.codec import AcapCodec
 from lcollision_core.acap.scaling import FeatureScaling
 from lcollision_core.embedding.autoencoders import (
     AutoencoderWeights,
     build_decoder,
+    ring_average,
     run_encoders,
 )
 from lcollision_core.embedding.decoder import DecoderGroup, FeatureDecoder
-from lcollision_core.embedding.masks import LEAST_SHARE, attention_mask, judge_masks, keep_one_patch
 from lcollision_core.embedding.network import TiedAutoencoder, decode_features, ring_mean
-from lcollision_core.embedding.seeding import (
-    bridged_edges,
-    locality_weights,
-    moving_parts,
-    part_distances,
-    principal_components,
-    radius_of_overlap,
-    ring_average,
-    vertex_areas,
-)
-from lcollision_core.errors import PoseSetError, ShapeError
-from lcollision_core.meshes import Topology
-from tests.core.shapes import Mesh, join, sphere
-
-FloatArray = npt.NDArray[np.float64]
-
-
-def strip(n_columns: int) -> Mesh:
-    """Make a flat strip along x, two vertices wide, one unit a column."""
-    vertices = [[float(x), float(y), 0.0] for x in range(n_columns) for y in range(2)]
-    faces = []
-    for x in range(n_columns - 1):
-        a = 2 * x
-        faces += [[a, a + 2, a + 1], [a + 1, a + 2, a + 3]]
-    return Mesh(np.array(vertices), np.array(faces, dtype=np.int32))
-
-
-def turning_in_blocks(blocks: list[int], n_poses: int = 6) -> FloatArray:
-    """Features of a strip whose blocks of columns turn each by its own angles."""
-    rng = np.random.default_rng(0)
-    features = np.zeros((n_poses, 2 * sum(blocks), 9))
-    features[..., [3, 6, 8]] = 1.0
-    start = 0
-    for columns in blocks:
-        angles = rng.uniform(-2.0, 2.0, (n_poses, 1, 3))
-        features[:, 2 * start : 2 * (start + columns), :3] = angles
-        start += columns
-    return features
-
-
-def test_parts_are_the_blocks_that_turn_as_one() -> None:
-    blocks = [9, 4, 7]
-    mesh = strip(20)
-    part = moving_parts(turning_in_blocks(blocks), mesh.topology, mesh.vertices / 19.0, 3)
-    # Part 0 is the one farthest along the longest side.
-    expected = np.repeat([2, 1, 0], [2 * columns for columns in blocks])
-    assert part.tolist() == expected.tolist()
-
-
-def test_parts_that_turn_alike_but_lie_apart_stay_apart() -> None:
-    mesh = strip(20)
-    features = turning_in_blocks([6, 8, 6])
-    features[:, 28:] = features[:, :12]
-    part = moving_parts(features, mesh.topology, mesh.vertices / 19.0, 3)
-    assert part.tolist() == np.repeat([2, 1, 0], [12, 16, 12]).tolist()
-
-
-def test_loose_parts_and_lone_vertices_join_the_body() -> None:
-    far = strip(3).moved([0.0, 5.0, 0.0])
-    mesh = join(strip(8), far)
-    vertices = np.concatenate([mesh.vertices, [[20.0, 0.0, 0.0]]])
-    topology = Topology(mesh.faces, len(vertices))
-    edges = bridged_edges(topology, vertices)
-    assert len(edges) == len(topology.edges) + 2
-    matrix = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2)
-    assert sparse.csgraph.connected_components(matrix, directed=False)[0] == 1
-    features = np.zeros((3, len(vertices), 9))
-    part = moving_parts(features, topology, vertices / 20.0, 2)
-    assert sorted(set(part.tolist())) == [0, 1]
-    assert (vertex_areas(topology, vertices) > 0.0).all()
-
-
-def test_impossible_numbers_of_parts_are_refused() -> None:
-    mesh = strip(3)
-    features = turning_in_blocks([3])
-    for n_parts in (0, 7):
-        with pytest.raises(PoseSetError, match=f"cannot have {n_parts} domains"):
-            moving_parts(features, mesh.topology, mesh.vertices, n_parts)
-    assert sorted(moving_parts(features, mesh.topology, mesh.vertices, 6).tolist()) == list(
-        range(6)
-    )
-    with pytest.raises(ShapeError, match="features"):
-        moving_parts(features[:, :-1], mesh.topology, mesh.vertices, 2)
-
-
-def test_locality_rises_with_the_distance_from_the_part() -> None:
-    mesh = strip(11)
-    part = np.zeros(22, dtype=np.int32)
-    part[:2] = 1
-    distances = part_distances(part, mesh.topology, mesh.vertices)
-    weights = locality_weights(distances, (0.1, 0.5))
-    assert (weights[0, 2:] == 0.0).all()
-    assert (weights[1, :2] == 0.0).all()
-    columns = weights[1, ::2]
-    assert all(later >= earlier for earlier, later in pairwise(columns))
-    # Along edges the farthest vertices are 11 apart: 10 columns and once across.
-    assert columns[3] == pytest.approx((3 / 11 - 0.1) / 0.4)
-    assert columns[[1, 6, 10]].tolist() == [0.0, 1.0, 1.0]
-
-
-def test_reach_gives_the_overlap_asked_for() -> None:
-    mesh = strip(40)
-    part = np.repeat(np.arange(4, dtype=np.int32), 20)
-    distances = part_distances(part, mesh.topology, mesh.vertices)
-    for overlap in (1.3, 2.0):
-        radius = radius_of_overlap(distances, overlap)
-        squared = np.clip(1.0 - distances / radius, 0.0, 1.0) ** 2
-        shares = squared / squared.sum(axis=0)
-        assert (1.0 / (shares**2).sum(axis=0)).mean() == pytest.approx(overlap, abs=1e-3)
-    assert radius_of_overlap(distances, 9.0) == radius_of_overlap(distances, 2.5)
-    alone = part_distances(np.zeros(80, dtype=np.int32), mesh.topology, mesh.vertices)
-    assert radius_of_overlap(alone, 3.0) > 0.0
-
-
-def test_principal_components_are_orthonormal_and_ordered() -> None:
-    rng = np.random.default_rng(1)
-    axes = np.linalg.qr(rng.standard_normal((12, 3)))[0].T
-    rows = rng.standard_normal((40, 3)) * [5.0, 2.0, 0.5] @ axes
-    found = principal_components(rows, 5)
-    assert found @ found.T == pytest.approx(np.eye(5), abs=1e-12)
-    assert np.abs(np.linalg.svd(rows)[2][:3] @ found[:3].T) == pytest.approx(np.eye(3), abs=1e-9)
-    assert (found[np.arange(5), np.abs(found).argmax(axis=1)] > 0.0).all()
-
-
-def test_mask_shares_by_squared_weight() -> None:
-    mesh = strip(3)
-    components = np.zeros((2, 6, 9))
-    components[0, :, 0] = 1.0
-    components[1, :, 1:4] = [0.0, 2.0, 0.0]
-    components[1, 0] = 0.0
-    mask = attention_mask(components, mesh.topology, mesh.vertices)
-    assert mask.dtype == np.float32
-    assert mask[:, 0].tolist() == [1.0, 0.0]
-    assert mask[:, 1:] == pytest.approx(np.repeat([[0.2], [0.8]], 5, axis=1))
-
-
-def test_masks_sum_to_one_and_have_an_edge() -> None:
-    rng = np.random.default_rng(0)
-    mesh = strip(32)
-    n_vertices = mesh.topology.n_vertices
-    components = (
-        rng.standard_normal((5, n_vertices, 9)) * rng.uniform(0, 1, (5, n_vertices, 1)) ** 6
-    )
-    mask = attention_mask(components, mesh.topology, mesh.vertices)
-    assert mask.sum(axis=0) == pytest.approx(np.ones(n_vertices), abs=1e-6)
-    assert ((mask == 0.0) | (mask >= LEAST_SHARE)).all()
-    assert (mask == 0.0).any()
-
-
-def test_untouched_vertices_take_their_nearest_owners_mask() -> None:
-    body, loose = strip(6), strip(2).moved([7.0, 0.0, 0.0])
-    mesh = join(body, loose)
-    components = np.zeros((2, mesh.topology.n_vertices, 9))
-    components[0, :2, 0] = 1.0
-    components[1, 10:12, 0] = 1.0
-    mask = attention_mask(components, mesh.topology, mesh.vertices)
-    assert mask[0, :6].tolist() == [1.0] * 6
-    assert mask[1, 6:].tolist() == [1.0] * 10
-    assert np.isfinite(mask).all()
-    with pytest.raises(ShapeError, match="all weights"):
-        attention_mask(np.zeros_like(components), mesh.topology, mesh.vertices)
-
-
-def test_islands_go_to_the_next_strongest_component() -> None:
-    mesh = strip(12)
-    components = np.zeros((3, 24, 9), dtype=np.float32)
-    components[0, :16, 0] = 2.0
-    components[1, 12:, 1] = 3.0
-    components[1, 4:6, 1] = 3.0
-    components[2, 10:12, 2] = 1.0
-    components[2, 20:22, 2] = 4.0
-    # The norms do not count, so that the last is no stronger for being longer.
-    components[2] *= 0.1
-    before = components.copy()
-    kept = keep_one_patch(components, mesh.topology, mesh.vertices)
-    assert np.array_equal(components, before)
-    units = kept / np.linalg.norm(kept.reshape(3, -1), axis=1)[:, None, None]
-    mask = attention_mask(units, mesh.topology, mesh.vertices)
-    quality = judge_masks(mask, mesh.topology, mesh.vertices)
-    assert quality.connected_share.tolist() == [1.0, 1.0, 1.0]
-    # Domain 2 cuts two vertices off the end of domain 1, which nobody else touches.
-    assert mask.argmax(axis=0).tolist() == [0] * 12 + [1] * 8 + [2] * 4
-    assert (kept[1, 4:6] == 0.0).all()
-    assert (kept[1, 22:] == 0.0).all()
-    assert np.array_equal(kept[2], components[2])
-
-
-def test_mask_quality_counts_patches_and_overlap() -> None:
-    mesh = strip(10)
-    mask = np.zeros((3, 20))
-    mask[0, :16] = 1.0
-    mask[1, 16:] = 1.0
-    mask[:2, 4:8] = [[0.0], [1.0]]
-    quality = judge_masks(mask, mesh.topology, mesh.vertices)
-    assert quality.connected_share.tolist() == [8 / 12, 0.5, 0.0]
-    assert quality.n_owned.tolist() == [12, 8, 0]
-    assert quality.domains_per_vertex == 1.0
-    mask[:] = 1.0 / 3.0
-    assert judge_masks(mask, mesh.topology, mesh.vertices).domains_per_vertex == pytest.approx(3.0)
-    assert judge_masks(mask, mesh.topology, mesh.vertices).undivided_share == 0.0
+from tests.core.embedding.strips import strip
+from tests.core.shapes import Mesh, sphere
 
 
 def small_network(n_codes: int, seed: int, mesh: Mesh) -> TiedAutoencoder:
