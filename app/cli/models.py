@@ -78,7 +78,7 @@ def info(
     model = PoseModel.load(model_name)
     report = describe(model)
     if figure is not None:
-        from app.view.figures import draw_masks
+        from app.view.masks_figure import draw_masks
 
         draw_masks(model, figure)
         note(f"drew the domains of {model.name} to {figure}")

@@ -12,6 +12,7 @@ from app.cli.console import progress_bar, tell
 from app.cli.inputs import PosesArgument, ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
+from app.cli.partial_output import unfinished_poses
 from app.cli.results import (
     FormatOption,
     FormOutput,
@@ -22,7 +23,6 @@ from app.cli.results import (
     require_output,
     write_result,
 )
-from app.cli.unfinished import unfinished_poses
 from app.wording import fit_error
 from lcollision_core.errors import LCollisionError, PoseSetError
 

@@ -13,6 +13,7 @@ from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_b
 from app.cli.inputs import ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
+from app.cli.partial_output import UnfinishedPoses, unfinished_poses
 from app.cli.results import (
     FormatOption,
     FormOutput,
@@ -22,7 +23,6 @@ from app.cli.results import (
     require_one_mesh,
     write_result,
 )
-from app.cli.unfinished import UnfinishedPoses, unfinished_poses
 from app.wording import counted, fit_error
 from lcollision_core.errors import LCollisionError, ModelFileError
 

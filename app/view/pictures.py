@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, QTimer, Signal, Slot
 
-from app.view.rendering import PoseRenderer, save_png
+from app.view.offscreen import PoseRenderer, save_png
 from app.view.theme import current_theme
 from app.view.turntable import TurntableStyle, TurntableVideo
 from app.work.threads import guarded

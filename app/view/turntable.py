@@ -16,7 +16,7 @@ from lcollision_core.jobs import CancelToken, Progress
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from app.view.rendering import PoseRenderer
+    from app.view.offscreen import PoseRenderer
 
 FORMATS = (".gif", ".webp", ".png")
 """A GIF has 256 colours, a WebP all of them, and PNG is a folder of numbered pictures."""

@@ -41,7 +41,7 @@ from app.window.shortcuts import WindowShortcuts
 from app.window.status_bar import StatusBar
 from app.window.view_actions import ViewActions
 from app.wording import one_line
-from app.work.preparing import Preparing
+from app.work.compiling import Preparing
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 

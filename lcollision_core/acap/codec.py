@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.acap.bridges import component_bridges
+from lcollision_core.acap.components import component_bridges
 from lcollision_core.acap.consistency import component_roots, consistent_logarithms
 from lcollision_core.acap.features import (
     N_FEATURES,

@@ -18,7 +18,7 @@ from lcollision_core.contact.kernels import (
     add_vertex_energy,
     search_pose,
 )
-from lcollision_core.contact.near import near_vertices
+from lcollision_core.contact.near_exclusion import near_vertices
 from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from lcollision_core.acap.bridges import component_bridges
+from lcollision_core.acap.components import component_bridges
 from lcollision_core.acap.features import N_FEATURES, N_ROTATION
 from lcollision_core.errors import PoseSetError
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph

@@ -10,7 +10,6 @@ from lcollision_core.model.export import (
     export_frame,
     export_mesh,
 )
-from lcollision_core.model.keeping import change_model, save_trained
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace
 from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry, fingerprint_of_pose
 from lcollision_core.model.model_store import (
@@ -37,6 +36,7 @@ from lcollision_core.model.pose_file import (
 from lcollision_core.model.pose_library import LibraryChange, PoseLibrary, user_poses_folder
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.model.sampling import sample_poses
+from lcollision_core.model.saving import change_model, save_trained
 
 __all__ = [
     "EXPORT_SCALES",

@@ -3,9 +3,9 @@
 from lcollision_core.resolve.exact import ExactCheck, exported_vertices
 from lcollision_core.resolve.free_poses import find_free_poses
 from lcollision_core.resolve.ladder import ALL_LOCKED
+from lcollision_core.resolve.motion import largest_correction_change
 from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult, Solver, Step
 from lcollision_core.resolve.resolver import PoseResolver
-from lcollision_core.resolve.sequence import largest_correction_change
 
 __all__ = [
     "ALL_LOCKED",

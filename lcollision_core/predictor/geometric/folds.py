@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector, SelfCollisions
-from lcollision_core.contact.near import are_pairs_near, near_vertices
+from lcollision_core.contact.near_exclusion import are_pairs_near, near_vertices
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.inference.points import (

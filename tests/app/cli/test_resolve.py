@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.cli import unfinished
+from app.cli import partial_output
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import (
@@ -485,15 +485,15 @@ def test_a_name_with_a_dot_that_is_no_format_is_a_folder(
 
 _STOP_AFTER_TWO = """
 import os, signal, sys
-from app.cli import main, unfinished
+from app.cli import main, partial_output
 how = getattr(signal, sys.argv.pop(1))
-unfinished._SECONDS_BETWEEN_WRITES, unfinished._LARGEST_FRACTION = 0.0, 1.0
-keep = unfinished.UnfinishedPoses.keep
+partial_output._SECONDS_BETWEEN_WRITES, partial_output._LARGEST_FRACTION = 0.0, 1.0
+keep = partial_output.UnfinishedPoses.keep
 def keep_two(self, *arguments):
     keep(self, *arguments)
     if len(self.finished) >= 2:
         os.kill(os.getpid(), how)
-unfinished.UnfinishedPoses.keep = keep_two
+partial_output.UnfinishedPoses.keep = keep_two
 main.main()
 """
 
@@ -595,7 +595,7 @@ def test_a_full_disk_loses_nothing_of_what_an_earlier_run_left(
 
     with monkeypatch.context() as full:
         full.setattr("lcollision_core.model.write_poses", write)
-        full.setattr(unfinished, "_SECONDS_BETWEEN_WRITES", -1.0)
+        full.setattr(partial_output, "_SECONDS_BETWEEN_WRITES", -1.0)
         result = lcollision("resolve", model_file, poses, "-o", out, "--workers", "1")
     assert result.exit_code == 2
     # Once for what is kept, and once for the output.

@@ -20,7 +20,7 @@ from app.editing.document import PoseDocument
 from app.view.camera import View
 from app.view.canvas import Canvas
 from app.view.legend import LegendStrip
-from app.view.rendering import PoseRenderer
+from app.view.offscreen import PoseRenderer
 from app.view.shading import Shading
 from app.view.theme import DARK, LIGHT, apply_theme
 from app.view.turntable import TurntableStyle

@@ -35,7 +35,7 @@ from app.window.main_window import MainWindow
 from app.window.status_bar import StatusBar
 from app.window.widgets import HANDLE
 from app.work import jobs
-from app.work.preparing import REASON
+from app.work.compiling import REASON
 from app.work.threads import Failure
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes import read_mesh, write_mesh

@@ -15,7 +15,7 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.window.garbage import GarbageCollector
+from app.window.garbage_collection import GarbageCollector
 from app.work.frames import FrameEvaluator, LiveFrame
 from app.work.long_work import LongWork
 from app.work.threads import Failure

@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from app.view.camera import preset_view
+from app.view.offscreen import PoseRenderer, save_png
 from app.view.palettes import LIGHT
-from app.view.rendering import PoseRenderer, save_png
 from app.view.shading import mask_colours
 
 if TYPE_CHECKING:

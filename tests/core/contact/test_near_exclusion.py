@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.contact import DEPTH_TOLERANCE, CollisionDetector, near
+from lcollision_core.contact import DEPTH_TOLERANCE, CollisionDetector
+from lcollision_core.contact import near_exclusion as near_exclusion_module
 from lcollision_core.errors import ShapeError
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import Mesh, grid, join, random_rotation, soup, strip
@@ -189,10 +190,10 @@ def test_a_limit_that_is_no_length_is_refused(near_exclusion: float) -> None:
 
 def test_a_table_beyond_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = grid(30)
-    whole = near.near_vertices(mesh.topology, mesh.vertices, 10.0)
+    whole = near_exclusion_module.near_vertices(mesh.topology, mesh.vertices, 10.0)
     assert len(whole.vertex) == len(mesh.vertices) ** 2
-    monkeypatch.setattr(near, "MAX_NEAR", len(whole.vertex))
-    near.near_vertices(mesh.topology, mesh.vertices, 10.0)
-    monkeypatch.setattr(near, "MAX_NEAR", len(whole.vertex) - 1)
+    monkeypatch.setattr(near_exclusion_module, "MAX_NEAR", len(whole.vertex))
+    near_exclusion_module.near_vertices(mesh.topology, mesh.vertices, 10.0)
+    monkeypatch.setattr(near_exclusion_module, "MAX_NEAR", len(whole.vertex) - 1)
     with pytest.raises(ShapeError, match=r"near exclusion .* make it smaller"):
         CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=10.0)
