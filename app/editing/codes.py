@@ -18,11 +18,11 @@ FloatArray = npt.NDArray[np.float64]
 
 
 class CodeEditing(PoseHistory):
-    """Edits the working pose of a model by its codes; `PoseDocument` tells of the signals.
+    """Edits the working pose of a model by its codes; see `PoseDocument` for the signals.
 
     Attributes
     ----------
-    locked_domains : that Resolve, Randomise, Reset all and blending leave as they are
+    locked_domains : not changed by Resolve, Randomise, Reset all and blending
     """
 
     locks_changed = Signal()
@@ -35,7 +35,7 @@ class CodeEditing(PoseHistory):
 
     @property
     def has_model(self) -> bool:
-        """Whether the first model is in."""
+        """Whether a model is loaded."""
         return self._model is not None
 
     @property
@@ -62,12 +62,12 @@ class CodeEditing(PoseHistory):
         self._set_codes(f"Reset {self.code_name(index)}", index, 0.0)
 
     def reset_all(self) -> None:
-        """Set all numbers to 0, but for those of locked domains."""
+        """Set all numbers to 0, except those of locked domains."""
         self._tell_if_locked()
         self._edit("Reset all", self._with_locked(np.zeros_like(self.latent)))
 
     def randomise(self, amount: float, seed: int) -> None:
-        """Move the pose towards a random one, but for its locked domains.
+        """Move the pose towards a random one, except its locked domains.
 
         Parameters
         ----------
@@ -81,7 +81,7 @@ class CodeEditing(PoseHistory):
         self._edit("Randomise", self._with_locked(latent))
 
     def blend_towards(self, latent: npt.ArrayLike, fraction: float) -> None:
-        """Blend from the pose at the gesture's begin, fraction 0, to a (D,) other one, 1.
+        """Blend from the pose at the start of the gesture, fraction 0, to another (D,) one, 1.
 
         Locked domains stay as they are.
         """
@@ -91,13 +91,13 @@ class CodeEditing(PoseHistory):
         self._edit("Blend", self._with_locked(blended))
 
     def code_name(self, index: int) -> str:
-        """Return what a person would call one number of the latent."""
+        """Return the display name of one latent entry."""
         group = next(g for g in self.model.latent_space.groups if index < g.codes.stop)
         name = self.model.code_names[index]
         return name if group.colour is None else f"{group.name}, {name}"
 
     def reset_domain(self, domain: int) -> None:
-        """Set all numbers of a domain to 0: its own, and the whole body's that its lock holds."""
+        """Set all numbers of a domain to 0: its own, and its entry of the whole body."""
         codes = self.model.embedding.codes_of([domain])
         self._set_codes(f"Reset {self.model.domain_names[domain]}", codes, 0.0)
 
@@ -107,7 +107,7 @@ class CodeEditing(PoseHistory):
         self._edit(label, latent, run)
 
     def set_locked(self, domain: int, locked: bool) -> None:
-        """Lock a domain against Resolve, Randomise, Reset all and blending, or let it go."""
+        """Lock a domain against Resolve, Randomise, Reset all and blending, or unlock it."""
         changed = self.locked_domains | {domain} if locked else self.locked_domains - {domain}
         if changed != self.locked_domains:
             self.locked_domains = changed
@@ -115,7 +115,7 @@ class CodeEditing(PoseHistory):
             self.locks_changed.emit()
 
     def _follow_locks(self) -> None:
-        """Tell the workers, before the widgets, that the locks are others."""
+        """Notify the workers, then the widgets, of changed locks."""
 
     def training_pose(self, number: int) -> NamedPose:
         """Return a training pose of the model by its number, from 0."""
@@ -133,5 +133,5 @@ class CodeEditing(PoseHistory):
             self.message.emit("All body parts are locked; unlock one to move the pose")
 
     def _with_locked(self, latent: FloatArray) -> FloatArray:
-        """Return the latent with the present codes of locked domains."""
+        """Return the latent with the current codes of locked domains."""
         return np.where(self.model.embedding.codes_of(self.locked_domains), self.latent, latent)

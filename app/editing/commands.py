@@ -1,4 +1,4 @@
-"""The undo command of the editor: the document's state before and after one act."""
+"""The undo command of the editor: the document's state before and after one action."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from lcollision_core.resolve import ResolveResult
 
 MERGE_SECONDS = 1.0
-"""Steps on one slider that follow each other this fast are one step of undo."""
+"""Seconds within which steps on one slider merge into one step of undo."""
 
 _MERGE_ID = 1
 
@@ -47,7 +47,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class DocumentState:
-    """All that undo brings back, but for the library, which changes by `LibraryChange`.
+    """All that undo restores, except the library, which changes by `LibraryChange`.
 
     Attributes
     ----------
@@ -82,10 +82,10 @@ class ChangeState(QUndoCommand):
 
     Parameters
     ----------
-    label : what the menu calls the act
+    label : the name of the action in the menu
     apply : puts a state into the document and makes changes to the library; a method of the
         document, as commands know no widget
-    before, after : the two states, which `PoseHistory` may amend
+    before, after : the two states, which `PoseHistory` may change
     run : steps of one run on one slider merge when they follow fast; None never merges
     changes : of the library, one after the other
     """

@@ -56,7 +56,7 @@ class PoseDocument(CodeEditing):
     ----------
     model_file : that the model was read from, or the name of one that was not
     frame : the newest computed one; while a slider moves, an instant behind `latent`
-    exact : the exact check of `latent`; None until it is known
+    exact : the exact check of `latent`; None until then
     may_replace : asked before a model or a file comes in over edits made while it was read
 
     Signals
@@ -194,7 +194,7 @@ class PoseDocument(CodeEditing):
     # Models and files.
 
     def set_model(self, model: PoseModel) -> None:
-        """Put in another model, with a new pose and the user's library of it.
+        """Load another model, with a new pose and the user's library of it.
 
         Parameters
         ----------
@@ -245,7 +245,7 @@ class PoseDocument(CodeEditing):
         self._tell_modified()
 
     def open_model(self, name_or_path: str | Path) -> None:
-        """Read a model in the long worker and put it in."""
+        """Read a model in the long worker and load it."""
         self._bring(
             f"Opening {name_or_path}", partial(jobs.open_model, name_or_path), self._on_model
         )
@@ -263,7 +263,7 @@ class PoseDocument(CodeEditing):
         self._long.start("Saving the body parts", work, self._on_parts)
 
     def new_pose(self) -> None:
-        """Start anew: the reference pose, unnamed, no file, no history; the library stays."""
+        """Start again from the reference pose: unnamed, no file, no history; the library stays."""
         self._long.cancel(self._incoming)
         self._begin(self._blank(), None)
 
@@ -283,7 +283,7 @@ class PoseDocument(CodeEditing):
         self._bring(f"Opening {Path(path).name}", work, self._on_poses)
 
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
-        """Read what a crash left, as `LostPose` tells of it, and make it the pose, unsaved."""
+        """Restore what a crash left, see `LostPose`, as the unsaved pose."""
         model = self.model if model_file == self.model_file else None
 
         work = partial(jobs.read_poses, model, model_file, poses_file)
@@ -358,11 +358,11 @@ class PoseDocument(CodeEditing):
         self._exports.append(self._long.start(label, work, self.message.emit))
 
     def finish_exports(self) -> None:
-        """Write here and now what still waits to be exported, as before the window closes.
+        """Write at once what still waits to be exported, as before the window closes.
 
         Raises
         ------
-        MeshFileError : a file cannot be written; asked again, the others are.
+        MeshFileError : a file cannot be written; called again, the others are.
         """
         for number in self._exports:
             self._long.finish(number)
@@ -403,7 +403,7 @@ class PoseDocument(CodeEditing):
             self.solve_finished.emit(None)
 
     def cancel_all(self) -> None:
-        """Stop all long work but the loading of the predictor."""
+        """Stop all long work except loading the predictor."""
         self.cancel_resolve()
         self._long.cancel_all()
         self._load_predictor()
@@ -426,7 +426,7 @@ class PoseDocument(CodeEditing):
         ended = [self._live.close(deadline), self._long.close(deadline)]
         return all(ended)
 
-    # What the workers answer.
+    # The results of the workers.
 
     @Slot(object)
     def _on_frame_computed(self, frame: LiveFrame) -> None:
@@ -555,7 +555,7 @@ class PoseDocument(CodeEditing):
         self.solve_finished.emit(result)
 
     def _load_predictor(self) -> None:
-        """Have predictions soon: the pose is shown, and can be edited, before."""
+        """Load the predictor in the background; the pose can be edited meanwhile."""
         if self.can_resolve and not self._predicts and not self._closed:
             work = partial(jobs.load_predictor, self.model)
             self._loading = self._long.start("Loading predictions", work, self._on_predictor)
@@ -566,9 +566,9 @@ class PoseDocument(CodeEditing):
             self._live.follow(self.model, self.latent, self._predicts)
 
     def _bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:
-        """Start what will bring another pose; the newest such wish wins, also over Resolve.
+        """Start work that replaces the pose; the newest request wins, also over Resolve.
 
-        What undo does not take back is to `ask` before it comes in over later edits.
+        What undo cannot restore must `ask` before it replaces later edits.
         """
         self.cancel_resolve()
         self._long.cancel(self._incoming)

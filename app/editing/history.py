@@ -24,20 +24,20 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 UNNAMED = "pose"
-"""What a pose without a name is called."""
+"""Name of a pose without a name."""
 
 UNDO_STEPS = 1000
-"""Kept at most: a step is a few kilobytes, so that memory stays small however long one edits."""
+"""Most steps kept: each is a few kilobytes, so memory stays small however long one edits."""
 
 
 class PoseHistory(QObject):
-    """The working pose and the user's library, and how both came to be.
+    """The working pose and the user's library, and their history.
 
     Every change of either is one step of `undo_stack`. Between `begin_gesture` and `end_gesture`
     changes of the pose show at once but make one step together, and none where they end as they
     began. The library is a file of its own, written at every change; the poses of the file that
     was opened are a third thing, which nothing here changes. `PoseDocument`, which is what the
-    window holds, tells what the signals mean.
+    window holds, documents the signals.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ class PoseHistory(QObject):
 
     @property
     def outcome(self) -> ResolveResult | None:
-        """What the Resolve that ended in this pose reported."""
+        """Result of the Resolve that ended in this pose."""
         return self._state.outcome
 
     @property
@@ -170,19 +170,19 @@ class PoseHistory(QObject):
         self._tell_modified()
 
     def cancel_gesture(self) -> None:
-        """End a drag and go back to where it began, as for Escape."""
+        """Cancel a drag and restore its start, as for Escape."""
         if self._gesture is not None:
             _, before = self._gesture
             self._gesture = None
             self._apply(before)
 
     def undo(self) -> None:
-        """Take back the last step; a drag that has not ended is that step."""
+        """Undo the last step; a drag that has not ended is that step."""
         self.end_gesture()
         self.undo_stack.undo()
 
     def redo(self) -> None:
-        """Do again the step that was taken back last."""
+        """Redo the last undone step."""
         self.end_gesture()
         self.undo_stack.redo()
 
@@ -216,7 +216,7 @@ class PoseHistory(QObject):
         self._step(f"Replace {name}", [(old, new)], self._as_in_library(new))
 
     def update_library_pose(self) -> None:
-        """Let the pose of the library that the working pose came from be as that is now.
+        """Update the pose of the library that the working pose came from.
 
         Raises
         ------
@@ -325,7 +325,7 @@ class PoseHistory(QObject):
         return self._free_names([name])[0]
 
     def refresh_library(self) -> None:
-        """Take in what another program has changed in the library's file."""
+        """Load what another program has changed in the library's file."""
         if self._library is not None and self._library.refresh():
             self.library_changed.emit()
             self._tell_modified()
@@ -336,7 +336,7 @@ class PoseHistory(QObject):
             self._library.change(())
 
     def mark_saved(self) -> None:
-        """Count the pose as saved, as where the user gives the changes up."""
+        """Count the pose as saved, as when the user discards the changes."""
         self._saved = self.pose
         self._tell_modified()
 
@@ -402,7 +402,7 @@ class PoseHistory(QObject):
         self.pose_loaded.emit()
 
     def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
-        # How far a mesh is from the pose that was fitted to it says nothing of another pose.
+        # The fit error of a mesh does not apply to another pose.
         pose = replace(self.pose, latent=read_only(latent), fit_error_mean=None, fit_error_max=None)
         self._push(label, replace(self._state, pose=pose, ghost=None, outcome=None), run)
 
@@ -414,7 +414,7 @@ class PoseHistory(QObject):
             self.undo_stack.push(ChangeState(label, self._apply, self._state, state, run))
 
     def _amend(self, state: DocumentState) -> None:
-        """Put in a state that the undo steps on both sides of it lead to, in the place of this."""
+        """Replace the current state, also in the undo steps on both sides of it."""
         place = self.undo_stack.index()
         earlier = self.undo_stack.command(place - 1)
         later = self.undo_stack.command(place)
@@ -425,7 +425,7 @@ class PoseHistory(QObject):
         self._apply(state)
 
     def _keep_saved(self, pose: NamedPose, file: Path) -> None:
-        """Remember what a file holds now, whichever way undo comes back to it."""
+        """Record what a file holds now, in every state that undo can restore."""
         self.file, self._saved = file, pose
         origin = self._state.origin
         if origin is None or origin.source is not Source.LIBRARY:
@@ -440,7 +440,7 @@ class PoseHistory(QObject):
         file: Path | None = None,
         file_poses: tuple[NamedPose, ...] = (),
     ) -> None:
-        """Put in a pose without a past, which counts as saved.
+        """Set a pose without history, which counts as saved.
 
         Parameters
         ----------
@@ -452,7 +452,7 @@ class PoseHistory(QObject):
     def _begin(
         self, state: DocumentState, file: Path | None, file_poses: tuple[NamedPose, ...] = ()
     ) -> None:
-        """Put in a state without a past."""
+        """Set a state without history."""
         self._gesture = None
         self.file, self.file_poses, self._saved = file, file_poses, state.pose
         self._apply(state)
@@ -462,7 +462,7 @@ class PoseHistory(QObject):
         self.pose_loaded.emit()
 
     def _apply(self, state: DocumentState, changes: Sequence[LibraryChange] = ()) -> None:
-        """Put in a state and tell what has changed: the one place where pose or library change."""
+        """Set a state and signal what has changed: only this changes pose or library."""
         before, self._held = self._state, state
         if changes and self._library is not None:
             self._library.change(changes)
@@ -480,7 +480,7 @@ class PoseHistory(QObject):
         self._tell_modified()
 
     def _follow_latent(self) -> None:
-        """Tell the workers, before the widgets, that the pose is another."""
+        """Notify the workers, then the widgets, of another pose."""
 
     def _tell_modified(self) -> None:
         if self.changed != self._told_changed:
@@ -492,7 +492,7 @@ class PoseHistory(QObject):
 
 
 def read_only(array: FloatArray) -> FloatArray:
-    """Return the array itself, from now on read-only, as other threads read it."""
+    """Make an array read-only, as other threads read it, and return it."""
     array.flags.writeable = False
     return array
 

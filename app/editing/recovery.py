@@ -1,8 +1,8 @@
-"""What survives a crash: the edited pose, written every few seconds, and found at the next start.
+"""Recovery after a crash: the edited pose, written every few seconds, and found at the next start.
 
-Each editor has a session, a folder of its own below `sessions_folder`, which it holds by a lock
-for as long as its process lives: however that ends, the lock ends with it, and the next editor
-that starts can take the session over, but never one that another editor holds.
+Each editor has a session, a folder below `sessions_folder`, locked for as long as its process
+runs. However that ends, the lock ends with it, and the next editor that starts can take the session
+over, but never one that another editor holds.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 AUTOSAVE_SECONDS = 3.0
-"""The most work that a crash costs, but for the moment that writing takes."""
+"""Seconds of work that a crash loses at most, apart from the time to write."""
 
 _LOCK = "lock"
 _POSES = "poses.json"
@@ -54,7 +54,7 @@ class Session:
 
     Attributes
     ----------
-    folder : with the lock, and the poses once there was something to keep
+    folder : with the lock, and the poses once there is something to keep
     """
 
     def __init__(self, folder: Path, lock: QLockFile) -> None:
@@ -73,9 +73,9 @@ class Session:
 
     @classmethod
     def held(cls, folder: Path) -> Session | None:
-        """Take a session over, or return None if a living process holds it.
+        """Take a session over, or return None if a running process holds it.
 
-        Nor is one taken whose lock is not a plain file: Qt would wait for a pipe for ever.
+        Nor if its lock is not a plain file: Qt would wait for a pipe for ever.
         """
         try:
             require_regular(folder / _LOCK)
@@ -90,11 +90,11 @@ class Session:
         return cls(folder, lock) if lock.tryLock(0) else None
 
     def release(self) -> None:
-        """Leave the session to whoever starts next."""
+        """Leave the session to the next editor that starts."""
         self._lock.unlock()
 
     def discard(self) -> None:
-        """Delete the session and all that it kept."""
+        """Delete the session with its files."""
         self._lock.unlock()
         shutil.rmtree(self.folder, ignore_errors=True)
 
@@ -160,11 +160,11 @@ def _lost(parent: Path) -> Iterator[LostPose]:
 
 
 class Autosave(QObject):
-    """Keeps what a document has not saved, until it is saved or given up.
+    """Keeps what a document has not saved, until it is saved or discarded.
 
     Parameters
     ----------
-    document : is looked at whenever it says that it has changed
+    document : read whenever it signals a change
     parent_folder : of all sessions; the user's own by default
     seconds : after a change until it is written, however many changes follow
 
@@ -207,15 +207,15 @@ class Autosave(QObject):
         document.recovered.connect(self._on_recovered)
 
     def recover(self, lost: LostPose) -> None:
-        """Put a lost pose into the document, unsaved, and go on in its session.
+        """Load a lost pose into the document, unsaved, and continue its session.
 
-        Should its model be gone, `PoseDocument.failed` tells, and the session is left as it is.
+        If its model is gone, `PoseDocument.failed` is emitted and the session does not change.
         """
         self._recovering = lost
         self._document.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
 
     def close(self, timeout: float = 5.0, keep: bool = False) -> bool:
-        """End, and give up what is not saved unless it is to be kept for the next start.
+        """End, and discard what is not saved unless it is to be kept for the next start.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Why the first waits are long: loops are compiled for this computer, which the core logs."""
+"""Explains long first waits: loops are compiled for this computer, which the core logs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ REASON = "First use: preparing for this computer, some seconds"
 
 
 class Preparing(QObject):
-    """Tells in the window's thread, until it is closed, when loops are being compiled in any.
+    """Signals in the window's thread when loops are compiled in any, until it is closed.
 
     Signals
     -------
@@ -27,7 +27,7 @@ class Preparing(QObject):
         self._log.addHandler(self._handler)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._log.removeHandler(self._handler)
 
 

@@ -43,7 +43,7 @@ class LiveFrame:
     vertices : (V, 3) float32 array, read-only, in the data's unit, in the reference's frame
     normals : (V, 3) float32 array, read-only, of length 1, area-weighted
     prediction : None for a model without a predictor
-    seconds : what decoding, normals and prediction took
+    seconds : taken by decoding, normals and prediction
     """
 
     request_id: int
@@ -77,7 +77,7 @@ class ExactVerdict:
 
 
 class FrameEvaluator:
-    """Computes frames and verdicts of one model; used by one thread at a time.
+    """Computes frames and exact checks of one model; for one thread at a time.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class FrameEvaluator:
         Parameters
         ----------
         latent : (D,) finite array
-        request_id : is handed on
+        request_id : of the frame
         """
         start = time.perf_counter()
         predictor = self.model.predictor if self.predicts else None
@@ -157,7 +157,7 @@ def _beside() -> ThreadPoolExecutor:
 
 
 def keep_torch_to_one_thread(model: PoseModel) -> None:
-    """Let torch use one core in the calling thread: a single pose has nothing to spread.
+    """Let torch use one core in the calling thread: a single pose is too small to parallelise.
 
     On a busy machine torch's threads wait for each other: one prediction took 32 ms instead of
     0.4. Does nothing for a model whose predictions of a pose need no torch.

@@ -62,7 +62,7 @@ class OtherModel:
     ----------
     path : the file
     model : that the poses belong to
-    failure : that tells of it
+    failure : for the user
     """
 
     path: Path
@@ -72,7 +72,7 @@ class OtherModel:
 
 @dataclass(frozen=True)
 class PartEdits:
-    """How a user wants body parts called, coloured and listed.
+    """New names, colours and order of body parts.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ def open_model(name_or_path: str | Path, _: Progress, cancel: CancelToken) -> Op
 
 
 def warm_up(model: PoseModel) -> None:
-    """Compute once, in the thread that has the time, what a first drag needs but predictions."""
+    """Compute once, in another thread, what a first drag needs apart from predictions."""
     evaluator = FrameEvaluator(model)
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
@@ -109,7 +109,7 @@ def warm_up(model: PoseModel) -> None:
 
 
 def load_predictor(model: PoseModel, _: Progress, __: CancelToken) -> PoseModel:
-    """Load what predicts, and use it once: what it compiles or imports may take seconds."""
+    """Load the predictor and use it once: compiling and importing may take seconds."""
     keep_torch_to_one_thread(model)
     model.predict(np.zeros(model.latent_size))
     return model
@@ -153,7 +153,7 @@ class WrongScale:
     Attributes
     ----------
     path : its file
-    what : is wrong
+    what : the problem
     factor : what brings it into the model's unit
     """
 
@@ -182,7 +182,7 @@ def encode(
 def mirror_poses(
     model: PoseModel, poses: Sequence[NamedPose], progress: Progress, cancel: CancelToken
 ) -> list[tuple[NamedPose, MirroredPose]]:
-    """Return the mirror images of poses, and what there is to say of each."""
+    """Return the mirror images of poses, and a remark on each."""
     from lcollision_core.model import MAX_NAME_LENGTH
 
     images = []
@@ -245,7 +245,7 @@ def resolve(
     ghost.flags.writeable = False
     before = seconds_compiling()
     result = model.resolve(latent, options, progress=progress, cancel=cancel, placement=placement)
-    # Compiling, at the first use, is preparation and no search.
+    # Compiling, at the first use, does not count as search time.
     searched = max(0.0, result.seconds - (seconds_compiling() - before))
     return replace(result, seconds=searched), ghost
 

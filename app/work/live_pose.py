@@ -1,7 +1,7 @@
 """The pose that is edited, computed in another thread: its frame, then the exact check.
 
-The worker is never given a second request while it works on a first: the newest request wins, and
-nothing queues up.
+The worker gets no second request while it works on a first: the newest request wins, and nothing
+queues up.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class VerdictRequest:
 
 
 class LiveWorker(QObject):
-    """Computes frames and verdicts, in its own thread; `answered` tells what was asked too."""
+    """Computes frames and exact checks in its own thread; `answered` carries the request too."""
 
     answered = Signal(object, object)
 
@@ -90,12 +90,12 @@ class LiveWorker(QObject):
 
 
 class LivePose(QObject):
-    """Follows one pose: its frame as soon as can be, its verdict when it rests.
+    """Follows one pose: its frame at once, its exact check when it rests.
 
     Changes within one turn of the event loop are one request; while the worker is busy, only the
     newest pose waits. A quick frame is waited for, far shorter than a picture takes, so that the
-    slider and the mesh are drawn together: drawing the window twice would cost more than all
-    else. A failure that repeats from pose to pose is reported once.
+    slider and the mesh are drawn together: drawing the window twice would cost the
+    most. A failure that repeats from pose to pose is reported once.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class LivePose(QObject):
         self._rested = single_shot(self, rest_milliseconds, self._ask)
 
     def follow(self, model: PoseModel, latent: npt.NDArray[np.float64], predicts: bool) -> None:
-        """Want the frame, and later the verdict, of another pose.
+        """Request the frame, and later the exact check, of another pose.
 
         Parameters
         ----------
@@ -161,7 +161,7 @@ class LivePose(QObject):
 
     @Slot()
     def _ask(self) -> bool:
-        """Hand on what is wanted next, unless the worker is busy; tell whether it was."""
+        """Send the next request unless the worker is busy; return whether it was sent."""
         if self._asked is not None:
             return False
         if self._next is not None:
@@ -178,14 +178,14 @@ class LivePose(QObject):
 
     @Slot(object, object)
     def _on_answered(self, request: FrameRequest | VerdictRequest, answer: Response) -> None:
-        # One that was waited for comes a second time this way, maybe amid a later request.
+        # A response that was waited for arrives here again, maybe during a later request.
         if request is self._asked:
             self._take(answer)
 
     def _take(self, answer: Response) -> None:
         request, self._asked = self._asked, None
-        # What is next is handed on before the answer is drawn: the worker need not wait for that.
-        # Nor is it waited for here: it would be told before this answer.
+        # The next request is sent before the response is drawn: the worker need not wait.
+        # It is not waited for here: its response would be signalled before this one.
         self._ask()
         if request is None or request.model is not self._model:
             return

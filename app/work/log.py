@@ -1,4 +1,4 @@
-"""The editor's log file: what went wrong, with the tracebacks that no dialog shows."""
+"""The editor's log file: errors, with the tracebacks that no dialog shows."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def log_file() -> Path:
 
 
 def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
-    """Write what is logged, what Qt says and unhandled errors into the log file.
+    """Write records, Qt's messages and unhandled errors into the log file.
 
-    A file that cannot be written is done without: the editor works all the same.
+    If the file cannot be written, the editor runs without it.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
             sys.__excepthook__(error_type, error, trace)
             return
         _log.error("unhandled error", exc_info=(error_type, error, trace))
-        # Qt's threads too tell here of what their slots raise.
+        # Errors in slots of Qt's threads come here too.
         if tell is not None and threading.current_thread() is threading.main_thread():
             tell(unexpected(error))
 
@@ -75,7 +75,7 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
 
 
 def unexpected(error: BaseException) -> Failure:
-    """Tell of an error that is the program's own."""
+    """Report a bug of the program."""
     return Failure(
         f"unexpected error ({type(error).__name__}: {error})",
         "save your pose under a new name, and see the log file for details",

@@ -48,7 +48,7 @@ class LongWorker(QObject):
 
     @Slot(object)
     def answer(self, job: JobRequest) -> None:
-        """Do one job, whatever happens."""
+        """Do one job; its errors become its response."""
         self.answered.emit(guarded(job.request_id, job.label, self._value, job))
 
     def _value(self, job: JobRequest) -> object:
@@ -69,7 +69,7 @@ class LongWork(QObject):
     """Does jobs one after the other in its own thread, and tells of them in the window's.
 
     `busy_changed` carries the label of the oldest job that is not done, "" if there is none;
-    `failed` a `Failure`; `progressed` the job's number and what its work told.
+    `failed` a `Failure`; `progressed` the job's number and its progress.
     """
 
     busy_changed = Signal(str)
@@ -90,7 +90,7 @@ class LongWork(QObject):
 
     @property
     def busy(self) -> str:
-        """What is being done, or ""."""
+        """Label of the running job, or ""."""
         return next((job.label for job in self._jobs.values()), "")
 
     def label_of(self, number: int) -> str:
@@ -104,7 +104,7 @@ class LongWork(QObject):
         done: Callable[[Any], None],
         failed: Callable[[], None] = lambda: None,
     ) -> int:
-        """Do some work when what was started before is done.
+        """Queue some work behind the jobs started before.
 
         Parameters
         ----------
@@ -125,7 +125,7 @@ class LongWork(QObject):
         return job.request_id
 
     def cancel(self, number: int) -> None:
-        """Stop a job; nothing more is heard of it. Does nothing if it is done."""
+        """Stop a job; it signals nothing more. Does nothing if it is done."""
         job = self._jobs.pop(number, None)
         if job is not None:
             job.cancel.cancel()

@@ -17,12 +17,12 @@ from lcollision_core.errors import CancelledError, LCollisionError
 _log = logging.getLogger(__name__)
 
 _SWITCH_SECONDS = 0.001
-"""A worker in plain Python holds the interpreter for so long before the window has its turn."""
+"""Seconds that a worker in plain Python holds the interpreter before the window gets it."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """What went wrong, for people and for the log.
+    """An error, for the user and for the log.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Failure:
 
     @classmethod
     def of(cls, error: LCollisionError) -> Failure:
-        """Tell of an error that the user can fix."""
+        """Report an error that the user can fix."""
         details = "".join(traceback.format_exception(error))
         return cls(error.headline, error.next_step, details)
 
@@ -53,7 +53,7 @@ class Response:
 
 
 def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
-    """Move a worker, which has no parent, into a thread of its own."""
+    """Move a worker, which has no parent, into a new thread."""
     sys.setswitchinterval(_SWITCH_SECONDS)
     thread = QThread(parent)
     thread.setObjectName(name)
@@ -63,7 +63,7 @@ def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
 
 
 def end_thread(thread: QThread, deadline: float) -> bool:
-    """Let a thread end after what it does now, and tell whether it has by the deadline.
+    """End a thread after its current work; return whether it has ended by the deadline.
 
     One that has not, as in the first compiling, is kept from being destroyed, as Qt would abort.
     """
@@ -95,7 +95,7 @@ def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], object]) 
 def guarded(
     request_id: int, label: str, work: Callable[..., object], *arguments: object
 ) -> Response:
-    """Run some work and turn whatever it raises into an answer."""
+    """Run some work and turn whatever it raises into a response."""
     try:
         return Response(request_id, work(*arguments))
     except CancelledError:

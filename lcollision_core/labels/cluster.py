@@ -1,4 +1,4 @@
-"""Labelling on a Dask cluster: workers label chunks, this process alone writes them."""
+"""Labelling on a Dask cluster: workers label chunks, only this process writes them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def label_on_cluster(
     """Label chunks on the workers of a Dask scheduler.
 
     The workers need this program in the same version. Those that leave are replaced by others,
-    those that come later join in; every chunk tells which version labelled it.
+    those that come later join in; every chunk carries the version that labelled it.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def label_on_cluster(
                 for future in [future for future in pending if future.done()]:
                     rows = pending.pop(future)
                     worker, found, labelled = future.result()
-                    # Of every chunk: workers that come late are not asked before.
+                    # For every chunk: workers that join late are not checked before.
                     _require_version(worker, found)
                     count(labelled)
                     yield rows, labelled
@@ -109,7 +109,7 @@ def label_on_cluster(
 
 
 def program_version() -> str:
-    """Return the version of this program; workers are asked for theirs."""
+    """Return the version of this program, which the workers' must equal."""
     return version("lcollision")
 
 

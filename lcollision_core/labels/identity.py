@@ -12,10 +12,10 @@ from lcollision_core.labels.labeller import Labeller
 
 
 def is_held_out(index: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Tell which samples test a predictor and never train it: those whose index ends in 7, 8, 9.
+    """Return which samples test a predictor and never train it: those whose index ends in 7, 8, 9.
 
     A fixed 30 %, so that a row keeps its side when its store grows. Samples are independent, so
-    every tenth is as random as any other.
+    any fixed choice is as random as another.
 
     Parameters
     ----------

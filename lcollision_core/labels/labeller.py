@@ -15,7 +15,7 @@ from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding
 
 
 def blocks_of(rows: range) -> Iterator[range]:
-    """Cut rows, from a multiple of `ROWS_PER_BLOCK` on, into what a thread labels in one go."""
+    """Split rows, from a multiple of `ROWS_PER_BLOCK` on, into blocks, one task each."""
     for first in range(rows.start, rows.stop, ROWS_PER_BLOCK):
         yield range(first, min(first + ROWS_PER_BLOCK, rows.stop))
 
@@ -27,10 +27,10 @@ class LabelRows:
     Attributes
     ----------
     latent : (B, D) float32 array, Z_all
-    domain_energy : (B, K) float64 array, S_k, each row sums to `energy`, normalised length squared
-    energy : (B,) float64 array, PDe-sum, normalised length squared
+    domain_energy : (B, K) float64 array, S_k, sums to `energy`, in normalised length squared
+    energy : (B,) float64 array, PDe-sum, in normalised length squared
     n_pairs : (B,) int32 array, colliding pairs of faces
-    n_near_pairs : (B,) int32 array, pairs within the near exclusion, which count for nothing else
+    n_near_pairs : (B,) int32 array, pairs within the near exclusion, not counted elsewhere
     """
 
     latent: npt.NDArray[np.float32]
@@ -53,7 +53,7 @@ class LabelRows:
 
     @classmethod
     def joined(cls, parts: Sequence[LabelRows]) -> LabelRows:
-        """Put rows one after the other, in one copy."""
+        """Concatenate rows, in one copy."""
         return cls(
             *(
                 np.concatenate([getattr(part, field.name) for part in parts])
@@ -67,14 +67,14 @@ class Labeller:
     """Decodes latent poses and finds their exact labels; may be shared between threads.
 
     Vertices are tested as `PoseModel` exports them: in the data's unit, rounded to float32. So a
-    label agrees with the exact verdict on the same pose wherever else it is asked for.
+    label agrees with every other exact check of the same pose.
 
     Attributes
     ----------
     embedding : decodes
     body_size : in the data's unit
     near_exclusion : pairs of faces this near along the surface, normalised, are counted separately
-    fingerprint : tells the model from others
+    fingerprint : identifies the model
     """
 
     embedding: Embedding
@@ -92,7 +92,7 @@ class Labeller:
         )
 
     def prepare(self) -> None:
-        """Build what labelling needs, once, before several threads would each begin to."""
+        """Build the lazy parts once, before several threads would."""
         _ = self.detector, self.embedding.codec, self.embedding.decoder
 
     def label_rows(self, seed: int, rows: range) -> LabelRows:

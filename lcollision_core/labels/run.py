@@ -1,4 +1,4 @@
-"""The labelling run: which rows are missing, who labels them, how far it is."""
+"""The labelling run: which rows are missing, who labels them, its progress."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lcollision_core.labels.store import LabelStore, chunks_of
 
 @dataclass(frozen=True)
 class LabelStatus:
-    """How far a labelling run is.
+    """Progress of a labelling run.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ def label_poses(
     progress: StatusCallback = no_status,
     cancel: CancelToken | None = None,
 ) -> LabelStatus:
-    """Bring a store to at least `n_rows` labelled samples of a model's latent box.
+    """Extend a store to at least `n_rows` labelled samples of a model's latent box.
 
     Goes on where an earlier run ended, however that ended; rows that are damaged, or missing before
     later ones, are labelled again. Sample i of (model, seed) has the same labels to the last bit on
@@ -138,7 +138,7 @@ def label_poses(
         results = label_locally(labeller, seed, missing, n_threads, count, token)
     else:
         results = label_on_cluster(labeller, seed, missing, scheduler, count, token)
-    # Closed even when a chunk cannot be written: the workers must not label on.
+    # Closed even when a chunk cannot be written: the workers must stop labelling.
     with closing(results):
         for chunk, rows in results:
             store.write(chunk, rows)

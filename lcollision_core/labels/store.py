@@ -4,7 +4,7 @@
 samples FIRST to LAST; FIRST is a multiple of `ROWS_PER_CHUNK`, and of shards with one FIRST the
 longest counts. Rows are a function of the manifest and their indices alone, and a shard appears
 under its name whole: what is there is done, whoever wrote it. A damaged shard is found by the
-CRC-32 of its arrays, or by other samples than its name says.
+CRC-32 of its arrays, or by samples that do not match its name.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FORMAT_VERSION = 2
 """The version that stores are written in; version 1 was a Zarr group."""
 
 ROWS_PER_CHUNK = 1024
-"""What an interruption may cost; a multiple of `ROWS_PER_BLOCK`."""
+"""Most rows that an interruption loses; a multiple of `ROWS_PER_BLOCK`."""
 
 MANIFEST = "labels.json"
 KIND = "lcollision labels"
@@ -45,7 +45,7 @@ _MAX_MANIFEST_BYTES = 2**20
 
 
 def chunks_of(n_rows: int) -> Iterator[range]:
-    """Give the rows of each chunk that the first `n_rows` rows are kept in."""
+    """Yield the rows of each chunk that holds some of the first `n_rows` rows."""
     for first in range(0, n_rows, ROWS_PER_CHUNK):
         yield range(first, min(first + ROWS_PER_CHUNK, n_rows))
 
@@ -247,7 +247,7 @@ class LabelStore:
         return labelled
 
     def write(self, rows: range, labelled: LabelRows) -> None:
-        """Put a chunk on disk, whole or not at all.
+        """Write a chunk, whole or not at all.
 
         Parameters
         ----------
@@ -276,7 +276,7 @@ class LabelStore:
 
         Returns
         -------
-        damaged : stretches of rows, each as long as it can be
+        damaged : maximal ranges of rows
 
         Raises
         ------
@@ -297,7 +297,7 @@ class LabelStore:
 
     @property
     def repair_advice(self) -> str:
-        """What to do when it is damaged."""
+        """Advice for a damaged store."""
         seed = f" --seed {self.identity.seed}" if self.identity.seed else ""
         return (
             f"run `lcollision label M -n {self.end} -o {self.path}{seed}` with its model M to "

@@ -1,4 +1,4 @@
-"""A trained body: one file in, everything that a front end needs out."""
+"""A trained body: reads one file and offers everything that a front end needs."""
 
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.encode import encode_mesh, read_model_mesh, with_detail

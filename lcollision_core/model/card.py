@@ -1,4 +1,4 @@
-"""What a model says of itself beside its weights: the section ``model`` of its file."""
+"""A model's metadata beside its weights: the section ``model`` of its file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lcollision_core.json_values import from_json, quoted
 from lcollision_core.model.naming import MAX_NAME_LENGTH
 
 _LEAST_BODY_SIZE = 1e-12
-"""Of a body, in whatever unit; its inverse is the largest."""
+"""Least body size, in any unit; its inverse is the largest."""
 
 _MAX_TEXT_LENGTH = 1000
 _CARD = "the model's card"
@@ -34,7 +34,7 @@ class ModelCard:
     source : what the model was trained on
     licence : of the model
     provenance : how it was made, JSON values by name
-    domain_order : all K domains, indices from 0, in listing order; empty for the latent's
+    domain_order : all K domains, indices from 0, in listing order; empty for that of the latent
 
     Raises
     ------

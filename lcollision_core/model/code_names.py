@@ -15,7 +15,7 @@ FloatArray = npt.NDArray[np.float64]
 _CHUNK = 32
 """Poses that are decoded together: memory stays small for large meshes."""
 _STEP = 0.5
-"""Of a code's range above zero, at which its effect is measured."""
+"""Fraction of a code's range above zero where its effect is measured."""
 _AIMLESS = 0.5
 """Of what a code moves, as sums of squares: with less as one shift, a turn or a bend names it."""
 _OWN = 0.25
@@ -69,7 +69,7 @@ def code_effects(
     Notes
     -----
     What moves as the code goes from 0 to half of its range is weighted by the squares of the mask:
-    what a domain owns, not what it touches. The leading domain's motion is split into a shift, a
+    the core of a domain, not its border. The leading domain's motion is split into a shift, a
     turn about its middle, by least squares, and what is left.
     """
     up = np.eye(3)[up_axis]
@@ -162,6 +162,6 @@ def _effect(
 
 
 def _way(along: FloatArray) -> str:
-    """Return the word for a direction's largest part up, forward or to the left."""
+    """Return the word for the largest component of a direction."""
     way = int(np.abs(along).argmax())
     return _WAYS[way][int(along[way] < 0.0)]

@@ -1,4 +1,4 @@
-"""Mesh files as latent poses, and what encoding loses of them."""
+"""Mesh files as latent poses, and the detail that encoding loses."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ def encode_mesh(
 def with_detail(
     model: PoseModel, mesh: npt.NDArray[np.float64], pose: NamedPose, result: ResolveResult
 ) -> npt.NDArray[np.float64] | None:
-    """Move a mesh as Resolve moved the pose that it was encoded as, so that its detail stays.
+    """Move a mesh by the displacement that Resolve gave its encoded pose, to keep its detail.
 
     Parameters
     ----------
     model : of the pose
     mesh : (V, 3) float64 array, the vertices that were encoded
-    pose : as which they were encoded
+    pose : that they were encoded as
     result : of its Resolve
 
     Returns
@@ -67,7 +67,7 @@ def with_detail(
     vertices : (V, 3) float64 array that the exact check found free; None if the moved mesh
         would collide
     """
-    # Where the pose did not move, the mesh stays as it is to the bit.
+    # Where the pose did not move, the mesh is unchanged to the bit.
     moved: npt.NDArray[np.float64] = mesh + (
         result.vertices - model.exported_vertices(pose.latent, pose.placement)
     )

@@ -1,4 +1,4 @@
-"""What encoding a mesh gives."""
+"""The result of encoding a mesh."""
 
 from __future__ import annotations
 

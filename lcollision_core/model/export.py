@@ -22,7 +22,7 @@ class ExportAxes(StrEnum):
     """For which program a mesh is written: its axes, and its unit for a model in metres.
 
     Each is what the program's own importer, with its default settings, puts upright and facing
-    its front: Blender's turns an OBJ file from y up to z up and leaves PLY and STL as they are;
+    its front: Blender's turns an OBJ file from y up to z up and leaves PLY and STL unchanged;
     Maya takes y up and centimetres; Unreal takes centimetres and z up, x forward, and itself
     turns y round, as its axes are left-handed.
     """
@@ -41,7 +41,7 @@ EXPORT_SCALES = {
     ExportAxes.MAYA: 100.0,
     ExportAxes.UNREAL: 100.0,
 }
-"""The file's units in a metre, which is the unit that models are taken to be in."""
+"""The file's units in a metre, the assumed unit of models."""
 
 _ALREADY_FIXED = ".glb"
 """glTF's own axes and unit are y up, z forward and the metre."""
@@ -49,7 +49,7 @@ _ALREADY_FIXED = ".glb"
 
 @dataclass(frozen=True, eq=False)
 class ExportFrame:
-    """Axes and unit of a file, against those of the model.
+    """Axes and unit of a file, relative to those of the model.
 
     Attributes
     ----------
@@ -115,14 +115,14 @@ def export_mesh(
     ----------
     path : see `write_mesh`
     model : of the pose
-    vertices : (V, 3) array, in the data's unit, in the place that they are exported to
-    placement : what brought them there, for a mesh that came in from somewhere; else None
+    vertices : (V, 3) array, in the data's unit, placed for export
+    placement : that was applied to them, for an imported mesh; else None
     frame : the file's axes and unit, by `export_frame`; the model's if None. A mesh that has a
         place is turned like all others.
 
     Returns
     -------
-    written : (V, 3) array as the file holds it, but for the turn of a GLB file, which is exact
+    written : (V, 3) array as the file holds it, except the rotation of a GLB file, which is exact
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Which latent space a model has, and which of the listed models has a given one."""
+"""Fingerprints of latent spaces, and the listed model that has a given one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EMBEDDING = "embedding"
 
 
 def fingerprint_of(arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]) -> str:
-    """Return 16 hexadecimal digits that tell a latent space from others, whatever its box.
+    """Return 16 hexadecimal digits that identify a latent space, whatever its box.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the numbers of a latent pose are: groups, names, colours and ranges."""
+"""The entries of a latent pose: groups, names, colours and ranges."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class LatentGroup:
     ----------
     name : "Whole body", or the domain's name
     colour : "#rrggbb" of the domain, None for the whole body
-    codes : where the group stands in the latent
+    codes : slice of the group in the latent
     code_names : what each code is called within the group: for the whole body the domain that it
         moves most, for a domain "motion 1" and so on
     """
@@ -29,7 +29,7 @@ class LatentGroup:
     code_names: tuple[str, ...]
 
     def full_name(self, place: int) -> str:
-        """Return what the group's code at a place is called among all, as in "arm, motion 3"."""
+        """Return the full name of one of the group's codes, as in "arm, motion 3"."""
         name = self.code_names[place]
         return name if self.colour is None else f"{self.name}, {name}"
 

@@ -1,4 +1,4 @@
-"""Whether a mesh is of a model's topology, and fit to be encoded."""
+"""Whether a mesh is of a model's topology, and can be encoded."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _UNITS = (0.001, 0.01, 0.0254, 0.1, 0.3048, 1.0)
 
 
 def require_same_faces(topology: Topology, needed: Topology, source: str, model: str) -> None:
-    """Refuse a mesh whose faces are not a model's, in whatever order they come.
+    """Refuse a mesh whose faces are not a model's, in any order.
 
     Parameters
     ----------
     topology : the mesh's
     needed : the model's
-    source, model : what the sentence calls the two
+    source, model : names of the two in the message
 
     Raises
     ------
@@ -97,7 +97,7 @@ def checked_mesh(
     lengths, known = (topology.edge_lengths(one) for one in (mesh, reference))
     size, limit = scale_of(lengths, known), LARGEST_SIZE
     if size is None:
-        # Not scaled as a whole: not a pose perhaps, but no other unit unless it is far off.
+        # Not scaled uniformly: perhaps no pose, but no other unit unless it is far off.
         size, limit = body_size(mesh, topology) / body_size(reference, topology), _MOST_SIZE
     if not 1.0 / limit < size < limit:
         sentence = (
@@ -122,7 +122,7 @@ def likely_factor(measured: float) -> float:
 
     Parameters
     ----------
-    measured : > 0, what sizes were found to differ by
+    measured : > 0, the measured ratio of sizes
 
     Returns
     -------

@@ -124,7 +124,7 @@ def pose_bytes(latent: npt.NDArray[Any], placement: RigidTransform | None) -> by
 
 
 def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | None) -> str:
-    """Return 16 hexadecimal digits that tell a pose and its place, to the bit."""
+    """Return 16 hexadecimal digits that identify a pose and its placement, to the bit."""
     return hashlib.sha256(pose_bytes(latent, placement)).hexdigest()[:16]
 
 
@@ -154,10 +154,10 @@ class PoseMirror:
         progress: Progress = no_progress,
         cancel: CancelToken | None = None,
     ) -> MirroredPose:
-        """Find the pose nearest to the mirror image of one, in the mirrored place.
+        """Find the pose nearest to the mirror image of one, with the mirrored placement.
 
         The plane is the reference's, for a placed pose too. Where the pose is free and what comes
-        of it is not, it is resolved; a pose that collides is mirrored as it is.
+        of it is not, it is resolved; a colliding pose is not resolved.
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class PoseMirror:
         placement : where the decoded pose belongs, None for the model's own coordinates
         source : what the pose was mirrored from, or None: where it is still that image, what
             comes back is the source, to the bit
-        options : of the Resolve; its locked domains keep what they have in the mirror
+        options : of the Resolve; its locked domains keep their mirrored codes
         progress : called with (steps of the Resolve done, all steps)
         cancel : polled between the steps
 
@@ -183,8 +183,8 @@ class PoseMirror:
         if source is not None and restored:
             found, place = source.latent, source.placement
         else:
-            # In its place: a rigid motion left to the fit would be one more thing to undo, and
-            # the codes hold it nearly as well.
+            # With the placement fixed: a fitted rigid motion would have to be undone, and the
+            # codes hold it nearly as well.
             fit = self.embedding.encode(image, cancel, in_place=True)
             found = fit.latent.astype(np.float64)
         check = replace(check, placement=place)

@@ -1,4 +1,4 @@
-"""What a person would call each domain."""
+"""Readable names of the domains."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy.typing as npt
 MAX_NAME_LENGTH = 60
 
 _MAIN_SHARE = 0.6
-"""Of a domain's weight: a labelled part with as much names the domain alone."""
+"""Fraction of a domain's weight with which a labelled part names the domain alone."""
 _SECOND_SHARE = 0.2
-"""Of a domain's weight: a second part with less is not worth naming."""
+"""Fraction of a domain's weight that a second part needs to be named."""
 _SAME_SHARE = 0.5
-"""Of the other side's weight: with more, a domain belongs to both sides."""
+"""Fraction of the other side's weight; with more, a domain belongs to both sides."""
 
 
 def numbered_names(n_domains: int) -> tuple[str, ...]:
@@ -31,11 +31,11 @@ def names_from_labels(
 ) -> tuple[str, ...]:
     """Name each domain after the body parts that its mask covers.
 
-    Parts count by the squares of the mask's weights: what a domain owns, not what it touches.
+    Parts count by the squares of the mask's weights: the core of a domain, not its border.
     The leading part names it; where that has less than 60 %, a second part with at least 20 %
-    joins it, as in "left forearm & hand". A left and a right part of like share count as one,
-    "thighs", and the two sides of the body are named alike. Domains that would share a name take
-    their second part too, and where that does not help, their place: "upper left thigh".
+    joins it, as in "left forearm & hand". A left and a right part of similar weight count as one,
+    "thighs", and the two sides of the body are named symmetrically. Domains that would share
+    a name take their second part too and, if that does not help, a position: "upper left thigh".
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def join_names(first: str, second: str) -> str:
 
 
 def _ranked_parts(shares: dict[str, float]) -> list[tuple[str, float]]:
-    """Return parts and shares from the largest down, both sides of a part that are alike as one."""
+    """Return parts with their fractions, largest first; similar sides of a part are merged."""
     merged = dict(shares)
     for part, left in shares.items():
         stem = part.removeprefix("left ")

@@ -35,7 +35,7 @@ MAX_TAGS = 50
 
 _NOT_ROTATED = 1e-6
 _LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e30
-"""Far beyond any pose and any unit; what is larger overflows somewhere."""
+"""Far beyond any pose and any unit; larger numbers would overflow."""
 _LEAST_SCALE = 1e-9
 
 
@@ -45,7 +45,7 @@ class NamedPose:
 
     Attributes
     ----------
-    name : unlike that of the file's other poses
+    name : unique in the file
     latent : (D,) float64 array
     placement : where the decoded pose belongs, for one that came in as a mesh; None leaves it in
         the model's coordinates
@@ -69,7 +69,7 @@ class NamedPose:
         return pose_bytes(self.latent, self.placement) == pose_bytes(other.latent, other.placement)
 
     def mirrored(self, image: MirroredPose) -> NamedPose:
-        """Return what mirroring this pose gave, under the same name and tags."""
+        """Return the mirror image of this pose as a pose with the same name and tags."""
         return replace(
             self,
             latent=image.latent,
@@ -87,7 +87,7 @@ class PoseFile:
     Attributes
     ----------
     poses : in the file's order, names all different
-    working : the pose that was being edited, which may be called as one of `poses`
+    working : the pose that was being edited, which may have the name of one of `poses`
     """
 
     poses: tuple[NamedPose, ...]
@@ -107,7 +107,7 @@ class PoseFile:
 
 
 class DamagedPosesError(ModelFileError):
-    """A file is no file of poses that this program, of whatever version, wrote for a model."""
+    """A file is not a file of poses from any version of this program."""
 
 
 class OtherModelError(ModelFileError):
@@ -226,7 +226,7 @@ def read_pose_file(path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
 
 
 def why_no_name(name: str) -> str:
-    """Say why a pose cannot be called so, or return "" if it can."""
+    """Return why a name is refused for a pose, or "" if it is allowed."""
     if not 0 < len(name) <= MAX_NAME_LENGTH:
         return f"its name must be a text of 1 to {MAX_NAME_LENGTH} characters"
     if any("\ud800" <= character <= "\udfff" for character in name):
@@ -276,7 +276,7 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> Pos
 def _other_model(
     path: str | os.PathLike[str], owner: dict[str, Any], model: PoseModel
 ) -> OtherModelError:
-    """Say whose poses a file holds, by the names of models alone."""
+    """Say which model a file belongs to, by name."""
     fingerprint, name = (str(owner.get(key))[:MAX_NAME_LENGTH] for key in ("fingerprint", "name"))
     listed = find_latent_space(fingerprint, name)
     if listed is not None:
@@ -297,7 +297,7 @@ def _other_model(
 
 
 def to_json(pose: NamedPose) -> dict[str, Any]:
-    """Return what a file holds of a pose; equal for equal poses, to the bit."""
+    """Return the JSON record of a pose; equal for equal poses, to the bit."""
     entry: dict[str, Any] = {"name": pose.name} | _placed_to_json(pose)
     if pose.fit_error_mean is not None and pose.fit_error_max is not None:
         entry["fit_error"] = {"mean": pose.fit_error_mean, "max": pose.fit_error_max}

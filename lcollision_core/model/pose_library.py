@@ -1,8 +1,8 @@
 """The user's own poses of a model: a file in their data folder, written at every change.
 
-Several programs may have one library open. A change is therefore no new content but a difference,
-which is applied to what the file holds by then, under a lock: no program's poses are lost, and
-undoing a change leaves those of others.
+Several programs may have one library open. A change is therefore stored as a difference,
+which is applied to the current file under a lock: no program's poses are lost, and undoing a change
+keeps those of others.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class LibraryChange:
 
     @property
     def inverse(self) -> LibraryChange:
-        """The change that takes this one back."""
+        """The inverse change."""
         return LibraryChange(self.new, self.old, self.place)
 
 
@@ -62,7 +62,7 @@ class PoseLibrary:
 
     Parameters
     ----------
-    model : that the poses belong to; a library is found again whatever the model is called
+    model : that the poses belong to; a library does not depend on the model's name
     folder : of all libraries; it is made when there is something to write
     tell : called with the error where the file cannot be read or written; a change that cannot
         be written stays here, and is written with the next one that can
@@ -118,7 +118,7 @@ class PoseLibrary:
         self._poses = _changed(self._in_file, self._unwritten)
 
     def refresh(self) -> bool:
-        """Take in what another program has changed; return whether there was anything."""
+        """Load what another program has changed; return whether there was anything."""
         self._find_file()
         stamp = file_stamp(self.path)
         if stamp is None or stamp in (self._seen, self._refused):
@@ -138,7 +138,7 @@ class PoseLibrary:
             self.path = _path(self._model, self._folder)
 
     def _read(self) -> None:
-        """Learn what the file holds; what it held before counts where it is gone or damaged."""
+        """Read the file; if it is gone or damaged, keep its previous content."""
         stamp = file_stamp(self.path)
         if stamp is None or stamp == self._seen:
             return
@@ -156,7 +156,7 @@ class PoseLibrary:
 
 
 def _changed(poses: Sequence[NamedPose], changes: Sequence[LibraryChange]) -> tuple[NamedPose, ...]:
-    """Apply changes; a pose that another program has changed meanwhile is left as it is."""
+    """Apply changes; a pose that another program has changed meanwhile is kept."""
     held = list(poses)
     for change in changes:
         place = next((at for at, pose in enumerate(held) if _alike(pose, change.old)), None)

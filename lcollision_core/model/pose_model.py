@@ -1,4 +1,4 @@
-"""One model file in, everything that a front end needs out."""
+"""A model read from one file, with everything that a front end needs."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ class PoseModel:
     name : what the model is called
     embedding : its latent space
     card : its units, names and origin
-    other_sections : of its file, by name: a predictor, known free poses, and such as this version
-        of the program does not know, which are saved as they are
+    other_sections : of its file, by name: a predictor, known free poses, and sections unknown to
+        this version of the program, which are saved unchanged
 
     Attributes
     ----------
-    name, embedding, card : as given; front ends need only what follows
+    name, embedding, card : as given; front ends need only the following
     reference : (V, 3) float64 array, read-only, in the data's unit
     attention_mask : (K, V) float32 array, read-only, each column sums to 1
     training_latent : (N, D) float64 array, read-only, the training poses' codes
@@ -112,7 +112,7 @@ class PoseModel:
 
     @classmethod
     def load(cls, name_or_path: str | os.PathLike[str]) -> PoseModel:
-        """Read a model; nothing in its file is ever run.
+        """Read a model; no code in its file is executed.
 
         Parameters
         ----------
@@ -235,7 +235,7 @@ class PoseModel:
         return exported_vertices(self.decode(latent, n_threads=1), placement)
 
     def exact_check(self, placement: RigidTransform | None = None) -> ExactCheck:
-        """Return what tests poses where they are exported to."""
+        """Return the exact check of poses placed for export."""
         from lcollision_core.resolve import ExactCheck
 
         return ExactCheck(self.embedding, self.detector, self.body_size, placement)
@@ -341,7 +341,7 @@ class PoseModel:
         )
 
     def require_topology(self, topology: Topology, source: str) -> None:
-        """Refuse a mesh whose faces are not the model's, in whatever order they come.
+        """Refuse a mesh whose faces are not the model's, in any order.
 
         Parameters
         ----------
@@ -360,7 +360,7 @@ class PoseModel:
         colours: Mapping[int, str] | None = None,
         order: Sequence[int] | None = None,
     ) -> PoseModel:
-        """Return the same model with some domains called, coloured or listed otherwise.
+        """Return the same model with other names, colours or order of some domains.
 
         Parameters
         ----------
@@ -392,12 +392,12 @@ class PoseModel:
         )
 
     def with_card(self, card: ModelCard, name: str | None = None) -> PoseModel:
-        """Return the same model with another card, and what was computed of it.
+        """Return the same model with another card; computed properties are kept.
 
         Parameters
         ----------
         card : names, colours or order differ; units and poses are the same
-        name : what to call the model, by default as it is
+        name : the new name of the model, by default the same
         """
         other = copy(self)
         other.card, other.name = card, name or self.name
@@ -447,7 +447,7 @@ class PoseModel:
 
     @cached_property
     def predictor(self) -> CollisionPredictor | None:
-        """What predicts collisions; None if none was trained yet.
+        """The collision predictor; None if none was trained yet.
 
         Raises
         ------
@@ -476,7 +476,7 @@ class PoseModel:
         return PredictorRecord.of_section(section, self.embedding)
 
     def require_predictor(self) -> CollisionPredictor:
-        """Return the predictor, or raise ModelFileError where there is none or a damaged one."""
+        """Return the predictor, or raise ModelFileError if there is none or it is damaged."""
         predictor = self.predictor
         if predictor is None:
             raise ModelFileError(
@@ -545,10 +545,10 @@ class PoseModel:
 
     @cached_property
     def fingerprint(self) -> str:
-        """16 hexadecimal digits that tell which latent space this is.
+        """16 hexadecimal digits that identify the latent space.
 
-        Models with one fingerprint understand each other's latent poses: it depends on neither
-        names nor anything that is trained on the latent space.
+        Models with one fingerprint can exchange latent poses: it depends on neither names nor
+        anything that is trained on the latent space.
         """
         return fingerprint_of(*self.embedding.to_arrays())
 
@@ -574,7 +574,7 @@ class PoseModel:
 
     @cached_property
     def code_effects(self) -> tuple[CodeEffect, ...]:
-        """What raising each of the D codes does to the body, measured by decoding some poses."""
+        """The effect of raising each of the D codes, measured by decoding some poses."""
         return code_effects(
             self.decode,
             self.latent_space.high,
@@ -586,7 +586,7 @@ class PoseModel:
 
     @cached_property
     def code_names(self) -> tuple[str, ...]:
-        """D names of what the codes do, different within each group: "left thigh forward"."""
+        """D names of the codes by effect, unique within each group: "left thigh forward"."""
         return code_names(self.code_effects, self.domain_names, self.embedding.group_sizes)
 
     @cached_property
@@ -596,7 +596,7 @@ class PoseModel:
 
     @property
     def topology(self) -> Topology:
-        """The faces that all poses share, and what follows from them."""
+        """The faces that all poses share, with derived connectivity."""
         return self.embedding.topology
 
     @property

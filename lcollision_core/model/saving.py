@@ -19,12 +19,12 @@ def change_model(
     Parameters
     ----------
     path : its file
-    change : gets the model as it is in the file now, and returns what is to be written
+    change : gets the model that the file holds now, and returns the one to write
 
     Raises
     ------
     ModelFileError : as for `PoseModel.load` and `PoseModel.save`, and whatever `change` raises.
-    MeshFileError : another command is at it, see `locked`.
+    MeshFileError : another command holds it, see `locked`.
     """
     with locked(path):
         model = change(PoseModel.load(path))
@@ -55,7 +55,7 @@ def save_trained(
     Raises
     ------
     ModelFileError : the file cannot be written.
-    MeshFileError : another command is at it, see `locked`.
+    MeshFileError : another command holds it, see `locked`.
     """
     with locked(destination):
         path, base = destination, model

@@ -15,10 +15,10 @@ from lcollision_core.resolve.exact import ExactCheck
 from lcollision_core.resolve.problem import ResolveProblem
 
 MAX_REGIONS = 6
-"""Contacts of a pose at most, one for each of the deepest pairs of domains."""
+"""Most contacts of a pose, one for each of the deepest pairs of domains."""
 
 CLEARANCE = 2e-4
-"""In normalised length: how far apart touching surfaces are moved, as the model is linear."""
+"""In normalised length: gap that touching surfaces are moved to, as the model is linear."""
 
 POLISH_ROUNDS = 6
 _OPTIMAL = 1
@@ -103,9 +103,9 @@ def nearest_within(
 def polish(check: ExactCheck, problem: ResolveProblem, start: FloatArray) -> FloatArray | None:
     """Leave shallow contact by a small move.
 
-    Newton's method on the depths of the contacts: each round asks for the smallest move that parts
+    Newton's method on the depths of the contacts: each round takes the smallest move that separates
     all contacts seen so far. Depths of pairs of faces saturate where bodies are deep within each
-    other, and then point no way out: such poses are given up.
+    other, and then give no direction: such poses fail.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ def depth_slopes(
     normal = across / np.where(usable, length, 1.0)[:, :, None]
     along = np.einsum("pdx,ptcx->pdtc", normal, corners)
     least, most = along.min(axis=3), along.max(axis=3)
-    # By which the highest corner of one triangle is above the lowest of the other.
+    # Height of the highest corner of one triangle above the lowest of the other.
     overlap = np.stack([most[:, :, 0] - least[:, :, 1], most[:, :, 1] - least[:, :, 0]], axis=2)
     overlap[~usable] = np.inf
     best = overlap.reshape(n_pairs, -1).argmin(axis=1)

@@ -26,7 +26,7 @@ def exported_vertices(
 
     Returns
     -------
-    exported : (..., V, 3) array: as they are drawn, float32; where a pose has a place, which may
+    exported : (..., V, 3) array: as they are drawn, float32; with a placement, which may
         be far from the origin, moved there in float64
     """
     drawn: npt.NDArray[np.float32] = vertices.astype(np.float32)
@@ -38,8 +38,8 @@ def in_each_format(
 ) -> list[npt.NDArray[np.floating]]:
     """Return one pose's exported (V, 3) vertices as each of the formats holds them.
 
-    A pose that has a place is written in float64 and, by formats that hold no more, in float32,
-    where that leaves it its shape: see `lcollision_core.meshes.precision`.
+    A placed pose is written in float64 and, by formats that hold no more, in float32, if that
+    preserves its shape: see `lcollision_core.meshes.precision`.
     """
     if exported.dtype == np.float32 or not can_hold(exported, topology, np.float32):
         return [exported]
@@ -66,7 +66,7 @@ class ExactCheck:
     placement: RigidTransform | None = None
 
     def decode(self, latent: npt.ArrayLike) -> FloatArray:
-        """Decode (B, D) latent poses to (B, V, 3) vertices, normalised, in the reference's pose."""
+        """Decode (B, D) latent poses to (B, V, 3) vertices, normalised, in the model's frame."""
         return self.embedding.decode(np.atleast_2d(np.asarray(latent)), n_threads=1)
 
     def exported(self, decoded: FloatArray) -> npt.NDArray[np.floating]:

@@ -43,7 +43,7 @@ _Tried = tuple[Step, FloatArray | None]
 
 @dataclass(eq=False)
 class Ladder:
-    """One climb: see `PoseResolver.resolve`.
+    """One run of the ladder: see `PoseResolver.resolve`.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Ladder:
 
     @property
     def _n_steps(self) -> int:
-        """Count, at most, what `_steps` yields and pulling back."""
+        """Return the most steps that `_steps` yields, plus pulling back."""
         if self.options.solver == Solver.SQP:
             n_tries = len(ITERATIONS) + 1
         else:

@@ -1,4 +1,4 @@
-"""How far apart two latent poses are: by their codes, or by the displacement of the vertices."""
+"""Distances of latent poses: by their codes, or by the displacement of the vertices."""
 
 from __future__ import annotations
 

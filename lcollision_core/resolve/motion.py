@@ -15,7 +15,7 @@ from lcollision_core.resolve.options import ResolveResult
 def largest_correction_change(
     embedding: Embedding, latents: FloatArray, results: Sequence[ResolveResult]
 ) -> float:
-    """Measure how much a repaired motion flickers.
+    """Measure how much a resolved motion flickers.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ _STATUS = {
     nlopt.MAXTIME_REACHED: "out of time",
 }
 _FAILURES = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
-"""What NLopt raises where it cannot go on; from 2.10 its failures are no more `RuntimeError`."""
+"""What NLopt raises on failure; from 2.10 no longer `RuntimeError`."""
 
 _CONVERGED = {nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED}
 _ALGORITHMS = {
@@ -69,8 +69,8 @@ def solve_nlopt(
 
     Notes
     -----
-    The method of Tan et al. 2021 is AUGLAG, there by LOQO; here with LBFGS within, which has
-    tolerances of its own.
+    The method of Tan et al. 2021 is AUGLAG, there by LOQO; here with LBFGS within, with
+    separate tolerances.
     """
     movable = np.flatnonzero(problem.movable)
     target, weights = problem.target, problem.code_weights
@@ -92,7 +92,7 @@ def solve_nlopt(
         return OBJECTIVE_OFFSET + scale * float(weights @ moved**2)
 
     def evaluate(latent: FloatArray) -> tuple[float, FloatArray]:
-        """Ask the model, and keep the pose if it is the best so far."""
+        """Evaluate the model, and keep the pose if it is the best so far."""
         nonlocal best, evaluated, halt
         evaluated = True
         excess, slope = problem.excess(latent[None])

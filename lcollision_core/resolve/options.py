@@ -1,4 +1,4 @@
-"""What a user may ask of Resolve, and what comes back."""
+"""Options and result of Resolve."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ResolveOptions:
     ----------
     solver : of the paper's problem, the name of a `Solver`
     metric : what is kept small, the name of a `Metric`
-    threshold : collision probability that a pose may have to count as predicted free, in (0, 1)
+    threshold : largest collision probability of a pose that counts as predicted free, in (0, 1)
     margin : >= 0, how far below the threshold's logit the solver is to go at first; by default 0
         with the further margins of the ladder tried beside it
     locked_domains : indices from 0 of domains that keep their codes: Z_k, and the one code of
@@ -61,7 +61,7 @@ class ResolveOptions:
         group is multiplied; by default all 1
     time_budget : seconds after which the ladder goes straight to its last step; None for no limit.
         With one, results depend on the machine's speed.
-    verify : check exactly and climb the ladder; False stops at the solver's answer
+    verify : check exactly and climb the ladder; False returns the solver's result
     seed : >= 0, of the restarts
 
     Raises
@@ -129,7 +129,7 @@ class ResolveResult:
     pairs_before, pairs_after : exact number of colliding pairs; None without `verify`
     latent_distance : ||Z - Z*|| / ||Z*||, or ||Z - Z*|| where Z* is the zero pose; 0 for a pose
         that did not move
-    vertex_distance_mean, vertex_distance_max : from the decoded pose as it was
+    vertex_distance_mean, vertex_distance_max : from the decoded target
     iterations : of the solver at its least margin, for those of NLopt its evaluations; further
         margins and restarts do not count
     evaluations : poses for which the predictor was evaluated

@@ -14,7 +14,7 @@ from lcollision_core.meshes.topology import FloatArray
 
 
 class CollisionModel(Protocol):
-    """What Resolve asks of a predictor; it is to be smooth in the latent pose."""
+    """What Resolve needs of a predictor; it must be smooth in the latent pose."""
 
     def logit_and_gradient(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """(B, D) poses to (B,) collision logits and their (B, D) gradients."""
@@ -22,7 +22,7 @@ class CollisionModel(Protocol):
 
 @dataclass
 class Deadline:
-    """Clock and cancel token of one solve, asked at every evaluation.
+    """Clock and cancel token of one solve, polled at every evaluation.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Deadline:
 
     @property
     def seconds(self) -> float:
-        """Spent so far."""
+        """Seconds so far."""
         return time.perf_counter() - self.started
 
     @property
@@ -65,8 +65,8 @@ class ResolveProblem:
     low, high : (D,) float64 arrays; equal where a code is locked
     limit : the threshold's logit
     model : of the constraint
-    deadline : asked before each evaluation
-    evaluations : poses that the model was asked about so far
+    deadline : polled before each evaluation
+    evaluations : poses evaluated so far
 
     Notes
     -----
@@ -117,7 +117,7 @@ class ResolveProblem:
 
 @dataclass(frozen=True, eq=False)
 class SolverOutcome:
-    """The best that a solver has seen.
+    """The best iterate of a solver.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class SolverOutcome:
 
 
 FEASIBLE = 1e-3
-"""In the logit: a constraint that is violated by less holds."""
+"""Tolerance of the constraint, in the logit."""
 
 
 def rank(distance: float, violation: float) -> tuple[float, float]:

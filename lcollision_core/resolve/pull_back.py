@@ -14,7 +14,7 @@ FIRST_HALVINGS, FURTHER_HALVINGS = 3, 5
 SLIDES = 5
 _SLIDE_HALVINGS = 1
 _SETTLED = 0.01
-"""Fraction of the distance that a further slide must promise."""
+"""Fraction of the distance that a further slide must gain."""
 
 FALL_BACKS = 6
 """Known free poses that are tried, the nearest ones: the segment to the nearest of all often is
@@ -60,7 +60,7 @@ def pull_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> F
 
     First straight towards Z* by bisection. Where that is stopped, the contacts become linear
     constraints, and the nearest pose that they allow is the next goal: the pose slides along what
-    it touches. At last each domain that moved is put back alone, where that is free.
+    it touches. Finally each domain that moved is put back alone, where that is free.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def fall_back(
 ) -> FloatArray | None:
     """Bisect the segments from Z* to known free poses, and take the end that is nearest to Z*.
 
-    Locked codes stay, so that a known free pose may collide for want of them; such are left out.
+    Locked codes stay, so that a known free pose may collide without them; those are left out.
 
     Parameters
     ----------

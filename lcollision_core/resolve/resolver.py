@@ -30,7 +30,7 @@ class PoseResolver:
     Parameters
     ----------
     check : the exact check of the model's poses
-    predictor : says how a latent pose collides, smoothly: a `CollisionPredictor`
+    predictor : the differentiable predictor: a `CollisionPredictor`
     free_latents : (F, D) array of poses known to be collision-free: see `find_free_poses`. Without
         any, a pose that the other steps do not resolve stays colliding.
     """
@@ -123,8 +123,8 @@ class PoseResolver:
         sequence : the poses are the frames of a motion: a frame starts from the correction of the
             one before, so that the motion does not flicker. Frames that collide in a row are one
             thread's work.
-        done : results of an earlier run by place, which are not sought again
-        keep : called with each further result and its place as soon as it is there, from one
+        done : results of an earlier run by index, which are not computed again
+        keep : called with each further result and its index as soon as it is there, from one
             thread at a time: what was done is known whatever interrupts the rest
 
         Returns

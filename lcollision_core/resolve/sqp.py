@@ -66,7 +66,7 @@ class SqpBatch:
         return self._running
 
     def run(self, n_iterations: int) -> list[SolverOutcome]:
-        """Go on for at most so many iterations; the outcomes are in the order of the rows.
+        """Run at most so many further iterations; the outcomes are in the order of the rows.
 
         Raises
         ------
@@ -107,7 +107,7 @@ class SqpBatch:
         if settled and violation <= FEASIBLE:
             self._running[row] = False
         elif violation > FEASIBLE and (settled or self._iterations[row] >= _PATIENCE):
-            # Along a curved border steps gain on the constraint by a few percent each, or swing
+            # Along a curved border steps reduce the violation by a few percent each, or swing
             # about it; straight to it is nearly as near.
             goal, _ = _minimiser(problem, here, here, slope, violation)
         self._step[row] = goal - here
@@ -138,7 +138,7 @@ def _minimiser(
     slope: FloatArray,
     violation: float,
 ) -> tuple[FloatArray, float]:
-    """Go least far from a centre to slope . (Z - here) + violation <= 0, within the bounds.
+    """Find the pose nearest to a centre with slope . (Z - here) + violation <= 0 in the bounds.
 
     Codes that would leave the bounds stop there, and the others make up for it. Also returns the
     constraint's multiplier.

@@ -1,4 +1,4 @@
-"""One thread for each solve: its batches are too small to share out."""
+"""One thread for each solve: its batches are too small for more."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _before = 1
 def single_torch_thread() -> Iterator[None]:
     """Keep torch to the calling thread, and give it its threads back after the last solve.
 
-    A predictor's gradients of a few poses take a millisecond; on a busy machine the threads that
-    would share them wait for each other up to fifty times as long.
+    A predictor's gradients of a few poses take a millisecond; on a busy machine threads that
+    shared them would wait for each other up to fifty times as long.
     """
     global _inside, _before
     torch = sys.modules.get("torch")
