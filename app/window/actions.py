@@ -1,4 +1,4 @@
-"""Every action of the window: what it is called, its shortcut, its tool tip and its icon."""
+"""Every action of the window: its name, its shortcut, its tool tip and its icon."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Spec:
     Attributes
     ----------
     text : as the menu shows it
-    shortcut : in Qt's portable words; several are parted by ", "
+    shortcut : in Qt's portable words; several are separated by ", "
     tip : what it does, in plain words
     icon : name of its icon, or ""
     checkable : whether it is on or off
@@ -107,7 +107,7 @@ ACTIONS: dict[str, Spec] = {
     "log": Spec("Open &log file", "Ctrl+Shift+L", "Open the log with the details of errors"),
     "about": Spec("&About LCollision", "Shift+F1", "Version, licence and model"),
 }
-"""All actions that stand alone, by key."""
+"""All actions outside groups, by key."""
 
 SHADINGS: dict[Shading, Spec] = {
     Shading.PLAIN: Spec("&Plain", "Ctrl+1", "The body in one colour"),
@@ -149,7 +149,7 @@ DOCKS: dict[str, Spec] = {
 
 
 def make_action(spec: Spec, parent: QObject) -> QAction:
-    """Make an action as its line says; its tool tip names the shortcut."""
+    """Make an action from its `Spec`; its tool tip names the shortcut."""
     action = QAction(spec.text, parent)
     equip_action(action, spec)
     return action
@@ -158,7 +158,7 @@ def make_action(spec: Spec, parent: QObject) -> QAction:
 def make_choices(
     specs: Mapping[Any, Spec], chosen: Any, slot: Callable[[QAction], None], parent: QObject
 ) -> list[QAction]:
-    """Make actions of which one is chosen; each carries its key as data.
+    """Make exclusive actions; each carries its key as data.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def make_menu(title: str, actions: Iterable[QAction], parent: QWidget) -> QMenu:
 
 
 def equip_action(action: QAction, spec: Spec) -> None:
-    """Give an action, perhaps one of Qt's own, what its line says."""
+    """Set up an action, perhaps one of Qt's own, from its `Spec`."""
     action.setText(spec.text)
     keys = QKeySequence.listFromString(spec.shortcut.replace(", ", "; "))
     action.setShortcuts(keys)

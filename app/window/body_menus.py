@@ -1,4 +1,4 @@
-"""What a click with the right button offers: on the body or beside it, on a slider, on a row."""
+"""Context menus: on the body or beside it, on a slider, on a row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the menus Edit and Pose do, and when each can be chosen."""
+"""The actions of the menus Edit and Pose, and when each is enabled."""
 
 from __future__ import annotations
 

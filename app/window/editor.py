@@ -1,4 +1,4 @@
-"""Starting the editor: first the window, then behind it what takes time to load."""
+"""Starting the editor: first the window, then what takes time to load."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def open_editor(path: Path | None = None, model_name: str | None = None) -> int:
 
     Parameters
     ----------
-    path : a poses file, a mesh or a model to open; None opens the model with a pose of its own
+    path : a poses file, a mesh or a model to open; None opens the model with its own pose
     model_name : a model's file, or the name of a bundled or user model; by default the one that
         was used last
 
     Returns
     -------
-    status : 0, or 2 after one sentence on standard error where no window can be opened
+    status : 0, or 2 after one sentence on standard error if no window can be opened
     """
     reason = why_no_window(os.environ, sys.platform)
     if reason is not None:
@@ -45,7 +45,7 @@ def open_editor(path: Path | None = None, model_name: str | None = None) -> int:
 
 
 def why_no_window(environment: Mapping[str, str], platform: str) -> str | None:
-    """Say why no window can be opened here; None where one can be.
+    """Say why no window can be opened here; None if one can be.
 
     Qt aborts the process where it finds no display, so that this has to be asked before.
 
@@ -95,7 +95,7 @@ def _why_no_x(display: str) -> str | None:
 
 
 def _why_no_plugin() -> str | None:
-    """Load Qt's part for X, which aborts the process where a system library lacks."""
+    """Load Qt's plugin for X, which aborts the process if a system library is missing."""
     from PySide6.QtCore import QLibraryInfo
 
     folder = Path(QLibraryInfo.path(QLibraryInfo.LibraryPath.PluginsPath)) / "platforms"

@@ -56,7 +56,7 @@ def _mesh_suffixes() -> tuple[str, ...]:
 
 
 def _kind(path: Path) -> str:
-    """Name a file's kind after its extension, "FBX"."""
+    """Name a file's format after its extension, "FBX"."""
     return path.suffix.removeprefix(".").upper() or "A file without an extension"
 
 
@@ -70,7 +70,7 @@ class FileActions(QObject):
     window : that dialogs belong to
     document : opened into and saved from
     settings : remembers the last folder, the recent files and the model
-    viewport : of which pictures are saved
+    viewport : the source of pictures
     attempt : does something and shows what a user can fix of what goes wrong
 
     Attributes
@@ -126,7 +126,7 @@ class FileActions(QObject):
             self.open_path(path)
 
     def turn_upright(self) -> None:
-        """Turn the model by the next axis, in its file, and open it anew.
+        """Turn the model by the next axis, in its file, and open it again.
 
         Raises
         ------
@@ -183,7 +183,7 @@ class FileActions(QObject):
         self._settings["last_folder"] = str(path.resolve().parent)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:
-        """Open the first of some files that can be opened, and tell of the others once it is.
+        """Open the first of some files that can be opened, and report the others afterwards.
 
         Raises
         ------
@@ -258,7 +258,7 @@ class FileActions(QObject):
         return self.ask_save(title, self._name, kinds) if accepted else None
 
     def may_lose_changes(self) -> bool:
-        """Settle unsaved changes with the user; False where they want to go on editing."""
+        """Ask about unsaved changes; False if the user wants to go on editing."""
         if not (self._document.has_model and self._document.modified):
             return True
         file = self._document.file
@@ -268,7 +268,7 @@ class FileActions(QObject):
         return answer is Choice.DISCARD
 
     def _listing(self, title: str, fill: Callable[[], None]) -> QMenu:
-        """Make a menu that lists anew what there is whenever it is about to be shown."""
+        """Make a menu that is refilled whenever it is about to be shown."""
         menu = QMenu(title, self._window)
         menu.setToolTipsVisible(True)
         menu.aboutToShow.connect(fill)
@@ -357,12 +357,12 @@ class FileActions(QObject):
 
     @property
     def _name(self) -> str:
-        """What the pose on the screen is called: never as one that it is no longer."""
+        """The name of the pose on the screen, unless it has changed since."""
         document = self._document
         return f"{document.pose_name} changed" if document.changed else document.pose_name
 
     def ask_open(self, title: str, *kinds: str) -> Path | None:
-        """Ask for a file of some kinds: "poses", "meshes", "models"; None where there is none."""
+        """Ask for a file of some kinds: "poses", "meshes", "models"; None for none."""
         name, _ = QFileDialog.getOpenFileName(
             self._window, title, str(self._folder()), _kinds(*kinds)
         )
@@ -378,7 +378,7 @@ class FileActions(QObject):
         Parameters
         ----------
         title : of the dialog
-        name : of what is written, from which a file name that is not taken is made
+        name : of what is written; an unused file name is made from it
         kinds : extensions by what the kinds are called
         file : that is proposed instead, as it holds what is written
 
@@ -412,7 +412,7 @@ class FileActions(QObject):
 
 
 def _unused(folder: Path, name: str, suffix: str) -> Path:
-    """Return a file of a folder that is not there yet, called as a pose is."""
+    """Return an unused file of a folder, named after a pose."""
     from lcollision_core.meshes import file_stem, unused_name
 
     path = folder / f"{file_stem(name)}{suffix}"

@@ -11,10 +11,10 @@ _MILLISECONDS = 1000
 
 
 class GarbageCollector(QObject):
-    """Takes over from Python's own collector, until it is closed.
+    """Replaces Python's own collector until it is closed.
 
-    That looks for garbage wherever something is allocated: in a worker thread, where no widget may
-    be destroyed, or while Qt destroys another object, whose locks it then waits for without end.
+    Python's runs wherever something is allocated: in a worker thread, where no widget may be
+    destroyed, or while Qt destroys another object, whose locks it then waits for without end.
 
     Parameters
     ----------
@@ -40,6 +40,6 @@ class GarbageCollector(QObject):
             gc.collect(due[-1])
 
     def close(self) -> None:
-        """Let Python collect as it likes again."""
+        """Restore Python's own collector."""
         self._timer.stop()
         gc.enable()

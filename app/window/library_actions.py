@@ -28,13 +28,13 @@ LIBRARY_MENU = "&Library"
 
 
 class LibraryActions(QObject):
-    """The acts of the menu Library, which is also the browser's context menu.
+    """The actions of the menu Library, which is also the browser's context menu.
 
     Parameters
     ----------
     window : that dialogs belong to
     document : changed
-    panel : says which poses are chosen
+    panel : with the chosen poses
     files : asks for files
     actions : by key; their texts and whether they can be chosen follow the panel
 
@@ -176,7 +176,7 @@ class LibraryActions(QObject):
         self._panel.own.setChecked(True)
 
     def _addable(self) -> tuple[NamedPose, ...]:
-        """Return what Add would add: the chosen poses, or of a file all where none is chosen."""
+        """Return what Add would add: the chosen poses, or of a file all if none is chosen."""
         panel = self._panel
         if panel.source is Source.LIBRARY or not self._document.has_model:
             return ()

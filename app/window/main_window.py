@@ -53,12 +53,12 @@ _log = logging.getLogger(__name__)
 
 _LAYOUT_VERSION = 1
 _SIZE = QSize(1440, 900)
-_SIDE_SHARES = {"sliders": (0.25, 344, 460), "collision": (0.22, 312, 380)}
-"""Of the window's width, at least and at most, in device-independent pixels."""
+_SIDE_FRACTIONS = {"sliders": (0.25, 344, 460), "collision": (0.22, 312, 380)}
+"""Fraction of the window's width, least and most, in device-independent pixels."""
 _NARROW = 1100
-"""A window narrower than this has no room for the poses between the panels at its sides."""
+"""A window narrower than this has no space for the poses between the panels at its sides."""
 _VIEW_WIDTH = 400
-"""Of the view, before the panels beside it get more than they need."""
+"""Width of the view, before the panels beside it get more than they need."""
 _AREAS = {
     "sliders": Qt.DockWidgetArea.LeftDockWidgetArea,
     "collision": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -83,8 +83,8 @@ class MainWindow(QMainWindow):
 
     def __init__(self, document: PoseDocument, settings: Settings) -> None:
         super().__init__()
-        # A closed window must not wait for the garbage collector, which takes its widgets apart in
-        # any order: Qt then reads what is freed.
+        # A closed window must not wait for the garbage collector, which destroys its widgets in
+        # any order: Qt then reads freed memory.
         self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.document = document
         self.settings = settings
@@ -164,14 +164,14 @@ class MainWindow(QMainWindow):
         self._restore()
         self._on_model()
 
-    # What others may do to it.
+    # Public operations.
 
     def attempt(self, act: Callable[[], object]) -> object:
         """Do something, and show what a user can fix of what goes wrong.
 
         Returns
         -------
-        value : what `act` returned; None where it went wrong
+        value : what `act` returned; None if it failed
         """
         try:
             return act()
@@ -181,18 +181,18 @@ class MainWindow(QMainWindow):
             return None
 
     def set_autosave(self, autosave: Autosave) -> None:
-        """Take charge of an autosave: its failures are shown, and it ends with the window."""
+        """Take over an autosave: its failures are shown, and it ends with the window."""
         self._autosave = autosave
         autosave.failed.connect(self.show_failure)
 
     def recover(self, lost: LostPose) -> None:
-        """Go on with a pose that a crash left."""
+        """Continue with a pose that a crash left."""
         if self._autosave is not None:
             self._autosave.recover(lost)
 
     @Slot(object)
     def show_failure(self, failure: Failure) -> None:
-        """Tell what went wrong, in a dialog that leaves all else running; once while it is open."""
+        """Show an error in a dialog that is not modal; once while it is open."""
         told = [held for held in self.findChildren(FailureDialog) if held.isVisible()]
         if failure.headline in [held.failure.headline for held in told]:
             return
@@ -201,7 +201,7 @@ class MainWindow(QMainWindow):
         dialog.open()
 
     def set_theme(self, choice: str) -> None:
-        """Take on a theme: "system", "light" or "dark"."""
+        """Apply a theme: "system", "light" or "dark"."""
         application = QApplication.instance()
         assert isinstance(application, QApplication)
         self.settings["theme"] = choice
@@ -263,7 +263,7 @@ class MainWindow(QMainWindow):
         self.settings["window_layout"] = self.saveState(_LAYOUT_VERSION)
         self.settings["randomise_amount"] = self.randomise.amount.value() / 100
         self._preparing.close()
-        # What takes long to end need not be looked at.
+        # The window is hidden while long work ends.
         for held in (self, *self.findChildren(QWidget)):
             if held.isWindow():
                 held.hide()
@@ -277,7 +277,7 @@ class MainWindow(QMainWindow):
         super().closeEvent(event)
 
     def dragEnterEvent(self, event: QDragEnterEvent) -> None:  # noqa: N802 - Qt's name
-        """Welcome files."""
+        """Accept files."""
         if any(url.isLocalFile() for url in event.mimeData().urls()):
             event.acceptProposedAction()
 
@@ -319,7 +319,7 @@ class MainWindow(QMainWindow):
         document.modified_changed.connect(self._update_title)
         document.busy_changed.connect(self._on_busy)
         self.viewport.pictures.busy_changed.connect(self._on_busy)
-        # What was told of the pose before is past.
+        # Messages on the previous pose are outdated.
         document.pose_loaded.connect(self._status.clearMessage)
         document.message.connect(self._status.tell)
         document.failed.connect(self.show_failure)
@@ -343,10 +343,10 @@ class MainWindow(QMainWindow):
 
     @Slot()
     def _size_docks(self) -> None:
-        sides = [self.docks[key] for key in _SIDE_SHARES]
+        sides = [self.docks[key] for key in _SIDE_FRACTIONS]
         widths = [
-            round(min(max(share * self.width(), least), most))
-            for share, least, most in _SIDE_SHARES.values()
+            round(min(max(fraction * self.width(), least), most))
+            for fraction, least, most in _SIDE_FRACTIONS.values()
         ]
         if sum(widths) + _VIEW_WIDTH > self.width():
             widths = [side.minimumSizeHint().width() for side in sides]

@@ -1,4 +1,4 @@
-"""The menus and the tool bar: which actions stand where."""
+"""The menus and the tool bar: the places of the actions."""
 
 from __future__ import annotations
 

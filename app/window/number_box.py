@@ -1,4 +1,4 @@
-"""A field for a number: what is typed is taken as it is, or refused in a sentence that is seen."""
+"""A field for a number: what is typed is taken unchanged, or refused with a visible reason."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class NumberBox(QDoubleSpinBox):
         self.setKeyboardTracking(False)
 
     def textFromValue(self, value: float) -> str:  # noqa: N802
-        """Write many decimals only where they say something."""
+        """Write many decimals only if they carry information."""
         text = super().textFromValue(value)
         if self.decimals() <= 3:
             return text
@@ -48,14 +48,14 @@ class NumberBox(QDoubleSpinBox):
     def event(self, event: QEvent) -> bool:
         """Leave Undo and Redo to the pose: what is typed is a step of it."""
         if event.type() is QEvent.Type.ShortcutOverride and isinstance(event, QKeyEvent):
-            kinds = (QKeySequence.StandardKey.Undo, QKeySequence.StandardKey.Redo)
-            if any(event.matches(kind) for kind in kinds):
+            keys = (QKeySequence.StandardKey.Undo, QKeySequence.StandardKey.Redo)
+            if any(event.matches(key) for key in keys):
                 event.ignore()
                 return False
         return super().event(event)
 
     def validate(self, text: str, place: int) -> tuple[QValidator.State, str, int]:
-        """Let any number be typed; whether it can be taken is told when it is there."""
+        """Let any number be typed; its value is checked when it is complete."""
         found = super().validate(text, place)
         if found[0] is QValidator.State.Invalid and self._is_beyond(text):
             return QValidator.State.Intermediate, text, place

@@ -1,4 +1,4 @@
-"""How the process holds its memory."""
+"""Memory allocation of the process."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _N_ARENAS = 2
 
 
 def keep_memory_small() -> None:
-    """Give freed memory back at once, and share the pools that threads take theirs from.
+    """Return freed memory at once, and share memory pools between threads.
 
     By default each thread gets a pool of its own, and what is freed in a pool stays there. To be
-    called before the first thread starts. Does nothing where the C library is another than glibc.
+    called before the first thread starts. Does nothing unless the C library is glibc.
     """
     if sys.platform != "linux":
         return

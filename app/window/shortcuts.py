@@ -11,7 +11,7 @@ _EDITING = (_Key.Undo, _Key.Redo, _Key.Copy, _Key.Cut, _Key.Paste, _Key.SelectAl
 
 
 class WindowShortcuts(QObject):
-    """Lets a window's shortcuts win over the rarer editing keys of its fields, as Ctrl+E is on X.
+    """Gives a window's shortcuts priority over rare editing keys of its fields, as Ctrl+E is on X.
 
     Copying, pasting and the like stay the field's.
 
@@ -33,7 +33,7 @@ class WindowShortcuts(QObject):
             now.installEventFilter(self)
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: ARG002, N802 - Qt's names
-        """Keep from a field what is the window's; see Qt's ShortcutOverride."""
+        """Reserve the window's shortcuts; see Qt's ShortcutOverride."""
         if event.type() is not QEvent.Type.ShortcutOverride or not isinstance(event, QKeyEvent):
             return False
         if any(event.matches(key) for key in _EDITING):

@@ -1,4 +1,4 @@
-"""What is loaded behind the window when it is on the screen already."""
+"""What is loaded once the window is on the screen."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _LIVELY = ("dancer", "thinking")
 """Training poses of the built-in body that are worth looking at."""
 
 _POLL_MILLISECONDS = 500
-"""Between two chances for Python to look at signals, which Qt's loop would keep from it."""
+"""Milliseconds between two chances for Python to handle signals, which Qt's loop prevents."""
 
 _LATER_MILLISECONDS = 300
 
@@ -72,7 +72,7 @@ class StartUp(QObject):
 
         self._document.model_changed.disconnect(self._on_model)
         self._window.set_autosave(Autosave(self._document))
-        # The document is about to put in a pose of its own.
+        # The document is about to load its own pose.
         QTimer.singleShot(0, self, self._on_first_pose)
         self._document.pose_loaded.connect(self._on_pose_loaded)
         self._document.recovered.connect(self._window.viewport.frame_pose)
@@ -84,7 +84,7 @@ class StartUp(QObject):
             path = self._path
             self._window.attempt(lambda: self._window.files.open_path(path))
             return
-        # What the program does is neither a change to save nor one to take back.
+        # What the program does is no change to save or undo.
         self._document.begin_with(opening_pose(self._document.model))
 
     @Slot()
@@ -96,7 +96,7 @@ class StartUp(QObject):
     @Slot()
     def _on_ready(self) -> None:
         _log.info("the first pose is on the screen")
-        # Once the pose has been drawn: a question over an empty window would puzzle.
+        # Once the pose has been drawn: a question over an empty window would be confusing.
         QTimer.singleShot(_LATER_MILLISECONDS, self, self._offer_recovery)
 
     @Slot()
@@ -114,7 +114,7 @@ class StartUp(QObject):
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         _log.info("signal %d: closing", number)
-        # Python tells of signals between any two of its steps, in the middle of a picture too.
+        # Python handles signals between any two of its steps, in the middle of a picture too.
         QTimer.singleShot(0, self._window, self._window.close_unasked)
 
 
@@ -127,8 +127,8 @@ def last_model(remembered: str) -> str:
 def opening_pose(model: PoseModel) -> NamedPose:
     """Return a pose worth looking at.
 
-    The first of the bundled file of poses that is called as the model is; for a model without
-    one, a lively training pose by its name, or the last.
+    The first of the bundled file of poses with the name of the model; for a model without
+    one, a varied training pose by its name, or the last.
     """
     from lcollision_core.model import NamedPose, read_poses
 

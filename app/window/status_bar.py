@@ -1,4 +1,4 @@
-"""The line at the foot of the window: what has happened, what is being done, which model it is."""
+"""The line at the foot of the window: messages, long work, and the model."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ class StatusBar(QStatusBar):
         self.showMessage(one_line(sentence), _MESSAGE_MILLISECONDS)
 
     def show_facts(self, facts: str) -> None:
-        """Say what is true until another model comes."""
+        """Show a fact until another model is loaded."""
         self._facts.setText(one_line(facts))
 
     def show_busy(self, work: str) -> None:
-        """Say what is being done, or nothing for ""."""
+        """Show what is being done, nothing for ""."""
         self._work = one_line(work)
         self._reason = self._reason if work else ""
         self._show()
 
     @Slot(str)
     def explain(self, reason: str) -> None:
-        """Say why what is being done takes long."""
+        """Explain why the work takes long."""
         if self._work:
             self._reason = reason
             self._show()
@@ -57,5 +57,5 @@ class StatusBar(QStatusBar):
         self.busy.setText(f"{self._work}… {self._reason}".rstrip() if self._work else "")
         for widget in (self.busy, self._bar):
             widget.setVisible(bool(self._work))
-        # An endless bar is animated even while nobody sees it.
+        # Qt animates an endless bar even while it is hidden.
         self._bar.setRange(0, 0 if self._work else 1)

@@ -48,10 +48,10 @@ Box = TypeVar("Box", QHBoxLayout, QVBoxLayout)
 _NONE: Margins = (0, 0, 0, 0)
 
 NAME_SHARE = 9
-"""Parts of a row's room to one of its slider or bar, as long as the longest name needs them."""
+"""Largest width of a row's name, in parts to one of its slider or bar."""
 
 _FINE = 0.1
-"""Of the pointer's way that a handle follows while Ctrl or Shift is held."""
+"""Fraction of the pointer's motion that a handle follows while Ctrl or Shift is held."""
 
 _FINE_KEYS = Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
 
@@ -61,18 +61,18 @@ class Card(QFrame):
 
     Parameters
     ----------
-    kind : "card", or "truth" for what is exact, not predicted
+    name : "card", or "exact" for the exact check
     """
 
-    def __init__(self, kind: str = "card") -> None:
+    def __init__(self, name: str = "card") -> None:
         super().__init__()
-        self.setObjectName(kind)
+        self.setObjectName(name)
         self.column = vbox(margins=(NORMAL, NORMAL - 2, NORMAL, NORMAL - 2))
         self.setLayout(self.column)
 
 
 class ElidedLabel(QLabel):
-    """A label that shortens its text to the room it has, with the whole text as tool tip then.
+    """A label that elides its text to its width and then has the whole text as tool tip.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ class ElidedLabel(QLabel):
         self._offer_whole()
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
-        """See whether the text fits now."""
+        """Check whether the text fits."""
         super().resizeEvent(event)
         self._offer_whole()
 
@@ -124,7 +124,7 @@ def hbox(
     spacing: int = CLOSE,
     margins: Margins = _NONE,
 ) -> QHBoxLayout:
-    """Return things side by side.
+    """Return widgets side by side.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def hbox(
 def vbox(
     *items: QWidget | QLayout | None, spacing: int = CLOSE, margins: Margins = _NONE
 ) -> QVBoxLayout:
-    """Return things one below the other; see `hbox`."""
+    """Return widgets one below the other; see `hbox`."""
     return _filled(QVBoxLayout(), items, spacing, margins)
 
 
@@ -162,12 +162,12 @@ def _filled(
 
 
 def dialog_vbox(*items: QWidget | QLayout | None) -> QVBoxLayout:
-    """Return what a dialog shows, one below the other."""
+    """Return the content of a dialog, one below the other."""
     return vbox(*items, spacing=WIDE, margins=(WIDE + 4, WIDE + 4, WIDE + 4, WIDE))
 
 
 def title_row(title: str, source: ElidedLabel) -> QHBoxLayout:
-    """Return a card's title, with where its facts come from at the other end."""
+    """Return a card's title, with the source of its facts at the other end."""
     source.setObjectName("caption")
     source.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
     return hbox(labelled(title, "title"), source, wide=source)
@@ -210,7 +210,7 @@ class HoverRow(QWidget):
 
     Attributes
     ----------
-    menu_of : domain and code, None for none, of which a menu is wanted
+    menu_of : domain and code that the menu is for, None for none
     """
 
     hovered = Signal(object)
@@ -236,13 +236,13 @@ class HoverRow(QWidget):
         self.menu_wanted.emit(*self.menu_of, event.globalPos())
 
     def enterEvent(self, event: QEnterEvent) -> None:  # noqa: N802
-        """Tell the domain."""
+        """Signal the domain."""
         self.hovered.emit(self.domain)
         self.update()
         super().enterEvent(event)
 
     def leaveEvent(self, event: QEvent) -> None:  # noqa: N802
-        """Tell that the pointer left."""
+        """Signal that the pointer left."""
         self.hovered.emit(None)
         self.update()
         super().leaveEvent(event)
@@ -289,7 +289,7 @@ class Sign(QLabel):
         self.setPixmap(pixmap(name, colour, self.width(), self.devicePixelRatioF()))
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802
-        """Draw it again in the theme that has come."""
+        """Draw it again in the new theme."""
         super().changeEvent(event)
         if event.type() is QEvent.Type.StyleChange:
             self.show_icon(*self._drawing)
@@ -314,7 +314,7 @@ class Slider(QSlider):
 
     @property
     def origin(self) -> float:
-        """Where the bar begins, as a share of the groove from its left end."""
+        """Where the bar begins, as a fraction of the groove from its left end."""
         return 0.0
 
     def sizeHint(self) -> QSize:  # noqa: N802
@@ -371,8 +371,8 @@ class Slider(QSlider):
             painter.setBrush(QColor(theme.muted))
             painter.drawRect(QRectF(start - 0.5, middle - 5, 1, 10))
         handle = self._handle_x()
-        lively = self.isEnabled()
-        filled = self._colour or theme.accent if lively else theme.track
+        enabled = self.isEnabled()
+        filled = self._colour or theme.accent if enabled else theme.track
         bar = QRectF(min(start, handle), middle - 2.5, abs(handle - start), 5)
         if bar.width() > 0.0:
             fill_with(painter, bar, filled, 0.0)
@@ -381,23 +381,23 @@ class Slider(QSlider):
             halo.setAlpha(90)
             painter.setBrush(halo)
             painter.drawEllipse(QPointF(handle, middle), HANDLE + 3, HANDLE + 3)
-        painter.setBrush(QColor("#ffffff" if lively else theme.window))
-        bright = lively and (self.hasFocus() or self.underMouse())
-        rim = theme.accent if bright else theme.muted if lively else theme.border
+        painter.setBrush(QColor("#ffffff" if enabled else theme.window))
+        bright = enabled and (self.hasFocus() or self.underMouse())
+        rim = theme.accent if bright else theme.muted if enabled else theme.border
         painter.setPen(QPen(QColor(rim), 1.6))
         painter.drawEllipse(QPointF(handle, middle), HANDLE - 1.2, HANDLE - 1.2)
 
     def _handle_x(self) -> float:
-        share = (self.value() - self.minimum()) / max(self.maximum() - self.minimum(), 1)
-        return HANDLE + (self.width() - 2 * HANDLE) * share
+        fraction = (self.value() - self.minimum()) / max(self.maximum() - self.minimum(), 1)
+        return HANDLE + (self.width() - 2 * HANDLE) * fraction
 
     def _value_at(self, x: float) -> int:
-        share = (x - HANDLE) / max(self.width() - 2 * HANDLE, 1.0)
-        return self.minimum() + round(share * (self.maximum() - self.minimum()))
+        fraction = (x - HANDLE) / max(self.width() - 2 * HANDLE, 1.0)
+        return self.minimum() + round(fraction * (self.maximum() - self.minimum()))
 
 
 def wheel_if_focused(widget: QWidget, event: QWheelEvent, handle: object) -> None:
-    """Hand a wheel event on, or refuse it so that what is around scrolls."""
+    """Pass a wheel event on, or ignore it so that the parent scrolls."""
     if widget.hasFocus() and callable(handle):
         handle(event)
     else:
@@ -425,7 +425,7 @@ QProgressBar::chunk {{
 
 
 def plain_tip(text: str) -> str:
-    """Return a tool tip that shows a text to the letter, also one that looks like HTML."""
+    """Return a tool tip that shows a text literally, even if it looks like HTML."""
     return f"<span>{escape(text)}</span>" if "<" in text else text
 
 
@@ -440,24 +440,24 @@ def silent(*widgets: QObject) -> Iterator[None]:
             widget.blockSignals(blocked)
 
 
-def labelled(text: str, kind: str = "", wraps: bool = False) -> QLabel:
-    """Return a label that shows its text to the letter, as a name in it may look like HTML.
+def labelled(text: str, style: str = "", wraps: bool = False) -> QLabel:
+    """Return a label that shows its text literally, as a name in it may look like HTML.
 
     Parameters
     ----------
     text : of the label
-    kind : that the style knows: title, caption, verdict, headline, aside, refusal
+    style : its object name in the style sheet: title, caption, verdict, headline, aside, refusal
     wraps : whether it takes as many lines as it needs
     """
     label = QLabel(text)
     label.setWordWrap(wraps)
     label.setTextFormat(Qt.TextFormat.PlainText)
-    label.setObjectName(kind)
+    label.setObjectName(style)
     return label
 
 
 def show_verdict(widget: QWidget, verdict: str) -> None:
-    """Colour a widget as "free", "colliding", "waiting" or, beside what is known, "aside"."""
+    """Colour a widget as "free", "colliding", "waiting" or, beside known facts, "aside"."""
     if widget.property("verdict") != verdict:
         widget.setProperty("verdict", verdict)
         widget.style().unpolish(widget)

@@ -1,4 +1,4 @@
-"""How the body parts of a model are called, coloured and listed."""
+"""Names, colours and order of the body parts of a model."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class BodyPartsDialog(QDialog):
     ----------
     model : whose parts they are
     copies : whether the changes go to a copy, as the model came with the program
-    taken : names of models that there are, which the copy cannot have
+    taken : names of existing models, which the copy cannot have
     parent : the window that it belongs to
 
     Signals
     -------
-    edited : PartEdits, once it is accepted with something changed
+    edited : PartEdits, when accepted with a change
     """
 
     edited = Signal(object)
@@ -147,7 +147,7 @@ class BodyPartsDialog(QDialog):
         )
 
     def accept(self) -> None:
-        """Hand on what was changed; what cannot be is said, and stays to be put right."""
+        """Hand on what was changed; invalid input is reported and stays to be corrected."""
         # A name that is still being typed counts.
         self.save.setFocus()
         edits = self.edits()

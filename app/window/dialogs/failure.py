@@ -1,4 +1,4 @@
-"""What went wrong, in one sentence with what to do; the details stay folded."""
+"""An error, in one sentence with the next step; the details are folded."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.work.threads import Failure
 
 
 class FailureDialog(QDialog):
-    """Tells of a failure and leaves the window usable behind it.
+    """Shows a failure and leaves the window usable behind it.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class FailureDialog(QDialog):
 
 
 def open_log_file() -> None:
-    """Show the log file in whatever the desktop shows text files with."""
+    """Show the log file with the desktop's program for text files."""
     path = log_file()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch()

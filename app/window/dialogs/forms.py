@@ -1,4 +1,4 @@
-"""Short forms: how large a picture, how long a film, how Resolve works."""
+"""Short forms: size of a picture, length of a turntable video, options of Resolve."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ EXPORT_NAMES = {
     "maya": "Maya",
     "unreal": "Unreal",
 }
-"""What the export's axes are called, by `ExportAxes`."""
+"""Names of the export's axes, by `ExportAxes`."""
 
 
 class ColourButton(QPushButton):
@@ -76,7 +76,7 @@ class Form(QDialog):
     Parameters
     ----------
     title : of the dialog
-    action : what the button that accepts is called
+    action : text of the button that accepts
     settings : read and written
     parent : the window that it belongs to
     """
@@ -103,7 +103,7 @@ class Form(QDialog):
         accept.setDefault(True)
 
     def accept(self) -> None:
-        """Remember what the fields say, and close, unless one has just been refused."""
+        """Store the fields and close, unless a value has just been refused."""
         for field in self._fields.values():
             if isinstance(field, NumberBox):
                 field.interpretText()
@@ -135,7 +135,7 @@ class Form(QDialog):
         return field
 
     def add_choice(self, key: str, label: str, names: dict[str, str], tip: str) -> QComboBox:
-        """Add a field for one of several values, by what they are called."""
+        """Add a field for one of several values, by their names."""
         field = QComboBox()
         for value, name in names.items():
             field.addItem(name, value)
@@ -199,13 +199,13 @@ def screenshot_form(settings: Settings, parent: QWidget) -> Form:
 def export_form(
     settings: Settings, parent: QWidget, up_axis: int, front: npt.NDArray[np.float64]
 ) -> Form:
-    """Ask in which axes and unit a mesh is to be written.
+    """Ask for the axes and the unit of a mesh to write.
 
     Parameters
     ----------
     settings, parent : see `Form`
     up_axis : of the model, 0, 1 or 2
-    front : (3,) direction along an axis in which the model looks
+    front : (3,) direction along an axis that the model faces
     """
     from lcollision_core.model import EXPORT_SCALES, ExportAxes
 
@@ -239,7 +239,7 @@ def export_form(
 
 
 def turntable_form(settings: Settings, parent: QWidget) -> Form:
-    """Ask how long, how large and in front of what a turntable is to be, in which format."""
+    """Ask for length, size, background and format of a turntable."""
     from app.view.turntable import FASTEST_GIF
 
     form = Form("Turntable", "Choose file…", settings, parent)
@@ -282,7 +282,7 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
 
 
 def resolve_form(settings: Settings, parent: QWidget) -> Form:
-    """Ask how Resolve is to work."""
+    """Ask for the options of Resolve."""
     form = Form("Resolve options", "OK", settings, parent)
     metrics = {"eye": "the look of the pose", "latent": "the slider values"}
     tip = "What Resolve tries to change as little as possible"

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
 
 _TITLE_BAR = 60
-"""Of a dialog and what the desktop keeps for itself, in device-independent pixels."""
+"""Margin for a dialog frame and the desktop, in device-independent pixels."""
 
 _ABOUT = """\
 Version {version}, Apache-2.0 licence

@@ -1,4 +1,4 @@
-"""Asking for a name, and saying why one cannot be taken without losing what was typed."""
+"""Asking for a name; a refused one is explained and stays in the field."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from app.window.widgets import labelled
 from app.wording import heading, menu_text
 
 _WIDTH = 400
-"""At least, so that no title is cut."""
+"""Least width, so that no title is cut."""
 
 
 class NameDialog(QInputDialog):
-    """Asks what something is to be called; stays open with its text while the name is refused.
+    """Asks for a name; stays open with its text while the name is refused.
 
     Parameters
     ----------
     parent : the window that it belongs to
     title, label : of the dialog and of its field
     proposed : in the field at first
-    refuse : called with what was typed; says in a sentence why it cannot be, nothing where it can
+    refuse : called with what was typed; returns the reason in a sentence, "" if allowed
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class NameDialog(QInputDialog):
         return self.textValue().strip()
 
     def accept(self) -> None:
-        """Close where the name can be taken; else say why not."""
+        """Close if the name is allowed; else say why not."""
         reason = self._refuse(self.name)
         if not reason:
             super().accept()
@@ -79,7 +79,7 @@ def ask_for_name(
     proposed: str,
     refuse: Callable[[str], object] = lambda _: None,
 ) -> str | None:
-    """Ask what something is to be called; None where the user gives up."""
+    """Ask for a name; None if the user cancels."""
     dialog = NameDialog(parent, title, label, proposed, refuse)
     accepted = dialog.exec() == QDialog.DialogCode.Accepted
     dialog.deleteLater()

@@ -1,4 +1,4 @@
-"""Questions that have to be answered before anything goes on."""
+"""Questions that must be answered before work continues."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from app.work.jobs import WrongScale
 
 _WIDTH = 400
-"""At least, so that no title is cut."""
+"""Least width, so that no title is cut."""
 
 _Role = QMessageBox.ButtonRole
 
 
 class Choice(Enum):
-    """The answer to a question, by what becomes of the user's work."""
+    """The answer to a question, by its effect on the user's work."""
 
     SAVE = _Role.AcceptRole
     DISCARD = _Role.DestructiveRole
@@ -32,7 +32,7 @@ class Choice(Enum):
 
 
 def ask_about_changes(parent: QWidget, pose_name: str, file_name: str = "") -> Choice:
-    """Ask what becomes of unsaved changes, naming what Save writes: the file, where there is one.
+    """Ask about unsaved changes, naming what Save writes: the file, if there is one.
 
     The pose's name alone would promise that the library's pose of that name changes.
     """
@@ -44,7 +44,7 @@ def ask_about_changes(parent: QWidget, pose_name: str, file_name: str = "") -> C
 
 
 def ask_about_recovery(parent: QWidget, lost: LostPose) -> Choice:
-    """Offer a pose that an editor left when it ended without a word.
+    """Offer a pose that an editor left when it crashed.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def ask_about_scale(parent: QWidget, found: WrongScale) -> bool:
 
 
 def message_box(parent: QWidget, title: str, text: str, note: str) -> QMessageBox:
-    """Return a message that shows names to the letter; see `widen`."""
+    """Return a message that shows names literally; see `widen`."""
     box = QMessageBox(parent)
     box.setWindowTitle(title)
     box.setTextFormat(Qt.TextFormat.PlainText)
@@ -141,5 +141,5 @@ def _ask(
     box.exec()
     box.deleteLater()
     clicked = box.clickedButton()
-    # None where the window closed without asking.
+    # None if the window closed without asking.
     return Choice(box.buttonRole(clicked)) if clicked is not None else Choice.CANCEL

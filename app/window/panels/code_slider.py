@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _STEPS = 1000
 
 _FIELD_WIDTH = 78
-"""Of a number of seven signs and its two arrows, in device-independent pixels."""
+"""Width of a number of seven characters and its arrows, in device-independent pixels."""
 
 _BEYOND = 1.5
 """Widths of a slider's range that a number may be typed beyond either end of it."""
@@ -70,9 +70,9 @@ class CodeSlider(Slider):
 
     def show_number(self, number: float) -> None:
         """Move the handle without any signal; beyond the range it stays at the end."""
-        share = (number - self._low) / (self._high - self._low)
+        fraction = (number - self._low) / (self._high - self._low)
         with silent(self):
-            self.setValue(round(min(max(share, 0.0), 1.0) * _STEPS))
+            self.setValue(round(min(max(fraction, 0.0), 1.0) * _STEPS))
         self.update()
 
     @property
@@ -117,7 +117,7 @@ class CodeRow(HoverRow):
     code : index from 0 in the latent
     place : index from 0 in its group
     domain : of its group, None for the whole body's
-    name_width : room that the name takes before the slider gets any but the least
+    name_width : width of the name before the slider gets more than its least
     """
 
     def __init__(

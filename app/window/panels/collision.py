@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from app.editing.document import PoseDocument
 
 _MIN_WIDTH = 288
-"""In which every card is seen whole, beside a scroll bar."""
+"""Width that shows every card whole beside a scroll bar."""
 
 
 class CollisionPanel(QWidget):
@@ -62,6 +62,6 @@ class CollisionPanel(QWidget):
 
     @Slot()
     def _scroll_to_outcome(self) -> None:
-        """Show all that came of Resolve, or how it begins where there is no room for all."""
+        """Show the whole result of Resolve, or its beginning if there is no space for all."""
         self._area.ensureWidgetVisible(self.resolve, 0, CLOSE)
         self._area.ensureWidgetVisible(self.resolve.exactly_free, 0, CLOSE)

@@ -15,10 +15,10 @@ class Panel(QDockWidget):
 
     Parameters
     ----------
-    key : under which the layout remembers it
+    key : of the panel in the stored layout
     title : of the panel
     content : of the panel
-    window : to which it belongs
+    window : its parent
     """
 
     def __init__(self, key: str, title: str, content: QWidget, window: QMainWindow) -> None:
@@ -48,12 +48,12 @@ class Panel(QDockWidget):
         view = self._window.centralWidget()
         if view is None or not (self.isFloating() and self.isVisible()):
             return
-        room = self._window.screen().availableGeometry()
+        screen = self._window.screen().availableGeometry()
         # The body stands in the middle of the view.
         body = QRect(0, 0, view.width() // 2, view.height())
         body.moveCenter(QRect(view.mapToGlobal(QPoint(0, 0)), view.size()).center())
         frame = self.frameGeometry()
-        place = beside(frame, self._window.frameGeometry(), body, room)
+        place = beside(frame, self._window.frameGeometry(), body, screen)
         self.move(place)
 
 
@@ -65,7 +65,7 @@ def bring_up(content: QWidget) -> None:
         dock.raise_()
 
 
-def beside(panel: QRect, window: QRect, body: QRect, room: QRect) -> QPoint:
+def beside(panel: QRect, window: QRect, body: QRect, screen: QRect) -> QPoint:
     """Find where a panel hides neither its window nor the body in it.
 
     Parameters
@@ -73,16 +73,16 @@ def beside(panel: QRect, window: QRect, body: QRect, room: QRect) -> QPoint:
     panel : its size counts, and its top
     window : the window's frame
     body : in the window
-    room : of the screen
+    screen : its available area
 
     Returns
     -------
-    corner : right of the window, left, below or above it, where there is room; else at the edge of
+    corner : right of the window, left, below or above it, where there is space; else at the edge of
         the screen where it hides least of the body
     """
-    right, bottom = room.right() + 1 - panel.width(), room.bottom() + 1 - panel.height()
-    top = max(room.top(), min(panel.top(), bottom))
-    left = max(room.left(), min(panel.left(), right))
+    right, bottom = screen.right() + 1 - panel.width(), screen.bottom() + 1 - panel.height()
+    top = max(screen.top(), min(panel.top(), bottom))
+    left = max(screen.left(), min(panel.left(), right))
     outside = (
         QPoint(window.right() + CLOSE, top),
         QPoint(window.left() - CLOSE - panel.width(), top),
@@ -90,10 +90,10 @@ def beside(panel: QRect, window: QRect, body: QRect, room: QRect) -> QPoint:
         QPoint(left, window.top() - CLOSE - panel.height()),
     )
     for corner in outside:
-        if room.contains(QRect(corner, panel.size())):
+        if screen.contains(QRect(corner, panel.size())):
             return corner
-    edges = [QPoint(max(right, room.left()), top), QPoint(room.left(), top)]
-    edges += [QPoint(left, max(bottom, room.top())), QPoint(left, room.top())]
+    edges = [QPoint(max(right, screen.left()), top), QPoint(screen.left(), top)]
+    edges += [QPoint(left, max(bottom, screen.top())), QPoint(left, screen.top())]
 
     def hidden(corner: QPoint) -> int:
         over = QRect(corner, panel.size()).intersected(body)

@@ -1,4 +1,4 @@
-"""What is known of the pose: the exact check, which follows when the hand rests."""
+"""The exact check of the pose, which follows when the pose rests."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _BEFORE = "previous pose"
 
 
 class ExactCard(Card):
-    """The headline of the right panel: the exact verdict, with pairs and depth.
+    """The headline of the right panel: the exact result, with pairs and depth.
 
-    While a changed pose waits for its check, the verdict of the pose before stays, greyed and
-    said to be that: nothing flickers, and no line comes or goes.
+    While a changed pose waits for its check, the previous result stays, greyed and
+    marked as such: nothing flickers, and no line comes or goes.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class ExactCard(Card):
     """
 
     def __init__(self, document: PoseDocument) -> None:
-        super().__init__("truth")
+        super().__init__("exact")
         self._document = document
         self._sign = Sign(_SIGN_SIZE)
         self.verdict = labelled("", "headline", wraps=True)
@@ -44,17 +44,17 @@ class ExactCard(Card):
 
     @property
     def is_of_the_pose_before(self) -> bool:
-        """Whether what is said waits for the check of a pose that has changed since."""
+        """Whether the result shown is of a pose that has changed since."""
         return self._kind == "waiting" and self._sign.name != "wait"
 
     def _on_model(self) -> None:
-        """Forget the verdict of another model's pose."""
+        """Clear the result of another model's pose."""
         has_model = self._document.has_model
         self._sign.show_icon("wait", "waiting")
         self.verdict.setText("Checking…" if has_model else "No pose yet")
         self.details.setText("Follows a moment after the pose rests")
         if has_model:
-            # Folds that do not count are told of on a line of their own.
+            # Folds that do not count are reported on a separate line.
             lines = 2 if self._document.model.near_exclusion else 1
             self.details.setMinimumHeight(lines * self.details.fontMetrics().lineSpacing())
         self._on_exact()

@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from lcollision_core.model import NamedPose
 
 _PAUSE = 25
-"""Milliseconds between two pictures, so that the window stays live while they are drawn."""
+"""Milliseconds between two pictures, so that the window responds while they are drawn."""
 
-_HEIGHT_OF_A_ROW = 480
-"""Of the window, so that most of it stays the body's."""
+_HEIGHT_PER_ROW = 480
+"""Window height for each row, so that the body gets most of it."""
 
 _BLEND_STEPS = 100
 _ONLY = QItemSelectionModel.SelectionFlag.ClearAndSelect
@@ -159,12 +159,12 @@ class LibraryPanel(QWidget):
 
     @property
     def chosen_own(self) -> NamedPose | None:
-        """The chosen pose where the library is shown; None for none or for one of elsewhere."""
+        """The chosen pose where the library is shown; None for none or for one from elsewhere."""
         return self.chosen if self.source is Source.LIBRARY else None
 
     @property
     def source(self) -> Source:
-        """Whose poses are shown."""
+        """The source of the poses shown."""
         if self.own.isChecked():
             return Source.LIBRARY
         return Source.FILE if self.of_file.isChecked() else Source.TRAINING
@@ -180,7 +180,7 @@ class LibraryPanel(QWidget):
         self.refresh()
 
     def stop(self) -> None:
-        """Draw no more pictures, as the window goes."""
+        """Draw no more pictures, as the window closes."""
         self._due.stop()
         self._may_draw = False
 
@@ -281,13 +281,13 @@ class LibraryPanel(QWidget):
         self.list.hint.setText(hint)
         self.list.hint.setVisible(not n_shown)
         self._on_chosen()
-        # What is seen now wants its pictures first.
+        # Visible poses get their pictures first.
         self._wanted.clear()
         self.list.viewport().update()
 
     def sizeHint(self) -> QSize:  # noqa: N802
         """Ask for one row of pictures, and in a tall window for more."""
-        one, rows = super().sizeHint(), max(self.window().height() // _HEIGHT_OF_A_ROW, 1)
+        one, rows = super().sizeHint(), max(self.window().height() // _HEIGHT_PER_ROW, 1)
         return one + QSize(0, (rows - 1) * self.list.gridSize().height())
 
     def _names(self) -> list[str]:
@@ -319,7 +319,7 @@ class LibraryPanel(QWidget):
 
     @Slot()
     def _on_pose_loaded(self) -> None:
-        # Only a file's poses come in without a past.
+        # Only a file's poses are loaded without history.
         if self._document.file_poses and not self._document.undo_stack.count():
             self.of_file.setChecked(True)
 
@@ -427,7 +427,7 @@ class LibraryPanel(QWidget):
 
 
 def _action_button(action: QAction) -> QToolButton:
-    """Return a button that does what an action does, and says so as that does now."""
+    """Return a button that does what an action does, and has its current text and state."""
     button = QToolButton()
     button.setObjectName("action")
     button.setDefaultAction(action)

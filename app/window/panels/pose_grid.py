@@ -1,4 +1,4 @@
-"""A grid of pictures with names: as many rows as there is room, names on two lines."""
+"""A grid of pictures with names: as many rows as fit, names on two lines."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class PoseGrid(QListWidget):
         return QSize(400, self._cell.height() + CLOSE)
 
     def minimumSizeHint(self) -> QSize:  # noqa: N802
-        """Manage with one picture."""
+        """Allow a width of one picture."""
         return QSize(self._cell.width() + 20, self._cell.height() + TIGHT)
 
 

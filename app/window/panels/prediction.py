@@ -1,4 +1,4 @@
-"""The estimate: what the model believes of the pose at once, and one row for each domain."""
+"""The estimate: immediate, of the whole pose, and one row for each domain."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class ProbabilityMeter(QWidget):
         return self._probability
 
     def show_probability(self, probability: float | None, is_aside: bool = False) -> None:
-        """Move the mark; once the exact check has spoken it is grey, as it is no alarm."""
+        """Move the mark; once the exact check is known it is grey."""
         if (probability, is_aside) != (self._probability, self._is_aside):
             self._probability, self._is_aside = probability, is_aside
             self.update()
@@ -114,7 +114,7 @@ class DomainRow(HoverRow):
     ----------
     document : has the lock
     domain : index from 0
-    name_width : room that the name takes before the bar gets any but the least
+    name_width : width of the name before the bar gets more than its least
     """
 
     def __init__(self, document: PoseDocument, domain: int, name_width: int) -> None:
@@ -146,7 +146,7 @@ class DomainRow(HoverRow):
         self.show_lock(False)
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802
-        """Edge the bar as the theme that has come needs it."""
+        """Edge the bar for the new theme."""
         super().changeEvent(event)
         if event.type() is QEvent.Type.StyleChange:
             self.bar.setStyleSheet(bar_style(self._colour))
@@ -170,13 +170,13 @@ class DomainRow(HoverRow):
         self.bar.setVisible(energy is not None)
         if energy is not None:
             # The root of an energy is a depth.
-            share = math.sqrt(max(energy, 0.0)) / FULL_PREDICTED
-            self.bar.setValue(round(_BAR_STEPS * min(share, 1.0)))
+            fraction = math.sqrt(max(energy, 0.0)) / FULL_PREDICTED
+            self.bar.setValue(round(_BAR_STEPS * min(fraction, 1.0)))
             self.setToolTip(plain_tip(f"{self._name}: predicted overlap {overlap_text(energy)}"))
 
 
 class PredictionCard(Card):
-    """The estimate, beneath the exact check: small, and grey once that has spoken.
+    """The estimate, beneath the exact check: small, and grey once that is known.
 
     Signals
     -------

@@ -1,4 +1,4 @@
-"""Resolve: start and cancel it, follow it, and read what came of it."""
+"""Resolve: start and cancel it, its progress and its result."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lcollision_core.resolve import ResolveResult
 
 _WAITED = 0.5
-"""Seconds of waiting before the search that are worth telling."""
+"""Least seconds of waiting before the search that are reported."""
 
 _SIGNS = {True: ("check", "free"), False: ("error", "colliding"), None: ("info", "muted")}
 """Icon and colour for yes, no and not known."""
@@ -46,7 +46,7 @@ class Fact(QWidget):
         super().__init__()
         self._is_aside = is_aside
         self._sentences = dict(zip((True, False, None), sentences, strict=True))
-        self.truth: bool | None = None
+        self.answer: bool | None = None
         self._sign = Sign(18)
         self._text = labelled("", "aside" if is_aside else "", wraps=True)
         if is_aside:
@@ -59,18 +59,20 @@ class Fact(QWidget):
         """The icon that is shown: "check", "error" or "info"."""
         return self._sign.name
 
-    def show_truth(self, truth: bool | None, instead: str = "", looks: bool | None = None) -> None:
+    def show_answer(
+        self, answer: bool | None, instead: str = "", looks: bool | None = None
+    ) -> None:
         """Say yes, no, or that it is not known.
 
         Parameters
         ----------
-        truth : what is known
+        answer : None while not known
         instead : said in place of the fact's own sentence, where another fact outweighs this one
-        looks : as which of the three `instead` looks
+        looks : the answer that `instead` looks like
         """
-        self.truth = truth
-        self._sign.show_icon(*_SIGNS[None if self._is_aside else looks if instead else truth])
-        self._text.setText(instead or self._sentences[truth])
+        self.answer = answer
+        self._sign.show_icon(*_SIGNS[None if self._is_aside else looks if instead else answer])
+        self._text.setText(instead or self._sentences[answer])
 
 
 class ResolveCard(Card):
@@ -104,7 +106,7 @@ class ResolveCard(Card):
         self._make_outcome()
         self.resting = QWidget()
         self.resting.setLayout(hbox(self.button, self.options, wide=self.button))
-        # One takes the other's place, so that nothing jumps.
+        # They swap in place, so that nothing jumps.
         self.stack = QStackedWidget()
         self.stack.addWidget(self.resting)
         self.stack.addWidget(self.working)
@@ -169,7 +171,7 @@ class ResolveCard(Card):
     def _on_started(self) -> None:
         self._go_to(self.working, self.cancel)
         self.outcome.hide()
-        # Until the first report there is no telling how far it is.
+        # Until the first report its progress is unknown.
         self.bar.setRange(0, 0)
 
     def _go_to(self, page: QWidget, button: QPushButton) -> None:
@@ -190,7 +192,7 @@ class ResolveCard(Card):
     @Slot(object)
     def _on_finished(self, result: object) -> None:  # noqa: ARG002
         self._go_to(self.resting, self.button)
-        # An endless bar is animated even while nobody sees it.
+        # Qt animates an endless bar even while it is hidden.
         self.bar.setRange(0, 1)
         self._on_outcome()
 
@@ -210,7 +212,7 @@ class ResolveCard(Card):
 
         ran = result.solver_status != "not run"
         exactly_free, predicted_free = result.exactly_free, result.predicted_free
-        self.exactly_free.show_truth(exactly_free)
+        self.exactly_free.show_answer(exactly_free)
         # A search that was cut short has done its work where its pose is free.
         instead, looks = "", None
         if ran and exactly_free:
@@ -219,10 +221,10 @@ class ResolveCard(Card):
             instead = "No search: all body parts are locked"
         elif not ran and result.step != Step.UNCHANGED:
             instead = "No search: the time limit came first"
-        self.converged.show_truth(result.converged if ran else None, instead, looks)
+        self.converged.show_answer(result.converged if ran else None, instead, looks)
         overruled = exactly_free is not None and exactly_free != predicted_free
         word = "clear" if predicted_free else "colliding"
-        self.predicted_free.show_truth(
+        self.predicted_free.show_answer(
             predicted_free, f"Estimate: probably {word}, overruled" if overruled else ""
         )
         if result.energy_before is None or result.energy_after is None:

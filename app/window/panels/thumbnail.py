@@ -44,21 +44,21 @@ def draw_pose(
     pixels : (side, side, 4) uint8 array, red, green, blue and alpha, which is 0 beside the mesh
     """
     arm = view.position - view.focus
-    reach = float(np.linalg.norm(arm))
-    towards = arm / reach
+    distance = float(np.linalg.norm(arm))
+    towards = arm / distance
     axes = np.stack([np.cross(view.up, towards), view.up, towards])
-    place = (np.asarray(vertices, dtype=np.float64) - view.focus) @ axes.T
+    points = (np.asarray(vertices, dtype=np.float64) - view.focus) @ axes.T
     n_dots = side * _FINENESS
-    place *= 0.5 * n_dots / (reach * math.tan(math.radians(0.5 * VIEW_ANGLE)))
+    points *= 0.5 * n_dots / (distance * math.tan(math.radians(0.5 * VIEW_ANGLE)))
     lamp = np.array([-0.35, 0.5, 0.8])
     light = np.clip(normals @ axes.T @ (lamp / np.linalg.norm(lamp)), 0.0, 1.0)
-    a, b, c = (place[corner] for corner in faces.T)
+    a, b, c = (points[corner] for corner in faces.T)
     turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0.0
     seen = faces[turned]
-    edges = np.abs(place[seen] - place[np.roll(seen, 1, axis=1)])[..., :2]
+    edges = np.abs(points[seen] - points[np.roll(seen, 1, axis=1)])[..., :2]
     cuts = int(np.clip(math.ceil(np.quantile(edges, 0.98)) + 1, 1, _MOST_CUTS))
     weights = _barycentric(cuts)
-    dots = np.einsum("wk,fkd->fwd", weights, place[seen]).reshape(-1, 3)
+    dots = np.einsum("wk,fkd->fwd", weights, points[seen]).reshape(-1, 3)
     shade = np.einsum("wk,fk->fw", weights, light[seen]).ravel()
     order = np.argsort(dots[:, 2], kind="stable")
     columns = np.floor(0.5 * n_dots + dots[order, 0]).astype(np.intp)
@@ -70,8 +70,8 @@ def draw_pose(
     picture[rows[inside], columns[inside], :3] = strength * np.array(colour)
     picture[rows[inside], columns[inside], 3] = 255.0
     blocks = picture.reshape(side, _FINENESS, side, _FINENESS, 4).sum(axis=(1, 3))
-    hits = np.maximum(blocks[..., 3:] / 255.0, 1.0)
-    blocks[..., :3] /= hits
+    counts = np.maximum(blocks[..., 3:] / 255.0, 1.0)
+    blocks[..., :3] /= counts
     blocks[..., 3] /= _FINENESS**2
     return np.ascontiguousarray(blocks.round().astype(np.uint8))
 

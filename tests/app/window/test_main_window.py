@@ -208,8 +208,8 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     assert window.collision.exact.verdict.text() == "No collisions (checked)"
     assert document.outcome is not None
     assert card.outcome.isVisible()
-    assert card.exactly_free.truth is True
-    assert card.predicted_free.truth == document.outcome.predicted_free
+    assert card.exactly_free.answer is True
+    assert card.predicted_free.answer == document.outcome.predicted_free
     assert document.undo_stack.count() == steps + 1
     assert np.array_equal(document.ghost, before)
     QTest.keyClick(window, Qt.Key.Key_Z, Qt.KeyboardModifier.ControlModifier)
@@ -224,7 +224,7 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     )
     rest(qtbot, window)
     assert shown(window).tobytes() == after.tobytes()
-    assert card.exactly_free.truth is True
+    assert card.exactly_free.answer is True
 
 
 def words_on_the_screen(window: MainWindow) -> Iterator[str]:

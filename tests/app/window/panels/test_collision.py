@@ -1,4 +1,4 @@
-"""The right panel: it has the room it needs, and tells prediction and truth apart."""
+"""The right panel: it has the space it needs, and separates the estimate from the exact check."""
 
 from __future__ import annotations
 
@@ -131,8 +131,8 @@ def test_the_estimate_steps_back_once_the_check_has_spoken(
     )
     assert alarm in colours_of(card.meter)
     rest(qtbot, window)
-    truth = "Colliding (checked)" if collides else "No collisions (checked)"
-    assert headline.verdict.text() == truth
+    expected = "Colliding (checked)" if collides else "No collisions (checked)"
+    assert headline.verdict.text() == expected
     assert ink(headline.verdict) == getattr(current_theme(), "colliding" if collides else "free")
     assert card.verdict.text() == (said if right else "Overruled by the check")
     assert ink(card.verdict) == ink(card.percent) == current_theme().muted
@@ -239,7 +239,7 @@ def test_a_free_pose_reads_as_success_whatever_was_predicted(
         document._amend(replace(document._state, outcome=outcome))
         assert [fact.sign for fact in facts] == signs
         assert [text for fact in facts for text in texts(fact)] == words
-        assert [fact.truth for fact in facts] == [
+        assert [fact.answer for fact in facts] == [
             outcome.exactly_free,
             outcome.converged,
             outcome.predicted_free,
