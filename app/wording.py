@@ -1,4 +1,4 @@
-"""Numbers and names as people read them."""
+"""Formats numbers and names for the user."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NOT_IN_A_LINE = re.compile(
 )
 
 _FAR = 0.03
-"""Normalised fit error that is hardly ever exceeded, unless the mesh is another body."""
+"""Normalised fit error that is rarely exceeded unless the mesh is another body."""
 
 
 _MIRRORED = " mirrored"
@@ -49,7 +49,7 @@ def seconds_text(seconds: float) -> str:
 
 
 def menu_text(name: str) -> str:
-    """Write a name so that a menu, a button or a form's label shows it to the letter."""
+    """Write a name so that a menu, a button or a form's label shows it literally."""
     return one_line(name).replace("&", "&&")
 
 
@@ -59,14 +59,14 @@ def one_line(text: str) -> str:
 
 
 def fit_error(mean: float | None, most: float | None) -> str:
-    """Say how far off the nearest pose of a mesh is, normalised; None is not off at all."""
+    """Describe the fit error of a mesh, normalised; None for an exact pose."""
     mean, most = mean or 0.0, most or 0.0
     far = ", which is far: is it this body, in the model's vertex order?" if mean > _FAR else ""
     return f"fit error of {100.0 * mean:.3f} % of the body size, at most {100.0 * most:.2f} %{far}"
 
 
 def mirrored_name(name: str) -> str:
-    """Return what the mirror image of a pose is called: "twist left" of "twist right".
+    """Return the name of the mirror image of a pose: "twist left" of "twist right".
 
     Of a name without a side, "NAME mirrored"; and of that, NAME.
     """
@@ -83,7 +83,7 @@ def _other_side(word: re.Match[str]) -> str:
 
 
 def mirrored_text(mirrored: MirroredPose) -> str:
-    """Say what became of a mirrored pose: how far off it is, and whether it collides."""
+    """Describe a mirrored pose: its fit error, and whether it collides."""
     pairs = counted(mirrored.pairs_after, "pair of faces", "pairs of faces")
     if mirrored.pairs_after == 0 < mirrored.pairs_mirrored:
         resolved = counted(mirrored.pairs_mirrored, "pair of faces", "pairs of faces")

@@ -1,6 +1,6 @@
 """Exact self-collision against python-fcl and coal, pose by pose in one run.
 
-The peers know no "share a vertex" rule, so they are asked for every contact of the mesh with
+The peers have no "share a vertex" rule, so they are asked for every contact of the mesh with
 itself and their neighbours are dropped afterwards; they cannot stop at the first pair that
 counts. Each of their poses includes building their tree, as python-fcl cannot refit one; ours
 is built once for the set. All tools are given the same poses within one run, so their ratios hold
@@ -108,7 +108,7 @@ def time_detection(
             agrees=agreed,
         )
 
-    # Many poses a thread, so that its start and the last one's wait do not count.
+    # Many poses per thread, so that start-up and idling at the end hardly count.
     repeats = -(-BATCH_POSES_PER_THREAD * threads // len(vertices))
     batch = np.tile(vertices, (repeats, 1, 1))
     n_pairs = np.tile(n_expected, repeats)

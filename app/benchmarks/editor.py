@@ -1,4 +1,4 @@
-"""The editor as its user experiences it, model by model, each in a process of its own."""
+"""The editor as its user experiences it, model by model, each in a separate process."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STARTS = 3
 """Runs for each model: the first fills the caches, the last is the one that is measured."""
 
 _MOST_SECONDS, _MOST_SECONDS_AN_ACTION = 900.0, 10.0
-"""After which an editor is taken to hang: many times what a slow machine needs."""
+"""Seconds until an editor counts as hanging: many times what a slow machine needs."""
 
 
 @dataclass(frozen=True, slots=True)

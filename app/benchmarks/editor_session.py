@@ -135,7 +135,7 @@ class Session(QObject):
         return (time.process_time() - cpu) / (time.monotonic() - wall)
 
     def act(self, n_actions: int) -> tuple[list[str], float]:
-        """Do random actions, each whatever came of the one before.
+        """Do random actions, each whatever the result of the one before.
 
         Returns
         -------
@@ -167,7 +167,7 @@ class Session(QObject):
         self.pause()
 
     def _actions(self, chance: random.Random) -> dict[Callable[[], object], float]:
-        """Return what to do with how much weight."""
+        """Return the actions with their weights."""
         document, window = self._document, self._window
         viewport, model = window.viewport, document.model
         n_domains = len(model.domain_names)
@@ -232,7 +232,7 @@ class Session(QObject):
             "predict_ms": predict,
         }
 
-    # Waiting, with the window alive.
+    # Waiting, with events processed.
 
     def is_shown(self) -> bool:
         """Whether the picture on the screen is of the pose."""
@@ -240,7 +240,7 @@ class Session(QObject):
         return frame is not None and frame.latent is self._document.latent
 
     def is_settled(self) -> bool:
-        """Whether nothing is to be expected any more."""
+        """Whether no work is pending."""
         document = self._document
         return (
             self.is_shown()

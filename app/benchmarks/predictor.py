@@ -132,7 +132,7 @@ def _time_exact(
     detector = CollisionDetector(
         model.topology, model.reference, near_exclusion=model.near_exclusion
     )
-    # Compiling and the trees are not what a pose costs.
+    # Compiling and building the trees are not timed.
     first = model.decode(latent[:BATCH])
     detector.are_colliding(first[:8])
     decode = check = 0.0

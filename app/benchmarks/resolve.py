@@ -1,8 +1,8 @@
-"""Resolve on colliding poses, solver by solver, beside bisection that has learnt nothing.
+"""Resolve on colliding poses, solver by solver, beside bisection without learning.
 
 Each solver runs twice on each pose, on one core: alone, for the paper's figures of merit (whether
 the point that it returns is feasible for the classifier, and how much of the exact energy is
-gone), and with the whole ladder, for time, distances and the exact verdict.
+gone), and with the whole ladder, for time, distances and the exact check.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def score_baseline(model: PoseModel, poses: CollidingPoses) -> ResolveScore:
 
     Raises
     ------
-    LCollisionError : the model knows no free pose.
+    LCollisionError : the model stores no free pose.
     """
     if len(model.free_latent) == 0:
         raise LCollisionError(
@@ -182,7 +182,7 @@ def score_solver(
     CancelledError : `cancel` was set.
     """
     resolver = model.resolver
-    # What is built once for all poses is not a pose's time.
+    # What is built once for all poses is not timed.
     resolver.resolve(poses.latents[0], ResolveOptions(solver=solver, metric=metric))
     alone, whole = [], []
     for target, placement in zip(poses.latents, poses.placements, strict=True):

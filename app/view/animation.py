@@ -1,4 +1,4 @@
-"""What moves by itself for a moment: the mesh after Resolve, and the camera."""
+"""Short animations: of the mesh after Resolve, and of the camera."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from PySide6.QtCore import QAbstractAnimation, QEasingCurve, QObject, QVariantAn
 
 
 class Animation(QVariantAnimation):
-    """Leads once from one state to another, slowly at both ends.
+    """Animates once from one state to another, eased at both ends.
 
     Parameters
     ----------
@@ -29,16 +29,16 @@ class Animation(QVariantAnimation):
 
     @property
     def is_running(self) -> bool:
-        """Whether the end has not been reached."""
+        """Whether it is running."""
         return self.state() is not QAbstractAnimation.State.Stopped
 
     def begin(self, at: Callable[[float], object]) -> None:
-        """Start anew; `at` returns what is between the states at a fraction from 0 to 1."""
+        """Start again; `at` returns the state at a fraction from 0 to 1."""
         self.stop()
         self._at = at
         self.start()
 
     def updateCurrentValue(self, fraction: float) -> None:  # noqa: N802 - Qt's name
-        """Tell of the next state."""
+        """Emit the next state."""
         if self.is_running:
             self.moved.emit(self._at(fraction))

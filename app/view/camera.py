@@ -1,4 +1,4 @@
-"""Cameras: presets, framing, zooming and what is between two of them."""
+"""Cameras: presets, framing, zooming and blending."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def preset_view(
         "Back": -front,
         "Left": left,
         "Right": -left,
-        # Straight from above, a camera that keeps upright has no direction to turn in.
+        # Straight from above, an upright camera has no defined direction to turn in.
         "Top": up + 0.02 * front,
     }[name]
     return framing(vertices, towards, up, aspect)
@@ -102,7 +102,7 @@ def sees_all(view: View, vertices: npt.NDArray[Any], aspect: float) -> bool:
 def kept_in_view(
     view: View, before: npt.NDArray[Any], after: npt.NDArray[Any], aspect: float
 ) -> View | None:
-    """Go on seeing the whole mesh from the same side, if it was seen until another pose came in.
+    """Keep the whole mesh in view from the same side, if it was before the pose changed.
 
     Parameters
     ----------
@@ -140,8 +140,7 @@ def zoomed(
     Parameters
     ----------
     anchor : (3,) array, in the data's unit
-    factor : of the distance to it, below 1 to come nearer; no nearer than a hand, no farther than
-        where the body is a dot
+    factor : of the distance to it, below 1 to come nearer; limited at both ends
     vertices : (V, 3) array; turning goes round a point of the line of sight that is as deep in the
         scene as they are
     body_size : in the data's unit
@@ -177,7 +176,7 @@ def between(start: View, end: View, fraction: float) -> View:
     axis = np.cross(a, b)
     angle = np.arctan2(np.linalg.norm(axis), a @ b)
     if np.linalg.norm(axis) < 1e-3:
-        # From front to back there are many ways: the one round the upright.
+        # From front to back the axis is ambiguous: take the upright one.
         axis = end.up
     turn = Rotation.from_rotvec(fraction * angle * axis / np.linalg.norm(axis))
     length = (1.0 - fraction) * lengths[0] + fraction * lengths[1]

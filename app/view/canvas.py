@@ -35,11 +35,11 @@ _FOR_THE_WINDOW = (
     QEvent.Type.DragEnter,
     QEvent.Type.Drop,
 )
-"""VTK has keys of its own, and pyvistaqt would add any file as a mesh."""
+"""VTK binds keys itself, and pyvistaqt would add any dropped file as a mesh."""
 
 _SLOW_SECONDS, _FAST_SECONDS = 0.020, 0.012
 """A smooth picture that takes longer makes a drag stutter; one that takes less leaves time for
-all else before the screen wants the next."""
+other work before the next one."""
 _SLOW_PICTURES = 3
 
 
@@ -59,7 +59,7 @@ class Smoothness:
         return self._n_slow < _SLOW_PICTURES
 
     def note(self, seconds: float) -> None:
-        """Take account of how long a smooth picture took."""
+        """Record how long a smooth picture took."""
         if seconds < _FAST_SECONDS:
             self._n_slow = 0
         elif seconds > _SLOW_SECONDS:
@@ -125,7 +125,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._observer = self._vtk_interactor.AddObserver("RenderEvent", self._on_render_wanted)
 
     def redraw(self) -> None:
-        """Ask for a picture soon, and for a smooth one once nothing moves any more."""
+        """Request a picture, and a smooth one once nothing moves."""
         if self._shut:
             return
         self.is_settled = False
@@ -134,7 +134,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self.update()
 
     def pick_vertex(self, place: QPointF, actor: vtkActor) -> int | None:
-        """Return the vertex that is seen at a place.
+        """Return the vertex that is seen at a position.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
     def point_at(
         self, place: QPointF, actor: vtkActor, depth_of: npt.NDArray[Any]
     ) -> npt.NDArray[np.float64]:
-        """Return what is seen at a place, or beside the mesh a point as deep as another.
+        """Return the point seen at a position, or beside the mesh a point as deep as another.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self.painted.emit(seconds)
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Draw rough pictures while the window is pulled."""
+        """Draw rough pictures while the window is resized."""
         super().resizeEvent(event)
         self.redraw()
 
@@ -225,7 +225,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._right_press = event.position() if is_right else None
 
     def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
-        """Turn the camera while a button is pressed, tell of the pointer otherwise."""
+        """Turn the camera while a button is pressed, signal the pointer otherwise."""
         if self._right_press is not None:
             way = (event.position() - self._right_press).manhattanLength()
             if way < QApplication.startDragDistance():
@@ -272,7 +272,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         return bool(super().event(event))
 
     def leaveEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
-        """Tell that the pointer has gone."""
+        """Signal that the pointer has left."""
         self._hover.stop()
         self._pointer = None
         if not self._shut:

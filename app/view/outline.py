@@ -96,7 +96,7 @@ class Outline:
     """Draws a part's border on the body and the rim of its silhouette, in a constant width.
 
     The rim is the part's own skin, a little larger, with only its back faces drawn: where
-    the body does not hide it, it stands out round the part. No colour of the mesh is touched.
+    the body does not hide it, it stands out round the part. The colours of the mesh do not change.
 
     Parameters
     ----------

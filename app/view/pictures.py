@@ -45,7 +45,7 @@ class Pictures(QObject):
         self._document = document
         self._scene_now = scene_now
         self._video: TurntableVideo | None = None
-        # With 0 ms between two frames the window's own events still have their turn.
+        # With 0 ms between two frames the window's own events are still processed.
         self._next = QTimer(self, interval=0)
         self._next.timeout.connect(self._on_next)
 
@@ -105,7 +105,7 @@ class Pictures(QObject):
 
     @Slot()
     def cancel(self) -> None:
-        """Give up the video that is being drawn."""
+        """Cancel the video that is being drawn."""
         if self._video is not None:
             self._end().close()
             self._document.message.emit("The turntable was cancelled")

@@ -1,4 +1,4 @@
-"""What stands in front of the camera: the mesh, its ghost, the floor and the light."""
+"""The scene: the mesh, its ghost, the floor and the light."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Scene:
 
     Parameters
     ----------
-    plotter : what is in it goes
+    plotter : its content is removed
     model : of the poses to show
     theme : whose colours are used
     """
@@ -87,7 +87,7 @@ class Scene:
         self.set_theme(theme)
 
     def set_theme(self, theme: Theme) -> None:
-        """Take the colours of a theme."""
+        """Apply the colours of a theme."""
         self._renderer.set_background(theme.sky_bottom, top=theme.sky_top)
         self._floor.prop.color, self._shadow.prop.color = theme.floor, theme.shadow
         self._ghost.colours[:, :3] = pv.Color(theme.ghost).int_rgb
@@ -112,7 +112,7 @@ class Scene:
         Parameters
         ----------
         vertices, normals : (V, 3) arrays
-        colours : (V, 3) uint8 array; the last ones where None
+        colours : (V, 3) uint8 array; the previous ones if None
         """
         self.surface.vertices[:] = vertices
         self.surface.normals[:] = normals
@@ -199,16 +199,16 @@ class Scene:
         camera.position, camera.focal_point, camera.up = view.position, view.focus, view.up
         camera.view_angle = VIEW_ANGLE
         self._renderer.ResetCameraClippingRange()
-        # Otherwise pyvista turns the camera to a view of its own at the first picture.
+        # Otherwise pyvista turns the camera to a default view at the first picture.
         self._renderer.camera_set = True
 
     def turn_camera(self, degrees: float) -> None:
-        """Turn the camera round what it looks at, about its upright."""
+        """Turn the camera round its focus, about its up direction."""
         self._renderer.camera.Azimuth(degrees)
         self._renderer.ResetCameraClippingRange()
 
     def _fade_ghost(self) -> None:
-        """Leave of the ghost what the body has moved away from.
+        """Show the ghost only where the body has moved away from it.
 
         Where both coincide, patches of one and of the other would be seen.
         """

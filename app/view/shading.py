@@ -31,7 +31,7 @@ UNIT = "in % of the body size"
 
 
 class Shading(Enum):
-    """What the colours of the mesh say; the value is what their legend calls it."""
+    """What the colours of the mesh show; the value is the title of the legend."""
 
     PLAIN = "Plain"
     DOMAINS = "Body parts"
@@ -49,7 +49,7 @@ _RAMPS = {
 
 
 class Known(NamedTuple):
-    """What is known of a pose; None what is not, or not yet.
+    """What is known of a pose; None for what is not, or not yet.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Shader:
         self._leading = self._mask.argmax(axis=0)
 
     def leading_domain(self, vertex: int) -> int:
-        """Return the domain that owns most of a vertex."""
+        """Return the domain with the largest weight in a vertex."""
         return int(self._leading[vertex])
 
     def colours(self, shading: Shading, known: Known) -> ColourArray:
@@ -141,7 +141,7 @@ class Shader:
         if shading is Shading.PLAIN:
             return Legend()
         if shading is Shading.DOMAINS:
-            # Which colour is whose stands in the panels, and under the pointer.
+            # The panels, and a label at the pointer, name the colours.
             greys, ends = ("#ffffff", "#565b63"), ((0.0, "shared"), (1.0, "alone"))
             return Legend(shading.value, "stronger colour = only this part", "", greys, ends)
         if shading is Shading.PREDICTED and not has_predictor:
@@ -167,7 +167,7 @@ class Shader:
 
 
 def mask_colours(attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ...]) -> ColourArray:
-    """Colour each vertex by the domain that owns most of it, darker the more that is.
+    """Colour each vertex by the domain with the largest weight, darker with larger weight.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def mask_colours(attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ..
     -------
     colours : (V, 3) uint8 array, red, green, blue
     """
-    # Mixed hues would look like a domain that is not there; white cannot be mistaken for one.
+    # Mixed hues would look like another domain; white cannot.
     leading = attention_mask.argmax(axis=0)
     weight = attention_mask.max(axis=0)[:, None]
     full = np.array([rgb(colour) for colour in domain_colours], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Meshes that change at every picture, and the actors that draw them."""
+"""Meshes that change with every picture, and the actors that draw them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Surface:
 
     Attributes
     ----------
-    vertices, normals : (V, 3) float32 arrays that VTK reads and notices to be written into
+    vertices, normals : (V, 3) float32 arrays that VTK reads and that are written in place
     colours : (V, C) uint8 array, likewise
     """
 

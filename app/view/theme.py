@@ -1,7 +1,7 @@
 """How the window looks: two palettes, one scale of distances, and the style made of them.
 
 Fusion with an explicit palette looks alike everywhere, and can be dark where the desktop's own
-style cannot. What means "free" and "colliding" differs in hue for colour-blind eyes too, and is
+style cannot. What means "free" and "colliding" differs in hue for colour-blind readers too, and is
 never shown by colour alone.
 """
 
@@ -20,10 +20,10 @@ from app.view.shading import rgb
 from lcollision_core.bundled import bundled_file
 
 TIGHT, CLOSE, NORMAL, WIDE = 4, 8, 12, 16
-"""All distances in the window, in device-independent pixels."""
+"""The spacings of the window, in device-independent pixels."""
 
 ROW_HEIGHT = 26
-"""Of one slider and of one domain."""
+"""Of the row of a slider or a domain."""
 
 
 _DARKEST = 42.0
@@ -42,8 +42,8 @@ def wanted_theme(choice: str) -> Theme:
 
     Parameters
     ----------
-    choice : "light", "dark", or "system" for what the desktop asks for; light where it asks for
-        nothing
+    choice : "light", "dark", or "system" for what the desktop asks for; light if it has no
+        preference
     """
     if choice == "system":
         is_dark = QGuiApplication.styleHints().colorScheme() is Qt.ColorScheme.Dark
@@ -52,7 +52,7 @@ def wanted_theme(choice: str) -> Theme:
 
 
 def apply_theme(application: QApplication, theme: Theme) -> None:
-    """Give the whole application a theme; widgets learn of it by ``changeEvent``."""
+    """Apply a theme to the whole application; widgets get a ``changeEvent``."""
     global _current
     _current = theme
     # By name: a style made here, which Qt deletes, would leave its address to be taken for it.
@@ -62,7 +62,7 @@ def apply_theme(application: QApplication, theme: Theme) -> None:
 
 
 def _palette(theme: Theme) -> QPalette:
-    # What is not said here, Qt derives from these two.
+    # Qt derives the colours that are not set here from these two.
     palette = QPalette(QColor(theme.card), QColor(theme.window))
     role, disabled = QPalette.ColorRole, QPalette.ColorGroup.Disabled
     for colour, roles in {

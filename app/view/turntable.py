@@ -25,7 +25,7 @@ FASTEST_GIF = 50
 """Frames a second: a GIF counts in hundredths of a second, and players slow down one of 1."""
 
 _MOST_BYTES = 2**31
-"""Of all frames of a GIF or a WebP, which are in memory until it is packed."""
+"""Most bytes of all frames of a GIF or a WebP, which stay in memory until it is packed."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class TurntableStyle:
         return [int(unit * step) for step in np.diff(np.round(ends))]
 
     def refusal(self, path: Path) -> MeshFileError | None:
-        """Say why a video cannot be written so, or return None if it can."""
+        """Return why a video cannot be written in this style, or None if it can."""
         suffix = path.suffix.lower()
         where: str | Path = path.name
         n_bytes = self.n_frames * self.width * self.height * (1 if suffix == ".gif" else 4)
@@ -119,7 +119,7 @@ class TurntableVideo:
                 self._unfinished.close()
             return
         if self._format == "GIF":
-            # One palette for all frames: colours of their own would flicker.
+            # One palette for all frames: separate palettes would flicker.
             palette = self._frames[0] if self._frames else picture.quantize(dither=Dither.NONE)
             picture = picture.quantize(palette=palette, dither=Dither.NONE)
         self._frames.append(picture)
@@ -135,13 +135,13 @@ class TurntableVideo:
         picture.save(self._folder / name, format="PNG", compress_level=3)
 
     def close(self) -> None:
-        """Draw no more, and leave nothing of a PNG sequence that is not complete."""
+        """Stop drawing, and delete an incomplete PNG sequence."""
         self._renderer.close()
         incomplete = CancelledError("the video is not complete")
         self._unfinished.__exit__(CancelledError, incomplete, None)
 
     def pack(self, _: Progress, cancel: CancelToken) -> str:
-        """Write the video once all of it is drawn, and return what to say of it; a `Job`."""
+        """Write the video once all of it is drawn, and return a message; a `Job`."""
         from lcollision_core.meshes import atomic_write
 
         if self._format != "PNG":

@@ -1,4 +1,4 @@
-"""The mesh in the middle of the window: what is drawn of a document, and what the mouse says."""
+"""The mesh in the middle of the window: draws a document and handles the mouse."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ if TYPE_CHECKING:
     from lcollision_core.resolve import ResolveResult
 
 _GROWTH = 1.15
-"""How much larger than its first pose a body may grow before a limb leaves the view."""
+"""Margin round the first pose, so that other poses stay in view."""
 
 _TRANSITION_MILLISECONDS = 320
-"""From the pose before Resolve to the one after."""
+"""Milliseconds from the pose before Resolve to the one after."""
 
 _TURN_MILLISECONDS = 260
-"""From one camera to another."""
+"""Milliseconds from one camera to another."""
 
 _ZOOM_SECONDS = 0.5
-"""A wheel that turns on within this goes on towards the same point, if the pointer stays."""
+"""Seconds within which the wheel zooms towards the same point while the pointer stays."""
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
 
 
 class Viewport(QWidget):
-    """Draws the newest frame of a document, and nothing twice.
+    """Draws the newest frame of a document, each once.
 
     Cheap to construct: VTK is imported when the first model is in; until then the page
-    `waiting` says what is waited for. Call `shut_down` before the window closes.
+    `waiting` explains the wait. Call `shut_down` before the window closes.
 
     Parameters
     ----------
@@ -207,18 +207,18 @@ class Viewport(QWidget):
 
     @Slot()
     def frame_pose(self) -> None:
-        """Look at the document's pose as at a model's first, as soon as it is drawn."""
+        """Frame the document's pose like a model's first, as soon as it is drawn."""
         self._framed = self._document.latent
 
     def scene_now(self) -> Scene:
-        """Return the scene with what waits for the next picture on the screen."""
+        """Return the scene, brought up to date for the next picture."""
         if self.scene is None or self.shown_frame is None:
             raise LCollisionError("the mesh is not on the screen yet", "try again in a moment")
         self._bring_up_to_date()
         return self.scene
 
     def shut_down(self) -> None:
-        """Stop everything that moves and free what VTK holds; the widget stays empty."""
+        """Stop all animations and free VTK's memory; the widget stays empty."""
         self._transition.stop()
         self._turn.stop()
         self.waiting.stop()

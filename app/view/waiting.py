@@ -23,7 +23,7 @@ _ARC = 100
 
 
 class WaitingPage(QWidget):
-    """Says what is waited for, beside a ring that turns; or why nothing is waited for any more.
+    """Says what is loading beside a turning ring, or shows why loading failed.
 
     Signals
     -------
@@ -64,30 +64,30 @@ class WaitingPage(QWidget):
 
     @property
     def text(self) -> str:
-        """What is waited for and why it takes long, or what went wrong."""
+        """What is loading and why it takes long, or the error."""
         return self._words.text()
 
     @property
     def turns(self) -> bool:
-        """Whether something is waited for."""
+        """Whether something is loading."""
         return self._ring.timer.isActive()
 
     @Slot(str)
     def set_text(self, text: str) -> None:
-        """Say what is waited for; "" changes nothing, as there is always something."""
+        """Say what is loading; "" changes nothing."""
         if text and not self._stopped:
             self._what = text
             self._wait()
 
     @Slot(str)
     def explain(self, reason: str) -> None:
-        """Say why what is waited for takes long."""
+        """Say why loading takes long."""
         self._reason = reason
         if self.turns:
             self._wait()
 
     def stop(self) -> None:
-        """Stand still, for good."""
+        """Stop the ring for good."""
         self._stopped = True
         self._ring.timer.stop()
 
