@@ -16,11 +16,11 @@ Function = TypeVar("Function", bound=Callable[..., object])
 _log = logging.getLogger(__name__)
 
 _PAUSE_SECONDS = 1.0
-"""After which compiling is another wait, as that of Resolve after that of the first pose."""
+"""Seconds without compiling after which a later one is logged as another wait."""
 
 
 def compiled(function: Function) -> Function:
-    """Compile a loop over plain arrays with numba, cached on disk and free of the interpreter lock.
+    """Compile a loop over plain arrays with numba, cached on disk and without the interpreter lock.
 
     The lock is released so that a batch spreads over ordinary threads: numba's own thread pool
     is not safe to enter from two threads at once on every platform, and the editor does that.
@@ -45,7 +45,7 @@ def _compiled(function: Function, fastmath: bool | set[str]) -> Function:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:
         # Neither the installation nor the user's cache folder can be written, as for a service
-        # account without a home: slow at every start is better than not at all.
+        # account without a home: a slow start each time is better than none.
         dispatcher = numba.njit(**options)(function)
     return cast(Function, dispatcher)
 
@@ -53,8 +53,8 @@ def _compiled(function: Function, fastmath: bool | set[str]) -> Function:
 class _Compilations(event.Listener):  # type: ignore[misc]  # numba has no types
     """Logs that compiling begins, after a pause again, and adds up how long it takes.
 
-    What comes from the cache is none. Numba compiles one function at a time, and within it those
-    that it calls.
+    Loading from the cache does not count. Numba compiles one function at a time, and within it
+    those that it calls.
     """
 
     def __init__(self) -> None:

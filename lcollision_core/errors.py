@@ -1,4 +1,4 @@
-"""The errors that users see: what went wrong, where, what was expected, and what to do."""
+"""The errors that users see: problem, place, expected value and next step."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class WrongScaleError(PoseSetError):
 
     Attributes
     ----------
-    factor : what its coordinates are to be multiplied by
+    factor : multiplies its coordinates
     """
 
     def __init__(self, what: str, next_step: str = "", *, factor: float) -> None:

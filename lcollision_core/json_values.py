@@ -1,4 +1,4 @@
-"""JSON that somebody else wrote: parsed in bounded memory, and only of the types expected."""
+"""Untrusted JSON: parsed in bounded memory, and only of the expected types."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from typing import (
 )
 
 MAX_MEMORY = 2**29
-"""What the values of one document may take, in bytes."""
+"""Most bytes of memory for the values of one document."""
 
 _BYTES_EACH = {b"{": 232, b"[": 88, b",": 40, b'"': 30}
-"""The most that a value takes in memory for each of these characters in its text."""
+"""Most bytes of memory per such character of the text."""
 
 _QUOTED_LENGTH = 60
 
@@ -50,8 +50,8 @@ def parse_json(content: bytes) -> Any:
 def from_json(cls: type[T], values: Any, name: str) -> T:
     """Build a dataclass from a JSON object, each value of the type that the class documents.
 
-    A whole number stands for a float too, a list for a tuple. Entries that the class does not know
-    are passed over, as a later version may have added them.
+    A whole number stands for a float too, a list for a tuple. Unknown entries
+    are ignored, as a later version may have added them.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def from_json(cls: type[T], values: Any, name: str) -> T:
 
 
 def quoted(value: object) -> str:
-    """Return a value as a sentence may show it: as Python writes it, but never long."""
+    """Return a value for use in a message: its Python form, shortened."""
     text = repr(value)
     return text if len(text) <= _QUOTED_LENGTH else f"{text[: _QUOTED_LENGTH - 3]}..."
 
@@ -119,7 +119,7 @@ def _converted(value: Any, hint: Any, name: str) -> Any:
         # Whole numbers of JSON have any length.
         return float(value) if abs(value) < 2**1023 else _refuse(value, hint, name)
     if hint is str and isinstance(value, str):
-        # Half a character, of a file name that was no text, cannot be printed.
+        # A lone surrogate, from an undecodable file name, cannot be printed.
         return value.encode(errors="replace").decode()
     return _refuse(value, hint, name)
 

@@ -149,7 +149,7 @@ def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Sectio
 
 
 def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
-    """Read a model file; nothing in it is ever run.
+    """Read a model file; no code in it is executed.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def _read_open_file(file: BinaryIO, path: str | os.PathLike[str]) -> dict[str, S
             "check the name",
             where=path,
         )
-    # The header first, so that a file of another kind is refused before it fills the memory.
+    # The header first, so that a file of another format is refused before it fills the memory.
     header = _read_header(file, size, path)
     file.seek(0)
     content = file.read()
@@ -327,7 +327,7 @@ def _require_storable(full_name: str, name: str, array: npt.NDArray[Any]) -> Non
 
 
 def _digest(version: int, described: str, tensors: Mapping[str, npt.NDArray[Any]]) -> str:
-    """Return the SHA-256 of all that the file says, whatever its bytes' order."""
+    """Return the SHA-256 of the file's content, independent of the order of its parts."""
     digest = hashlib.sha256(f"{version}\n{described}\n".encode())
     for name in sorted(tensors):
         array = tensors[name]

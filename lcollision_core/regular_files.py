@@ -1,4 +1,4 @@
-"""Opening what somebody else named: regular files only."""
+"""Opening paths from untrusted sources: regular files only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _KINDS = (
 def require_regular(path: str | os.PathLike[str]) -> int:
     """Return the size in bytes of a file that may be opened, of whatever name.
 
-    Opening a pipe waits for whoever writes into it, a device may never end, and the error of a
+    Opening a pipe waits for its writer, a device may never end, and the error of a
     folder explains nothing; so none of them is opened.
 
     Raises

@@ -82,8 +82,8 @@ class AcapCodec:
 
         Parameters
         ----------
-        vertices : (B, V, 3) finite array, in normalised lengths; where a pose lies does not
-            matter, how it is turned does
+        vertices : (B, V, 3) finite array, in normalised lengths; translation does not
+            matter, rotation does
         n_threads : threads to spread the poses over, one for each core by default
 
         Returns
@@ -125,7 +125,7 @@ class AcapCodec:
         Returns
         -------
         vertices : (B, V, 3) float64 array, in normalised lengths, placed as the reference: features
-            do not know where a pose lies, so its mean vertex (weighted by the codec's
+            do not hold the position, so its mean vertex (weighted by the codec's
             `anchor_weights`) is put where the reference has it. Every pose gets the same bits
             however many are decoded together.
 

@@ -1,4 +1,4 @@
-"""What holds the connected components of a mesh together."""
+"""Edges that join the connected components of a mesh."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 def component_bridges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
     """Pair each connected component's vertex with the nearest one of the largest component.
 
-    Features do not know where a component lies. One extra edge to its neighbour lets eyes or
-    buttons follow the body that they sit on, and settles nothing else: no cycle runs through it.
+    Features do not hold the position of a component. One extra edge to its neighbour lets eyes or
+    buttons follow the body that they sit on, and constrains nothing else: no cycle runs through it.
 
     Parameters
     ----------

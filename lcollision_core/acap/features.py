@@ -1,4 +1,4 @@
-"""The nine numbers per vertex: log R and the upper triangle of S, and what they do to T = R S."""
+"""The nine numbers per vertex: log R and the upper triangle of S, and their map to T = R S."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The affine maps that bring a training set's features into the range that networks like."""
+"""The affine maps that bring a training set's features into the range of the networks."""
 
 from __future__ import annotations
 

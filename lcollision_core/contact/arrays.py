@@ -1,4 +1,4 @@
-"""The arrays that the compiled loops share: the tree, one pose's work, what was found."""
+"""The arrays of the compiled loops: the tree, workspace of one pose, and results."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class NearVertices(NamedTuple):
 
 
 class PoseWork(NamedTuple):
-    """What is computed anew for each pose, kept between poses.
+    """The workspace of one pose, kept between poses.
 
     Attributes
     ----------

@@ -64,7 +64,7 @@ def penetration_depth(
         pair = int(np.flatnonzero(~np.isfinite(corners).all(axis=(1, 2, 3)))[0])
         raise ShapeError("has a corner that is not finite", where=f"triangle pair {pair}")
     # Work near 1, so that neither products of tiny edges underflow nor huge ones overflow; by a
-    # power of two, so that what exactly touches still does.
+    # power of two, so that exact contact stays exact.
     origin = corners[:, :1, :1]
     _, exponent = np.frexp(np.abs(corners - origin).max(axis=(1, 2, 3), initial=0.0))
     scale: FloatArray = np.ldexp(1.0, exponent - 1)

@@ -42,10 +42,10 @@ _SHARES = 1000
 """Units of a search for the progress of `CollisionDetector.summarise`."""
 
 _POSES_PER_TASK = 8
-"""The most poses that a thread takes at a time: a prompt cancel, and little waiting at the end."""
+"""Most poses that a thread takes at a time: prompt cancellation, little idling at the end."""
 
 _TASKS_PER_THREAD = 4
-"""What small batches are cut into at least, or a few threads would do the work of all."""
+"""Least number of pieces of a small batch, to keep all threads busy."""
 
 
 @dataclass(frozen=True, slots=True)

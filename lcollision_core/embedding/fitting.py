@@ -17,9 +17,9 @@ MAX_STEPS = 20
 """The fit ends earlier when a step gains under 2 %."""
 
 PRIOR_SHARE = 2.5e-3
-"""Of the mean squared vertex distance reached so far: what a code at one training deviation costs.
-It settles what the vertices do not, and vanishes for a mesh that the decoder can reach, whose
-code thus comes back."""
+"""Cost of a code at one training deviation, relative to the mean squared vertex distance so far.
+It determines what the vertices do not, and vanishes for a mesh that the decoder can represent,
+whose code is thus recovered."""
 
 _SETTLED = 0.02
 _HALVINGS = 5

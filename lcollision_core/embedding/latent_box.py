@@ -17,17 +17,17 @@ BOX_SCALE = 1.2
 _LEAST_RANGE = 1e-6
 """So that the range of a code that no training pose uses still straddles 0."""
 _LARGEST_BOUND = 1e7
-"""Far beyond any training code, far below what overflows."""
+"""Far beyond any training code, far below overflow."""
 
 BOX_ARRAYS = frozenset({"box_low", "box_high"})
 
 ROWS_PER_BLOCK = 32
-"""Rows that one thread draws, decodes and labels in one go."""
+"""Rows that one thread draws, decodes and labels at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class LatentBox:
-    """Where a model's poses are: what is labelled, what Resolve searches, what sliders reach.
+    """The box of a model's poses: for labelling, Resolve and the range of sliders.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class LatentBox:
     def from_arrays(
         cls, arrays: Mapping[str, npt.NDArray[Any]], training_latent: npt.NDArray[np.float32]
     ) -> LatentBox:
-        """Rebuild a box from what `to_arrays` returned, or as it was before models kept theirs.
+        """Rebuild a box from what `to_arrays` returned, or as it was before models stored it.
 
         Raises
         ------

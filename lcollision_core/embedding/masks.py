@@ -1,4 +1,4 @@
-"""Attention masks: how much of each vertex belongs to each domain."""
+"""Attention masks: the share of each domain in each vertex."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, edge_graph, length_graph
 
 LEAST_SHARE = 1e-3
-"""Smaller shares of a vertex are given to its other domains, so that masks have an edge."""
+"""Smaller shares of a vertex go to its other domains, so that masks have compact support."""
 
 _UNTOUCHED = 1e-12
 """Of the mean squared weight: below this share no component touches a vertex."""
@@ -22,7 +22,7 @@ _UNTOUCHED = 1e-12
 def attention_mask(
     components: npt.NDArray[np.floating], topology: Topology, rest_vertices: FloatArray
 ) -> npt.NDArray[np.float32]:
-    """Share the vertices out by the weights of level 1's fully connected layer.
+    """Compute the masks from the weights of level 1's fully connected layer.
 
     M^{ki} = Σ_j (C^{kji})² / Σ_k Σ_j (C^{kji})², with shares under `LEAST_SHARE` set to 0 and the
     rest scaled up again. A vertex that no component touches takes the mask of the nearest one
@@ -67,7 +67,7 @@ def attention_mask(
 def keep_one_patch(
     components: npt.NDArray[np.float32], topology: Topology, rest_vertices: FloatArray
 ) -> npt.NDArray[np.float32]:
-    """Take each component off the vertices where it is strongest but cut off from its domain.
+    """Remove each component from vertices where it is strongest but disconnected from its domain.
 
     Poses that fold or tear, such as clothes, leave islands of one domain inside another. There
     the next strongest component takes over, until every domain is one connected patch.
@@ -127,7 +127,7 @@ def _nearest_owned(
 
 @dataclass(frozen=True)
 class MaskQuality:
-    """What a person would look for in a set of masks.
+    """Quality of a set of masks.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""How well a latent space rebuilds poses, and the plain principal components it must beat."""
+"""Reconstruction error of a latent space, and of plain principal components as a baseline."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LARGEST = 1e9
 
 @dataclass(frozen=True)
 class EmbeddingMetrics:
-    """What training measured, in normalised lengths. Codes are fitted as `Embedding.encode` does.
+    """Measurements of training, in normalised lengths. Codes are fitted as `Embedding.encode` does.
 
     Attributes
     ----------

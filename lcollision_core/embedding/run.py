@@ -1,4 +1,4 @@
-"""A training run: how far it is, and from which step a killed one goes on."""
+"""A training run: its progress, and resuming a killed one."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from lcollision_core.jobs import CancelToken
 
 @dataclass(frozen=True)
 class TrainingStatus:
-    """How far a training run is.
+    """Progress of a training run.
 
     Attributes
     ----------
-    model : "all poses", or "held out" for the second model that measures how unseen poses fare
+    model : "all poses", or "held out" for the second model that measures the error of unseen poses
     stage : "level 1", "level 2" or "codes"
     done, total : epochs and fitted poses of the whole run
     level1_error : mean vertex error with level 1 alone, of a few training poses, in normalised
@@ -39,11 +39,11 @@ StatusCallback = Callable[[TrainingStatus], None]
 
 
 def no_status(status: TrainingStatus) -> None:
-    """Report to nobody."""
+    """Ignore the progress."""
 
 
 class Run:
-    """The stages of one training run, each of which goes on where its checkpoint stands.
+    """The stages of one training run, each resumed from its checkpoint.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Where the domains start: connected patches of the body that move as one."""
+"""Initial domains: connected patches of the body that move rigidly."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BISECTIONS = 30
 
 
 def bridged_edges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
-    """Return the mesh's edges and the fewest further ones that make it one piece.
+    """Return the mesh's edges and the fewest further ones that connect it.
 
     Loose components, such as eyeballs, and vertices in no face are tied to the body by their
     shortest segment, so that distances and neighbourhoods exist across the gap.
@@ -65,7 +65,7 @@ def moving_domains(
     rest_vertices: FloatArray,
     n_domains: int,
 ) -> IntArray:
-    """Split the body into connected domains, each of which turns as one over the poses.
+    """Split the body into connected domains, that each move rigidly over the poses.
 
     Ward's clustering of the vertices by their rotations in all poses and their position on the
     reference, weighed by area and restricted to neighbours on the mesh: two patches merge when
@@ -101,7 +101,7 @@ def moving_domains(
     rotations = np.asarray(features[..., :N_ROTATION], dtype=np.float64)
     motion = rotations.transpose(1, 0, 2).reshape(n_vertices, -1) / np.sqrt(len(features))
     motion = motion - np.average(motion, axis=0, weights=areas)
-    # The leading directions hold all that tells domains apart; the rest is noise that costs time.
+    # The leading directions hold what distinguishes domains; the rest is noise that costs time.
     spread = motion.T @ (motion * areas[:, None])
     directions = np.linalg.eigh(spread)[1][:, ::-1][:, :_MOTION_DIRECTIONS]
     positions = np.hstack([motion @ directions, POSITION_WEIGHT * rest_vertices])
@@ -167,8 +167,8 @@ def domain_distances(
 
     Returns
     -------
-    distances : (K, V) float64 array, 0 inside the domain, as shares of the mesh's largest geodesic
-        distance
+    distances : (K, V) float64 array, 0 inside the domain, as fractions of the mesh's largest
+        geodesic distance
     """
     graph = length_graph(bridged_edges(topology, rest_vertices), rest_vertices)
     start = int(np.argmax(csgraph.dijkstra(graph, indices=0)))

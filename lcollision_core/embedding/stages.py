@@ -38,7 +38,7 @@ from lcollision_core.embedding.seeding import (
 from lcollision_core.meshes.topology import FloatArray
 
 _LOCALITY_START = 0.25
-"""Share of the windows' radius from which the locality loss rises."""
+"""Fraction of the windows' radius from which the locality loss rises."""
 
 _SAMPLED_POSES = 16
 _EPOCHS_BETWEEN_SAMPLES = 10

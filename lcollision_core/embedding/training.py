@@ -29,7 +29,7 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import body_size
 
 _RUN_VERSION = 1
-"""Goes up when training changes, so that no checkpoint is continued by other rules."""
+"""Raised when training changes, so that no checkpoint is resumed with other rules."""
 
 
 def train_embedding(
@@ -45,7 +45,7 @@ def train_embedding(
 
     Moves a set that lies far from the origin to it, aligns the poses to the first, takes their
     features, trains the bilevel autoencoder on all of them, fits their codes, and trains a second
-    one without every `held_out_stride`-th pose to measure how unseen poses fare beside plain
+    one without every `held_out_stride`-th pose to measure the error of unseen poses beside plain
     principal components. A killed run that is started again with the same checkpoint goes on where
     it was and ends with the same bits.
 
@@ -96,7 +96,7 @@ class _Trainer:
         topology = pose_set.topology
         vertices = np.asarray(pose_set.vertices, dtype=np.float64)
         if not can_hold(vertices[0], topology, np.float32):
-            # So far from the origin that what is drawn and learnt in float32 would lose its shape.
+            # So far from the origin that float32 would lose the shape.
             vertices = vertices - vertices[0, topology.picked].mean(axis=0)
         vertices = vertices / body_size(vertices[0], topology)
         key = run_key(

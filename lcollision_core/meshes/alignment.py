@@ -1,4 +1,4 @@
-"""Rigid alignment of poses to a reference, led by the parts that move least.
+"""Rigid alignment of poses to a reference, weighted towards the parts that move least.
 
 The convention everywhere is `aligned = R @ p + t`, so that `p = R.T @ (aligned - t)`.
 """
@@ -46,14 +46,14 @@ class RigidTransform:
         return self.scale * turned + self.translation
 
     def inverse(self) -> RigidTransform:
-        """Return the transform that leads back."""
+        """Return the inverse transform."""
         back = 1.0 / self.scale
         return RigidTransform(self.rotation.T, -back * (self.rotation.T @ self.translation), back)
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Poses in the reference's frame, and how to bring them back.
+    """Poses in the reference's coordinates, and how to bring them back.
 
     Attributes
     ----------

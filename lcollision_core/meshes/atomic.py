@@ -18,14 +18,14 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.locks import is_named, lock_open_file, locked, shortened
 
 _MAX_NAME_BYTES = 100
-"""Of the name that a file has while it is written, but for what marks it so."""
+"""Most bytes of a temporary name without its marks."""
 _MAX_STEM_BYTES = 200
-"""Of an unused name, so that the number fits."""
+"""Most bytes of an unused name, so that the number fits."""
 _SECONDS_TO_RENAME = 60.0
-"""On Windows, where a file is closed, and so no longer locked, before it is renamed."""
+"""Retries on Windows, where a file must be closed, and so unlocked, before it is renamed."""
 
 FileStamp = tuple[int, int, int, int]
-"""What changes whenever a file is replaced or written to."""
+"""Changes whenever a file is replaced or written to."""
 
 
 @contextmanager
@@ -73,7 +73,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 @contextmanager
 def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a folder for files that come into `folder` together, once all are complete.
+    """Yield a folder for files that move into `folder` together, once all are complete.
 
     Files of the same names are replaced, others stay. When the block raises, nothing comes, and a
     `folder` that was not there before is none again; what a killed process left is removed by the
@@ -114,7 +114,7 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
         ) from error
     finally:
         if is_new:
-            with suppress(OSError):  # it is not empty: all is well
+            with suppress(OSError):  # it is not empty, as it should be
                 target.rmdir()
 
 
@@ -127,7 +127,7 @@ def _move_all(folder: Path, target: Path) -> None:
         for name in names:
             (folder / name).replace(os.path.realpath(target / name))
     except KeyboardInterrupt:
-        # Half of it would be neither what was there nor what is to be.
+        # Half of it would be neither the old content nor the new.
         _move_all(folder, target)
         raise
 
@@ -141,7 +141,7 @@ def _remove_dead_folders(target: Path) -> None:
 
 
 def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
-    """Return what tells a file from any that replaces it; None if there is no file.
+    """Return a stamp that changes when a file is replaced; None if there is no file.
 
     Compared inside `locked`, it says whether the file is still the one that was read.
     """

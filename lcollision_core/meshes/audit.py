@@ -1,4 +1,4 @@
-"""What is wrong with a mesh or a pose set, in plain sentences."""
+"""Defects of a mesh or a pose set, in plain sentences."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class MeshAudit:
 
 
 def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
-    """Look for the defects that make a collision verdict, or a deformation, doubtful.
+    """Find the defects that make a collision check, or a deformation, unreliable.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
 
 @dataclass(frozen=True, eq=False)
 class PoseSetInspection:
-    """What there is at a path that should hold a pose set.
+    """Result of reading a path that should hold a pose set.
 
     Attributes
     ----------

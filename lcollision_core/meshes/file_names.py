@@ -1,4 +1,4 @@
-"""File names: what an extension says, and what a pose's name is as the name of a file."""
+"""File names: extensions, and valid file names made from the names of poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import PurePath
 from lcollision_core.meshes.locks import shortened
 
 MAX_STEM_BYTES = 130
-"""Of a file's name without its extension; file systems allow 143 to 255 for all of it."""
+"""Most bytes of a name without its extension; file systems allow 143 to 255 in all."""
 
 _OF_OTHER_PROGRAMS = re.compile(
     r"\.(3dm|3ds|3mf|7z|abc|blend|bvh|bz2|c4d|dae|docx?|dxf|fbx|glb|gltf|gz|iges|igs|ini|jsonl?|log|lwo|ma|max"
@@ -24,7 +24,7 @@ _MEDIA = MimeTypes()
 
 _NOT_IN_NAMES = re.compile(r'[\x00-\x1f\x7f-\x9f\u2028\u2029<>:"/\\|?*]+')
 _RESERVED = re.compile(r"(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³])\s*(\.|$)", re.I)
-"""What Windows takes for a device, with any extension."""
+"""Device names on Windows, with any extension."""
 
 
 def has_known_suffix(path: PurePath) -> bool:
@@ -34,7 +34,7 @@ def has_known_suffix(path: PurePath) -> bool:
 
 
 def file_stem(name: str) -> str:
-    """Return a name as that of a file, without extension, on every common file system."""
+    """Return a name made valid for a file, without extension, on common file systems."""
     stem = _cut(_NOT_IN_NAMES.sub("_", name), MAX_STEM_BYTES) or "pose"
     return f"_{_cut(stem, MAX_STEM_BYTES - 1)}" if _RESERVED.match(stem) else stem
 

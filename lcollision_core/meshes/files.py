@@ -1,4 +1,4 @@
-"""Mesh files: OBJ, PLY, OFF, STL, GLB and glTF, in and out without touching the vertex order."""
+"""Mesh files: OBJ, PLY, OFF, STL, GLB and glTF, read and written in unchanged vertex order."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ WRITABLE_SUFFIXES = tuple(_ENCODERS)
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """One triangle mesh as it is in its file.
+    """One triangle mesh as stored in its file.
 
     Attributes
     ----------
     vertices : (V, 3) float64 array, read-only, in the file's order and unit
     topology : its faces
     source : the file that it was read from
-    notes : sentences on what was done on reading, such as the triangulation of quads
+    notes : sentences on changes made on reading, such as the triangulation of quads
     coarseness : what is lost where a file of single precision holds a mesh so far from the origin
         that it cannot: a sentence, else None
     """

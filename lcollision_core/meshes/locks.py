@@ -14,7 +14,7 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.regular_files import require_regular
 
 _LOCKED_BYTE = 1 << 30
-"""Far beyond the file's end: Windows keeps others from reading what is locked."""
+"""Far beyond the file's end, as Windows prevents others from reading locked bytes."""
 _SECONDS_BETWEEN_TRIES = 0.05
 _MAX_NAME_BYTES = 200
 

@@ -27,7 +27,7 @@ _DAMAGE = (
     NotImplementedError,  # a compression method that zipfile lacks
     RuntimeError,  # an encrypted entry
     ValueError,  # UnicodeDecodeError too
-    TypeError,  # numpy's word for a type that there is not
+    TypeError,  # numpy's error for an unknown type
     OverflowError,
 )
 
@@ -38,7 +38,7 @@ _ORDER = re.compile(rb"'fortran_order': *(True|False)")
 _SHAPE = re.compile(rb"'shape': *\(([0-9, ]*)\)")
 _PLAIN_KINDS = "biufSU"
 _MOST_DEFLATED = 1032
-"""The most bytes that one byte of a compressed entry stands for."""
+"""Most bytes that one byte of a compressed entry expands to."""
 
 _CHUNK_BYTES = 1 << 24
 
@@ -48,7 +48,7 @@ def read_npz(
 ) -> tuple[dict[str, npt.NDArray[Any]], tuple[str, ...]]:
     """Read some arrays of an .npz archive; one that holds Python objects is refused.
 
-    What is not wanted takes no memory, whatever it is.
+    Other arrays take no memory.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> n
                 f"holds {count} numbers, at most {MAX_ITEMS} can be read",
                 where=f"its array {name!r}",
             )
-        # Of a size that nothing bears out no memory is taken.
+        # No memory is allocated for a size that the data do not confirm.
         if n_items * dtype.itemsize > min(info.file_size, _MOST_DEFLATED * info.compress_size):
             raise EOFError
         array = np.empty(n_items, dtype)

@@ -1,4 +1,4 @@
-"""Poses of a set that are not of the set's body: of another size, or order of vertices."""
+"""Poses of a set that are not of the same body: of another size, or order of vertices."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _COMPARED_POSES = 25
 
 
 def scale_of(lengths: FloatArray, known: FloatArray) -> float | None:
-    """Return the common scale of edges against known lengths, None if each has its own.
+    """Return the common scale of edges against known lengths, None if they differ.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def outlier_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, P
         return {}
     some = np.linspace(0, len(vertices) - 1, min(len(vertices), _COMPARED_POSES)).astype(int)
     lengths = np.array([topology.edge_lengths(vertices[pose]) for pose in some])
-    # Of two, the first; of an even number never the mean of a right one and a wrong one.
+    # Not the mean of the middle two: it could mix a right one with a wrong one.
     middle = (len(some) - 1) // 2
     known = lengths[0] if len(some) == 2 else np.partition(lengths, middle, axis=0)[middle]
     found = {}

@@ -36,7 +36,7 @@ _EXTRA_ARRAYS = ("format_version", "names", "notes", "near_exclusion", "up_axis"
 _MAX_TEXT_LENGTH = 500
 
 _LARGEST_COORDINATE = 1e150
-"""Whose square is finite."""
+"""Largest coordinate; its square is finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class PoseSet:
     topology : the faces that all poses share
     names : N names, the mesh files' or "pose 12"
     source : the folder or file that it was read from, if it was
-    notes : sentences on what was done on reading
+    notes : sentences on changes made on reading
     near_exclusion : normalised length up to which pairs are near, not colliding
     up_axis : 0, 1 or 2 for x, y or z; None if it is to be guessed
     vertex_labels : (V,) array of printable strings, the body part of each vertex, if known
@@ -89,7 +89,7 @@ class PoseSet:
                     "vertex_labels", f"({shape[1]},)", self.vertex_labels.shape
                 )
             _require_labels(self.vertex_labels)
-        # A view, so that the caller's own array stays as writable as it was.
+        # A view, so that the caller's array stays writable.
         view = self.vertices.view()
         view.flags.writeable = False
         object.__setattr__(self, "vertices", view)
@@ -113,7 +113,7 @@ class PoseSet:
 
     @property
     def up(self) -> UpGuess:
-        """Which way is up: what the set says, else a guess from its poses."""
+        """The up axis: as stored in the set, else guessed from its poses."""
         if self.up_axis is not None:
             return UpGuess(self.up_axis, True, "the set says so")
         return guess_up(self.topology, self.vertices)
@@ -134,7 +134,7 @@ def natural_key(path: Path) -> tuple[list[str | int], str]:
 def mesh_files(folder: Path) -> tuple[list[Path], list[str]]:
     """Return the mesh files of a folder in natural order, and the names of what else it holds.
 
-    What is hidden does not count.
+    Hidden files do not count.
 
     Raises
     ------
@@ -269,7 +269,7 @@ def _without_outliers(collected: Collected, report: Callable[[LCollisionError], 
 
 
 def _only(poses: PoseSet, kept: list[int]) -> PoseSet | None:
-    """Return some poses of a set, None without any."""
+    """Return some poses of a set, or None if there are none."""
     if len(kept) in (0, len(poses)):
         return poses if kept else None
     names = tuple(poses.names[pose] for pose in kept)
@@ -359,7 +359,7 @@ def _collect_folder(
     ]
     if others:
         sentences.append(f"{len(others)} other entries were ignored: {', '.join(others[:5])}")
-    # By its standard y is up in a glTF file.
+    # y is up in glTF, by its standard.
     up_axis = 1 if formats.keys() <= {".glb", ".gltf"} else None
     pose_set = PoseSet(
         vertices[: len(names)], topology, tuple(names), path, tuple(sentences), up_axis=up_axis
@@ -461,7 +461,7 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
         if (native.view(np.uint32) > sys.maxunicode).any():
             raise MeshFileError("holds a character that does not exist", where=name)
         texts = native.tolist()
-        # Half a character, of a file name that was no text, cannot be printed.
+        # A lone surrogate, from an undecodable file name, cannot be printed.
         return [text[:_MAX_TEXT_LENGTH].encode(errors="replace").decode() for text in texts]
 
     extras: dict[str, Any] = {}

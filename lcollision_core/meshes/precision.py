@@ -1,4 +1,4 @@
-"""Whether a number format can hold a mesh where it lies: the one rule for reading and writing."""
+"""Whether a number format can hold a mesh at its location, for reading and writing."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.topology import Topology
 
 SINGLE_PRECISION = (".stl", ".glb")
-"""Formats that hold float32 by their nature; the others hold what they are given."""
+"""Formats that hold only float32; the others hold either precision."""
 
 LARGEST_RATIO = 0.01
-"""Of a short edge, that the rounding step of a coordinate may be: beyond it, faces lose their
+"""Largest rounding step of a coordinate, relative to a short edge: beyond it, faces lose their
 shape, and results for a mesh do not hold for its file."""
 
 _SHORT_EDGES = 10.0
@@ -56,7 +56,7 @@ def rounding_step(
 
 
 def can_hold(vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLike) -> bool:
-    """Tell whether rounding to a number format leaves a mesh its shape, where it lies.
+    """Tell whether rounding to a number format preserves the shape of a mesh at its location.
 
     Parameters and terms are those of `rounding_step`.
     """
@@ -90,7 +90,7 @@ def as_stored(
             path, f"a coordinate exceeds float32, which {suffix} stores", "write .ply or .obj"
         )
     stored = np.asarray(vertices, dtype) if dtype is np.float32 else np.asarray(vertices)
-    # What came rounded is not rounded again.
+    # Already rounded: not rounded again.
     if stored.dtype != vertices.dtype or stored.dtype == np.float64:
         step, ratio = rounding_step(vertices, topology, dtype)
         if ratio > LARGEST_RATIO:

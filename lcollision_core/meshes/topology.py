@@ -16,7 +16,7 @@ IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
 
 _LEAST_LENGTH = 1e-12
-"""Of an edge in a graph of lengths."""
+"""Least length of an edge in a graph."""
 
 
 def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> sparse.csr_matrix:
@@ -38,7 +38,7 @@ def length_graph(edges: IntArray, vertices: FloatArray) -> sparse.csr_matrix:
 
 
 class Topology:
-    """An immutable triangle connectivity and what follows from it alone.
+    """An immutable triangle connectivity with derived properties.
 
     Parameters
     ----------
@@ -185,11 +185,11 @@ class Topology:
 
     @cached_property
     def picked(self) -> slice | IntArray:
-        """What picks the used vertices out of an array of all: a slice where all are used."""
+        """Index of the used vertices in an array of all: a slice where all are used."""
         return self.used_vertices if len(self.unused_vertices) else slice(None)
 
     def gathered(self, vertices: FloatArray) -> FloatArray:
-        """Put the vertices that no face names, which may lie anywhere, amid the others.
+        """Move the vertices that no face names, which may lie anywhere, among the others.
 
         Parameters
         ----------

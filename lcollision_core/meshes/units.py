@@ -1,4 +1,4 @@
-"""The unit of length that all reports share, and which way is up."""
+"""The unit of length that all reports share, and the up axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which way is up: a guess from the shape of the poses, and how far it can be trusted."""
+"""Guess the up axis from the shape of the poses, and its reliability."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CELLS = 24
 _SYMMETRIC = 0.01
 """Normalised: the mean distance of a symmetric body from its mirror image."""
 _LEAST_EXTENT = 0.35
-"""Of the longest side: what is flatter lies, and does not stand."""
+"""Fraction of the longest side: a flatter body lies and does not stand."""
 _LONGEST = 0.1
 _SURE = 0.15
 
@@ -41,7 +41,7 @@ class UpGuess:
 
 
 def guess_up(topology: Topology, vertices: npt.NDArray[Any]) -> UpGuess:
-    """Guess which axis is up from what a body stands on.
+    """Guess the up axis from the support of a body.
 
     A body is taken to stand on narrow legs, with its middle above what it stands on, in most of
     its poses, and never on a side, which its plane of symmetry tells.
@@ -99,7 +99,7 @@ def _stands(pose: FloatArray, axis: int) -> float:
 
 
 def _side(reference: FloatArray) -> int | None:
-    """Return the axis across which a body is symmetric, None if there is no one such."""
+    """Return the axis across which a body is symmetric, None if there is not exactly one."""
     extent = float(np.ptp(reference, axis=0).max())
     if extent == 0.0:
         return None

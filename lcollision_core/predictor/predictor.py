@@ -1,4 +1,4 @@
-"""A trained predictor: what the model file keeps, and what predicts."""
+"""A trained predictor, and its section of the model file."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ BATCH_ROWS = 500
 _ROWS_PER_REPORT = 50 * BATCH_ROWS
 
 _LEAST_ENERGY, _LARGEST_FACT = 1e-18, 1e6
-"""Of facts: far beyond what training finds, and far from what overflows."""
+"""Limits of facts: far beyond what training finds, far from overflow."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a predictor says of B poses; read-only arrays.
+    """Predictions of B poses; read-only arrays.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class TrainingFacts:
 
 @dataclass(frozen=True)
 class PredictorRecord:
-    """What a model file says of its predictor beside the weights.
+    """Metadata of a predictor beside the weights.
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ class CollisionPredictor:
 
     @property
     def needs_torch(self) -> bool:
-        """Whether predictions do."""
+        """Whether predictions are by domain."""
         return self._compiled is None
 
     @property
@@ -217,7 +217,7 @@ class CollisionPredictor:
         return Prediction(*results)
 
     def scaled_outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-        """Return what the network says: scaled energies, also below 0, and the shifted logit.
+        """Return the network's outputs: scaled energies, also below 0, and the shifted logit.
 
         Parameters
         ----------
@@ -304,13 +304,13 @@ class CollisionPredictor:
         )
 
     def with_metrics(self, metrics: PredictorMetrics) -> CollisionPredictor:
-        """Return the same predictor with what was measured of it."""
+        """Return the same predictor with its metrics."""
         return CollisionPredictor(
             self._embedding, self._arrays, self.config, self.facts, metrics, self.device
         )
 
     def to_section(self) -> Section:
-        """Return what the model file keeps: the weights in float32, and JSON values."""
+        """Return the section of the model file: the weights in float32, and JSON values."""
         metadata = {
             "preset": self.preset,
             "config": asdict(self.config),
@@ -341,7 +341,7 @@ class CollisionPredictor:
 
     @cached_property
     def _compiled(self) -> CompiledNetwork | None:
-        """What predicts on the CPU without torch; None for the preset `paper` and on a GPU."""
+        """The network for the CPU, without torch; None for the preset `paper` and on a GPU."""
         if self.preset != "default" or self.device != "cpu":
             return None
         return CompiledNetwork(self._embedding, self._arrays)

@@ -1,7 +1,7 @@
-"""What a model file must hold of a trained network: checked without building the network.
+"""Checks the arrays of a trained network in a model file, without building the network.
 
 Building one needs geometry of the body's surface, and the paper's needs torch; both wait until the
-first prediction. What is loaded is checked before that.
+first prediction. The arrays are checked before that.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 _LARGEST_WEIGHT, _LEAST_DEVIATION = 1e4, 1e-6
 _LARGEST_OUTPUT = 1e18
-"""What float32 can square."""
+"""Largest number that float32 can square."""
 
 _INPUTS_PER_FEATURE = 10.0
-"""A network's inputs are at most so many times the largest deformation feature."""
+"""A network's inputs are at most this many times the largest deformation feature."""
 
 
 def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain: bool) -> None:
@@ -61,7 +61,7 @@ def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain
 
 
 class _Reader:
-    """Takes arrays of a section, and remembers which."""
+    """Takes arrays of a section, and records which."""
 
     def __init__(self, arrays: Arrays) -> None:
         self._arrays = arrays

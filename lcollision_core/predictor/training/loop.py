@@ -31,7 +31,7 @@ from lcollision_core.predictor.training.row_split import RowSplit
 from lcollision_core.predictor.training.status import PredictorStatus, StatusCallback, patches_path
 
 _RUN_VERSION = 7
-"""Goes up when training changes, so that no checkpoint is continued by other rules."""
+"""Raised when training changes, so that no checkpoint is resumed with other rules."""
 
 _WATCHED_ROWS = 4000
 """Held-out rows whose accuracy is shown while training."""
@@ -41,7 +41,7 @@ _BUILDING_ROWS = 65_536
 
 _SECONDS_BETWEEN_REPORTS = 0.25
 _STEPS_BETWEEN_TALKS = 20
-"""Processes agree this often on whether to stop or to save: each time costs a round trip."""
+"""Processes agree at this interval on whether to stop or to save: each time costs a round trip."""
 
 _TIMES_PATCHES_KEPT, _LEAST_PATCHES_KEPT = 20, 4096
 """Patches are written after each twentieth of the training rows, or after so many rows."""
@@ -51,11 +51,11 @@ _TINY_MOMENT = 1e-30
 """What falls by 0.9 a step, as Adam's mean does, is still in normal form so many steps later."""
 
 _STEPS_BETWEEN_AVERAGES = 10
-"""The mean of the weights takes in every n-th step: all of them would cost a sixth of the time."""
+"""The mean of the weights uses every n-th step: all of them would cost a sixth of the time."""
 
 _WARM_UP = 0.2
 _LEAST_RATE = 1e-2
-"""Where the one-cycle schedule begins, in its largest rate."""
+"""Start of the one-cycle schedule, relative to its largest rate."""
 
 _PART, _PATCHES = "training", "patches"
 _NETWORK, _AVERAGE, _OPTIMISER = "network:", "average:", "optimiser:"
@@ -67,7 +67,7 @@ class TrainingLoop:
 
     Parameters
     ----------
-    rows : samples 0, 1, 2, ...; the latent codes are read where they are and never copied whole
+    rows : samples 0, 1, 2, ...; the latent codes are read in place and never copied whole
     split : which of them train
     embedding, config, facts : see `training.train_predictor`
     device : "auto", "cpu" or "cuda"
@@ -266,11 +266,11 @@ class TrainingLoop:
         )
 
     def _judged(self, network: PredictorNetwork) -> PredictorNetwork:
-        """Return the network that is watched and kept: itself, or with the mean of its weights."""
+        """Return the network to measure and store: itself, or with the mean of its weights."""
         return network if self._average is None else cast(PredictorNetwork, self._average.module)
 
     def _key(self) -> str:
-        """Return a digest of all that decides how this run ends."""
+        """Return a digest of everything that determines the result of this run."""
         rows = self.rows
         digest = hashlib.sha256()
         for array in (rows.latent, rows.domain_energy, rows.energy, rows.n_pairs):

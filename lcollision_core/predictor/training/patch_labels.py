@@ -1,4 +1,4 @@
-"""What the default network is taught beside the rows' labels: which patches of skin collide."""
+"""Further labels of the default network: which patches of skin collide."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The processes that torchrun starts: who shares the work, on which device."""
+"""The processes that torchrun starts: rank, device and communication."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class Processes:
         return start, min(start + each, n_rows)
 
     def any_of(self, flag: bool) -> bool:
-        """Tell all processes whether one of them says yes."""
+        """Return whether any process passes True, to all of them."""
         return bool(self._reduced(torch.tensor(float(flag)), dist.ReduceOp.MAX))
 
     def sum_of(self, value: torch.Tensor) -> float:
-        """Add up a number over all processes."""
+        """Sum a number over all processes."""
         return float(self._reduced(value.detach().clone()))
 
     def add_up(self, values: npt.NDArray[np.float16]) -> None:
@@ -52,7 +52,7 @@ class Processes:
             values[...] = total.cpu().numpy()
 
     def require_same(self, number: int) -> None:
-        """Refuse to go on where the processes begin at different steps.
+        """Refuse to continue if the processes begin at different steps.
 
         Raises
         ------
@@ -66,14 +66,14 @@ class Processes:
             )
 
     def _reduced(self, values: torch.Tensor, operation: Any = dist.ReduceOp.SUM) -> torch.Tensor:
-        """Return what all processes' values come to."""
+        """Reduce values over all processes."""
         if self.count > 1:
             values = values.to(self.device)
             dist.all_reduce(values, operation)
         return values
 
     def wait(self) -> None:
-        """Wait until all processes are here."""
+        """Wait for all processes."""
         if self.count > 1:
             dist.barrier()
 

@@ -14,7 +14,7 @@ _EVERY = 10
 """Every n-th held-out row chooses the decision threshold."""
 
 LEAST_BALANCING = 5000
-"""Fewer rows do not choose a decision threshold: their noise costs more than is gained."""
+"""Fewer rows do not choose a decision threshold: their noise would cost more than the gain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class RowSplit:
 
     Attributes
     ----------
-    training : rows that are learnt from
+    training : rows that train
     validation : rows that choose the decision threshold, or none
     held_out : rows that measure the result
     """
@@ -34,7 +34,7 @@ class RowSplit:
 
 
 def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
-    """Share out the samples 0, 1, ... of a store.
+    """Split the samples 0, 1, ... of a store.
 
     The decision threshold is chosen by a tenth of the rows that would measure, if these are many.
     """

@@ -1,4 +1,4 @@
-"""How far a training run is, and the files beside it."""
+"""Progress of a training run, and the files beside it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class PredictorStatus:
-    """How far a training run is.
+    """Progress of a training run.
 
     Attributes
     ----------
