@@ -91,11 +91,11 @@ def time_editor(
             'run it on a desktop, or in xvfb-run -a -s "-screen 0 1600x1000x24"',
         )
     rows = []
-    for place, model in enumerate(models):
+    for index, model in enumerate(models):
         for start in range(_STARTS):
             is_last = start == _STARTS - 1
             answer = _run(find_model(model), n_actions if is_last else -1)
-            progress(place * _STARTS + start + 1, len(models) * _STARTS)
+            progress(index * _STARTS + start + 1, len(models) * _STARTS)
         rows.append(EditorTiming(**answer))
     return rows
 

@@ -93,9 +93,9 @@ class Session(QObject):
             window with it is on the screen
         """
         seconds = []
-        for place in random.Random(0).sample(range(self._slider.maximum()), _EVENTS):
+        for value in random.Random(0).sample(range(self._slider.maximum()), _EVENTS):
             start = time.perf_counter()
-            self._slider.setValue(place)
+            self._slider.setValue(value)
             self.wait_for(self.is_shown)
             seen = time.perf_counter()
             ended, render = self._last_paint

@@ -228,10 +228,10 @@ def _energy_change(
 ) -> FloatArray:
     """Return by how much the exact energy changed, relative to what it was, where feasible."""
     changes = []
-    for place in np.flatnonzero(feasible).tolist():
+    for index in np.flatnonzero(feasible).tolist():
         before, after = (
             model.detector.detect(model.decode(latent, 1).astype(np.float32)).energy
-            for latent in (poses.latents[place], alone[place].latent)
+            for latent in (poses.latents[index], alone[index].latent)
         )
         # An encoded mesh that collides may decode to one that does not.
         if before > 0.0:

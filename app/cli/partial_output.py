@@ -33,7 +33,7 @@ class UnfinishedPoses:
     Attributes
     ----------
     path : the file, "free.partial.json" beside "free.json" or the folder "free"
-    finished : what is done, by place: a pose, and JSON values that come with it
+    finished : what is done, by index: a pose, and JSON values that come with it
     """
 
     def __init__(self, path: Path, model: PoseModel, key: str, total: int) -> None:
@@ -46,9 +46,9 @@ class UnfinishedPoses:
         if path.exists():
             self._go_on()
 
-    def keep(self, place: int, pose: NamedPose, facts: Mapping[str, Any]) -> None:
+    def keep(self, index: int, pose: NamedPose, facts: Mapping[str, Any]) -> None:
         """Remember a pose that is done; write the file when the last time is long past."""
-        self.finished[place] = (pose, facts)
+        self.finished[index] = (pose, facts)
         pause = max(_SECONDS_BETWEEN_WRITES, self._seconds / _LARGEST_FRACTION)
         if time.monotonic() - self._written > pause:
             self._write()
@@ -67,9 +67,9 @@ class UnfinishedPoses:
         record = {
             "key": self._key,
             "of": self._total,
-            "done": [{"place": place, **self.finished[place][1]} for place in indices],
+            "done": [{"place": index, **self.finished[index][1]} for index in indices],
         }
-        poses = [self.finished[place][0] for place in indices]
+        poses = [self.finished[index][0] for index in indices]
         failure = ""
         try:
             write_poses(self.path, self._model, poses, extra={"unfinished": record})

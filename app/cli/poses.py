@@ -66,16 +66,16 @@ def encode(
         cancel_on_interrupt() as cancel,
     ):
         with progress_bar("Encoding meshes") as progress:
-            for place, (name, mesh) in enumerate(zip(names, files, strict=True)):
-                if place not in unfinished.finished:
+            for index, (name, mesh) in enumerate(zip(names, files, strict=True)):
+                if index not in unfinished.finished:
                     try:
                         pose = encode_mesh(mesh, model, scale, cancel)
                     except PoseSetError as error:
                         raise cannot_encode(mesh.source, error) from error
-                    unfinished.keep(place, replace(pose, name=name), {})
-                progress(place + 1, len(files))
+                    unfinished.keep(index, replace(pose, name=name), {})
+                progress(index + 1, len(files))
         poses = [
-            replace(unfinished.finished[place][0], name=name) for place, name in enumerate(names)
+            replace(unfinished.finished[index][0], name=name) for index, name in enumerate(names)
         ]
         written = write_result(destination, model, poses)
     for pose in poses:
@@ -102,7 +102,7 @@ def decode(
         ),
     ] = None,
 ) -> None:
-    """Turn latent poses into meshes; one that came in as a mesh returns to its place.
+    """Turn latent poses into meshes; one that was imported returns to its placement.
 
     With --axes they come in upright, facing the front, with the settings that the program's own
     importer begins with: y-up; blender; maya and unreal, in centimetres. A GLB file is y up and
@@ -141,5 +141,5 @@ def sample(
     with progress_bar("Drawing poses") as progress:
         latent = sample_poses(model, count, seed, colliding, progress)
     width = len(str(count))
-    poses = [NamedPose(f"sample {place + 1:0{width}d}", row) for place, row in enumerate(latent)]
+    poses = [NamedPose(f"sample {index + 1:0{width}d}", row) for index, row in enumerate(latent)]
     write_result(destination, model, poses).note()

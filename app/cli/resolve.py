@@ -155,9 +155,9 @@ def resolve(
     ):
         finished = _results(model, unfinished)
 
-        def keep(place: int, result: ResolveResult) -> None:
-            pose = replace(requests[place].pose, latent=result.latent)
-            unfinished.keep(place, pose, _facts(result))
+        def keep(index: int, result: ResolveResult) -> None:
+            pose = replace(requests[index].pose, latent=result.latent)
+            unfinished.keep(index, pose, _facts(result))
 
         with progress_bar("Resolving poses") as progress:
             results = resolver.resolve_many(
@@ -319,17 +319,17 @@ def _facts(result: ResolveResult) -> dict[str, Any]:
 
 
 def _results(model: PoseModel, unfinished: UnfinishedPoses) -> dict[int, ResolveResult]:
-    """Return the results of an earlier run, by place."""
+    """Return the results of an earlier run, by index."""
     from lcollision_core.resolve import ResolveResult, Step
 
     try:
         return {
-            place: ResolveResult(
+            index: ResolveResult(
                 latent=pose.latent,
                 vertices=model.exported_vertices(pose.latent, pose.placement),
                 **{**facts, "step": Step(facts["step"])},
             )
-            for place, (pose, facts) in unfinished.finished.items()
+            for index, (pose, facts) in unfinished.finished.items()
         }
     except (KeyError, TypeError, ValueError) as error:
         raise unfinished.damaged() from error

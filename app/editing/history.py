@@ -391,9 +391,9 @@ class PoseHistory(QObject):
         held = list(self.poses)
         made = []
         for old, new in changes:
-            place = next((at for at, pose in enumerate(held) if pose is old), len(held))
-            made.append(LibraryChange(old, new, place))
-            held[place : place + 1] = [] if new is None else [new]
+            index = next((at for at, pose in enumerate(held) if pose is old), len(held))
+            made.append(LibraryChange(old, new, index))
+            held[index : index + 1] = [] if new is None else [new]
         before = self._state
         self.undo_stack.push(ChangeState(label, self._apply, before, state or before, changes=made))
 
@@ -415,9 +415,9 @@ class PoseHistory(QObject):
 
     def _amend(self, state: DocumentState) -> None:
         """Replace the current state, also in the undo steps on both sides of it."""
-        place = self.undo_stack.index()
-        earlier = self.undo_stack.command(place - 1)
-        later = self.undo_stack.command(place)
+        index = self.undo_stack.index()
+        earlier = self.undo_stack.command(index - 1)
+        later = self.undo_stack.command(index)
         if isinstance(earlier, ChangeState):
             earlier.after = state
         if isinstance(later, ChangeState):

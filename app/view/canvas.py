@@ -133,30 +133,30 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._rest.start()
         self.update()
 
-    def pick_vertex(self, place: QPointF, actor: vtkActor) -> int | None:
+    def pick_vertex(self, position: QPointF, actor: vtkActor) -> int | None:
         """Return the vertex that is seen at a position.
 
         Parameters
         ----------
-        place : in the widget, in device-independent pixels
+        position : in the widget, in device-independent pixels
         actor : the mesh
         """
         ratio = self.devicePixelRatioF()
         self._picker.InitializePickList()
         self._picker.AddPickList(actor)
-        x, y = place.x() * ratio, (self.height() - 1 - place.y()) * ratio
+        x, y = position.x() * ratio, (self.height() - 1 - position.y()) * ratio
         if not self._picker.Pick(x, y, 0.0, self.renderer) or self._picker.GetCellId() < 0:
             return None
         return int(self._picker.GetPointId())
 
     def point_at(
-        self, place: QPointF, actor: vtkActor, depth_of: npt.NDArray[Any]
+        self, position: QPointF, actor: vtkActor, depth_of: npt.NDArray[Any]
     ) -> npt.NDArray[np.float64]:
         """Return the point seen at a position, or beside the mesh a point as deep as another.
 
         Parameters
         ----------
-        place : in the widget, in device-independent pixels
+        position : in the widget, in device-independent pixels
         actor : the mesh
         depth_of : (3,) array, in the data's unit
 
@@ -164,13 +164,13 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         -------
         point : (3,) array, in the data's unit
         """
-        if self.pick_vertex(place, actor) is not None:
+        if self.pick_vertex(position, actor) is not None:
             return np.array(self._picker.GetPickPosition())
         ratio = self.devicePixelRatioF()
         self.renderer.SetWorldPoint(*np.asarray(depth_of, dtype=np.float64).tolist(), 1.0)
         self.renderer.WorldToDisplay()
         depth = self.renderer.GetDisplayPoint()[2]
-        x, y = place.x() * ratio, (self.height() - 1 - place.y()) * ratio
+        x, y = position.x() * ratio, (self.height() - 1 - position.y()) * ratio
         self.renderer.SetDisplayPoint(x, y, depth)
         self.renderer.DisplayToWorld()
         *point, scale = self.renderer.GetWorldPoint()

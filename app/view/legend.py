@@ -162,8 +162,8 @@ class _Ramp(QWidget):
             width = QFontMetricsF(self.font()).horizontalAdvance(words)
             # Beneath its position, but for words at the ends, which are flush with them.
             flush = position if position == 0.0 or len(legend.ticks) == 2 else 0.5
-            place = QRectF(position * bar.width() - flush * width, half, width + 2, half)
-            painter.drawText(place, Qt.AlignmentFlag.AlignVCenter, words)
+            area = QRectF(position * bar.width() - flush * width, half, width + 2, half)
+            painter.drawText(area, Qt.AlignmentFlag.AlignVCenter, words)
         painter.end()
 
 
@@ -181,15 +181,15 @@ class DomainTag(QLabel):
         self.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
         self.hide()
 
-    def point_at(self, place: QPointF, name: str, colour: str) -> None:
-        """Show a domain's name beside a place of the parent."""
+    def point_at(self, position: QPointF, name: str, colour: str) -> None:
+        """Show a domain's name beside a position in the parent."""
         self.setText(with_swatch(name, colour))
         self.adjustSize()
         over = self.parentWidget()
         assert over is not None
         limit = over.rect().bottomRight() - self.rect().bottomRight()
-        x = min(place.x() + 16.0, limit.x() - TIGHT)
-        y = min(place.y() + 16.0, limit.y() - TIGHT)
+        x = min(position.x() + 16.0, limit.x() - TIGHT)
+        y = min(position.y() + 16.0, limit.y() - TIGHT)
         self.move(round(x), round(y))
         self.show()
 

@@ -51,10 +51,10 @@ def draw_masks(model: PoseModel, path: str | os.PathLike[str]) -> None:
     scene.set_plain_background("#ffffff")
     normals = vertex_normals(vertices, model.faces)
     scene.show(vertices, normals, mask_colours(model.attention_mask, colours))
-    for place, side in enumerate(("Front", "Back")):
+    for index, side in enumerate(("Front", "Back")):
         aspect = _VIEW_WIDTH / _VIEW_HEIGHT
         scene.view = preset_view(side, vertices, model.up_axis, model.front, aspect)
-        picture.paste(renderer.drawn(), (place * _VIEW_WIDTH, 0))
+        picture.paste(renderer.drawn(), (index * _VIEW_WIDTH, 0))
     renderer.close()
 
     draw = ImageDraw.Draw(picture)

@@ -73,14 +73,14 @@ class PartShape:
             faces[crossed, (alone + step) % 3].astype(np.int64) for step in range(3)
         )
         pairs = np.sort(np.stack([corner, after, corner, before], axis=1).reshape(-1, 2), axis=1)
-        ends, place = np.unique(pairs, axis=0, return_inverse=True)
+        ends, index = np.unique(pairs, axis=0, return_inverse=True)
         at_first, at_second = lead[ends[:, 0]], lead[ends[:, 1]]
         fractions = (at_first / (at_first - at_second)).astype(np.float32)
         vertices, corners = np.unique(faces[count == 3], return_inverse=True)
         return cls(
             ends=ends,
             fractions=fractions[:, None],
-            segments=place.reshape(-1, 2),
+            segments=index.reshape(-1, 2),
             vertices=vertices.astype(np.int64),
             faces=corners.reshape(-1, 3),
         )

@@ -219,9 +219,9 @@ class Scene:
 
     def _lay_floor(self) -> None:
         low, high = self.surface.vertices.min(axis=0), self.surface.vertices.max(axis=0)
-        level, place = float(low[self._up_axis]), 0.5 * (low + high)
-        place[self._up_axis] = level - self._lift
-        self._floor.position = place
+        level, centre = float(low[self._up_axis]), 0.5 * (low + high)
+        centre[self._up_axis] = level - self._lift
+        self._floor.position = centre
         flat = np.eye(4)
         flat[self._up_axis, self._up_axis] = 0.0
         flat[self._up_axis, 3] = level - 0.5 * self._lift

@@ -443,17 +443,17 @@ class Viewport(QWidget):
             self.canvas.redraw()
 
     @Slot(QPointF, float)
-    def _on_zoom_wanted(self, place: QPointF, factor: float) -> None:
+    def _on_zoom_wanted(self, position: QPointF, factor: float) -> None:
         if self.scene is None or self.canvas is None:
             return
         self._turn.stop()
         view, now = self.scene.view, time.monotonic()
         anchor = self._zoom_anchor
-        if anchor is None or anchor[0] != place or now - anchor[2] > _ZOOM_SECONDS:
-            point = self.canvas.point_at(place, self.scene.body, view.focus)
+        if anchor is None or anchor[0] != position or now - anchor[2] > _ZOOM_SECONDS:
+            point = self.canvas.point_at(position, self.scene.body, view.focus)
         else:
             point = anchor[1]
-        self._zoom_anchor = (place, point, now)
+        self._zoom_anchor = (position, point, now)
         vertices, body_size = self.scene.surface.vertices, self._document.model.body_size
         self.scene.view = zoomed(view, point, factor, vertices, body_size)
         self.canvas.redraw()
@@ -461,28 +461,28 @@ class Viewport(QWidget):
     # The pointer.
 
     @Slot(QPointF)
-    def _on_menu_wanted(self, place: QPointF) -> None:
+    def _on_menu_wanted(self, position: QPointF) -> None:
         if self.canvas is not None:
-            where = self.canvas.mapToGlobal(place.toPoint())
-            self.menu_wanted.emit(self._domain_at(place), where)
+            where = self.canvas.mapToGlobal(position.toPoint())
+            self.menu_wanted.emit(self._domain_at(position), where)
 
-    def _domain_at(self, place: QPointF) -> int | None:
+    def _domain_at(self, position: QPointF) -> int | None:
         if self.canvas is None or self.scene is None or self._shader is None:
             return None
-        vertex = self.canvas.pick_vertex(place, self.scene.body)
+        vertex = self.canvas.pick_vertex(position, self.scene.body)
         return None if vertex is None else self._shader.leading_domain(vertex)
 
     @Slot(object)
-    def _on_hovered(self, place: QPointF | None) -> None:
+    def _on_hovered(self, position: QPointF | None) -> None:
         if self.canvas is None:
             return
-        domain = None if place is None or self.shown_frame is None else self._domain_at(place)
-        if domain is None or place is None:
+        domain = None if position is None or self.shown_frame is None else self._domain_at(position)
+        if domain is None or position is None:
             self._tag.hide()
         else:
             model = self._document.model
             name = heading(model.domain_names[domain])
-            self._tag.point_at(place, name, model.domain_colours[domain])
+            self._tag.point_at(position, name, model.domain_colours[domain])
         if domain != self.hovered_domain:
             self.hovered_domain = domain
             self.domain_hovered.emit(domain)

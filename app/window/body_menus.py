@@ -52,13 +52,13 @@ class BodyMenus(QObject):
         viewport.menu_wanted.connect(self.open_on_body)
 
     @Slot(object, QPoint)
-    def open_on_body(self, domain: int | None, place: QPoint) -> None:
+    def open_on_body(self, domain: int | None, position: QPoint) -> None:
         """Open the menu of the part under the pointer, which stays outlined meanwhile.
 
         Parameters
         ----------
         domain : index from 0, None beside the body
-        place : on the screen
+        position : on the screen
         """
         actions = self._actions
         menu = self._new_menu() if domain is None else self.part_menu(domain, None)
@@ -71,12 +71,12 @@ class BodyMenus(QObject):
         menu.addActions([actions["reset_camera"], actions["ghost"]])
         menu.addSeparator()
         menu.addActions([actions[key] for key in ("resolve", "reset", "undo")])
-        menu.popup(place)
+        menu.popup(position)
 
     @Slot(object, object, QPoint)
-    def open_on_part(self, domain: int | None, code: int | None, place: QPoint) -> None:
+    def open_on_part(self, domain: int | None, code: int | None, position: QPoint) -> None:
         """Open the menu of a code, or of a domain; neither is the whole body's."""
-        self.part_menu(domain, code).popup(place)
+        self.part_menu(domain, code).popup(position)
 
     def part_menu(self, domain: int | None, code: int | None) -> QMenu:
         """Make a menu that deletes itself when it is closed.

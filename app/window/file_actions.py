@@ -285,8 +285,8 @@ class FileActions(QObject):
     @Slot()
     def _fill_recent(self) -> None:
         self.recent_menu.clear()
-        for place, name in enumerate(self._settings["recent_files"], start=1):
-            self._list(self.recent_menu, f"&{place}  {menu_text(Path(name).name)}", name)
+        for index, name in enumerate(self._settings["recent_files"], start=1):
+            self._list(self.recent_menu, f"&{index}  {menu_text(Path(name).name)}", name)
         if self.recent_menu.isEmpty():
             self.recent_menu.addAction("No files yet").setEnabled(False)
 

@@ -137,7 +137,7 @@ class LibraryActions(QObject):
         self._panel.choose_own(document.pose_name)
 
     @Slot(QPoint)
-    def _show_menu(self, place: QPoint) -> None:
+    def _show_menu(self, position: QPoint) -> None:
         menu = QMenu(self._window)
         menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         for key in MENUS[LIBRARY_MENU]:
@@ -145,7 +145,7 @@ class LibraryActions(QObject):
                 menu.addSeparator()
             elif self._actions[key].isEnabled():
                 menu.addAction(self._actions[key])
-        menu.popup(place)
+        menu.popup(position)
 
     def _rename(self) -> None:
         chosen, document = self._panel.chosen_own, self._document

@@ -54,11 +54,11 @@ class NumberBox(QDoubleSpinBox):
                 return False
         return super().event(event)
 
-    def validate(self, text: str, place: int) -> tuple[QValidator.State, str, int]:
+    def validate(self, text: str, position: int) -> tuple[QValidator.State, str, int]:
         """Let any number be typed; its value is checked when it is complete."""
-        found = super().validate(text, place)
+        found = super().validate(text, position)
         if found[0] is QValidator.State.Invalid and self._is_beyond(text):
-            return QValidator.State.Intermediate, text, place
+            return QValidator.State.Intermediate, text, position
         return found
 
     def fixup(self, text: str) -> str:

@@ -55,7 +55,7 @@ class PoseWork(NamedTuple):
     boxes : (6 S,) float32, leaf by leaf the lower x of its slots, lower y, lower z, upper x, ...
     node_boxes : (n, 6) float32, lower x, y, z, upper x, y, z
     stack : (depth bound, 2) int32, pairs of nodes still to be visited
-    share : (depth bound,) float64, what fraction of the search each of these is guessed to be
+    fraction : (depth bound,) float64, what fraction of the search each of these is guessed to be
     """
 
     middle: npt.NDArray[np.float64]
@@ -63,7 +63,7 @@ class PoseWork(NamedTuple):
     boxes: npt.NDArray[np.float32]
     node_boxes: npt.NDArray[np.float32]
     stack: IntArray
-    share: npt.NDArray[np.float64]
+    fraction: npt.NDArray[np.float64]
 
 
 class Found(NamedTuple):

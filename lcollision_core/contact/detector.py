@@ -428,7 +428,7 @@ class _Searcher:
     @property
     def share_done(self) -> float:
         """The fraction of the search that is guessed to be done."""
-        return 1.0 - float(self._work.share[: self._waiting].sum())
+        return 1.0 - float(self._work.fraction[: self._waiting].sum())
 
     def _refuse(self, number: int | None) -> NoReturn:
         within = np.abs(self._pose) * self._scale <= MAX_DISTANCE  # False for NaN

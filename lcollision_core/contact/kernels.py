@@ -457,19 +457,19 @@ def search_pose(
     -------
     n_found : how many pairs this call has put into `found`; -1 where a vertex is not finite or
         beyond `MAX_DISTANCE`
-    n_waiting : how many pairs of nodes are still to be visited, 0 at the end; `work.share` says
+    n_waiting : how many pairs of nodes are still to be visited, 0 at the end; `work.fraction` says
         what fraction of the search each of them is guessed to be
     """
     boxes = work.node_boxes
     stack = work.stack
-    share = work.share
+    fraction = work.fraction
     # Not a plain 0: the search of leaves would be compiled twice for it.
     n_found: int = int(np.int64(0))
     if n_waiting == 0:
         if not _refit(pose, scale, tree, work):
             return -1, 0
         n_waiting = _push(stack, 0, 0, 0)
-        share[0] = 1.0
+        fraction[0] = 1.0
     while n_waiting > 0:
         n_waiting -= 1
         a = stack[n_waiting, 0]
@@ -495,7 +495,7 @@ def search_pose(
                 return n_found, 0
             continue
         first = n_waiting
-        part = share[first]
+        part = fraction[first]
         if a == b:
             one, two = tree.left[a], tree.right[a]
             n_waiting = _push(stack, n_waiting, one, one)
@@ -510,7 +510,7 @@ def search_pose(
                 if _overlap(boxes, child, b):
                     n_waiting = _push(stack, n_waiting, child, b)
         for k in range(first, n_waiting):
-            share[k] = part / (n_waiting - first)
+            fraction[k] = part / (n_waiting - first)
     return n_found, 0
 
 
@@ -525,9 +525,9 @@ def add_vertex_energy(
     for pair in range(n_found):
         if found.is_near[pair]:
             continue
-        share = found.squared_depth[pair] / 6.0
+        energy = found.squared_depth[pair] / 6.0
         for side in range(2):
             slot = found.slots[pair, side]
             base = slot // LEAF_SIZE * 3 * LEAF_SIZE + slot % LEAF_SIZE
             for c in range(3):
-                vertex_energy[tree.corners[base + c * LEAF_SIZE]] += share
+                vertex_energy[tree.corners[base + c * LEAF_SIZE]] += energy

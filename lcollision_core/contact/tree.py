@@ -138,5 +138,5 @@ def allocate_work(tree: FaceTree) -> PoseWork:
         boxes=np.empty(6 * n_slots, dtype=np.float32),
         node_boxes=np.empty((n_nodes, 6), dtype=np.float32),
         stack=np.empty((4 * levels + 4, 2), dtype=np.int32),
-        share=np.empty(4 * levels + 4),
+        fraction=np.empty(4 * levels + 4),
     )

@@ -28,9 +28,9 @@ class LatentGroup:
     codes: slice
     code_names: tuple[str, ...]
 
-    def full_name(self, place: int) -> str:
+    def full_name(self, index: int) -> str:
         """Return the full name of one of the group's codes, as in "arm, motion 3"."""
-        name = self.code_names[place]
+        name = self.code_names[index]
         return name if self.colour is None else f"{self.name}, {name}"
 
 

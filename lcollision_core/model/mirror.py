@@ -178,21 +178,21 @@ class PoseMirror:
         decoded = check.decode(pose)[0]
         pairs_before = len(check.find(check.exported(decoded)).pairs)
         image = self.symmetry.image(decoded * size) / size
-        place = None if placement is None else self.symmetry.image_of_placement(placement)
+        image_placement = None if placement is None else self.symmetry.image_of_placement(placement)
         restored = source is not None and source.is_of(pose, placement)
         if source is not None and restored:
-            found, place = source.latent, source.placement
+            found, image_placement = source.latent, source.placement
         else:
             # With the placement fixed: a fitted rigid motion would have to be undone, and the
             # codes hold it nearly as well.
             fit = self.embedding.encode(image, cancel, in_place=True)
             found = fit.latent.astype(np.float64)
-        check = replace(check, placement=place)
+        check = replace(check, placement=image_placement)
         mirrored = check.decode(found)[0]
         pairs_mirrored = pairs_after = len(check.find(check.exported(mirrored)).pairs)
         resolution = None
         if not restored and pairs_before == 0 < pairs_mirrored and self.resolver is not None:
-            resolution = self.resolver.resolve(found, options, progress, cancel, place)
+            resolution = self.resolver.resolve(found, options, progress, cancel, image_placement)
             if resolution.exactly_free:
                 found, pairs_after = resolution.latent, 0
                 mirrored = check.decode(found)[0]
@@ -200,7 +200,7 @@ class PoseMirror:
         distances = np.linalg.norm((mirrored - image)[picked], axis=1)
         return MirroredPose(
             latent=found,
-            placement=place,
+            placement=image_placement,
             fit_error_mean=float(distances.mean()),
             fit_error_max=float(distances.max()),
             restored=restored,
@@ -208,7 +208,7 @@ class PoseMirror:
             pairs_mirrored=pairs_mirrored,
             pairs_after=pairs_after,
             resolution=resolution,
-            source=MirrorSource(pose, placement, fingerprint_of_pose(found, place)),
+            source=MirrorSource(pose, placement, fingerprint_of_pose(found, image_placement)),
         )
 
 

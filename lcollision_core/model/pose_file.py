@@ -256,15 +256,15 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> Pos
     if owner.get("fingerprint") != model.fingerprint:
         raise _other_model(path, owner, model)
 
-    def pose(entry: Any, place: str) -> NamedPose:
+    def pose(entry: Any, location: str) -> NamedPose:
         try:
             return _from_json(entry, model.latent_size)
         except ValueError as error:
             raise DamagedPosesError.because(
-                path, f"is damaged at {place}", error, "repair or remove that pose"
+                path, f"is damaged at {location}", error, "repair or remove that pose"
             ) from error
 
-    poses = tuple(pose(entry, f"pose {place} (from 0)") for place, entry in enumerate(entries))
+    poses = tuple(pose(entry, f"pose {index} (from 0)") for index, entry in enumerate(entries))
     if len({pose.name for pose in poses}) < len(poses):
         raise DamagedPosesError(
             "is damaged: two of its poses share a name", "rename one", where=path

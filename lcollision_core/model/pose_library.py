@@ -44,17 +44,17 @@ class LibraryChange:
     ----------
     old : None if a pose is added
     new : None if a pose is removed
-    place : in the library, from 0, where a pose is added
+    index : from 0 in the library, where a pose is added
     """
 
     old: NamedPose | None
     new: NamedPose | None
-    place: int
+    index: int
 
     @property
     def inverse(self) -> LibraryChange:
         """The inverse change."""
-        return LibraryChange(self.new, self.old, self.place)
+        return LibraryChange(self.new, self.old, self.index)
 
 
 class PoseLibrary:
@@ -159,13 +159,13 @@ def _changed(poses: Sequence[NamedPose], changes: Sequence[LibraryChange]) -> tu
     """Apply changes; a pose that another program has changed meanwhile is kept."""
     held = list(poses)
     for change in changes:
-        place = next((at for at, pose in enumerate(held) if _alike(pose, change.old)), None)
-        if place is not None:
-            del held[place]
+        index = next((at for at, pose in enumerate(held) if _alike(pose, change.old)), None)
+        if index is not None:
+            del held[index]
         if change.new is not None:
             *_, name = unique_names([*(pose.name for pose in held), change.new.name])
             new = change.new if name == change.new.name else replace(change.new, name=name)
-            held.insert(change.place if place is None else place, new)
+            held.insert(change.index if index is None else index, new)
     return tuple(held)
 
 

@@ -166,8 +166,8 @@ class Ladder:
         poses = np.unique(np.stack([self.problem.target, *self._candidates]), axis=0)
         decoded = self.check.exported(self.check.decode(poses))
         energies = [self.check.find(vertices).energy for vertices in decoded]
-        for place in np.argsort(energies, kind="stable")[:_POLISHED]:
-            yield Step.POLISH, polish(self.check, self.problem, poses[place])
+        for index in np.argsort(energies, kind="stable")[:_POLISHED]:
+            yield Step.POLISH, polish(self.check, self.problem, poses[index])
 
     def _solve(self, margin: float, start: FloatArray) -> SolverOutcome:
         if self.options.solver == Solver.SQP:

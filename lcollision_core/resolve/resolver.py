@@ -145,15 +145,15 @@ class PoseResolver:
 
         def solve(run: range) -> None:
             near = None
-            for place in run:
-                result = known.get(place) or self.resolve(
-                    rows[place], options, no_progress, cancel, placed[place], near
+            for index in run:
+                result = known.get(index) or self.resolve(
+                    rows[index], options, no_progress, cancel, placed[index], near
                 )
-                near = result.latent - rows[place] if sequence else None
+                near = result.latent - rows[index] if sequence else None
                 with guard:
-                    results[place] = result
-                    if keep is not None and place not in known:
-                        keep(place, result)
+                    results[index] = result
+                    if keep is not None and index not in known:
+                        keep(index, result)
                     progress(len(results), len(rows))
 
         pool = ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="resolve")
@@ -168,7 +168,7 @@ class PoseResolver:
                 solved.result()
         finally:
             pool.shutdown(cancel_futures=True)
-        return [results[place] for place in range(len(rows))]
+        return [results[index] for index in range(len(rows))]
 
     def _is_colliding(
         self, latent: FloatArray, placement: RigidTransform | None, cancel: CancelToken | None

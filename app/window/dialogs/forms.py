@@ -265,9 +265,9 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
     def follow() -> None:
         is_gif = kind.currentData() == "gif"
         rate.setMaximum(FASTEST_GIF if is_gif else most)
-        place = list(backgrounds).index("transparent")
-        behind.setItemData(place, 0 if is_gif else None, Qt.ItemDataRole.UserRole - 1)
-        if is_gif and behind.currentIndex() == place:
+        index = list(backgrounds).index("transparent")
+        behind.setItemData(index, 0 if is_gif else None, Qt.ItemDataRole.UserRole - 1)
+        if is_gif and behind.currentIndex() == index:
             behind.setCurrentIndex(0)
         form.explain(note, f"One full turn, current shading. {meanings[kind.currentData()]}")
 

@@ -115,13 +115,13 @@ class CodeRow(HoverRow):
     ----------
     document : changed
     code : index from 0 in the latent
-    place : index from 0 in its group
+    index : from 0 in its group
     domain : of its group, None for the whole body's
     name_width : width of the name before the slider gets more than its least
     """
 
     def __init__(
-        self, document: PoseDocument, code: int, place: int, domain: int | None, name_width: int
+        self, document: PoseDocument, code: int, index: int, domain: int | None, name_width: int
     ) -> None:
         model = document.model
         moved = model.code_effects[code].domain if domain is None else domain
@@ -146,7 +146,7 @@ class CodeRow(HoverRow):
         self.field.setAccessibleName(f"{name}, number")
         self.slider.setToolTip(
             plain_tip(
-                f"{name} (motion {place + 1}): drag to move, hold Ctrl to move ten times finer, "
+                f"{name} (motion {index + 1}): drag to move, hold Ctrl to move ten times finer, "
                 "double-click to reset"
             )
         )

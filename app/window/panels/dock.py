@@ -53,8 +53,8 @@ class Panel(QDockWidget):
         body = QRect(0, 0, view.width() // 2, view.height())
         body.moveCenter(QRect(view.mapToGlobal(QPoint(0, 0)), view.size()).center())
         frame = self.frameGeometry()
-        place = beside(frame, self._window.frameGeometry(), body, screen)
-        self.move(place)
+        position = beside(frame, self._window.frameGeometry(), body, screen)
+        self.move(position)
 
 
 def bring_up(content: QWidget) -> None:

@@ -335,10 +335,10 @@ class LibraryPanel(QWidget):
         self.refresh()
 
     @Slot(QPoint)
-    def _on_menu(self, place: QPoint) -> None:
-        if self.list.itemAt(place) is None:
+    def _on_menu(self, position: QPoint) -> None:
+        if self.list.itemAt(position) is None:
             self.list.clearSelection()
-        self.menu_wanted.emit(self.list.viewport().mapToGlobal(place))
+        self.menu_wanted.emit(self.list.viewport().mapToGlobal(position))
 
     @Slot(int)
     def _on_picture_wanted(self, row: int) -> None:

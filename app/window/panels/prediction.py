@@ -83,15 +83,15 @@ class ProbabilityMeter(QWidget):
         if self._probability is not None:
             verdict = theme.colliding if self._probability > EVEN_ODDS else theme.free
             ink = QColor(theme.muted if self._is_aside else verdict)
-            place = bar.left() + self._probability * bar.width()
+            mark = bar.left() + self._probability * bar.width()
             filled = QColor(ink)
             filled.setAlpha(130)
             painter.setBrush(filled)
-            painter.setClipRect(QRectF(bar.left(), 0, place - bar.left(), self.height()))
+            painter.setClipRect(QRectF(bar.left(), 0, mark - bar.left(), self.height()))
             painter.drawRoundedRect(bar, 4, 4)
             painter.setClipping(False)
             painter.setBrush(ink)
-            tip = min(max(place, bar.left() + 4), bar.right() - 4)
+            tip = min(max(mark, bar.left() + 4), bar.right() - 4)
             corners = ((tip - 5, 1), (tip + 5, 1), (tip, 8))
             painter.drawPolygon(QPolygonF([QPointF(x, y) for x, y in corners]))
             painter.drawRect(QRectF(tip - 1, 7, 2, 12))

@@ -78,11 +78,11 @@ class GroupHeader(HoverRow):
 class SliderGroup(QWidget):
     """One group's header and rows; the rows are made when they are first seen."""
 
-    def __init__(self, panel: SlidersPanel, place: int, group: LatentGroup) -> None:
+    def __init__(self, panel: SlidersPanel, index: int, group: LatentGroup) -> None:
         super().__init__()
         self._panel = panel
         self._group = group
-        self._domain = place - 1 if place else None
+        self._domain = index - 1 if index else None
         self._open_before: bool | None = None
         self.rows: list[CodeRow] = []
         self.header = GroupHeader(heading(group.name), group.colour or "", self._domain)
@@ -115,8 +115,8 @@ class SliderGroup(QWidget):
         """
         names = (
             # By the number of before as well.
-            f"{self._group.name} {own} {self._group.full_name(place)}".casefold()
-            for place, own in enumerate(self._panel.document.model.code_names[self._group.codes])
+            f"{self._group.name} {own} {self._group.full_name(index)}".casefold()
+            for index, own in enumerate(self._panel.document.model.code_names[self._group.codes])
         )
         matches = [all(word in name for word in words.split()) for name in names]
         if words and self._open_before is None:
@@ -135,8 +135,8 @@ class SliderGroup(QWidget):
         document, codes = self._panel.document, self._group.codes
         name_width = longest_name(self, map(heading, document.model.code_names[codes]))
         order: list[QWidget] = [self.header.button]
-        for place, code in enumerate(range(codes.start, codes.stop)):
-            row = CodeRow(document, code, place, self._domain, name_width)
+        for index, code in enumerate(range(codes.start, codes.stop)):
+            row = CodeRow(document, code, index, self._domain, name_width)
             row.hovered.connect(self._panel.domain_hovered)
             row.menu_wanted.connect(self._panel.menu_wanted)
             self._column.addWidget(row)
@@ -223,9 +223,9 @@ class SlidersPanel(QWidget):
     def row_of(self, code: int) -> CodeRow:
         """Open the group of a code and return its row."""
         groups = self.document.model.latent_space.groups
-        place = next(k for k, group in enumerate(groups) if code < group.codes.stop)
-        self.groups[place].set_open(True)
-        return next(row for row in self.groups[place].rows if row.code == code)
+        index = next(k for k, group in enumerate(groups) if code < group.codes.stop)
+        self.groups[index].set_open(True)
+        return next(row for row in self.groups[index].rows if row.code == code)
 
     def _on_model(self) -> None:
         for group in self.groups:
@@ -238,11 +238,11 @@ class SlidersPanel(QWidget):
             opened = [group.header.button.isChecked() for group in self.groups]
         self._fingerprint = model.fingerprint
         groups = model.latent_space.groups
-        self.groups = [SliderGroup(self, place, group) for place, group in enumerate(groups)]
+        self.groups = [SliderGroup(self, index, group) for index, group in enumerate(groups)]
         shown = [self.groups[0], *(self.groups[1 + domain] for domain in model.domain_order)]
         before: QWidget = self.filter
-        for place, group in enumerate(shown):
-            self._column.insertWidget(place, group)
+        for index, group in enumerate(shown):
+            self._column.insertWidget(index, group)
             QWidget.setTabOrder(before, group.header.button)
             before = group.header.button
         self._shown = np.array(self.document.latent)

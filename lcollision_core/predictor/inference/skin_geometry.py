@@ -103,8 +103,8 @@ class SkinGeometry:
         distance = skin_distances(skin_graph(embedding), vertex, limit=DISTANT)[:, vertex]
         neighbours = np.isfinite(distance).astype(np.float32)
         order = neighbour_order(embedding.rest_vertices[vertex], BLOCK)
-        place = np.zeros(n_vertices, dtype=np.int32)
-        place[skin] = np.arange(len(skin))
+        index = np.zeros(n_vertices, dtype=np.int32)
+        index[skin] = np.arange(len(skin))
         groups, targets, code = [], [], 0
         for group in embedding.decoder.groups:
             n_codes = len(group.weights)
@@ -116,7 +116,7 @@ class SkinGeometry:
             code += n_codes
         return cls(
             point_vertices=vertex,
-            members=place[sites],
+            members=index[sites],
             geodesic_neighbours=neighbours,
             order=order,
             neighbour_blocks=in_blocks(neighbours, order),
