@@ -14,13 +14,13 @@ from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
 _DEEPEST = 100
-"""The most pairs of faces that are reported one by one."""
+"""Most pairs of faces that are listed one by one."""
 
 
 def check(
     meshes: Annotated[
         list[Path],
-        # readable=False: read_mesh says in its own words what is wrong with which file.
+        # readable=False: read_mesh reports the error and the file itself.
         typer.Argument(
             metavar="MESH...",
             readable=False,

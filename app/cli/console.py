@@ -19,11 +19,11 @@ from lcollision_core.jobs import Progress, no_progress
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 
 SECONDS_BETWEEN_LINES = 30.0
-"""Of progress, where it goes to a file or a pipe."""
+"""Seconds between progress notes in a file or a pipe."""
 
 
 class ExitStatus(IntEnum):
-    """What the command's exit status says; scripts depend on these numbers."""
+    """Exit statuses; scripts depend on these numbers."""
 
     DONE = 0
     ANSWER_IS_NO = 1
@@ -33,7 +33,7 @@ class ExitStatus(IntEnum):
 
 
 class ShowStatus(Protocol):
-    """Draws how far long work is."""
+    """Draws the progress of long work."""
 
     def __call__(
         self, done: float, total: float, facts: Iterable[str] = (), description: str | None = None
@@ -52,12 +52,12 @@ def tell(line: str) -> None:
 
 
 def note(sentence: str) -> None:
-    """Tell the user something beside the answer, on standard error, as `tell` does."""
+    """Print a note for the user on standard error, as `tell` does."""
     typer.echo(f"lcollision: {one_line(sentence)}", err=True)
 
 
 class _Notes(logging.Handler):
-    """Tells what is logged as notes, each once."""
+    """Prints log records as notes, each once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ def status_bar(task: str, *, rows: bool = False) -> Iterator[ShowStatus]:
     Parameters
     ----------
     task : what is done, until a status says otherwise
-    rows : show how many of how many are done, not the share and the time left
+    rows : show the counts done and in all, not the percentage and the time left
     """
     if not sys.stderr.isatty():
         last = time.monotonic()

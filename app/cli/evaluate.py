@@ -1,4 +1,4 @@
-"""``lcollision evaluate``: how well a model's predictor does on labelled samples."""
+"""``lcollision evaluate``: scores of a model's predictor on labelled samples."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def require_store_of(store: LabelStore, model: PoseModel) -> None:
 
 
 def scores_sentence(metrics: PredictorMetrics) -> str:
-    """Put the verdicts' scores into words."""
+    """Describe the scores of the classification."""
     return (
         f"accuracy {_percent(metrics.accuracy)} on {metrics.samples} unseen samples (majority "
         f"baseline: {_percent(metrics.majority_rate)}), false positive rate "

@@ -1,4 +1,4 @@
-"""What commands are given to read: files, folders in the place of the meshes in them, units."""
+"""Inputs of commands: files, folders of meshes, units."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ScaleOption = Annotated[
 
 
 def expanded(inputs: Iterable[Path]) -> list[Path]:
-    """Put the meshes of each folder, in natural order, in its place.
+    """Replace each folder by its meshes, in natural order.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
 
 
 def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
-    """Say that a mesh cannot be encoded, and which option helps where it has another unit."""
+    """Say that a mesh cannot be encoded, and which option helps if it has another unit."""
     next_step = error.next_step
     if isinstance(error, WrongScaleError):
         next_step = f"scale it with --scale {error.factor:.6g}"
@@ -68,5 +68,5 @@ def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
 
 
 def up_sentence(guess: UpGuess) -> str:
-    """Say which way was taken to be up, and why."""
+    """Report which axis was taken as up, and why."""
     return f"{'xyz'[guess.axis]} is {'' if guess.is_sure else 'perhaps '}up: {guess.reason}"

@@ -12,7 +12,7 @@ from lcollision_core.jobs import CancelToken
 
 @contextmanager
 def cancel_on_interrupt() -> Iterator[CancelToken]:
-    """Give a token that the first Ctrl-C or SIGTERM sets; a second Ctrl-C interrupts at once."""
+    """Yield a token that the first Ctrl-C or SIGTERM sets; a second Ctrl-C interrupts at once."""
     token = CancelToken()
     previous: dict[signal.Signals, Any] = {}
 

@@ -143,7 +143,7 @@ def _check(model: PoseModel, path: Path, as_json: bool) -> None:
 
 @contextmanager
 def _labelling_bar() -> Iterator[StatusCallback]:
-    """Give a callback that draws rows, rate, time left and share colliding on a terminal."""
+    """Give a callback that draws rows, rate, time left and fraction colliding on a terminal."""
     from datetime import timedelta
 
     with status_bar("Labelling", rows=True) as draw:

@@ -1,4 +1,4 @@
-"""The commands, and what becomes of an error.
+"""The commands, and the handling of errors.
 
 Every command imports what it needs when it runs: ``lcollision --help`` loads no array library.
 """
@@ -34,7 +34,7 @@ from lcollision_core.errors import CancelledError, LCollisionError
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
-"""What typer raises for wrong words; typer itself gives only this child a public name."""
+"""Typer's usage error; only this subclass has a public name."""
 
 
 class _Commands(TyperGroup):
@@ -67,7 +67,7 @@ class _Commands(TyperGroup):
             note("out of memory; give it smaller meshes or fewer poses")
             raise typer.Exit(ExitStatus.BAD_INPUT) from None
         except BrokenPipeError:
-            # The reader left, as `head` does; typer's own status 1 would be an answer.
+            # The reader closed the pipe, as `head` does; typer's status 1 would mean a result.
             _drop_what_is_buffered()
             raise typer.Exit(ExitStatus.INTERRUPTED) from None
         except OSError as error:
@@ -82,7 +82,7 @@ class _Commands(TyperGroup):
 
 
 def _drop_what_is_buffered() -> None:
-    """Let standard output not fail once more at the exit."""
+    """Keep standard output from failing again at the exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -145,7 +145,7 @@ def main() -> None:
     """Run the command line and exit with an `ExitStatus`."""
     try:
         app()
-    except Exception:  # the last resort: a bug must not look like an answer
+    except Exception:  # the last resort: a bug must not look like a result
         traceback.print_exc()
         note("this is a bug in lcollision; please report it")
         sys.exit(ExitStatus.BUG)

@@ -1,4 +1,4 @@
-"""``lcollision models``, ``info`` and ``domains``: what models there are, and what they hold."""
+"""``lcollision models``, ``info`` and ``domains``: the models and their content."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def describe(model: PoseModel) -> dict[str, Any]:
 
 
 def measured_model(model: PoseModel) -> dict[str, Any]:
-    """Return the JSON fields that tell which model a predictor's figures are of."""
+    """Return the JSON fields that identify the model of a predictor's figures."""
     first, *others = model.embedding.group_sizes
     return {
         "model": model.name,
@@ -216,7 +216,7 @@ def measured_model_sentence(model: PoseModel) -> str:
 
 
 def note_if_beside(written: Path, destination: Path) -> None:
-    """Say why a trained model is not where it was to go."""
+    """Explain why a trained model was written to another path."""
     if written != destination:
         note(
             f"{destination} was replaced by another model during the training and stays as it "

@@ -1,4 +1,4 @@
-"""What an interrupted command has done, kept beside its output for the same command to go on."""
+"""What an interrupted command has done, kept beside its output to resume it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _SECONDS_BETWEEN_WRITES = 5.0
 _MAX_STEM_BYTES = 200
 _LARGEST_FRACTION = 0.05
-"""Of a command's time, for writing when there are many poses."""
+"""Fraction of a command's time for writing when there are many poses."""
 
 
 class UnfinishedPoses:
@@ -59,7 +59,7 @@ class UnfinishedPoses:
             note(f"stopped; {self.path} has {self._told}, run the same command again to go on")
 
     def _write(self) -> bool:
-        """Write, or say once why not: a full disk neither ends the command nor hides what does."""
+        """Write, or report once why not: a full disk neither ends the command nor hides errors."""
         from lcollision_core.model import write_poses
 
         started = time.monotonic()
@@ -144,7 +144,7 @@ def unfinished_poses(
         try:
             yield held
         except LCollisionError as error:
-            # What the command cannot do it could not do the next time either.
+            # An error of the command itself would recur next time.
             if isinstance(error, CancelledError) or len(held.finished) == total:
                 held.stop()
             else:

@@ -293,7 +293,7 @@ def _requests_of(model: PoseModel, path: Path, scale: float) -> Iterator[_Reques
 def _depends_on(
     model: PoseModel, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """Return what the results follow from: arrays, and JSON values."""
+    """Return the inputs that determine the results: arrays, and JSON values."""
     from lcollision_core.model import fingerprint_of_pose
 
     predictor = model.require_predictor().to_section()
@@ -313,7 +313,7 @@ def _depends_on(
 
 
 def _facts(result: ResolveResult) -> dict[str, Any]:
-    """Return all of a result but its arrays, as JSON values."""
+    """Return a result without its arrays, as JSON values."""
     names = (field.name for field in fields(result))
     return {name: getattr(result, name) for name in names if name not in ("latent", "vertices")}
 
@@ -351,7 +351,7 @@ def _detailed(
 
 
 def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str:
-    """Say what became of one pose; figures of a mesh are those of the pose nearest to it."""
+    """Report the result of one pose; figures of a mesh are those of the pose nearest to it."""
     from lcollision_core.resolve import Step
 
     moved = (

@@ -1,4 +1,4 @@
-"""Where commands put latent poses and meshes: the output's form decides."""
+"""Output of latent poses and meshes, by the form of the output path."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ FormatOption = Annotated[MeshFormat, typer.Option("--format", help="Of the meshe
 
 @dataclass(frozen=True)
 class Output:
-    """Where a command is to put poses or meshes.
+    """The output of a command for poses or meshes.
 
     Attributes
     ----------
     path : as it was named
-    form : what it is to be
+    form : of the output
     before : what was there when the command began, by `file_stamp`
     """
 
@@ -60,7 +60,7 @@ class Output:
 
 @dataclass(frozen=True)
 class WrittenPoses:
-    """Where poses went.
+    """The files that poses were written to.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class WrittenPoses:
 
 
 def require_output(path: Path, suffix: str) -> Output:
-    """Refuse an output that is not one file of a kind, before the work for it is done.
+    """Refuse an output that is not one file of a format, before the work for it is done.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def require_output(path: Path, suffix: str) -> Output:
 
 
 def note_near_exclusion(model: PoseModel) -> None:
-    """Say which pairs of faces the figures beside this leave out, where there are any."""
+    """Report the pairs of faces that the figures leave out, if any."""
     if model.near_exclusion:
         note(
             f"pairs of faces within {model.near_exclusion:g} body sizes along the surface are "
@@ -107,7 +107,7 @@ def note_near_exclusion(model: PoseModel) -> None:
 
 
 def output_named(name: str) -> Output:
-    """Say what an output is to be, before the work for it is done.
+    """Determine the form of an output, before the work for it is done.
 
     An existing folder and what ends in a slash are folders whatever they are called; else the
     extension decides. A name without one, or with what is no kind of file, as in "results_v0.9",
@@ -167,7 +167,7 @@ def require_format_holds(
     poses: Sequence[NamedPose],
     mesh_format: MeshFormat = "obj",
 ) -> None:
-    """Refuse a format that cannot hold a pose where it lies, before the work for it is done.
+    """Refuse a format that cannot hold a pose at its location, before the work for it is done.
 
     Raises
     ------
@@ -222,7 +222,7 @@ def write_result(
         for file, pose, mesh in zip(files, poses, given, strict=True):
             if mesh is None:
                 mesh = exported_vertices(model.decode(pose.latent), pose.placement)
-            # OBJ and OFF would get float32's short decimals, which float64 readers take for others.
+            # OBJ and OFF would get short decimals of float32, which are other numbers in float64.
             frame = export_frame(model, axes, file, scale)
             export_mesh(file, model, mesh.astype(float), pose.placement, frame)
 

@@ -160,7 +160,7 @@ class PoseHistory(QObject):
         self._gesture = (label, self._state)
 
     def end_gesture(self) -> None:
-        """End a drag; does nothing where none has begun."""
+        """End a drag; does nothing if none has begun."""
         if self._gesture is None:
             return
         label, before = self._gesture

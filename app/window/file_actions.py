@@ -384,7 +384,7 @@ class FileActions(QObject):
 
         Returns
         -------
-        path : None where the user gives up
+        path : None if the user cancels
         """
         from lcollision_core.meshes import has_known_suffix
 

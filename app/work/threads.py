@@ -27,7 +27,7 @@ class Failure:
     Attributes
     ----------
     headline : what happened, and where
-    next_step : what to do; empty where there is nothing
+    next_step : what to do; empty if there is nothing
     details : the traceback
     """
 
