@@ -1,4 +1,4 @@
-"""The choices of stage 2, by preset."""
+"""The options of stage 2, by preset."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class PredictorConfig:
                 raise LCollisionError.must_be(name, "over 0", getattr(self, name))
 
     def passes(self, n_rows: int) -> int:
-        """Return how often `n_rows` training rows are gone through: at most `epochs`.
+        """Return the number of passes over `n_rows` training rows: at most `epochs`.
 
         Many rows need fewer passes, but no fewer than `LEAST_PASSES`.
         """
@@ -80,7 +80,7 @@ class PredictorConfig:
         return min(self.epochs, max(LEAST_PASSES, -(-self.shown_rows // n_rows)))
 
     def with_loss(self, loss: Loss) -> PredictorConfig:
-        """Return the same choices with some of the loss's terms left out.
+        """Return the same options without some of the loss's terms.
 
         Raises
         ------

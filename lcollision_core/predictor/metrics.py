@@ -1,4 +1,4 @@
-"""How well a predictor tells what it has not seen."""
+"""Scores of a predictor on held-out samples."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lcollision_core.meshes.topology import FloatArray
 CALIBRATION_BINS = 10
 
 _PAIRING_SEED = 0
-"""Of the pairs of RANK, so that equal predictions get equal scores."""
+"""Seed of the pairs of RANK, so that equal predictions get equal scores."""
 
 
 @dataclass(frozen=True)

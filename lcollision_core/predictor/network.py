@@ -18,7 +18,7 @@ from lcollision_core.predictor.config import PredictorConfig
 
 
 class NetworkOutput(NamedTuple):
-    """What a network says of B poses.
+    """The outputs of a network for B poses.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Targets(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SkinCells:
-    """How the skin is divided, into patches and into folds.
+    """The division of the skin into patches and folds.
 
     Attributes
     ----------

@@ -31,7 +31,7 @@ PATIENCE = 30_000
 
 
 def settings_in(folder: Path) -> Settings:
-    """Return settings that nobody else reads."""
+    """Return settings that nothing else reads."""
     return Settings(QSettings(str(folder / "editor.ini"), QSettings.Format.IniFormat))
 
 

@@ -1,1 +1,1 @@
-"""The default network, in torch: what is trained, and what predicts on a GPU."""
+"""The default network, in torch, for training and for prediction on a GPU."""

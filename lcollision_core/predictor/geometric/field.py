@@ -1,4 +1,4 @@
-"""What the points of the body have near them, in torch; the sums themselves compiled on the CPU."""
+"""Contact features at the points of the body, in torch; the sums themselves compiled on the CPU."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
 
 
 class ContactField(torch.nn.Module):
-    """Sums up at each point what distant parts of the skin come near it.
+    """Sums at each point over distant parts of the skin that come near it.
 
     Implicit moving least squares (Kolluri 2008): another point at distance d weighs
     (1 - d^2 / radius^2)^3, and less as it falls behind the tangent plane. Whichever points they

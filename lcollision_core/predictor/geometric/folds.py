@@ -1,4 +1,4 @@
-"""Where skin folds onto itself, and the few vertices about such a site that tell when it does."""
+"""Sites where skin folds onto itself, and a few vertices about each that indicate the fold."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SPREAD, _REDUNDANCE = 0.02, 0.85
 """Normalised length within which a chosen site makes its neighbours redundant, and how much."""
 
 _MASKED_FOLD = 0.2
-"""What a fold is worth in a pose that collides elsewhere too."""
+"""Weight of a fold in a pose that collides elsewhere too."""
 
 _SEARCHED_POSES = 3000
 _POSES_AT_ONCE = 256
@@ -70,7 +70,7 @@ def find_fold_sites(
     Parameters
     ----------
     embedding : decodes
-    latent : (n, D) poses that collide; some thousands are looked at
+    latent : (n, D) poses that collide; some thousands are used
     near_exclusion : of pairs that do not count, in normalised length
 
     Returns

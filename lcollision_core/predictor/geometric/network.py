@@ -1,4 +1,4 @@
-"""The default preset's network: it looks at the body's shape instead of the latent codes.
+"""The default preset's network: its inputs are the body's shape, not the latent codes.
 
 A latent code is a poor coordinate for collision: whether a hand touches a thigh depends on where
 both are, and that on every joint between. So the codes are decoded to some hundred points of the
@@ -53,7 +53,7 @@ _ROWS_AT_ONCE = 64
 
 _PATCH_WEIGHT, _DEPTH_WEIGHT = 20.0, 5.0
 _FOLD_WEIGHT, _FOLD_DEPTH_WEIGHT = 5.0, 1.25
-"""Of cross entropies and depths, which are means over hundreds of mostly free patches."""
+"""Weights of cross entropies and depths, means over hundreds of mostly free patches."""
 
 _FITTED_POSES = 4000
 _MEASURED_POSES = 2000
@@ -76,7 +76,7 @@ class _Auxiliary(NamedTuple):
 
 
 class GeometricNetwork(PredictorNetwork):
-    """Patches of skin, each with a network that reads what comes near it.
+    """Patches of skin, each with a network that reads its contact features.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ class GeometricNetwork(PredictorNetwork):
         self.fold.fit(torch.cat(folds, dim=1), _LEAST_GRADIENT_DEVIATION)
 
     def skin_cells(self, embedding: Embedding) -> SkinCells:
-        """Divide the skin into patches and folds, whose exact energies the loss wants."""
+        """Divide the skin into patches and folds, whose exact energies the loss needs."""
         centres = self.site_vertices[:, 0].cpu().numpy()
         return SkinCells(
             skin_cells(embedding, self.skin.point_vertices), skin_cells(embedding, centres)
@@ -217,7 +217,7 @@ class GeometricNetwork(PredictorNetwork):
         values = self.head[-1](values)
         contact = torch.logsumexp(patch_logit, dim=1) * self.any_hit[0] + self.any_hit[1]
         root = values[:, 1:]
-        # Energies are taught as square roots: their tail is long.
+        # Energies are learned as square roots: their tail is long.
         energy = root[:, :-1].clamp_min(0.0).square()
         return NetworkOutput(
             energy, values[:, 0] + contact, _Auxiliary(patch_logit, patch_root, root)
@@ -277,7 +277,7 @@ class _PatchNetworks(nn.Module):
             cast(StackedLinear, self.layers[-1]).bias[:, :, 0] = -3.0
 
     def fit(self, inputs: torch.Tensor, least_deviation: float) -> None:
-        """Take the means and deviations of some inputs."""
+        """Store the means and deviations of some inputs."""
         if not inputs.numel():
             return
         self.mean.copy_(inputs.mean(dim=1, keepdim=True))

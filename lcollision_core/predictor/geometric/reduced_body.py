@@ -13,11 +13,11 @@ from lcollision_core.predictor.inference.skin_kernels import SMALLEST_SQUARED_AN
 _DAMPING = 1e-8
 
 _SYMMETRIC = [3, 4, 5, 4, 6, 7, 5, 7, 8]
-"""Where the features hold the nine entries of S."""
+"""Indices of the nine entries of S in the features."""
 
 
 class ReducedBody(nn.Module):
-    """Latent codes to the deformation of the skin, and to where the points of the body are.
+    """Latent codes to the deformation of the skin and the positions of the points of the body.
 
     The gradients are those of the embedding. Positions are a linear map of those at the points, as
     the body's vertices are of all gradients, fitted to decoded poses.
@@ -85,7 +85,7 @@ class ReducedBody(nn.Module):
         return features
 
     def forward(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return what (B, D) codes make of the skin.
+        """Return the skin posed by (B, D) codes.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""The compiled loops of the contact field: what points have near them, forward and backward.
+"""The compiled loops of the contact field, forward and backward.
 
 Several points are taken at a time, without branches: far ones weigh 0. Those are mostly left out
 all the same: forward, a block of neighbours goes through the points near its box, side by side;
@@ -75,7 +75,7 @@ def contact_field(
     """
     n_points, n_ordered = positions.shape[2], len(order)
     n_blocks = n_ordered // BLOCK
-    # What compilers know to be `BLOCK` they write out, point by point.
+    # A width that compilers know to be `BLOCK` would be unrolled point by point.
     width = n_ordered // n_blocks
     dtype = frame.dtype.type
     ordered = np.empty((6, n_ordered), dtype=frame.dtype)
@@ -147,7 +147,7 @@ def _add_near(
     width: int,
     lanes: Array,
 ) -> None:
-    """Add what some others weigh to a block's points.
+    """Add the weighted sums over some other points to a block's points.
 
     Parameters
     ----------

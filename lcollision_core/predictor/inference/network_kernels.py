@@ -19,7 +19,7 @@ _AT_ONCE = 4
 """Inputs whose products are summed up before the outputs are touched again."""
 
 _SMALL = 2**15
-"""Numbers of an array that new memory is cheap for."""
+"""Size of an array up to which new memory is cheap."""
 
 _FEW_ROWS = 8
 """Up to so many, reading the weights takes the time, and a library's threads would take more."""
@@ -32,7 +32,7 @@ class Workspace:
         self._memory: dict[str, Array] = {}
 
     def empty(self, name: str, *shape: int) -> Array:
-        """Return an array whose values nobody needs any more."""
+        """Return an array whose values are no longer needed."""
         size = math.prod(shape)
         if size < _SMALL:
             return np.empty(shape, dtype=np.float32)

@@ -12,7 +12,7 @@ from lcollision_core.meshes.normals import vertex_normals
 from lcollision_core.meshes.topology import FloatArray, length_graph
 
 N_POINTS = 240
-"""Of a mesh that has as many vertices; see the table in docs/experiments.md."""
+"""Points of a mesh with enough vertices; see the table in docs/experiments.md."""
 
 
 def body_points(embedding: Embedding, n_points: int = N_POINTS) -> npt.NDArray[np.int64]:
@@ -21,7 +21,7 @@ def body_points(embedding: Embedding, n_points: int = N_POINTS) -> npt.NDArray[n
     Parameters
     ----------
     embedding : of the body
-    n_points : fewer are chosen of a mesh that has not as many used vertices
+    n_points : fewer for a mesh with fewer used vertices
     """
     rest, topology = embedding.rest_vertices, embedding.topology
     used = np.setdiff1d(np.arange(len(rest)), topology.unused_vertices)
@@ -47,8 +47,8 @@ def farthest_points(positions: FloatArray, first: int, n_points: int) -> npt.NDA
 def neighbour_order(positions: FloatArray, block: int) -> npt.NDArray[np.int32]:
     """Order (n, 3) positions so that each block of so many in turn lies close together.
 
-    They are halved across their longest extent, and the halves likewise. The last one is there
-    again as often as fills its block.
+    They are halved across their longest extent, and the halves likewise. The last one is
+    repeated to fill its block.
     """
 
     def ordered(index: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:

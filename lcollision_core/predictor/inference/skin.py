@@ -38,11 +38,11 @@ class PosedSkin(NamedTuple):
 
 
 class CompiledSkin:
-    """What a reduced body makes of latent codes.
+    """A reduced body posed by latent codes.
 
     Parameters
     ----------
-    geometry : where the body is looked at
+    geometry : the points of the body
     weight : (3 P, P) float32 array, from the points' deformation gradients to their positions
     origin : (3, P) of the positions, in normalised length
     """

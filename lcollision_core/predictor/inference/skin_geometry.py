@@ -1,4 +1,4 @@
-"""Where the default network looks at a body, and how that skin follows from latent codes."""
+"""The points that the default network uses of a body, and their map from latent codes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Float32Array = npt.NDArray[np.float32]
 
 
 class CodeGroup(NamedTuple):
-    """What a group of codes moves.
+    """The points that a group of codes moves.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class SkinGeometry:
     def of(
         cls, embedding: Embedding, sites: npt.NDArray[np.integer], n_points: int = N_POINTS
     ) -> SkinGeometry:
-        """Look at an embedding's body.
+        """Choose the points of an embedding's body.
 
         Parameters
         ----------

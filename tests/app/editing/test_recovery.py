@@ -1,4 +1,4 @@
-"""Autosave: what is not saved outlives the editor, and nobody's session is taken from him."""
+"""Autosave: unsaved work survives a crash, and no running editor loses its session."""
 
 from __future__ import annotations
 

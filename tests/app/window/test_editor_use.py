@@ -131,7 +131,7 @@ def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
     bent = editor_model.decode(0.4 * editor_model.latent_space.high)
     write_mesh(mesh, bent, editor_model.faces)
     editor = start(mesh, "--model", model_file)
-    # An imported mesh is a change that nobody has saved.
+    # An imported mesh is an unsaved change.
     wait_for_file(editor, "*/session.json")
     editor.send_signal(how)
     assert editor.wait(PATIENCE / 1000) == status

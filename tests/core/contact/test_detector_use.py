@@ -201,7 +201,7 @@ def test_cancelling(
     # Four tasks of a few poses went ahead, and no thread is left.
     assert done_at[-1] < len(many) // 4
     assert threading.active_count() == n_threads
-    # A token that nobody sets changes nothing, and the detector is as good as before.
+    # A token that is never set changes nothing, and the detector is as good as before.
     idle = search(poses, cancel=CancelToken())
     verdict = idle.colliding if mode == "detect_batch" else idle
     assert verdict.tolist() == [detector.detect(pose).colliding for pose in poses]

@@ -165,7 +165,7 @@ def test_the_first_hit_is_sought_past_near_pairs_in_whatever_order() -> None:
 def test_near_pairs_of_a_crumpled_sheet_against_brute_force(near_exclusion: float) -> None:
     rng = np.random.default_rng(9)
     sheet = grid(10)
-    # An uneven reference, so that no path is as long as the limit by chance.
+    # An uneven reference, so that no path happens to be as long as the limit.
     uneven = Mesh(sheet.vertices + rng.normal(scale=0.02, size=sheet.vertices.shape), sheet.faces)
     pose = uneven.vertices + rng.normal(scale=0.3, size=sheet.vertices.shape)
     detector = CollisionDetector(sheet.topology, uneven.vertices, near_exclusion=near_exclusion)

@@ -67,7 +67,7 @@ def test_islands_go_to_the_next_strongest_component() -> None:
     mask = attention_mask(units, mesh.topology, mesh.vertices)
     quality = judge_masks(mask, mesh.topology, mesh.vertices)
     assert quality.connected_share.tolist() == [1.0, 1.0, 1.0]
-    # Domain 2 cuts two vertices off the end of domain 1, which nobody else touches.
+    # Domain 2 cuts two vertices off the end of domain 1, which no other domain touches.
     assert mask.argmax(axis=0).tolist() == [0] * 12 + [1] * 8 + [2] * 4
     assert (kept[1, 4:6] == 0.0).all()
     assert (kept[1, 22:] == 0.0).all()

@@ -1,4 +1,4 @@
-"""Two writers of one file: neither loses what the other wrote, and nobody's leftovers stay."""
+"""Two writers of one file: neither's changes are lost, and no lock files stay."""
 
 from __future__ import annotations
 

@@ -469,7 +469,7 @@ def test_save_asks_before_it_replaces_what_another_program_wrote_meanwhile(
     with qtbot.waitSignal(document.opened, timeout=PATIENCE):
         drop(window, path)
     document.set_code(0, 0.25)
-    # Nobody else has written it: no question.
+    # No other program has written it: no question.
     press(window, Qt.Key.Key_S, CONTROL)
     assert not document.modified
     write_poses(path, document.model, [NamedPose("of another", latent[2])])
