@@ -36,7 +36,7 @@ class LegendStrip(QWidget):
         self.setObjectName("legend")
         self.setAttribute(Qt.WidgetAttribute.WA_StyledBackground)
         self.legend = Legend()
-        self._title, self._note, words = QLabel(), QLabel(), QWidget()
+        self._title, self._note, words = QLabel(), QLabel(), QWidget(self)
         self._title.setObjectName("title")
         self._note.setObjectName("caption")
         column = QVBoxLayout(words)
@@ -45,7 +45,7 @@ class LegendStrip(QWidget):
         column.addWidget(self._title)
         column.addWidget(self._note)
         self._ramp = _Ramp(self)
-        self._crossing = QLabel()
+        self._crossing = QLabel(self)
         self._blocks = (words, self._ramp, self._crossing)
         self._rows: list[list[QWidget]] = [[]]
         self._grid = QGridLayout(self)
