@@ -90,6 +90,9 @@ class LCollisionError(Exception):
     def __str__(self) -> str:
         return f"{self.headline}; {self.next_step}" if self.next_step else self.headline
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self)!r})"
+
     def __reduce__(self) -> tuple[Any, ...]:
         # Pickling copies an exception by its positional arguments; the fields are none.
         return copyreg.__newobj__, (type(self), self.what), self.__dict__  # type: ignore[attr-defined]
@@ -119,8 +122,8 @@ class WrongScaleError(PoseSetError):
     factor : multiplies its coordinates
     """
 
-    def __init__(self, what: str, next_step: str = "", *, factor: float) -> None:
-        super().__init__(what, next_step)
+    def __init__(self, what: str, next_step: str = "", *, factor: float = 1.0, **fields: object):
+        super().__init__(what, next_step, **fields)
         self.factor: Final = factor
 
 

@@ -270,6 +270,7 @@ def _read(model: PoseModel, inputs: Sequence[Path], scale: float) -> tuple[list[
 
 
 def _requests_of(model: PoseModel, path: Path, scale: float) -> Iterator[_Request]:
+    from lcollision_core.meshes.files import KEEP_PRECISION
     from lcollision_core.model import encode_mesh, read_model_mesh, read_poses
 
     if path.suffix.lower() == ".json":
@@ -281,7 +282,7 @@ def _requests_of(model: PoseModel, path: Path, scale: float) -> Iterator[_Reques
         return
     mesh = read_model_mesh(path, model)
     if mesh.coarseness:
-        note(f"{path}: {mesh.coarseness}")
+        note(f"{path}: {mesh.coarseness}; {KEEP_PRECISION}")
     try:
         pose = encode_mesh(mesh, model, scale)
     except LCollisionError as error:

@@ -27,7 +27,7 @@ UNNAMED = "pose"
 """Name of a pose without a name."""
 
 UNDO_STEPS = 1000
-"""Most steps kept: each is a few kilobytes, so memory stays small however long one edits."""
+"""Most steps kept: a few kilobytes each, and two meshes for a Resolve."""
 
 
 class PoseHistory(QObject):
@@ -302,12 +302,12 @@ class PoseHistory(QObject):
         ----------
         old : the present name of the pose, "" for a new one
         """
-        from lcollision_core.model import MAX_NAME_LENGTH, why_no_name
+        from lcollision_core.model import MAX_POSE_NAME_LENGTH, why_no_name
 
         if not name:
             return ModelFileError("a pose needs a name", "type one")
         if why_no_name(name):
-            what = f"a name has at most {MAX_NAME_LENGTH} characters"
+            what = f"a name has at most {MAX_POSE_NAME_LENGTH} characters"
             return ModelFileError(what, "choose a shorter one")
         taken = self.name_taken_by(name)
         if taken and taken != old:

@@ -193,7 +193,7 @@ class Autosave(QObject):
         except OSError as error:
             _log.warning("there is no autosave: %s", error)
         # In another thread: a disk may take longer than a frame, and no Resolve is waited for.
-        self._work = LongWork(self)
+        self._work = LongWork(self, "autosave")
         self._work.failed.connect(self._on_failed)
         self._due = single_shot(self, int(1000 * seconds), self._write)
         for changed in (

@@ -117,13 +117,13 @@ SHADINGS: dict[Shading, Spec] = {
         "Body parts in colour; stronger colour = only this part controls it",
     ),
     Shading.PREDICTED: Spec(
-        "&Estimate", "Ctrl+3", "Where the model estimates collisions, and how deep", "", True
+        "&Estimate", "Ctrl+3", "Where the model estimates collisions, and how deep"
     ),
     Shading.EXACT: Spec(
-        "E&xact", "Ctrl+4", "Where the check finds collisions; crossing triangles in red", "", True
+        "E&xact", "Ctrl+4", "Where the check finds collisions; crossing triangles in red"
     ),
     Shading.MOVEMENT: Spec(
-        "Mo&vement", "Ctrl+5", "How far Resolve has moved each point of the body", "", True
+        "Mo&vement", "Ctrl+5", "How far Resolve has moved each point of the body"
     ),
 }
 """The ways to colour the body."""
@@ -142,7 +142,7 @@ THEMES: dict[str, Spec] = {
 DOCKS: dict[str, Spec] = {
     "sliders": Spec("&Sliders", "Ctrl+Alt+1", "Show or hide the sliders"),
     "collision": Spec(
-        "&Collisions", "Ctrl+Alt+2", "Show or hide the check, the estimate and Resolve", "", True
+        "&Collisions", "Ctrl+Alt+2", "Show or hide the check, the estimate and Resolve"
     ),
     "library": Spec("&Poses", "Ctrl+Alt+3", "Show or hide the pose library"),
 }

@@ -214,10 +214,12 @@ def _split(text: str) -> list[str]:
 
 
 def _why_no_tags(tags: list[str]) -> str:
-    from lcollision_core.model import MAX_NAME_LENGTH, MAX_TAGS
+    from lcollision_core.model import MAX_POSE_NAME_LENGTH, MAX_TAGS
 
-    if len(tags) > MAX_TAGS or any(len(tag) > MAX_NAME_LENGTH for tag in tags):
-        return f"a pose has at most {MAX_TAGS} tags of {MAX_NAME_LENGTH} characters; shorten them"
+    if len(tags) > MAX_TAGS or any(len(tag) > MAX_POSE_NAME_LENGTH for tag in tags):
+        return (
+            f"a pose has at most {MAX_TAGS} tags of {MAX_POSE_NAME_LENGTH} characters; shorten them"
+        )
     return ""
 
 

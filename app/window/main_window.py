@@ -117,7 +117,8 @@ class MainWindow(QMainWindow):
             self, document, settings, self.sliders, self.randomise, self.viewport.pictures, act
         )
         library_actions = LibraryActions(self, document, self.library, self.files, act)
-        views = ViewActions(self, document, settings, self.viewport, act["ghost"])
+        ghost, reset_camera = act["ghost"], act["reset_camera"]
+        views = ViewActions(self, document, settings, self.viewport, ghost, reset_camera)
         themes = actions.make_choices(THEMES, settings["theme"], self._on_theme_chosen, self)
         self.menus = fill_menus(
             self,

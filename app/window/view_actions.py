@@ -29,7 +29,7 @@ class ViewActions(QObject):
     document : shows or hides its ghost
     settings : remember the shading and whether there is a ghost
     viewport : coloured and turned
-    ghost : the action that shows the ghost
+    ghost, reset_camera : actions of the window
 
     Attributes
     ----------
@@ -45,10 +45,11 @@ class ViewActions(QObject):
         settings: Settings,
         viewport: Viewport,
         ghost: QAction,
+        reset_camera: QAction,
     ) -> None:
         super().__init__(window)
         self._document, self._settings = document, settings
-        self._viewport, self._ghost = viewport, ghost
+        self._viewport, self._ghost, self._reset_camera = viewport, ghost, reset_camera
         self.acts: dict[str, Callable[[], object]] = {
             "ghost": lambda: document.show_ghost(ghost.isChecked()),
             "reset_camera": lambda: viewport.set_camera(CAMERAS[0]),
@@ -72,6 +73,8 @@ class ViewActions(QObject):
         for action in (*self.shadings, *self.cameras):
             needed = action.data() is not Shading.PREDICTED or document.can_resolve
             action.setEnabled(document.has_model and needed)
+        for action in (self._ghost, self._reset_camera):
+            action.setEnabled(document.has_model)
 
     @Slot()
     def _on_ghost(self) -> None:

@@ -183,12 +183,12 @@ def mirror_poses(
     model: PoseModel, poses: Sequence[NamedPose], progress: Progress, cancel: CancelToken
 ) -> list[tuple[NamedPose, MirroredPose]]:
     """Return the mirror images of poses, and a remark on each."""
-    from lcollision_core.model import MAX_NAME_LENGTH
+    from lcollision_core.model import MAX_POSE_NAME_LENGTH
 
     images = []
     for done, pose in enumerate(poses, 1):
         image = model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel)
-        name = mirrored_name(pose.name)[:MAX_NAME_LENGTH]
+        name = mirrored_name(pose.name)[:MAX_POSE_NAME_LENGTH]
         images.append((replace(pose.mirrored(image), name=name), image))
         progress(done, len(poses))
     return images

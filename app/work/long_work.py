@@ -78,10 +78,10 @@ class LongWork(QObject):
 
     _wanted = Signal(object)
 
-    def __init__(self, parent: QObject | None = None) -> None:
+    def __init__(self, parent: QObject | None = None, name: str = "long work") -> None:
         super().__init__(parent)
         self._worker = LongWorker()
-        self._thread = started_thread("long work", self._worker, self)
+        self._thread = started_thread(name, self._worker, self)
         self._wanted.connect(self._worker.answer)
         self._worker.answered.connect(self._on_answered)
         self._worker.progressed.connect(self._on_progressed)

@@ -34,6 +34,10 @@ WRITABLE_SUFFIXES = tuple(_ENCODERS)
 """Extensions that `write_mesh` writes, in lower case."""
 
 
+KEEP_PRECISION = "export it nearer to the origin, or with double precision"
+"""What to do about a mesh that `coarseness_of` has something to say of."""
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """One triangle mesh as stored in its file.
@@ -97,7 +101,9 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
     if topology is not None and found == topology:
         found = topology
     coarseness = coarseness_of(vertices, found) if polygons.is_single else None
-    notes = polygons.notes + notes + ((coarseness,) if coarseness else ())
+    notes = polygons.notes + notes
+    if coarseness:
+        notes += (f"{coarseness}; {KEEP_PRECISION}",)
     return Mesh(vertices, found, source, notes, coarseness)
 
 
@@ -108,7 +114,7 @@ def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:
     step, ratio = rounding_step(vertices, topology, np.float32)
     return (
         f"so far from the origin its coordinates are stored in steps of {step:.2g}, {ratio:.0%} of "
-        f"a short edge; export it nearer to the origin, or with double precision"
+        f"a short edge"
     )
 
 

@@ -18,6 +18,7 @@ from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError,
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.files import (
+    KEEP_PRECISION,
     READABLE_SUFFIXES,
     coarseness_of,
     first_not_finite,
@@ -345,7 +346,7 @@ def _collect_folder(
             elif (too_far := _too_far_to_compute(where, mesh.vertices)) is not None:
                 report(too_far)
             elif mesh.coarseness:
-                report(PoseSetError(f"is damaged: {mesh.coarseness}", where=where))
+                report(PoseSetError(f"is damaged: {mesh.coarseness}", KEEP_PRECISION, where=where))
             else:
                 vertices[len(names)] = mesh.vertices
                 names.append(file.name)
@@ -419,7 +420,7 @@ def _collect_npz(
         if (too_far := _too_far_to_compute(where, mesh)) is not None:
             report(too_far)
         elif mesh.dtype == np.float32 and (coarseness := coarseness_of(mesh, topology)):
-            report(PoseSetError(f"is damaged: {coarseness}", where=where))
+            report(PoseSetError(f"is damaged: {coarseness}", KEEP_PRECISION, where=where))
         else:
             kept.append(pose)
     progress(len(vertices), len(vertices))

@@ -20,9 +20,8 @@ from lcollision_core.model.model_store import (
     model_destination,
     user_models_folder,
 )
-from lcollision_core.model.naming import unique_names
+from lcollision_core.model.naming import MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.model.pose_file import (
-    MAX_NAME_LENGTH,
     MAX_TAGS,
     NamedPose,
     OtherModelError,
@@ -40,7 +39,7 @@ from lcollision_core.model.saving import change_model, save_trained
 
 __all__ = [
     "EXPORT_SCALES",
-    "MAX_NAME_LENGTH",
+    "MAX_POSE_NAME_LENGTH",
     "MAX_TAGS",
     "EncodedPose",
     "ExportAxes",

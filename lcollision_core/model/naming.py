@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 MAX_NAME_LENGTH = 60
+MAX_POSE_NAME_LENGTH = 200
 
 _MAIN_SHARE = 0.6
 """Fraction of a domain's weight with which a labelled part names the domain alone."""
@@ -107,7 +108,7 @@ def _plural(part: str) -> str:
     return part if part.endswith("s") else f"{part}s"
 
 
-def unique_names(names: Iterable[str], max_length: int = 200) -> list[str]:
+def unique_names(names: Iterable[str], max_length: int = MAX_POSE_NAME_LENGTH) -> list[str]:
     """Return the names, numbered where an earlier one differs by case at most: "a", "A 2".
 
     Numbered names are at most `max_length` long.

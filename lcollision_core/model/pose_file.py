@@ -19,7 +19,7 @@ from lcollision_core.meshes import RigidTransform, atomic_write
 from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.mirror import MirroredPose, MirrorSource, pose_bytes
 from lcollision_core.model.model_store import ListedModel, user_models_folder
-from lcollision_core.model.naming import unique_names
+from lcollision_core.model.naming import MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.regular_files import read_regular
 
@@ -30,7 +30,6 @@ POSES_VERSION = 2
 MAX_FILE_BYTES = 2**28
 """Of some 80 000 poses of 110 numbers; reading takes some four times that in memory."""
 
-MAX_NAME_LENGTH = 200
 MAX_TAGS = 50
 
 _NOT_ROTATED = 1e-6
@@ -119,9 +118,9 @@ class OtherModelError(ModelFileError):
     """
 
     def __init__(
-        self, what: str, next_step: str = "", *, where: object, model: ListedModel | None
+        self, what: str, next_step: str = "", *, model: ListedModel | None = None, **fields: object
     ) -> None:
-        super().__init__(what, next_step, where=where)
+        super().__init__(what, next_step, **fields)
         self.model: Final = model
 
 
@@ -227,8 +226,8 @@ def read_pose_file(path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
 
 def why_no_name(name: str) -> str:
     """Return why a name is refused for a pose, or "" if it is allowed."""
-    if not 0 < len(name) <= MAX_NAME_LENGTH:
-        return f"its name must be a text of 1 to {MAX_NAME_LENGTH} characters"
+    if not 0 < len(name) <= MAX_POSE_NAME_LENGTH:
+        return f"its name must be a text of 1 to {MAX_POSE_NAME_LENGTH} characters"
     if any("\ud800" <= character <= "\udfff" for character in name):
         return "its name has half a character, which no text file holds"
     return ""
@@ -237,7 +236,7 @@ def why_no_name(name: str) -> str:
 def name_of_file(path: Path) -> str:
     """Name a pose after its file, without what a file of poses cannot hold."""
     stem = path.stem.encode(errors="replace").decode()
-    return stem[:MAX_NAME_LENGTH]
+    return stem[:MAX_POSE_NAME_LENGTH]
 
 
 def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
@@ -277,7 +276,9 @@ def _other_model(
     path: str | os.PathLike[str], owner: dict[str, Any], model: PoseModel
 ) -> OtherModelError:
     """Say which model a file belongs to, by name."""
-    fingerprint, name = (str(owner.get(key))[:MAX_NAME_LENGTH] for key in ("fingerprint", "name"))
+    fingerprint, name = (
+        str(owner.get(key))[:MAX_POSE_NAME_LENGTH] for key in ("fingerprint", "name")
+    )
     listed = find_latent_space(fingerprint, name)
     if listed is not None:
         what = f"holds poses of the model {listed.name!r}, not of {model.name!r}"
@@ -368,7 +369,7 @@ def _tags(value: Any) -> tuple[str, ...]:
     for tag in value:
         if not isinstance(tag, str) or why_no_name(tag):
             raise ValueError(
-                f"each of its tags must be a text of 1 to {MAX_NAME_LENGTH} characters"
+                f"each of its tags must be a text of 1 to {MAX_POSE_NAME_LENGTH} characters"
             )
     return tuple(dict.fromkeys(value))
 

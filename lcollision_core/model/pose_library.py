@@ -110,8 +110,10 @@ class PoseLibrary:
             self._in_file = poses
             self._unwritten.clear()
         except (ModelFileError, MeshFileError, OSError) as error:
-            reason = getattr(error, "strerror", None) or error
+            reason = error.headline if isinstance(error, LCollisionError) else error.strerror
             next_step = "export it to another place before you close the editor"
+            if isinstance(error, ModelFileError) and error.next_step:
+                next_step = f"{error.next_step}, or {next_step}"
             self._tell(
                 ModelFileError(f"your pose library could not be saved ({reason})", next_step)
             )

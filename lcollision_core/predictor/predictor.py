@@ -188,7 +188,7 @@ class CollisionPredictor:
 
     @property
     def needs_torch(self) -> bool:
-        """Whether predictions are by domain."""
+        """Whether predictions need torch."""
         return self._compiled is None
 
     @property

@@ -7,7 +7,6 @@ costs little more than the model's gradients, and those of several problems come
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.problem import FEASIBLE, ResolveProblem, SolverOutcome, rank
@@ -59,11 +58,6 @@ class SqpBatch:
             rank(float(distance), float(over))
             for distance, over in zip(distances, self._violation, strict=True)
         ]
-
-    @property
-    def running(self) -> npt.NDArray[np.bool_]:
-        """(B,) which rows have not converged."""
-        return self._running
 
     def run(self, n_iterations: int) -> list[SolverOutcome]:
         """Run at most so many further iterations; the outcomes are in the order of the rows.

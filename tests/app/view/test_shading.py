@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from app.editing.settings import SETTINGS
 from app.view.shading import (
     COLLIDING_FACE,
     FULL_EXACT,
@@ -167,3 +168,8 @@ def test_legends_name_what_is_drawn(shader: Shader) -> None:
 
 def test_a_vertex_belongs_to_the_domain_that_owns_most(shader: Shader) -> None:
     assert [shader.leading_domain(vertex) for vertex in (0, 1, 3)] == [0, 0, 1]
+
+
+def test_each_shading_is_remembered() -> None:
+    choices = SETTINGS["shading"].choices
+    assert choices == tuple(shading.name.lower() for shading in Shading)

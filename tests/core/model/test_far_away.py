@@ -22,6 +22,7 @@ from lcollision_core.meshes import (
     write_mesh,
     write_pose_set,
 )
+from lcollision_core.meshes.files import KEEP_PRECISION
 from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
 from lcollision_core.model.matching import likely_factor
 from lcollision_core.resolve import ExactCheck
@@ -86,7 +87,7 @@ def test_a_mesh_that_came_rounded_is_said_to_be(tmp_path: Path, suffix: str) -> 
     write_mesh(path, rounded, BALL.faces)
     mesh = read_mesh(path)
     assert mesh.coarseness is not None
-    assert mesh.coarseness in mesh.notes
+    assert f"{mesh.coarseness}; {KEEP_PRECISION}" in mesh.notes
     assert "stored in steps of 0.062" in mesh.coarseness
 
 
