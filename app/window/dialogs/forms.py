@@ -166,7 +166,7 @@ class Form(QDialog):
         """Put another text into a note, and leave space for it."""
         note.setText(text)
         # A form asks for one line of it, however narrow.
-        note.setFixedHeight(note.heightForWidth(_WIDTH - 2 * _BORDER))
+        note.setFixedHeight(max(0, note.heightForWidth(_WIDTH - 2 * _BORDER)))
         self.adjustSize()
 
     def _add(

@@ -66,6 +66,11 @@ class NameDialog(QInputDialog):
             return
         self.reason.setText(f"{heading(str(reason))}.")
         self.reason.show()
+        layout = self.layout()
+        assert layout is not None
+        layout.activate()
+        needed = layout.totalHeightForWidth(self.width())
+        self.resize(self.width(), max(self.height(), needed, self.sizeHint().height()))
         field = self.findChild(QLineEdit)
         if isinstance(field, QLineEdit):
             field.setFocus()
