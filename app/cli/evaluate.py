@@ -86,10 +86,9 @@ def require_store_of(store: LabelStore, model: PoseModel) -> None:
     ------
     LabelStoreError : naming the first difference.
     """
-    from lcollision_core.labels import Labeller, StoreIdentity
+    from lcollision_core.labels import StoreIdentity
 
-    labeller = Labeller(model.embedding, model.body_size, model.near_exclusion, model.fingerprint)
-    store.require(StoreIdentity.of(labeller, store.identity.seed))
+    store.require(StoreIdentity.of(model.labeller(), store.identity.seed))
 
 
 def scores_sentence(metrics: PredictorMetrics) -> str:

@@ -58,7 +58,7 @@ def label(
     on from there. The rows do not depend on who labels them. Rows that are damaged are labelled
     again.
     """
-    from lcollision_core.labels import Labeller, LabelStore, label_poses
+    from lcollision_core.labels import LabelStore, label_poses
     from lcollision_core.model import PoseModel
 
     if workers is not None and scheduler is not None:
@@ -71,7 +71,7 @@ def label(
     if count is None:
         _check(model, output, as_json)
         return
-    labeller = Labeller(model.embedding, model.body_size, model.near_exclusion, model.fingerprint)
+    labeller = model.labeller()
     started = time.monotonic()
     try:
         with cancel_on_interrupt() as cancel, _labelling_bar() as progress:

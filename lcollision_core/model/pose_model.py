@@ -48,6 +48,7 @@ from lcollision_core.model_file import (
 )
 
 if TYPE_CHECKING:
+    from lcollision_core.labels import Labeller
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
     from lcollision_core.resolve import ExactCheck, PoseResolver, ResolveOptions, ResolveResult
 
@@ -239,6 +240,12 @@ class PoseModel:
         from lcollision_core.resolve import ExactCheck
 
         return ExactCheck(self.embedding, self.detector, self.body_size, placement)
+
+    def labeller(self) -> Labeller:
+        """Return what labels samples of the model's latent box, by the model's pair rule."""
+        from lcollision_core.labels import Labeller
+
+        return Labeller(self.embedding, self.body_size, self.near_exclusion, self.fingerprint)
 
     def predict(self, latent: npt.ArrayLike) -> Prediction:
         """Predict whether poses collide, and how deeply in which domain, without decoding them.

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from lcollision_core.labels import Labeller
 from lcollision_core.model import PoseModel, user_models_folder
 from tests.bending_tube import bending_tube
 
@@ -22,7 +21,7 @@ def trained_tube() -> PoseModel:
         n_domains=2, n_domain_codes=3, level1_epochs=60, level2_epochs=20, held_out_stride=0
     )
     bare = PoseModel.from_training("tube", train_embedding(poses, config), poses, "a tube", "CC0")
-    labeller = Labeller(bare.embedding, bare.body_size, bare.near_exclusion, bare.fingerprint)
+    labeller = bare.labeller()
     rows = labeller.label_rows(0, range(32))
     # The mean of the weights would lag behind: two passes are few.
     quick = replace(PRESETS["paper"], epochs=2, average_passes=0.0)

@@ -10,7 +10,7 @@ from lcollision_core.model import PoseModel
 
 
 def labeller_of(model: PoseModel) -> Labeller:
-    return Labeller(model.embedding, model.body_size, model.near_exclusion, model.fingerprint)
+    return model.labeller()
 
 
 def as_bytes(rows: LabelRows) -> dict[str, bytes]:
