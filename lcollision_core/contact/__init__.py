@@ -15,13 +15,3 @@ from lcollision_core.contact.detector import (
     SelfCollisions,
 )
 from lcollision_core.contact.energy import domain_energy
-
-__all__ = [
-    "DEPTH_TOLERANCE",
-    "BatchCollisions",
-    "CollisionDetector",
-    "CollisionSummary",
-    "SelfCollisions",
-    "domain_energy",
-    "penetration_depth",
-]

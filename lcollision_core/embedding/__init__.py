@@ -10,19 +10,3 @@ from lcollision_core.embedding.masks import MaskQuality, attention_mask, judge_m
 from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.embedding.run import TrainingStatus
 from lcollision_core.embedding.training import train_embedding
-
-__all__ = [
-    "ROWS_PER_BLOCK",
-    "AutoencoderWeights",
-    "Embedding",
-    "EmbeddingConfig",
-    "EmbeddingMetrics",
-    "FeatureDecoder",
-    "LatentBox",
-    "LatentFit",
-    "MaskQuality",
-    "TrainingStatus",
-    "attention_mask",
-    "judge_masks",
-    "train_embedding",
-]

@@ -4,16 +4,3 @@ from lcollision_core.labels.identity import StoreIdentity, is_held_out
 from lcollision_core.labels.labeller import Labeller, LabelRows
 from lcollision_core.labels.run import LabelStatus, StatusCallback, label_poses, no_status
 from lcollision_core.labels.store import ROWS_PER_CHUNK, LabelStore
-
-__all__ = [
-    "ROWS_PER_CHUNK",
-    "LabelRows",
-    "LabelStatus",
-    "LabelStore",
-    "Labeller",
-    "StatusCallback",
-    "StoreIdentity",
-    "is_held_out",
-    "label_poses",
-    "no_status",
-]

@@ -18,24 +18,3 @@ from lcollision_core.predictor.training.status import (
     patches_path,
 )
 from lcollision_core.predictor.training.train import train_predictor
-
-__all__ = [
-    "LOSSES",
-    "PRESETS",
-    "CalibrationBin",
-    "CollisionPredictor",
-    "Loss",
-    "Prediction",
-    "PredictorConfig",
-    "PredictorMetrics",
-    "PredictorRecord",
-    "PredictorStatus",
-    "StatusCallback",
-    "TrainingFacts",
-    "evaluate_predictor",
-    "has_begun",
-    "held_out_rows",
-    "no_status",
-    "patches_path",
-    "train_predictor",
-]

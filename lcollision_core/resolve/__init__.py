@@ -6,17 +6,3 @@ from lcollision_core.resolve.ladder import ALL_LOCKED
 from lcollision_core.resolve.motion import largest_correction_change
 from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult, Solver, Step
 from lcollision_core.resolve.resolver import PoseResolver
-
-__all__ = [
-    "ALL_LOCKED",
-    "ExactCheck",
-    "Metric",
-    "PoseResolver",
-    "ResolveOptions",
-    "ResolveResult",
-    "Solver",
-    "Step",
-    "exported_vertices",
-    "find_free_poses",
-    "largest_correction_change",
-]

