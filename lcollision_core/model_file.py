@@ -13,7 +13,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.regular_files import open_regular
+from lcollision_core.regular_files import require_regular
 
 FORMAT_VERSION = 2
 """The version that `write_model_file` stores; older ones are read, later ones are refused.
@@ -29,19 +29,10 @@ FORMAT_VERSION = 2
 Since version 2 the embedding's section has the latent box.
 """
 
-MAX_HEADER_BYTES = 16 * 2**20
 MAX_FILE_BYTES = 4 * 2**30
 
 _METADATA_KEY = "lcollision"
-_DTYPES = {
-    "F16": np.dtype(np.float16),
-    "F32": np.dtype(np.float32),
-    "F64": np.dtype(np.float64),
-    "I32": np.dtype(np.int32),
-    "I64": np.dtype(np.int64),
-    "U8": np.dtype(np.uint8),
-    "BOOL": np.dtype(np.bool_),
-}
+_DTYPES = tuple(map(np.dtype, ("f2", "f4", "f8", "i4", "i8", "u1", "?")))
 
 
 @dataclass(frozen=True)
@@ -165,86 +156,16 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
         a later version, or larger than `MAX_FILE_BYTES`.
     """
     try:
-        with open_regular(path) as file:
-            return _read_open_file(file, path)
-    except FileNotFoundError as error:
-        raise ModelFileError("does not exist", "check the name", where=path) from error
-    except RecursionError as error:
+        document, tensors = _read(path)
+        described = _canonical_json(document["sections"])
+    except (RecursionError, ValueError) as error:  # too deep, or a number beyond those of JSON
         _refuse_damaged(path, error)
-    except (OSError, ValueError) as error:
-        raise ModelFileError.unreadable(path, error, "check the file") from error
-
-
-def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
-    """Read one section of a model file and nothing else, without the check of the whole file.
-
-    Returns
-    -------
-    section : None if the file has none of this name
-
-    Raises
-    ------
-    ModelFileError : the file cannot be read, is not an LCollision model, or of another version.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with open_regular(path) as file:
-            header = _read_header(file, os.fstat(file.fileno()).st_size, path)
-        metadata = header.document["sections"].get(name)
-        if metadata is None:
-            return None
-        with safe_open(path, "numpy") as tensors:
-            arrays = {
-                full_name.removeprefix(f"{name}/"): tensors.get_tensor(full_name)
-                for full_name in tensors.keys()  # noqa: SIM118 - no mapping
-                if full_name.startswith(f"{name}/")
-            }
-    except SafetensorError as error:
-        _refuse_damaged(path, error)
-    except OSError as error:
-        raise ModelFileError.unreadable(path, error) from error
-    return Section(arrays, metadata)
-
-
-def _read_open_file(file: BinaryIO, path: str | os.PathLike[str]) -> dict[str, Section]:
-    from safetensors import SafetensorError
-    from safetensors.numpy import load
-
-    size = os.fstat(file.fileno()).st_size
-    if size == 0:
-        raise ModelFileError("is empty", "copy or train the model again", where=path)
-    if size > MAX_FILE_BYTES:
-        raise ModelFileError(
-            f"has {size} bytes, more than the {MAX_FILE_BYTES} of any model",
-            "check the name",
-            where=path,
-        )
-    # The header first, so that a file of another format is refused before it fills the memory.
-    header = _read_header(file, size, path)
-    file.seek(0)
-    content = file.read()
-    if len(content) != size or header.end_of_data != size:
-        raise ModelFileError(
-            "was truncated or added to",
-            "copy or train the model again",
-            where=path,
-            expected=f"{header.end_of_data} bytes",
-            got=len(content),
-        )
-    try:
-        tensors = load(content)
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
-        _refuse_damaged(path, error)
-    del content
-    document = header.document
-    described = _canonical_json(document["sections"])
     if _digest(document["format_version"], described, tensors) != document["sha256"]:
         _refuse_damaged(path)
     arrays: dict[str, dict[str, npt.NDArray[Any]]] = {name: {} for name in document["sections"]}
     for full_name, array in tensors.items():
         section_name, _, name = full_name.rpartition("/")
-        if section_name not in arrays:
+        if section_name not in arrays or array.dtype not in _DTYPES:
             _refuse_damaged(path)
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ModelFileError(
@@ -259,50 +180,72 @@ def _read_open_file(file: BinaryIO, path: str | os.PathLike[str]) -> dict[str, S
     }
 
 
-@dataclass(frozen=True)
-class _Header:
-    """The JSON document of a model file, and where its last tensor ends, in bytes."""
+def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
+    """Read one section of a model file and nothing else, without the check of the whole file.
 
-    document: dict[str, Any]
-    end_of_data: int
+    Returns
+    -------
+    section : None if the file has none of this name
+
+    Raises
+    ------
+    ModelFileError : the file cannot be read, is not an LCollision model, or of another version.
+    """
+    document, tensors = _read(path, f"{name}/")
+    if name not in document["sections"]:
+        return None
+    arrays = {full_name.removeprefix(f"{name}/"): array for full_name, array in tensors.items()}
+    return Section(arrays, document["sections"][name])
 
 
-def _read_header(file: BinaryIO, size: int, path: str | os.PathLike[str]) -> _Header:
-    foreign = ModelFileError(
-        "is not an LCollision model", "name a file that `lcollision train` wrote", where=path
-    )
-    length = int.from_bytes(file.read(8), "little")
-    if size < 8 or length > MAX_HEADER_BYTES:
-        raise foreign
-    text = file.read(length)
-    if not text.startswith(b"{"):
-        raise foreign
-    if len(text) < length:
+def _read(
+    path: str | os.PathLike[str], prefix: str = ""
+) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """Read the JSON document, and the tensors whose names begin with `prefix`."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        size = require_regular(path)
+        if size > MAX_FILE_BYTES:
+            raise ModelFileError(
+                f"has {size} bytes, more than the {MAX_FILE_BYTES} of any model",
+                "check the name",
+                where=path,
+            )
+        with safe_open(path, "numpy") as file:
+            document = _checked_document(file.metadata() or {}, path)
+            names = [name for name in file.keys() if name.startswith(prefix)]  # noqa: SIM118 - no mapping
+            return document, {name: file.get_tensor(name) for name in names}
+    except FileNotFoundError as error:
+        raise ModelFileError("does not exist", "check the name", where=path) from error
+    except (OSError, ValueError) as error:
+        raise ModelFileError.unreadable(path, error, "check the file") from error
+    except SafetensorError as error:
         raise ModelFileError(
-            f"was truncated at {size} bytes", "copy or train the model again", where=path
+            "is not an LCollision model, or was truncated or added to",
+            "name a file that `lcollision train` wrote, or copy it again",
+            where=path,
+        ) from error
+    except (TypeError, AttributeError) as error:  # a type of numbers that NumPy lacks
+        _refuse_damaged(path, error)
+
+
+def _checked_document(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> dict[str, Any]:
+    if _METADATA_KEY not in metadata:
+        raise ModelFileError(
+            "is not an LCollision model", "name a file that `lcollision train` wrote", where=path
         )
     try:
-        header = parse_json(text)
-        metadata = header.pop("__metadata__", {})
-        if _METADATA_KEY not in metadata:
-            raise foreign
-        document = parse_json(metadata[_METADATA_KEY].encode())
-        version = document["format_version"]
-        if isinstance(version, int) and version > FORMAT_VERSION:
+        document: dict[str, Any] = parse_json(metadata[_METADATA_KEY].encode())
+        version, sections = document["format_version"], document["sections"].values()
+        if type(version) is int and version > FORMAT_VERSION:
             raise ModelFileError.too_new(path, quoted(version), FORMAT_VERSION)
-        if type(version) is not int or version < 1:
+        is_sound = type(version) is int and version >= 1 and isinstance(document["sha256"], str)
+        if not is_sound or not all(isinstance(section, dict) for section in sections):
             _refuse_damaged(path)
-        if not all(isinstance(section, dict) for section in document["sections"].values()):
-            _refuse_damaged(path)
-        unknown = {tensor["dtype"] for tensor in header.values()} - _DTYPES.keys()
-        if unknown or not isinstance(document["sha256"], str):
-            _refuse_damaged(path)
-        ends = [int(tensor["data_offsets"][1]) for tensor in header.values()]
-        if not all(0 <= end <= MAX_FILE_BYTES for end in ends):
-            _refuse_damaged(path)
-    except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
         _refuse_damaged(path, error)
-    return _Header(document, 8 + length + max(ends, default=0))
+    return document
 
 
 def _refuse_damaged(path: str | os.PathLike[str], cause: Exception | None = None) -> NoReturn:
@@ -316,7 +259,7 @@ def _canonical_json(value: Any) -> str:
 def _require_storable(full_name: str, name: str, array: npt.NDArray[Any]) -> None:
     if "/" in name:
         raise ModelFileError(f"a model cannot hold an array called {name!r}: it has a slash")
-    if array.dtype not in _DTYPES.values():
+    if array.dtype not in _DTYPES:
         raise ModelFileError(
             f"a model cannot hold {full_name} of dtype {array.dtype}", "convert it"
         )
