@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.inputs import expanded
+from app.cli.inputs import MeshesArgument, NearExclusionOption, expanded
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
@@ -18,25 +18,9 @@ _DEEPEST = 100
 
 
 def check(
-    meshes: Annotated[
-        list[Path],
-        # readable=False: read_mesh reports the error and the file itself.
-        typer.Argument(
-            metavar="MESH...",
-            readable=False,
-            help="OBJ, PLY, OFF, STL or GLB files, or folders of them.",
-        ),
-    ],
+    meshes: MeshesArgument,
     as_json: JsonOption = False,
-    near_exclusion: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            metavar="X",
-            help="Count pairs within X body sizes along the surface separately.",
-        ),
-    ] = 0.0,
+    near_exclusion: NearExclusionOption = None,
 ) -> None:
     """Find the exact self-collisions of any triangle mesh.
 
@@ -46,7 +30,7 @@ def check(
     failed = False
     for path in expanded(meshes):
         try:
-            report = check_mesh(path, near_exclusion)
+            report = check_mesh(path, near_exclusion or 0.0)
         except LCollisionError as error:
             note(str(error))
             failed = True

@@ -6,10 +6,10 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import typer
 
@@ -17,6 +17,9 @@ from app.wording import one_line
 from lcollision_core.jobs import Progress, no_progress
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
+
+Told = tuple[float, float, str, list[str]]
+"""What a bar shows: how much is done of how much, what is done now, and facts beside it."""
 
 SECONDS_BETWEEN_LINES = 30.0
 """Seconds between progress notes in a file or a pipe."""
@@ -30,15 +33,6 @@ class ExitStatus(IntEnum):
     BAD_INPUT = 2
     BUG = 3
     INTERRUPTED = 130
-
-
-class ShowStatus(Protocol):
-    """Draws the progress of long work."""
-
-    def __call__(
-        self, done: float, total: float, facts: Iterable[str] = (), description: str | None = None
-    ) -> None:
-        """Draw what is done of all, facts beside it, and what is done now."""
 
 
 def print_json(document: Any) -> None:
@@ -85,38 +79,40 @@ def progress_bar(task: str) -> Iterator[Progress]:
         yield no_progress
         return
     with _bar(task, "count", "time") as show:
-        yield show
+        yield lambda done, total: show(done, total, task, [])
 
 
 @contextmanager
-def status_bar(task: str, *, rows: bool = False) -> Iterator[ShowStatus]:
-    """Give a `ShowStatus` that draws a bar on a terminal, and in a pipe tells now and then.
+def status_bar(
+    task: str, told_of: Callable[[Any], Told], *, rows: bool = False
+) -> Iterator[Callable[[Any], None]]:
+    """Give a callback that draws a bar on a terminal, and in a pipe tells now and then.
 
     Parameters
     ----------
     task : what is done, until a status says otherwise
+    told_of : what the bar shows of a status, with which the callback is called
     rows : show the counts done and in all, not the percentage and the time left
     """
-    if not sys.stderr.isatty():
-        last = time.monotonic()
-
-        def tell_now_and_then(
-            done: float, total: float, facts: Iterable[str] = (), description: str | None = None
-        ) -> None:
-            nonlocal last
-            if time.monotonic() - last >= SECONDS_BETWEEN_LINES:
-                last = time.monotonic()
-                amount = f"{done:.0f} of {total:.0f}" if rows else f"{100.0 * done / total:.0f} %"
-                note(", ".join([f"{description or task}: {amount}", *facts]))
-
-        yield tell_now_and_then
+    if sys.stderr.isatty():
+        with _bar(task, *(("count",) if rows else ("share", "time"))) as show:
+            yield lambda status: show(*told_of(status))
         return
-    with _bar(task, *(("count",) if rows else ("share", "time"))) as show:
-        yield show
+    last = time.monotonic()
+
+    def tell_now_and_then(status: Any) -> None:
+        nonlocal last
+        if time.monotonic() - last >= SECONDS_BETWEEN_LINES:
+            last = time.monotonic()
+            done, total, description, facts = told_of(status)
+            amount = f"{done:.0f} of {total:.0f}" if rows else f"{100.0 * done / total:.0f} %"
+            note(", ".join([f"{description}: {amount}", *facts]))
+
+    yield tell_now_and_then
 
 
 @contextmanager
-def _bar(task: str, *amounts: str) -> Iterator[ShowStatus]:
+def _bar(task: str, *amounts: str) -> Iterator[Callable[[float, float, str, list[str]], None]]:
     """Draw a bar that vanishes at the end; amounts are of "count", "share" and "time"."""
     from rich import progress
     from rich.console import Console
@@ -135,15 +131,8 @@ def _bar(task: str, *amounts: str) -> Iterator[ShowStatus]:
     with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
         bar = bars.add_task(task, total=None, facts="")
 
-        def show(
-            done: float, total: float, facts: Iterable[str] = (), description: str | None = None
-        ) -> None:
-            bars.update(
-                bar,
-                completed=done,
-                total=total,
-                facts=", ".join(facts),
-                description=description or task,
-            )
+        def show(done: float, total: float, description: str, facts: list[str]) -> None:
+            told = ", ".join(facts)
+            bars.update(bar, completed=done, total=total, description=description, facts=told)
 
         yield show

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.inputs import up_sentence
+from app.cli.inputs import NearExclusionOption, PoseSetArgument, up_sentence
 from app.wording import counted
 
 app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no_args_is_help=True)
@@ -16,21 +16,9 @@ app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no
 
 @app.command("check")
 def check(
-    path: Annotated[
-        Path,
-        typer.Argument(metavar="PATH", readable=False, help="A folder of meshes or an .npz file."),
-    ],
+    path: PoseSetArgument,
     as_json: JsonOption = False,
-    near_exclusion: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            metavar="X",
-            help="Count pairs within X body sizes along the surface separately. "
-            "Default: what the set says.",
-        ),
-    ] = None,
+    near_exclusion: NearExclusionOption = None,
 ) -> None:
     """Report the topology, size, defects and self-collisions of a pose set.
 

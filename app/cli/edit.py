@@ -27,19 +27,12 @@ def edit(
     from app.window.editor import open_editor
     from lcollision_core.errors import LCollisionError
 
-    if file is not None and file.is_dir():
-        raise LCollisionError(
-            "is a folder",
-            "name a file of poses, a mesh or a model, or fix all its meshes with "
-            "`lcollision resolve`",
-            where=file,
-        )
     if file is not None and not file.is_file():
-        raise LCollisionError(
-            "is not there",
-            "name a file of poses, a mesh or a model, or none to start a new pose",
-            where=file,
-        )
+        what, instead = "is not there", "none to start a new pose"
+        if file.is_dir():
+            what, instead = "is a folder", "fix all its meshes with `lcollision resolve`"
+        advice = f"name a file of poses, a mesh or a model, or {instead}"
+        raise LCollisionError(what, advice, where=file)
     raise typer.Exit(open_editor(file, model_name))
 
 

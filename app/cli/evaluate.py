@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from lcollision_core.model import PoseModel
     from lcollision_core.predictor import CollisionPredictor, PredictorMetrics
 
+StoreArgument = Annotated[
+    Path, typer.Argument(metavar="STORE", help="Samples of the model, by `lcollision label`.")
+]
+
 
 def evaluate(
     model_name: ModelArgument,
-    store_path: Annotated[
-        Path, typer.Argument(metavar="STORE", help="Samples of the model, by `lcollision label`.")
-    ],
+    store_path: StoreArgument,
     n_rows: RowsOption = None,
     threshold: Annotated[
         float,
@@ -45,14 +47,12 @@ def evaluate(
     count, on any other store of the model every row does. MSE and RANK are in energies divided
     by the mean of the colliding training samples.
     """
-    from lcollision_core.labels import LabelStore
     from lcollision_core.model import PoseModel
     from lcollision_core.predictor import evaluate_predictor
 
     model = PoseModel.load(model_name)
     trained = model.require_predictor()
-    store = LabelStore.open(store_path)
-    require_store_of(store, model)
+    store = open_store(store_path, model)
     rows = _unseen(store, store.load(n_rows), trained)
     with cancel_on_interrupt() as cancel, progress_bar("Evaluating") as progress:
         metrics = evaluate_predictor(
@@ -79,16 +79,18 @@ def evaluate(
             tell(f"    {entry.probability:.2f}: {entry.colliding_share:.2f} ({entry.samples})")
 
 
-def require_store_of(store: LabelStore, model: PoseModel) -> None:
-    """Refuse a store that labels another model than this.
+def open_store(path: Path, model: PoseModel) -> LabelStore:
+    """Open the labels of a model.
 
     Raises
     ------
-    LabelStoreError : naming the first difference.
+    LabelStoreError : there are none, or they are of another model, naming the first difference.
     """
-    from lcollision_core.labels import StoreIdentity
+    from lcollision_core.labels import LabelStore, StoreIdentity
 
+    store = LabelStore.open(path)
     store.require(StoreIdentity.of(model.labeller(), store.identity.seed))
+    return store
 
 
 def scores_sentence(metrics: PredictorMetrics) -> str:

@@ -16,12 +16,39 @@ if TYPE_CHECKING:
 
 Axis = Literal["x", "y", "z"]
 
+MeshesArgument = Annotated[
+    list[Path],
+    # readable=False: read_mesh reports the error and the file itself.
+    typer.Argument(
+        metavar="MESH...",
+        readable=False,
+        help="OBJ, PLY, OFF, STL or GLB files, or folders of them.",
+    ),
+]
+PoseSetArgument = Annotated[
+    Path,
+    typer.Argument(metavar="DATASET", readable=False, help="A folder of meshes or an .npz file."),
+]
 PosesArgument = Annotated[
     Path, typer.Argument(metavar="POSES", readable=False, help="A .json file of poses.")
 ]
 RowsOption = Annotated[
     int | None,
     typer.Option("--rows", min=1, metavar="N", help="Use the first N rows. Default: all."),
+]
+NearExclusionOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0,
+        max=1.0,
+        metavar="X",
+        help="Count pairs within X body sizes along the surface separately. Default: what the "
+        "pose set says, else 0.",
+    ),
+]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one for each core."),
 ]
 ScaleOption = Annotated[
     float,

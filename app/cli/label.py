@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, status_bar, tell
-from app.cli.evaluate import require_store_of
+from app.cli.evaluate import open_store
+from app.cli.inputs import ThreadsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from app.wording import counted
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
 
 if TYPE_CHECKING:
-    from lcollision_core.labels import LabelStatus, StatusCallback
+    from app.cli.console import Told
+    from lcollision_core.labels import LabelStatus
     from lcollision_core.model import PoseModel
 
+_TASK = "Labelling"
 _LISTED = 5
 """Ranges of damaged rows that are listed one by one."""
 
@@ -41,10 +44,7 @@ def label(
         bool,
         typer.Option("--check", help="Label nothing: read the store, and tell what is damaged."),
     ] = False,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one for each core."),
-    ] = None,
+    workers: ThreadsOption = None,
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Label on the workers of this Dask scheduler."),
@@ -74,7 +74,8 @@ def label(
     labeller = model.labeller()
     started = time.monotonic()
     try:
-        with cancel_on_interrupt() as cancel, _labelling_bar() as progress:
+        bar = status_bar(_TASK, told_of, rows=True)
+        with cancel_on_interrupt() as cancel, bar as progress:
             status = label_poses(
                 labeller,
                 output,
@@ -115,10 +116,7 @@ def label(
 
 def _check(model: PoseModel, path: Path, as_json: bool) -> None:
     """Say whether all rows of a store read back as they were labelled."""
-    from lcollision_core.labels import LabelStore
-
-    store = LabelStore.open(path)
-    require_store_of(store, model)
+    store = open_store(path, model)
     with cancel_on_interrupt() as cancel, progress_bar("Reading") as progress:
         damaged = store.check(progress, cancel)
     n_sound = store.end - sum(map(len, damaged))
@@ -141,20 +139,12 @@ def _check(model: PoseModel, path: Path, as_json: bool) -> None:
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
-@contextmanager
-def _labelling_bar() -> Iterator[StatusCallback]:
-    """Give a callback that draws rows, rate, time left and fraction colliding on a terminal."""
-    from datetime import timedelta
-
-    with status_bar("Labelling", rows=True) as draw:
-
-        def show(status: LabelStatus) -> None:
-            facts = []
-            if status.rows_per_second is not None and status.seconds_left is not None:
-                left = timedelta(seconds=round(status.seconds_left))
-                facts += [f"{status.rows_per_second:.0f}/s", f"{left} left"]
-            if status.colliding_share is not None:
-                facts.append(f"{100.0 * status.colliding_share:.1f} % collide")
-            draw(status.done, status.total, facts)
-
-        yield show
+def told_of(status: LabelStatus) -> Told:
+    """Put the rows, the rate, the time left and the fraction that collides into words."""
+    facts = []
+    if status.rows_per_second is not None and status.seconds_left is not None:
+        left = timedelta(seconds=round(status.seconds_left))
+        facts += [f"{status.rows_per_second:.0f}/s", f"{left} left"]
+    if status.colliding_share is not None:
+        facts.append(f"{100.0 * status.colliding_share:.1f} % collide")
+    return status.done, status.total, _TASK, facts

@@ -103,19 +103,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.command("edit")(edit.edit)
-app.command("models")(models.models)
-app.command("info")(models.info)
-app.command("domains")(models.domains)
-app.command("upright")(models.upright)
-app.command("check")(check.check)
-app.command("encode")(poses.encode)
-app.command("decode")(poses.decode)
-app.command("sample")(poses.sample)
-app.command("mirror")(mirror.mirror)
-app.command("resolve")(resolve.resolve)
-app.command("label")(label.label)
-app.command("evaluate")(evaluate.evaluate)
+for command in (
+    edit.edit,
+    *(models.models, models.info, models.domains, models.upright),
+    check.check,
+    *(poses.encode, poses.decode, poses.sample),
+    *(mirror.mirror, resolve.resolve, label.label, evaluate.evaluate),
+):
+    app.command()(command)
 app.add_typer(dataset.app, name="dataset")
 app.add_typer(train.app, name="train")
 app.add_typer(benchmark.app, name="benchmark")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from app.cli.console import progress_bar, tell
-from app.cli.inputs import PosesArgument, ScaleOption, cannot_encode, expanded
+from app.cli.inputs import MeshesArgument, PosesArgument, ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.partial_output import unfinished_poses
@@ -29,18 +28,11 @@ from lcollision_core.errors import LCollisionError, PoseSetError
 
 def encode(
     model_name: ModelArgument,
-    meshes: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="MESH...",
-            readable=False,
-            help="Meshes of the model's topology, or folders of them.",
-        ),
-    ],
+    meshes: MeshesArgument,
     output: PosesOutput,
     scale: ScaleOption = 1.0,
 ) -> None:
-    """Turn meshes into latent poses, and say how well each fits.
+    """Turn meshes of the model's topology into latent poses, and say how well each fits.
 
     What is done when it is stopped is kept beside the output, and the same command goes on.
     """

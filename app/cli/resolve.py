@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.inputs import ScaleOption, cannot_encode, expanded
+from app.cli.inputs import ScaleOption, ThreadsOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.partial_output import UnfinishedPoses, unfinished_poses
@@ -94,10 +94,7 @@ def resolve(
         float | None,
         typer.Option(metavar="SECONDS", help="For each pose, then straight to the last step."),
     ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one for each core."),
-    ] = None,
+    workers: ThreadsOption = None,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the solver's starts.")] = 0,
     mesh_format: FormatOption = "obj",
     as_json: JsonOption = False,

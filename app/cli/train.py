@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from app.cli.console import note, status_bar
-from app.cli.evaluate import require_store_of, scores_sentence
-from app.cli.inputs import Axis, RowsOption, up_sentence
+from app.cli.evaluate import StoreArgument, open_store, scores_sentence
+from app.cli.inputs import Axis, NearExclusionOption, PoseSetArgument, RowsOption, up_sentence
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import (
     ModelArgument,
@@ -26,9 +26,9 @@ from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken
 
 if TYPE_CHECKING:
-    from lcollision_core.embedding import run
+    from app.cli.console import Told
     from lcollision_core.embedding.run import TrainingStatus
-    from lcollision_core.predictor import PredictorStatus, StatusCallback
+    from lcollision_core.predictor import PredictorStatus
 
 app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
 
@@ -45,12 +45,7 @@ OutputOption = Annotated[
 
 @app.command("embedding")
 def embedding(
-    dataset: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DATASET", readable=False, help="A folder of meshes or an .npz file."
-        ),
-    ],
+    dataset: PoseSetArgument,
     output: OutputOption,
     n_domains: Annotated[
         int, typer.Option("--domains", min=1, max=64, metavar="K", help="Domains of the body.")
@@ -59,16 +54,7 @@ def embedding(
         int,
         typer.Option("--domain-codes", min=1, max=64, metavar="k", help="Codes of each domain."),
     ] = 10,
-    near_exclusion: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            max=0.99,
-            metavar="X",
-            help="Count pairs within X body sizes along the surface separately. "
-            "Default: what the set says.",
-        ),
-    ] = None,
+    near_exclusion: NearExclusionOption = None,
     up: Annotated[
         Axis | None,
         typer.Option(help="The axis that is up. Default: what the set says, else a guess."),
@@ -99,13 +85,10 @@ def embedding(
     poses = read_pose_set(dataset)
     if scale != 1.0:
         poses = poses.scaled(scale)
-    if up is not None:
-        poses = replace(poses, up_axis="xyz".index(up))
-    else:
-        guess = poses.up
-        if not guess.is_sure:
-            note(f"{up_sentence(guess)}; --up x|y|z says otherwise, now or by `lcollision upright`")
-        poses = replace(poses, up_axis=guess.axis)
+    guess = poses.up
+    if up is None and not guess.is_sure:
+        note(f"{up_sentence(guess)}; --up x|y|z says otherwise, now or by `lcollision upright`")
+    poses = replace(poses, up_axis=guess.axis if up is None else "xyz".index(up))
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
     if near_exclusion is not None:
@@ -113,7 +96,8 @@ def embedding(
     config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)
     checkpoint = checkpoint_path(destination)
     require_writable(checkpoint)
-    with _resumable(checkpoint, Path.exists) as cancel, _embedding_bar() as progress:
+    bar = status_bar("reading features", told_of_embedding)
+    with _resumable(checkpoint, Path.exists) as cancel, bar as progress:
         trained = train_embedding(
             poses, config, checkpoint=checkpoint, progress=progress, cancel=cancel, seed=seed
         )
@@ -129,9 +113,7 @@ def embedding(
 @app.command("predictor")
 def predictor(
     model_name: ModelArgument,
-    store_path: Annotated[
-        Path, typer.Argument(metavar="STORE", help="The model's store, by `lcollision label`.")
-    ],
+    store_path: StoreArgument,
     output: OutputOption,
     preset: Annotated[
         Literal["default", "paper"],
@@ -160,10 +142,15 @@ def predictor(
     run that was stopped or killed go on when it is started again; it is removed at the end. To use
     several devices or machines, start it with `torchrun -m app train predictor ...`.
     """
-    from lcollision_core.labels import LabelStore
     from lcollision_core.meshes import file_stamp, require_writable
     from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
-    from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
+    from lcollision_core.predictor import (
+        PRESETS,
+        has_begun,
+        no_status,
+        patches_path,
+        train_predictor,
+    )
     from lcollision_core.resolve import find_free_poses
 
     destination = model_destination(output)
@@ -172,12 +159,12 @@ def predictor(
     require_writable(patches_path(checkpoint))
     before = file_stamp(destination)
     model = PoseModel.load(model_name)
-    store = LabelStore.open(store_path)
-    require_store_of(store, model)
+    store = open_store(store_path, model)
     config = PRESETS[preset].with_loss(loss)
     # torchrun starts this command many times; the first process writes for all.
     leads = os.environ.get("RANK", "0") == "0"
-    with _resumable(checkpoint, has_begun, leads) as cancel, _predictor_bar(leads) as progress:
+    bar = status_bar("reading rows", told_of_predictor) if leads else nullcontext(no_status)
+    with _resumable(checkpoint, has_begun, leads) as cancel, bar as progress:
         trained = train_predictor(
             store.load(n_rows),
             model.embedding,
@@ -246,44 +233,20 @@ def _provenance(vertices: Any, seed: int) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def _embedding_bar() -> Iterator[run.StatusCallback]:
-    """Give a callback that draws the stage and both levels' errors on a terminal."""
-    with status_bar("reading features") as draw:
-
-        def show(status: TrainingStatus) -> None:
-            errors = [
-                f"{levels} {100.0 * error:.2f} %"
-                for levels, error in (
-                    ("level 1", status.level1_error),
-                    ("both levels", status.both_error),
-                )
-                if error is not None
-            ]
-            facts = [f"error {', '.join(errors)}"] if errors else []
-            draw(status.done, status.total, facts, f"{status.model}: learning {status.stage}")
-
-        yield show
+def told_of_embedding(status: TrainingStatus) -> Told:
+    """Put the stage and both levels' errors into words."""
+    levels = {"level 1": status.level1_error, "both levels": status.both_error}
+    errors = [f"{name} {100.0 * e:.2f} %" for name, e in levels.items() if e is not None]
+    facts = [f"error {', '.join(errors)}"] if errors else []
+    return status.done, status.total, f"{status.model}: learning {status.stage}", facts
 
 
-@contextmanager
-def _predictor_bar(leads: bool) -> Iterator[StatusCallback]:
-    """Give a callback that draws steps, loss and held-out accuracy on a terminal."""
-    from lcollision_core.predictor import no_status
-
-    if not leads:
-        yield no_status
-        return
-    with status_bar("reading rows") as draw:
-
-        def show(status: PredictorStatus) -> None:
-            if status.preparing is not None:
-                draw(status.preparing, 1.0, description="labelling patches")
-                return
-            facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
-            if status.held_out_accuracy is not None:
-                facts.append(f"{100.0 * status.held_out_accuracy:.1f} % accuracy")
-            epoch = f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}"
-            draw(status.done, status.total, facts, epoch)
-
-        yield show
+def told_of_predictor(status: PredictorStatus) -> Told:
+    """Put the epoch, the loss and the held-out accuracy into words."""
+    if status.preparing is not None:
+        return status.preparing, 1.0, "labelling patches", []
+    facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
+    if status.held_out_accuracy is not None:
+        facts.append(f"{100.0 * status.held_out_accuracy:.1f} % accuracy")
+    epoch = f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}"
+    return status.done, status.total, epoch, facts

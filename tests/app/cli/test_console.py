@@ -19,31 +19,31 @@ import pty
 
 BARS = {
     "label": (
-        "from app.cli.label import _labelling_bar as bar\n"
+        "from app.cli.label import told_of\n"
         "from lcollision_core.labels import LabelStatus\n"
         "status = LabelStatus(30, 200, 15, 28, 10.0)\n"
-        "made = bar()",
+        "rows = True",
         ("Labelling", "30/200", "3/s, 0:01:01 left, 50.0 % collide"),
     ),
     "embedding": (
-        "from app.cli.train import _embedding_bar as bar\n"
+        "from app.cli.train import told_of_embedding as told_of\n"
         "from lcollision_core.embedding.run import TrainingStatus\n"
         "status = TrainingStatus('held out', 'level 2', 40, 100, 0.04, 0.01)\n"
-        "made = bar()",
+        "rows = False",
         ("held out: learning level 2", "40%", "error level 1 4.00 %, both levels 1.00 %"),
     ),
     "predictor": (
-        "from app.cli.train import _predictor_bar as bar\n"
+        "from app.cli.train import told_of_predictor as told_of\n"
         "from lcollision_core.predictor import PredictorStatus\n"
         "status = PredictorStatus(1, 30, 20, 100, 0.5, 0.875, None)\n"
-        "made = bar(True)",
+        "rows = False",
         ("epoch 2 of 30", "20%", "loss 0.500, 87.5 % accuracy"),
     ),
     "patches": (
-        "from app.cli.train import _predictor_bar as bar\n"
+        "from app.cli.train import told_of_predictor as told_of\n"
         "from lcollision_core.predictor import PredictorStatus\n"
         "status = PredictorStatus(0, 30, 0, 100, None, None, 0.25)\n"
-        "made = bar(True)",
+        "rows = False",
         ("labelling patches", "25%"),
     ),
 }
@@ -51,7 +51,8 @@ BARS = {
 
 def draw(code: str, error: int, before: str = "") -> None:
     """Draw one status in another process, whose standard error is `error`."""
-    held = f"{before}\n{code}\nwith made as progress:\n    progress(status)\n"
+    bar = "from app.cli.console import status_bar as bar\nwith bar('', told_of, rows=rows) as show:"
+    held = f"{before}\n{code}\n{bar}\n    show(status)\n"
     held += "    import time; time.sleep(0.3)"
     environment = {**os.environ, "COLUMNS": "160", "TERM": "xterm"}
     subprocess.run([sys.executable, "-c", held], env=environment, stderr=error, check=True)
