@@ -213,7 +213,7 @@ def write_result(
     """
     from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, unused_name
     from lcollision_core.model import export_frame, export_mesh, write_poses
-    from lcollision_core.resolve import exported_vertices
+    from lcollision_core.posing import exported_vertices
 
     require_one_mesh(output, len(poses))
     given = [None] * len(poses) if vertices is None else vertices

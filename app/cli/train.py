@@ -177,7 +177,7 @@ def predictor(
             seed=seed,
         )
     if leads:
-        free_latent = find_free_poses(model.exact_check())
+        free_latent = find_free_poses(model.embedding, model.exact_check())
         if not len(free_latent):
             note(
                 "no pose of this body that was tried is free of collision; Resolve has nowhere "

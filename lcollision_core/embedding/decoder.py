@@ -106,6 +106,23 @@ class FeatureDecoder:
             start = stop
         return tangents
 
+    def pull_back(self, latent: npt.NDArray[Any], by_features: npt.NDArray[Any]) -> FloatArray:
+        """Turn derivatives by one pose's features, (n, V, 9), into those by its codes, (n, D).
+
+        The transpose of `tangents` at the (D,) latent.
+        """
+        codes = self._checked(np.asarray(latent)[None])[0]
+        scaled = (by_features * self.scale).astype(np.float32)
+        by_codes = np.zeros((len(scaled), len(codes)))
+        start = 0
+        for group in self.groups:
+            stop = start + len(group.weights)
+            _pull_group(
+                codes[start:stop], group.blocks, group.support, scaled, by_codes[:, start:stop]
+            )
+            start = stop
+        return by_codes
+
     def _checked(self, latent: npt.NDArray[Any]) -> Float32Array:
         if np.ndim(latent) != 2 or np.shape(latent)[1] != self.latent_size:
             raise ShapeError.must_be(
@@ -156,3 +173,41 @@ def _add_group(
                 out = features[pose, support[first + n]]
                 for j in range(9):
                     out[j] += scale[j] * total[9 * n + j]
+
+
+@compiled
+def _pull_group(
+    codes: npt.NDArray[np.float32],
+    blocks: npt.NDArray[np.float32],
+    support: npt.NDArray[np.int32],
+    by_output: npt.NDArray[np.float32],
+    by_codes: FloatArray,
+) -> None:
+    """Add the derivative by one group's codes, given the one by its scaled output.
+
+    Parameters
+    ----------
+    codes : (m,) float32 array
+    blocks, support : of a `DecoderGroup`
+    by_output : (n, V, 9) float32 array
+    by_codes : (n, m) float64 array, added to
+    """
+    width = blocks.shape[2]
+    weighted = np.zeros((len(by_output), width), dtype=np.float32)
+    for block in range(len(blocks)):
+        slope = np.zeros(width, dtype=np.float32)
+        for k in range(len(codes)):
+            slope += codes[k] * blocks[block, k]
+        slope = np.tanh(slope)
+        slope = np.float32(1.0) - slope * slope
+        first = block * width // 9
+        last = min(first + width // 9, len(support))
+        for row in range(len(by_output)):
+            out = weighted[row]
+            for n in range(last - first):
+                given = by_output[row, support[first + n]]
+                for j in range(9):
+                    out[9 * n + j] = given[j] * slope[9 * n + j]
+            out[9 * (last - first) :] = np.float32(0.0)
+        # A product for each block, small enough for the library to keep to this thread.
+        by_codes += np.dot(weighted, blocks[block].T)

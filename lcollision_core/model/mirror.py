@@ -15,7 +15,8 @@ from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.model.matching import sorted_faces
 
 if TYPE_CHECKING:
-    from lcollision_core.resolve import ExactCheck, PoseResolver, ResolveOptions, ResolveResult
+    from lcollision_core.posing import ExactCheck
+    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -49,8 +49,9 @@ from lcollision_core.model_file import (
 
 if TYPE_CHECKING:
     from lcollision_core.labels import Labeller
+    from lcollision_core.posing import ExactCheck, LatentPoseSpace, PoseDragger
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
-    from lcollision_core.resolve import ExactCheck, PoseResolver, ResolveOptions, ResolveResult
+    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -231,15 +232,28 @@ class PoseModel:
         ----------
         placement : where the pose is exported to; None leaves it in the model's coordinates
         """
-        from lcollision_core.resolve import exported_vertices
+        from lcollision_core.posing import exported_vertices
 
         return exported_vertices(self.decode(latent, n_threads=1), placement)
 
     def exact_check(self, placement: RigidTransform | None = None) -> ExactCheck:
         """Return the exact check of poses placed for export."""
-        from lcollision_core.resolve import ExactCheck
+        from lcollision_core.posing import ExactCheck
 
-        return ExactCheck(self.embedding, self.detector, self.body_size, placement)
+        return ExactCheck(self.pose_space, self.detector, self.body_size, placement)
+
+    @cached_property
+    def pose_space(self) -> LatentPoseSpace:
+        """The latent poses as dragging and Resolve see them."""
+        from lcollision_core.posing import LatentPoseSpace
+
+        return LatentPoseSpace(self.embedding)
+
+    def dragger(self, placement: RigidTransform | None = None) -> PoseDragger:
+        """Return what drags poses placed for export by hand; for one thread at a time."""
+        from lcollision_core.posing import PoseDragger
+
+        return PoseDragger(self.exact_check(placement))
 
     def labeller(self) -> Labeller:
         """Return what labels samples of the model's latent box, by the model's pair rule."""

@@ -1,6 +1,5 @@
 """The nearest collision-free pose: the paper's problem, then a ladder of exactly checked steps."""
 
-from lcollision_core.resolve.exact import ExactCheck, exported_vertices
 from lcollision_core.resolve.free_poses import find_free_poses
 from lcollision_core.resolve.ladder import ALL_LOCKED
 from lcollision_core.resolve.motion import largest_correction_change

@@ -6,8 +6,9 @@ from itertools import chain
 
 import numpy as np
 
+from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.resolve.exact import ExactCheck
+from lcollision_core.posing import ExactCheck
 
 MOST_POSES = 200
 ENOUGH_POSES = 16
@@ -18,12 +19,13 @@ _SHRINKINGS = (0.75, 0.5, 0.25)
 _AT_ONCE = 32
 
 
-def find_free_poses(check: ExactCheck) -> FloatArray:
+def find_free_poses(embedding: Embedding, check: ExactCheck) -> FloatArray:
     """Find collision-free latent poses: the mean pose, training poses, then samples.
 
     Parameters
     ----------
-    check : of the model's poses
+    embedding : of the model
+    check : of its poses
 
     Returns
     -------
@@ -32,7 +34,6 @@ def find_free_poses(check: ExactCheck) -> FloatArray:
         and up to 2048 samples of the latent box are searched too, so that F = 0 says that none of
         some thousand poses is free.
     """
-    embedding = check.embedding
     training = embedding.training_latent.astype(np.float64)
     chosen = np.unique(np.linspace(0, len(training) - 1, MOST_POSES - 1).round().astype(int))
     sources = chain(

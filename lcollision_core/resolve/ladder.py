@@ -12,10 +12,9 @@ import numpy as np
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.jobs import Progress
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.resolve.contacts import polish
-from lcollision_core.resolve.exact import ExactCheck
-from lcollision_core.resolve.metric import relative_distance
+from lcollision_core.posing import ExactCheck
 from lcollision_core.resolve.options import ResolveOptions, ResolveResult, Solver, Step
+from lcollision_core.resolve.polish import polish
 from lcollision_core.resolve.problem import ResolveProblem, SolverOutcome
 from lcollision_core.resolve.pull_back import fall_back, pull_back
 from lcollision_core.resolve.sqp import SqpBatch
@@ -231,3 +230,8 @@ class Ladder:
             seconds=problem.deadline.seconds,
             note="; ".join(filter(None, (self.remark, note))) or None,
         )
+
+
+def relative_distance(latent: FloatArray, target: FloatArray) -> float:
+    """Measure ||Z - Z*|| / ||Z*|| of two (D,) poses, or ||Z - Z*|| where Z* is the zero pose."""
+    return float(np.linalg.norm(latent - target)) / (float(np.linalg.norm(target)) or 1.0)

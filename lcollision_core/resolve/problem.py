@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.posing.contacts import Contacts, nearest_within
 
 
 class CollisionModel(Protocol):
@@ -101,6 +102,12 @@ class ResolveProblem:
         """Measure the solvers' squared distance of (..., D) poses from Z*: (...)."""
         squared: FloatArray = (latent - self.target) ** 2 @ self.code_weights
         return squared
+
+    def nearest(self, centre: FloatArray, contacts: Contacts) -> FloatArray | None:
+        """Return the pose nearest to a (D,) pose in all half-spaces, None if there is none."""
+        return nearest_within(
+            self.metric, centre, self.low, self.high, contacts.normals, contacts.offsets
+        )
 
     def excess(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Evaluate (B, D) poses: how far the logits are above the limit, (B,), and (B, D) slopes.

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.resolve.contacts import Contacts
-from lcollision_core.resolve.exact import ExactCheck
+from lcollision_core.posing import ExactCheck
+from lcollision_core.posing.contacts import Contacts
 from lcollision_core.resolve.problem import ResolveProblem
 
 FIRST_HALVINGS, FURTHER_HALVINGS = 3, 5
@@ -116,13 +116,13 @@ def fall_back(
 def _slide(
     check: ExactCheck, problem: ResolveProblem, free: FloatArray, colliding: FloatArray
 ) -> FloatArray:
-    contacts = Contacts(check, problem)
+    contacts = Contacts(check)
     for _ in range(SLIDES):
         problem.deadline.poll()
         if problem.deadline.expired or not contacts.add(colliding):
             break
         contacts.drop_refuted(free)
-        goal = contacts.nearest(problem.target)
+        goal = problem.nearest(problem.target, contacts)
         if goal is None:
             break
         if problem.distance(goal) >= (1.0 - _SETTLED) ** 2 * problem.distance(free):
@@ -143,7 +143,7 @@ def _put_domains_back(check: ExactCheck, problem: ResolveProblem, free: FloatArr
         latent[codes] = problem.target[codes]
         return latent
 
-    groups = np.split(np.arange(len(free)), np.cumsum(check.embedding.group_sizes)[:-1])
+    groups = np.split(np.arange(len(free)), np.cumsum(check.space.group_sizes)[:-1])
     for codes in sorted(groups, key=lambda codes: float(problem.distance(put_back(codes)))):
         problem.deadline.poll()
         if problem.deadline.expired:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property
 from itertools import pairwise, repeat
 from threading import Lock
 
@@ -16,9 +15,8 @@ from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.resolve.exact import ExactCheck
+from lcollision_core.posing import ExactCheck
 from lcollision_core.resolve.ladder import Ladder
-from lcollision_core.resolve.metric import displacement_metric
 from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult
 from lcollision_core.resolve.problem import CollisionModel, Deadline, ResolveProblem
 from lcollision_core.resolve.threads import single_torch_thread
@@ -41,11 +39,10 @@ class PoseResolver:
         predictor: CollisionModel,
         free_latents: npt.ArrayLike,
     ) -> None:
-        self._check, self._embedding, self._predictor = check, check.embedding, predictor
-        size = check.embedding.latent_size
+        self._check, self._space, self._predictor = check, check.space, predictor
+        self._low, self._high = check.space.low, check.space.high
+        size = len(self._low)
         self._free_latents: FloatArray = np.array(free_latents, np.float64).reshape(-1, size)
-        box = check.embedding.box
-        self._low, self._high = box.low, box.high
 
     def resolve(
         self,
@@ -138,7 +135,7 @@ class PoseResolver:
         rows = [self._checked(row) for row in np.atleast_2d(np.asarray(latents, np.float64))]
         placed = [None] * len(rows) if placements is None else placements
         # Built once, before several threads would each begin to.
-        _ = self._displacement_metric, self._embedding.codec, self._embedding.decoder
+        _ = self._space.metric, self._space.decode(np.zeros((1, len(self._low))))
         known = done or {}
         results: dict[int, ResolveResult] = {}
         guard = Lock()
@@ -177,13 +174,9 @@ class PoseResolver:
             cancel.raise_if_cancelled()
         return not replace(self._check, placement=placement).is_free(latent)
 
-    @cached_property
-    def _displacement_metric(self) -> FloatArray:
-        return displacement_metric(self._embedding)
-
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         target: FloatArray = np.array(latent, dtype=np.float64)
-        size = self._embedding.latent_size
+        size = len(self._low)
         if target.shape != (size,):
             raise ShapeError.must_be("a latent pose", f"{size} numbers", f"shape {target.shape}")
         if not np.isfinite(target).all():
@@ -194,8 +187,8 @@ class PoseResolver:
         self, target: FloatArray, options: ResolveOptions, cancel: CancelToken | None
     ) -> ResolveProblem:
         is_displacement = options.metric == Metric.DISPLACEMENT
-        metric = self._displacement_metric if is_displacement else np.eye(len(target))
-        sizes = self._embedding.group_sizes
+        metric = self._space.metric if is_displacement else np.eye(len(target))
+        sizes = self._space.group_sizes
         weights = options.group_weights or (1.0,) * len(sizes)
         if len(weights) != len(sizes):
             raise ShapeError.must_be("group weights", f"{len(sizes)} numbers", len(weights))
@@ -203,12 +196,12 @@ class PoseResolver:
         root = np.sqrt(code_weights)
         low, high = np.minimum(self._low, target), np.maximum(self._high, target)
         for domain in sorted(options.locked_domains):
-            if not 0 <= domain < self._embedding.n_domains:
+            if not 0 <= domain < self._space.n_domains:
                 raise LCollisionError(
                     f"unknown domain {domain + 1} to lock",
-                    f"the model has {self._embedding.n_domains}",
+                    f"the model has {self._space.n_domains}",
                 )
-        locked = self._embedding.codes_of(options.locked_domains)
+        locked = self._space.codes_of(options.locked_domains)
         low[locked] = high[locked] = target[locked]
         return ResolveProblem(
             target,

@@ -19,7 +19,7 @@ def test_a_model_of_version_1_resolves_to_the_same_result(
 ) -> None:
     """It had no latent box: its training codes tell which was meant."""
     old, new, again = (tmp_path / f"{name}.safetensors" for name in ("old", "new", "again"))
-    free = find_free_poses(editor_model.exact_check())
+    free = find_free_poses(editor_model.embedding, editor_model.exact_check())
     editor_model.with_free_poses(free).save(new)
     sections = read_model_file(new)
     embedding = sections["embedding"]

@@ -21,7 +21,7 @@ TURN = random_rotation(np.random.default_rng(4))
 
 @pytest.fixture(scope="module")
 def model(editor_model: PoseModel) -> PoseModel:
-    free = find_free_poses(editor_model.exact_check())
+    free = find_free_poses(editor_model.embedding, editor_model.exact_check())
     return editor_model.with_free_poses(free)
 
 

@@ -27,7 +27,6 @@ from lcollision_core.meshes import (
 )
 from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
 from lcollision_core.resolve import PoseResolver, find_free_poses
-from lcollision_core.resolve.exact import ExactCheck
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 from tests.core.brute_force import all_pairs
@@ -56,7 +55,7 @@ FIELDS = [
 
 @pytest.fixture(scope="module")
 def model(editor_model: PoseModel) -> PoseModel:
-    free = find_free_poses(editor_model.exact_check())
+    free = find_free_poses(editor_model.embedding, editor_model.exact_check())
     return editor_model.with_free_poses(free)
 
 
@@ -319,7 +318,7 @@ def test_the_mesh_written_is_the_one_that_was_proved_free(
 ) -> None:
     latent, turn = 0.3 * model.training_latent[4], random_rotation(np.random.default_rng(2))
     pose = NamedPose("placed", latent, RigidTransform(turn, np.array([1e4, -70.0, 3.0])))
-    check = ExactCheck(model.embedding, model.detector, model.body_size, pose.placement)
+    check = model.exact_check(pose.placement)
     exported = check.exported(check.decode(latent)[0])
     path, out = tmp_path / "placed.json", tmp_path / f"placed{suffix}"
     write_poses(path, model, [pose])

@@ -25,7 +25,7 @@ from lcollision_core.meshes import (
 from lcollision_core.meshes.files import KEEP_PRECISION
 from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
 from lcollision_core.model.matching import likely_factor
-from lcollision_core.resolve import ExactCheck
+from lcollision_core.posing import ExactCheck
 from tests.bending_tube import LENGTH_IN_FILES
 from tests.core.shapes import random_rotation, sphere
 
@@ -114,7 +114,7 @@ def test_a_far_mesh_is_fitted_checked_and_given_back_as_a_near_one(
 ) -> None:
     colliding = sample_poses(tube_model, 2, seed=5, colliding=True)
     free = sample_poses(tube_model, 2, seed=5, colliding=False)
-    near = ExactCheck(tube_model.embedding, tube_model.detector, tube_model.body_size)
+    near = tube_model.exact_check()
     far = replace(near, placement=placed(distance, turn))
     for latent in (*colliding, *free):
         decoded = far.decode(latent)[0]
@@ -174,9 +174,7 @@ def test_a_mesh_in_another_unit_comes_back_in_its_own(
     tolerance = 2.0 * factor * (fit.fit_error_max * tube_model.body_size + 1e-6 + 1e-15 * distance)
     assert np.abs(again - mesh).max() < tolerance
     assert fit.placement.scale == pytest.approx(factor)
-    check = ExactCheck(
-        tube_model.embedding, tube_model.detector, tube_model.body_size, fit.placement
-    )
+    check = tube_model.exact_check(fit.placement)
     expected = tube_model.detector.detect(tube_model.decode(fit.latent))
     found = check.find(check.exported(check.decode(fit.latent)[0]))
     assert len(found.pairs) == pytest.approx(len(expected.pairs), rel=0.2)

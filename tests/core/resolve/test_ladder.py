@@ -17,6 +17,7 @@ from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.posing import ExactCheck
 from lcollision_core.resolve import (
     Metric,
     PoseResolver,
@@ -27,7 +28,6 @@ from lcollision_core.resolve import (
     find_free_poses,
     largest_correction_change,
 )
-from lcollision_core.resolve.exact import ExactCheck
 from lcollision_core.resolve.problem import CollisionModel
 from lcollision_core.resolve.pull_back import bisect
 from tests.core.brute_force import all_pairs
@@ -40,7 +40,7 @@ MEAN_ALONE = 1
 
 @pytest.fixture(scope="module")
 def free_latents(tube_model: PoseModel) -> FloatArray:
-    return find_free_poses(tube_model.exact_check())
+    return find_free_poses(tube_model.embedding, tube_model.exact_check())
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def colliding(tube_model: PoseModel) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def check(tube_model: PoseModel) -> ExactCheck:
-    return ExactCheck(tube_model.embedding, tube_model.detector, tube_model.body_size)
+    return tube_model.exact_check()
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ import pytest
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.posing.contacts import nearest_within
 from lcollision_core.resolve import ResolveOptions, Solver
-from lcollision_core.resolve.contacts import nearest_within
 from lcollision_core.resolve.nlopt_solvers import solve_nlopt
 from lcollision_core.resolve.problem import Deadline, ResolveProblem, SolverOutcome
 from lcollision_core.resolve.sqp import SqpBatch
@@ -263,7 +263,9 @@ def test_nearest_within_half_spaces_agrees_with_a_general_solver() -> None:
         normals = generator.normal(size=(3, size))
         inside = problem.target + generator.uniform(-0.05, 0.05, size)
         offsets = normals @ inside + generator.uniform(0.0, 0.01, 3)
-        nearest = nearest_within(problem, problem.target, normals, offsets)
+        nearest = nearest_within(
+            problem.metric, problem.target, problem.low, problem.high, normals, offsets
+        )
         expected = minimize(
             quadratic(problem),
             problem.target,
@@ -285,11 +287,15 @@ def test_nearest_within_half_spaces_agrees_with_a_general_solver() -> None:
 def test_half_spaces_without_a_common_point_have_no_nearest() -> None:
     problem = toy_problem(HalfSpace(NORMAL, 0.0), TARGET)
     normals = np.stack([NORMAL, -NORMAL])
-    assert nearest_within(problem, TARGET, normals, np.array([-1.0, -1.0])) is None
+    bounds = problem.low, problem.high
+    offsets = np.array([-1.0, -1.0])
+    assert nearest_within(problem.metric, TARGET, *bounds, normals, offsets) is None
 
 
 def test_without_half_spaces_the_centre_is_nearest() -> None:
     problem = toy_problem(HalfSpace(NORMAL, 0.0), TARGET)
-    nearest = nearest_within(problem, TARGET, np.empty((0, 4)), np.empty(0))
+    nearest = nearest_within(
+        problem.metric, TARGET, problem.low, problem.high, np.empty((0, 4)), np.empty(0)
+    )
     assert nearest is not None
     assert nearest.tolist() == TARGET.tolist()

@@ -1,4 +1,4 @@
-"""The exact check of latent poses: the vertices that a file would hold."""
+"""The exact check of poses: the vertices that a file would hold."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector, SelfCollisions
-from lcollision_core.embedding import Embedding
 from lcollision_core.meshes import RigidTransform, Topology, can_hold
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.posing.pose_space import PoseSpace
 
 
 def exported_vertices(
@@ -48,26 +48,26 @@ def in_each_format(
 
 @dataclass(frozen=True, eq=False)
 class ExactCheck:
-    """Decodes latent poses and tests them as they are exported; safe to share between threads.
+    """Decodes poses and tests them as they are exported; safe to share between threads.
 
     A pose is free when it is in each format that can hold it.
 
     Attributes
     ----------
-    embedding : decodes
+    space : decodes
     detector : in the data's unit
     body_size : in the data's unit
     placement : where a pose is exported to, None for the model's own coordinates
     """
 
-    embedding: Embedding
+    space: PoseSpace
     detector: CollisionDetector
     body_size: float
     placement: RigidTransform | None = None
 
     def decode(self, latent: npt.ArrayLike) -> FloatArray:
         """Decode (B, D) latent poses to (B, V, 3) vertices, normalised, in the model's frame."""
-        return self.embedding.decode(np.atleast_2d(np.asarray(latent)), n_threads=1)
+        return self.space.decode(np.atleast_2d(np.asarray(latent)))
 
     def exported(self, decoded: FloatArray) -> npt.NDArray[np.floating]:
         """Return decoded (..., V, 3) vertices, normalised, as they are exported."""

@@ -8,10 +8,9 @@ import pytest
 from lcollision_core.contact import penetration_depth
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model import PoseModel, sample_poses
-from lcollision_core.resolve.contacts import contact_slopes, pull_to_latent
-from lcollision_core.resolve.depth_slopes import depth_slopes
-from lcollision_core.resolve.exact import ExactCheck
-from lcollision_core.resolve.metric import displacement_metric
+from lcollision_core.posing import ExactCheck
+from lcollision_core.posing.contacts import ContactRegions, contact_slopes
+from lcollision_core.posing.depth_slopes import depth_slopes
 from lcollision_core.resolve.threads import single_torch_thread
 
 STEP = 1e-6
@@ -71,7 +70,7 @@ def colliding(tube_model: PoseModel) -> FloatArray:
 
 
 def check_of(model: PoseModel) -> ExactCheck:
-    return ExactCheck(model.embedding, model.detector, model.body_size)
+    return model.exact_check()
 
 
 def test_slopes_by_codes_are_those_of_differences(
@@ -82,7 +81,7 @@ def test_slopes_by_codes_are_those_of_differences(
     generator = np.random.default_rng(1)
     by_vertices = generator.normal(size=(3, tube_model.n_vertices, 3))
     latent = colliding[0]
-    slopes = pull_to_latent(tube_model.embedding, latent, by_vertices)
+    slopes = tube_model.embedding.pull_back(latent, by_vertices)
     differences = np.empty_like(slopes)
     for code in range(tube_model.latent_size):
         ends = np.tile(latent, (4, 1))
@@ -102,7 +101,9 @@ def test_contacts_get_shallower_against_their_slopes(
     for latent in colliding:
         decoded = check.decode(latent)[0]
         found = check.find(check.exported(decoded))
-        depth, slopes = contact_slopes(tube_model.embedding, latent, decoded, found)
+        regions = ContactRegions.of(check.space, found)
+        deepest, slopes = contact_slopes(check.space, latent, decoded, found, regions)
+        depth = regions.depth[deepest]
         assert depth.max() <= found.penetration_depth.max() * (1 + 1e-12)
         assert (np.diff(depth) <= 0.0).all()
         assert len(depth) == len(slopes) >= 1
@@ -125,7 +126,7 @@ def test_contacts_get_shallower_against_their_slopes(
 def test_the_displacement_metric_measures_vertices(tube_model: PoseModel) -> None:
     """Its distance predicts the mean squared vertex motion; the plain one knows nothing of it."""
     embedding = tube_model.embedding
-    metric = displacement_metric(embedding)
+    metric = tube_model.pose_space.metric
     generator = np.random.default_rng(2)
     latents = tube_model.latent_space.sample(40, generator)
     steps = 0.05 * generator.normal(size=latents.shape) * embedding.latent_deviation

@@ -1,0 +1,258 @@
+"""Drags of a pose by hand: damped least squares with contacts as constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import SelfCollisions
+from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.posing.contacts import ContactRegions, Contacts, least_step
+from lcollision_core.posing.exact import ExactCheck, exported_vertices
+from lcollision_core.posing.goals import CodesGoal, Decoded, Goal, PatchGoal, TwistGoal
+from lcollision_core.posing.grip import Grip, Pin, Twist, make_grip
+
+MAX_STEPS = 3
+"""Steps of one event: where the pointer leapt, the next events go on."""
+
+ROUNDS = 3
+"""Times that a step is solved with the contacts that it ran into before."""
+
+CUTS = (0.5, 0.25, 0.1)
+"""Fractions of a step that are tried where it still collides after the last round."""
+
+KEPT_CONTACTS = 18
+
+DAMPING, HOLD = 0.02, 0.002
+"""Prices of the mean squared vertex displacement of a step, and of that since the drag began,
+against the squared miss of the grip."""
+
+IMPLAUSIBLE = 1e-6
+"""Price of the squared Mahalanobis distance from the drag's start: see `PoseSpace.precision`."""
+
+_STILL = 1e-5
+"""Root of the mean squared vertex displacement, normalised, of a step that is none."""
+
+
+@dataclass(frozen=True)
+class DragOptions:
+    """How a drag goes about it.
+
+    Attributes
+    ----------
+    solid : keep the pose out of itself
+    strength : of the price of implausible poses: 0 for none
+    locked_domains : body parts whose codes stay
+    """
+
+    solid: bool = True
+    strength: float = 1.0
+    locked_domains: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True, eq=False)
+class DragStep:
+    """Where one event of a drag has led.
+
+    Attributes
+    ----------
+    latent : (D,) float64 array, read-only
+    vertices : (V, 3) float32 array, read-only, in the data's unit, in the model's frame
+    miss : what is left to the target: normalised length, radians of a twist
+    found : the exact check of these vertices where they are exported to; None of a drag that is
+        not solid
+    contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
+        the pose from going on
+    settled : whether the same target would lead no further
+    """
+
+    latent: FloatArray
+    vertices: npt.NDArray[np.float32]
+    miss: float
+    found: SelfCollisions | None
+    contacts: FloatArray
+    settled: bool
+
+    @property
+    def exactly_free(self) -> bool | None:
+        """Whether the pose is free of collisions; None if it was not checked."""
+        return None if self.found is None else not self.found.colliding
+
+
+class PoseDragger:
+    """Drags poses of one space; for one thread at a time.
+
+    After `begin` each `move` is one event of the pointer. A solid drag that starts free stays
+    exactly free; one that starts colliding deepens no contact.
+
+    Parameters
+    ----------
+    check : decodes and checks the poses, placed for export
+    """
+
+    def __init__(self, check: ExactCheck) -> None:
+        self._check, self._space = check, check.space
+        self._goal: Goal | None = None
+
+    def begin(
+        self,
+        latent: npt.ArrayLike,
+        grip: Grip | Twist | None,
+        pins: Iterable[Pin] = (),
+        options: DragOptions | None = None,
+    ) -> DragStep:
+        """Start a drag.
+
+        Parameters
+        ----------
+        latent : (D,) finite array; codes beyond their bounds may stay there
+        grip : what `move` gets the targets of: a patch, a twist, or the codes themselves where
+            None; then codes that a target leaves as they were do not move
+        pins : patches that stay in their places; those of codes do not
+        options : the defaults if None
+
+        Returns
+        -------
+        step : the pose as it is
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        LCollisionError : a pin that the mesh does not have.
+        """
+        space, check = self._space, self._check
+        self._options = options or DragOptions()
+        start: FloatArray = np.array(latent, dtype=np.float64)
+        if start.shape != space.low.shape:
+            raise ShapeError.must_be("a pose to drag", f"{len(space.low)} numbers", start.shape)
+        if not np.isfinite(start).all():
+            raise ShapeError("a pose to drag has a number that is not finite", "repair the pose")
+        self._start = start
+        self._low, self._high = np.minimum(space.low, start), np.maximum(space.high, start)
+        locked = space.codes_of(self._options.locked_domains)
+        self._low[locked] = self._high[locked] = start[locked]
+        self._contacts = Contacts(check)
+        self._here = Decoded(start, check.decode(start)[0])
+        self._found: SelfCollisions | None = None
+        self._allowed: dict[int, tuple[float, float]] = {}
+        if self._options.solid:
+            self._found = check.find(check.exported(self._here.vertices))
+            self._allowed = self._depths(self._found)
+        held = [
+            (
+                make_grip(space, pin.vertex, pin.radius),
+                np.array(pin.position) / check.body_size,
+            )
+            for pin in pins
+        ]
+        if isinstance(grip, Grip):
+            self._goal = PatchGoal(space, grip, held)
+        elif isinstance(grip, Twist):
+            self._goal = TwistGoal(space, grip.domain, held, self._here.vertices)
+        else:
+            self._goal = CodesGoal(space)
+        return self._result(0.0, settled=True)
+
+    def move(self, target: npt.ArrayLike) -> DragStep:
+        """Go towards a target, by a few short steps at most.
+
+        Parameters
+        ----------
+        target : of a patch (3,), a point in the data's unit, in the model's frame; of a twist an
+            angle in radians since the start; of codes (D,). With a number that is not finite the
+            pose stays.
+
+        Raises
+        ------
+        RuntimeError : no drag has begun.
+        """
+        if self._goal is None:
+            raise RuntimeError("no drag has begun")
+        goal, aim = self._goal, np.array(target, dtype=np.float64).reshape(-1)
+        if not np.isfinite(aim).all():
+            return self._result(float("nan"), settled=True)
+        if isinstance(goal, PatchGoal):
+            aim /= self._check.body_size
+        settled = False
+        for _ in range(MAX_STEPS):
+            settled = not self._step(goal, aim)
+            if settled:
+                break
+        return self._result(goal.miss(self._here, aim), settled)
+
+    def end(self) -> None:
+        """End the drag; its contacts are forgotten."""
+        self._goal = None
+
+    def _step(self, goal: Goal, aim: FloatArray) -> bool:
+        """Go one step; False if there is none to go."""
+        space, here = self._space, self._here.codes
+        low, high = self._low, self._high
+        hessian, gradient = goal.cost(self._here, aim)
+        if isinstance(goal, CodesGoal):
+            stays = (aim == self._start) & (here == self._start)
+            low, high = np.where(stays, here, low), np.where(stays, here, high)
+        else:
+            price = self._options.strength * IMPLAUSIBLE * space.precision
+            gradient = gradient + (HOLD * space.metric + price) @ (here - self._start)
+            hessian = hessian + (DAMPING + HOLD) * space.metric + price
+        solid = self._options.solid
+        for _ in range(ROUNDS if solid else 1):
+            there = least_step(
+                hessian, gradient, here, low, high, self._contacts.normals, self._contacts.offsets
+            )
+            if there is None:
+                # Contacts seen from different poses contradict each other.
+                self._contacts = Contacts(self._check)
+            elif self._is_still(there):
+                return False
+            elif self._goes(there):
+                return True
+        if there is None or not solid:
+            return False
+        return any(self._goes(here + cut * (there - here)) for cut in CUTS)
+
+    def _is_still(self, there: FloatArray) -> bool:
+        way = there - self._here.codes
+        return float(way @ self._space.metric @ way) < _STILL**2
+
+    def _goes(self, there: FloatArray) -> bool:
+        """Go to codes if the pose may be there; else remember what is in the way."""
+        check = self._check
+        decoded = check.decode(there)[0]
+        if self._options.solid:
+            found = check.find(check.exported(decoded))
+            depths, allowed = self._depths(found), self._allowed
+            if any(deep > allowed.get(name, (0.0, 0.0))[1] for name, (_, deep) in depths.items()):
+                may_keep = {name: depth for name, (depth, _) in allowed.items()}
+                self._contacts.separate(there, decoded, found, may_keep)
+                return False
+            self._found, self._allowed = found, depths
+            if not found.colliding:
+                self._contacts.drop_refuted(there, KEPT_CONTACTS)
+        self._here = Decoded(there, decoded)
+        return True
+
+    def _depths(self, found: SelfCollisions) -> dict[int, tuple[float, float]]:
+        """Return the depth of each region in contact, and the sum of its pairs' squared depths."""
+        regions = ContactRegions.of(self._space, found)
+        values = zip(regions.depth.tolist(), regions.squared_depth.tolist(), strict=True)
+        return dict(zip(regions.names.tolist(), values, strict=True))
+
+    def _result(self, miss: float, settled: bool) -> DragStep:
+        vertices = exported_vertices(self._here.vertices * self._check.body_size)
+        latent = self._here.codes.copy()
+        latent.flags.writeable = vertices.flags.writeable = False
+        touching = np.unique(self._contacts.touching(latent))
+        return DragStep(
+            latent=latent,
+            vertices=vertices,
+            miss=miss,
+            found=self._found,
+            contacts=vertices[touching].astype(np.float64),
+            settled=settled,
+        )

@@ -1,0 +1,175 @@
+"""What a drag wants of a pose, as a quadratic model of its cost about where the pose is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.posing.grip import Grip
+from lcollision_core.posing.pose_space import PoseSpace
+
+PIN_WEIGHT = 100.0
+"""Of the squared drift of a pin, against the squared miss of the grip."""
+
+REACH = 0.06
+"""The most of the way that one step aims at, in normalised length, as the model is linear."""
+
+TURN_REACH = 0.25
+"""The same of a twist, in radians."""
+
+CODES_REACH = 0.02
+"""The same of codes, as root of the mean squared vertex displacement."""
+
+Held = Sequence[tuple[Grip, FloatArray]]
+"""Patches that stay, each with the (3,) normalised place of its mean."""
+
+
+class Decoded(NamedTuple):
+    """A pose and its mesh.
+
+    Attributes
+    ----------
+    codes : (D,) float64 array
+    vertices : (V, 3) float64 array, in normalised length
+    """
+
+    codes: FloatArray
+    vertices: FloatArray
+
+
+class Goal(Protocol):
+    """A goal of the poses of one drag; lengths are normalised."""
+
+    def miss(self, pose: Decoded, target: FloatArray) -> float:
+        """Measure what is left to a target."""
+
+    def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the (D, D) hessian and (D,) gradient of half the squared miss by the codes."""
+
+
+class PatchGoal:
+    """A patch's mean goes to a point; other patches stay.
+
+    Parameters
+    ----------
+    space : of the poses
+    grip : the patch
+    pins : that stay
+    """
+
+    def __init__(self, space: PoseSpace, grip: Grip, pins: Held) -> None:
+        self._space, self._pins, self._grip = space, pins, grip
+        self._rows = _rows(space, [grip, *(pin for pin, _ in pins)])
+
+    def miss(self, pose: Decoded, target: FloatArray) -> float:
+        """Measure the distance to the target."""
+        return float(np.linalg.norm(target - self._grip.position(pose.vertices)))
+
+    def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `Goal.cost`."""
+        way = _shortened(target - self._grip.position(pose.vertices), REACH)
+        return _squares(self._space, pose.codes, self._rows, [way, *_drifts(self._pins, pose)])
+
+
+class TwistGoal:
+    """A body part turns about its long axis by an angle; its middle and pinned patches stay.
+
+    Parameters
+    ----------
+    space : of the poses
+    domain : the body part
+    pins : that stay
+    decoded : (V, 3) float64 array, the vertices at the drag's start
+    """
+
+    def __init__(self, space: PoseSpace, domain: int, pins: Held, decoded: FloatArray) -> None:
+        inside = np.flatnonzero(space.vertex_domain == domain)
+        self._part = Grip(int(inside[0]), 0.0, inside, np.full(len(inside), 1.0 / len(inside)))
+        self._space = space
+        self._pins = [(self._part, self._part.position(decoded)), *pins]
+        self._rows = _rows(space, [self._part, *(pin for pin, _ in self._pins)])
+        self._arms = self._arms_of(decoded)
+        self.axis: FloatArray = np.linalg.eigh(self._arms.T @ self._arms)[1][:, -1]
+
+    def _arms_of(self, decoded: FloatArray) -> FloatArray:
+        arms: FloatArray = decoded[self._part.vertices] - self._part.position(decoded)
+        return arms
+
+    def _angle(self, arms: FloatArray) -> float:
+        """Return by which angle the part has turned about the axis since the start."""
+        before, now = (np.cross(self.axis, one) for one in (self._arms, arms))
+        return float(
+            np.arctan2((np.cross(self._arms, arms) @ self.axis).sum(), (before * now).sum())
+        )
+
+    def miss(self, pose: Decoded, target: FloatArray) -> float:
+        """Measure the angle that is left, in radians."""
+        return abs(float(target[0]) - self._angle(self._arms_of(pose.vertices)))
+
+    def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `Goal.cost`; the miss is the way of a vertex at the part's mean distance."""
+        arms = self._arms_of(pose.vertices)
+        across = np.cross(self.axis, arms)
+        radius = np.sqrt((across**2).sum() / len(arms))
+        left = float(target[0]) - self._angle(arms)
+        rows = self._rows.copy()
+        # The first row is the turn: the mean of the motions across the axis.
+        rows[:3] = 0.0
+        rows[0, self._part.vertices] = across / (radius * len(arms))
+        way = np.array([radius * np.clip(left, -TURN_REACH, TURN_REACH), 0.0, 0.0])
+        return _squares(self._space, pose.codes, rows, [way, *_drifts(self._pins, pose)])
+
+
+class CodesGoal:
+    """The codes go to others; those that the target leaves as they were at the start stay.
+
+    Parameters
+    ----------
+    space : of the poses
+    """
+
+    def __init__(self, space: PoseSpace) -> None:
+        self._space = space
+
+    def miss(self, pose: Decoded, target: FloatArray) -> float:
+        """Measure the root of the mean squared vertex displacement that is left, roughly."""
+        way = target - pose.codes
+        return float(np.sqrt(way @ self._space.metric @ way))
+
+    def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `Goal.cost`."""
+        miss = self.miss(pose, target)
+        way = (target - pose.codes) * min(1.0, CODES_REACH / max(miss, CODES_REACH))
+        return self._space.metric, -(self._space.metric @ way)
+
+
+def _rows(space: PoseSpace, patches: Sequence[Grip]) -> FloatArray:
+    """Return the (3 n, V, 3) derivatives of n patches' means by the vertices."""
+    rows = np.zeros((len(patches), 3, space.topology.n_vertices, 3))
+    for row, patch in zip(rows, patches, strict=True):
+        for axis in range(3):
+            row[axis, patch.vertices, axis] = patch.weights
+    return rows.reshape(-1, *rows.shape[2:])
+
+
+def _drifts(pins: Held, pose: Decoded) -> list[FloatArray]:
+    return [_shortened(place - pin.position(pose.vertices), REACH) for pin, place in pins]
+
+
+def _shortened(way: FloatArray, most: float) -> FloatArray:
+    length = float(np.linalg.norm(way))
+    return way if length <= most else way * (most / length)
+
+
+def _squares(
+    space: PoseSpace, codes: FloatArray, by_vertices: FloatArray, ways: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton of half the squared ways that are left: the first patch's, then pins'."""
+    rows = space.pull_back(codes, by_vertices)
+    weights = np.full(len(rows), PIN_WEIGHT)
+    weights[:3] = 1.0
+    weighted = rows * weights[:, None]
+    return weighted.T @ rows, -(np.concatenate(ways) @ weighted)

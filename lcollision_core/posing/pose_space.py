@@ -1,0 +1,128 @@
+"""What dragging, contacts and the exact check know of a space of poses, and the latent one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.embedding import Embedding
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+_JACOBIAN_POSES = 8
+_STIFFENING = 1e-3
+"""Of the mean diagonal: what a code costs that moves no vertex, so that the metric is definite."""
+
+_LEAST_VARIANCE = 0.02
+"""Of the mean variance of the training codes: few poses leave most directions without any."""
+
+
+class PoseSpace(Protocol):
+    """Poses of one mesh as vectors of D numbers, the codes, that belong to K body parts.
+
+    Lengths are normalised, and vertices lie in the model's frame. All of it may be shared between
+    threads.
+    """
+
+    @property
+    def topology(self) -> Topology:
+        """The connectivity of all poses."""
+
+    @property
+    def rest_vertices(self) -> FloatArray:
+        """(V, 3) float64 array, the reference."""
+
+    @property
+    def low(self) -> FloatArray:
+        """(D,) float64 array, the lower bounds of the codes."""
+
+    @property
+    def high(self) -> FloatArray:
+        """(D,) float64 array, the upper bounds."""
+
+    @property
+    def group_sizes(self) -> tuple[int, ...]:
+        """How many codes each group has; groups follow each other."""
+
+    @property
+    def n_domains(self) -> int:
+        """K, the number of body parts."""
+
+    @property
+    def vertex_domain(self) -> npt.NDArray[np.intp]:
+        """(V,) the body part that leads each vertex, from 0."""
+
+    @property
+    def metric(self) -> FloatArray:
+        """(D, D) symmetric positive definite G.
+
+        (Z - Z')^T G (Z - Z') is, to first order, the mean squared vertex displacement.
+        """
+
+    @property
+    def precision(self) -> FloatArray:
+        """(D, D) symmetric positive definite P: Z^T P Z is D for a typical move between poses."""
+
+    def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
+        """Return which codes body parts own: (D,)."""
+
+    def decode(self, codes: FloatArray) -> FloatArray:
+        """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
+
+    def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
+        """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
+
+
+class LatentPoseSpace:
+    """The latent poses of an embedding as a `PoseSpace`.
+
+    Parameters
+    ----------
+    embedding : decodes
+    """
+
+    def __init__(self, embedding: Embedding) -> None:
+        self.embedding = embedding
+        self.topology, self.rest_vertices = embedding.topology, embedding.rest_vertices
+        self.low, self.high = embedding.box.low, embedding.box.high
+        self.group_sizes, self.n_domains = embedding.group_sizes, embedding.n_domains
+        self.vertex_domain = embedding.attention_mask.argmax(axis=0)
+
+    @cached_property
+    def metric(self) -> FloatArray:
+        """J^T J / V of the decoder's Jacobian J, averaged over evenly spaced training poses."""
+        embedding = self.embedding
+        latent = embedding.training_latent
+        chosen = np.unique(np.linspace(0, len(latent) - 1, _JACOBIAN_POSES).astype(int))
+        gram = np.zeros((embedding.latent_size, embedding.latent_size))
+        for row in latent[chosen]:
+            features = embedding.decoder.features(row[None])[0]
+            tangents = embedding.decoder.tangents(row)
+            moved = embedding.codec.decode_jvp(features, tangents, n_threads=1)
+            by_code = moved.reshape(len(moved), -1)
+            gram += by_code @ by_code.T / (len(chosen) * embedding.topology.n_vertices)
+        gram[np.diag_indices_from(gram)] += _STIFFENING * np.trace(gram) / len(gram)
+        return gram
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """The inverse covariance of the training poses' codes, shrunk towards a multiple of 1."""
+        latent = self.embedding.training_latent.astype(np.float64)
+        covariance = latent.T @ latent / len(latent)
+        shrunk = _LEAST_VARIANCE * float(covariance.trace()) / len(covariance)
+        return np.linalg.inv(covariance + shrunk * np.eye(len(covariance))).astype(np.float64)
+
+    def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
+        """Return which codes belong to domains: (D,); see `Embedding.codes_of`."""
+        return self.embedding.codes_of(domains)
+
+    def decode(self, codes: FloatArray) -> FloatArray:
+        """Decode (B, D) latent poses to (B, V, 3) vertices."""
+        return self.embedding.decode(codes, n_threads=1)
+
+    def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
+        """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
+        return self.embedding.pull_back(codes, by_vertices)
