@@ -120,7 +120,6 @@ def make(
         raise MeshFileError.unwritable(output, "a pose set is an .npz file", "rename it")
     require_writable(output)
     with progress_bar("Posing the body") as progress:
-        body = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)
-    write_pose_set(output, body.pose_set)
-    topology = body.pose_set.topology
-    note(f"wrote {len(body.pose_set)} poses of {topology.n_vertices} vertices to {output}")
+        poses = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)
+    write_pose_set(output, poses)
+    note(f"wrote {len(poses)} poses of {poses.topology.n_vertices} vertices to {output}")

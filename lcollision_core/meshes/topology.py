@@ -206,11 +206,6 @@ class Topology:
         gathered[..., self.unused_vertices, :] = middle
         return gathered
 
-    @property
-    def euler_characteristic(self) -> int:
-        """V - E + F over the vertices that a face names; 2 for a sphere."""
-        return self.n_vertices - len(self.unused_vertices) - len(self.edges) + self.n_faces
-
     def edge_lengths(self, vertices: npt.NDArray[Any]) -> FloatArray:
         """(E,) lengths of `edges` for one pose, `vertices` (V, 3), in its unit."""
         start, end = np.asarray(vertices, dtype=np.float64)[self.edges.T]

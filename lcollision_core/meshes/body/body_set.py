@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -11,12 +10,12 @@ import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import Progress, no_progress
-from lcollision_core.meshes.body.cache import cached_template
 from lcollision_core.meshes.body.figure import Arm, Figure, Foot, Leg
 from lcollision_core.meshes.body.motions import jump_motion, swing_motion
 from lcollision_core.meshes.body.poses import authored_poses
-from lcollision_core.meshes.body.skeleton import ANGLES, BONES, Skeleton, limits_of
+from lcollision_core.meshes.body.skeleton import BONES, Skeleton, limits_of
 from lcollision_core.meshes.body.skinning import Skin
+from lcollision_core.meshes.body.template import build_template
 from lcollision_core.meshes.pose_set import PoseSet
 from lcollision_core.meshes.topology import Topology
 
@@ -45,53 +44,13 @@ _PARTS = {
 }
 
 
-@dataclass(frozen=True)
-class BodySet:
-    """Poses of the built-in body, an upright adult of neutral build.
-
-    Attributes
-    ----------
-    vertices : (N, V, 3) float32 array, metres, z up, facing -y, its left at x > 0; the lowest
-        vertex of a pose, or of a motion's first frame, is at z = 0
-    faces : (F, 3) int32 array, outward; watertight, genus 0
-    rest_vertices : (V, 3) float32 array, arms held away from the body, free of contact
-    pose_names : N names, such as "left lunge", or "frame 12"
-    vertex_bone : (V,) int32 array, the index in `bone_names` of each vertex's strongest bone
-    bone_names : parts of the body, such as "left forearm"
-    mirror_vertex : (V,) int32 array, each vertex's image under x -> -x
-    joint_angles : (N, A) float64 array, degrees, columns as in `skeleton.ANGLES`
-    up_axis : 2, the index of z
-    """
-
-    vertices: npt.NDArray[np.float32]
-    faces: npt.NDArray[np.int32]
-    rest_vertices: npt.NDArray[np.float32]
-    pose_names: tuple[str, ...]
-    vertex_bone: npt.NDArray[np.int32]
-    bone_names: tuple[str, ...]
-    mirror_vertex: npt.NDArray[np.int32]
-    joint_angles: FloatArray
-    up_axis: int = UP_AXIS
-
-    @property
-    def pose_set(self) -> PoseSet:
-        """The poses as any other pose set, each vertex labelled with its part of the body."""
-        return PoseSet(
-            self.vertices,
-            Topology(self.faces, self.vertices.shape[1]),
-            self.pose_names,
-            up_axis=self.up_axis,
-            vertex_labels=np.array(self.bone_names)[self.vertex_bone],
-        )
-
-
 def make_body(
     kind: BodyKind,
     n_vertices: int | None = None,
     seed: int = 0,
     progress: Progress = no_progress,
-) -> BodySet:
-    """Pose the built-in body.
+) -> PoseSet:
+    """Pose the built-in body, an upright adult of neutral build.
 
     Parameters
     ----------
@@ -102,6 +61,12 @@ def make_body(
         pose excepted
     progress : called with (poses done, poses in all)
 
+    Returns
+    -------
+    poses : float32, in metres, z up, facing -y, its left at x > 0; the lowest vertex of a pose, or
+        of a motion's first frame, is at z = 0. The mesh is watertight, of genus 0, and each vertex
+        labelled with its part of the body.
+
     Raises
     ------
     ShapeError : `n_vertices` is out of range.
@@ -111,31 +76,23 @@ def make_body(
     if not MIN_VERTICES <= count <= MAX_VERTICES:
         needed = f"{MIN_VERTICES} to {MAX_VERTICES}"
         raise ShapeError.must_be("the built-in body's number of vertices", needed, count)
-    template = cached_template(count)
-    skin = Skin(template)
-    names, figures = figures_of(kind, template.skeleton, seed)
-    angles = joint_angles([*figures, authored_poses()["rest"]], template.skeleton)
-    vertices = np.empty((len(angles), count, 3))
-    for pose, figure in enumerate([*figures, authored_poses()["rest"]]):
-        row = dict(zip(ANGLES, angles[pose], strict=True))
-        vertices[pose] = skin.pose(*template.skeleton.pose(row, *figure.pelvis(template.skeleton)))
-        if pose < len(figures):
-            progress(pose + 1, len(figures))
+    template = build_template(count)
+    skin, skeleton = Skin(template), template.skeleton
+    names, figures = figures_of(kind, skeleton, seed)
+    vertices = np.empty((len(figures), count, 3))
+    for pose, figure in enumerate(figures):
+        angles = joint_angles(figure, skeleton)
+        vertices[pose] = skin.pose(*skeleton.pose(angles, *figure.pelvis(skeleton)))
+        progress(pose + 1, len(figures))
     # A jump leaves the floor, so a motion has one floor and each authored pose its own.
     lowest = vertices[..., UP_AXIS].min(axis=1)
-    if kind != "body":
-        lowest[:-1] = lowest[0]
-    vertices[..., UP_AXIS] -= lowest[:, None]
-    bone_names, vertex_bone = _parts(template.weights)
-    return BodySet(
-        vertices=vertices[:-1].astype(np.float32),
-        faces=template.faces,
-        rest_vertices=vertices[-1].astype(np.float32),
-        pose_names=names,
-        vertex_bone=vertex_bone,
-        bone_names=bone_names,
-        mirror_vertex=template.mirror,
-        joint_angles=angles[:-1],
+    vertices[..., UP_AXIS] -= lowest[:, None] if kind == "body" else lowest[0]
+    return PoseSet(
+        vertices.astype(np.float32),
+        Topology(template.faces, count),
+        names,
+        up_axis=UP_AXIS,
+        vertex_labels=_part_of_vertex(template.weights),
     )
 
 
@@ -163,19 +120,12 @@ def figures_of(
     return names, varied
 
 
-def joint_angles(figures: Sequence[Figure], skeleton: Skeleton) -> FloatArray:
-    """Joint angles of figures, held within `skeleton.LIMITS`.
-
-    Returns
-    -------
-    angles : (N, A) float64 array, degrees, columns as in `skeleton.ANGLES`
-    """
-    low, high = np.array([limits_of(name) for name in ANGLES]).T
-    table = np.zeros((len(figures), len(ANGLES)))
-    for row, figure in zip(table, figures, strict=True):
-        angles = figure.angles(skeleton)
-        row[:] = [angles.get(name, 0.0) for name in ANGLES]
-    return np.asarray(np.clip(table, low, high))
+def joint_angles(figure: Figure, skeleton: Skeleton) -> dict[str, float]:
+    """Joint angles of a figure by name, in degrees, held within `skeleton.LIMITS`."""
+    return {
+        name: float(np.clip(angle, *limits_of(name)))
+        for name, angle in figure.angles(skeleton).items()
+    }
 
 
 def _varied(figure: Figure, generator: np.random.Generator) -> Figure:
@@ -183,6 +133,9 @@ def _varied(figure: Figure, generator: np.random.Generator) -> Figure:
 
     def degrees(scale: float = 3.0) -> float:
         return float(np.clip(generator.normal(0.0, scale), -2 * scale, 2 * scale))
+
+    def moved(old: tuple[float, ...], scales: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple(angle + degrees(scale) for angle, scale in zip(old, scales, strict=True))
 
     def arm(old: Arm) -> Arm:
         return replace(
@@ -206,24 +159,15 @@ def _varied(figure: Figure, generator: np.random.Generator) -> Figure:
         right_arm=arm(figure.right_arm),
         left_leg=leg(figure.left_leg),
         right_leg=leg(figure.right_leg),
-        spine=(
-            figure.spine[0] + degrees(3.0),
-            figure.spine[1] + degrees(2.0),
-            figure.spine[2] + degrees(3.0),
-        ),
-        neck=(
-            figure.neck[0] + degrees(3.0),
-            figure.neck[1] + degrees(2.0),
-            figure.neck[2] + degrees(4.0),
-        ),
+        spine=moved(figure.spine, (3.0, 2.0, 3.0)),
+        neck=moved(figure.neck, (3.0, 2.0, 4.0)),
     )
 
 
-def _parts(weights: FloatArray) -> tuple[tuple[str, ...], npt.NDArray[np.int32]]:
-    """Names of the parts and the part of each vertex: bones that move one part are merged."""
+def _part_of_vertex(weights: FloatArray) -> npt.NDArray[np.str_]:
+    """Name the part of the body of each vertex: bones that move one part are merged."""
     part_of = [_PARTS.get(bone, bone.removesuffix(" end")) for bone in BONES]
-    names = list(dict.fromkeys(part_of))
-    merged = np.zeros((len(weights), len(names)))
-    for column, part in enumerate(part_of):
-        merged[:, names.index(part)] += weights[:, column]
-    return tuple(names), merged.argmax(axis=1).astype(np.int32)
+    names, part = np.unique(part_of, return_inverse=True)
+    merged = weights @ np.eye(len(names))[part]
+    labels: npt.NDArray[np.str_] = names[merged.argmax(axis=1)]
+    return labels

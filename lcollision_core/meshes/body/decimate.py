@@ -9,6 +9,8 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.meshes.normals import vertex_normals
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 _Point = tuple[float, float, float]
@@ -252,16 +254,6 @@ def mirror_whole(
     whole = np.concatenate([vertices, vertices[~on_rim] * [-1.0, 1.0, 1.0]])
     mirror = np.concatenate([image, np.flatnonzero(~on_rim).astype(np.int32)])
     return whole, np.concatenate([faces, image[faces[:, ::-1]]]), mirror
-
-
-def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(V, 3) means of the normals of each vertex's faces by area, of length 1."""
-    a, b, c = vertices[faces.T]
-    face_normals = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], face_normals)
-    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
 def _plane_quadrics(vertices: FloatArray, faces: npt.NDArray[np.integer]) -> list[list[float]]:

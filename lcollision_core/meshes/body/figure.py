@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.meshes.body.skeleton import (
     BONES,
     MIRROR,
+    TRUNK_ANGLES,
     Skeleton,
     turn_x,
     turn_y,
@@ -22,6 +23,11 @@ FloatArray = npt.NDArray[np.float64]
 
 STRAIGHT = 0.998
 """Fraction of its full length to which a standing leg stretches: a knee bent by seven degrees."""
+
+
+_ARM_ANGLES = ("arm raise", "arm plane", "arm turn", "elbow", "pronation", "wrist bend", "shrug")
+_LEG_ANGLES = ("hip flexion", "hip spread", "hip turn", "knee", "ankle", "toes")
+"""The joint angles that the fields of `Arm` and `Leg` give, in their order."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +105,8 @@ class Figure:
     right_arm: Arm = Arm(14)
     left_leg: Leg | Foot = Foot()
     right_leg: Leg | Foot = Foot()
-    spine: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    neck: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spine: tuple[float, ...] = (0.0, 0.0, 0.0)
+    neck: tuple[float, ...] = (0.0, 0.0, 0.0)
     drop: float = 0.0
     shift: float = 0.0
     ahead: float = 0.0
@@ -126,30 +132,16 @@ class Figure:
 
     def angles(self, skeleton: Skeleton) -> dict[str, float]:
         """Joint angles by name, in degrees."""
-        angles: dict[str, float] = {}
-        for part, values in (("spine", self.spine), ("neck", self.neck)):
-            for name, value in zip(("bend", "side", "twist"), values, strict=True):
-                angles[f"{part} {name}"] = value
-        for side, arm in (("left", self.left_arm), ("right", self.right_arm)):
-            angles[f"{side} arm raise"] = arm.lift
-            angles[f"{side} arm plane"] = arm.plane
-            angles[f"{side} arm turn"] = arm.turn
-            angles[f"{side} elbow"] = arm.elbow
-            angles[f"{side} pronation"] = arm.pronation
-            angles[f"{side} wrist bend"] = arm.wrist
-            angles[f"{side} shrug"] = arm.shrug
-        for side, leg in (("left", self.left_leg), ("right", self.right_leg)):
+        angles = dict(zip(TRUNK_ANGLES, (*self.spine, *self.neck), strict=True))
+        for side, arm, leg in (
+            ("left", self.left_arm, self.left_leg),
+            ("right", self.right_arm, self.right_leg),
+        ):
+            own = dict(zip(_ARM_ANGLES, astuple(arm), strict=True))
             if isinstance(leg, Foot):
-                own = _leg_angles(skeleton, *self.pelvis(skeleton), leg, side)
+                own |= _leg_angles(skeleton, *self.pelvis(skeleton), leg, side)
             else:
-                own = {
-                    "hip flexion": leg.flexion,
-                    "hip spread": leg.spread,
-                    "hip turn": leg.turn,
-                    "knee": leg.knee,
-                    "ankle": leg.ankle,
-                    "toes": leg.toes,
-                }
+                own |= zip(_LEG_ANGLES, astuple(leg), strict=True)
             angles |= {f"{side} {name}": value for name, value in own.items()}
         return angles
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -116,23 +117,20 @@ LIMITS: dict[str, tuple[float, float]] = {
 }
 """Least and greatest value of each joint angle; limbs have one of each for each side."""
 
-_TRUNK_ANGLES = [name for name in LIMITS if name.startswith(("spine", "neck"))]
-_LIMB_ANGLES = [name for name in LIMITS if name not in _TRUNK_ANGLES]
-ANGLES: list[str] = _TRUNK_ANGLES + [f"{s} {n}" for s in ("left", "right") for n in _LIMB_ANGLES]
-"""The joint angles of a pose, in the order of the angle tables."""
+TRUNK_ANGLES = [name for name in LIMITS if name.startswith(("spine", "neck"))]
+_LIMB_ANGLES = [name for name in LIMITS if name not in TRUNK_ANGLES]
 
 
 def limits_of(angle: str) -> tuple[float, float]:
-    """Least and greatest value of an angle of `ANGLES`, in degrees."""
+    """Least and greatest value of a joint angle, in degrees."""
     return LIMITS[angle.removeprefix("left ").removeprefix("right ")]
 
 
 def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
     """(3, 3) rotation by `angle` radians about `axis` (3,), which need not have unit length."""
     direction = np.asarray(axis, dtype=np.float64)
-    x, y, z = direction / (np.linalg.norm(direction) or 1.0)
-    cross: FloatArray = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
+    unit = direction / (np.linalg.norm(direction) or 1.0)
+    return np.asarray(Rotation.from_rotvec(angle * unit).as_matrix())
 
 
 def turn_x(degrees: float) -> FloatArray:
@@ -167,7 +165,7 @@ class Skeleton:
     """Joint positions at rest and the rotations from rest to the zero pose.
 
     In the zero pose the body stands upright with arms hanging, palms to the thighs, legs straight
-    and parallel; all `ANGLES` are zero there.
+    and parallel; all joint angles are zero there.
 
     Attributes
     ----------
@@ -216,7 +214,7 @@ class Skeleton:
 
         Parameters
         ----------
-        angles : degrees by name of `ANGLES`; what is missing is zero
+        angles : degrees by name; what is missing is zero
         orientation : (3, 3) rotation of the pelvis
         location : (3,) where the pelvis joint is, metres
 

