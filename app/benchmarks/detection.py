@@ -5,6 +5,16 @@ itself and their neighbours are dropped afterwards; they cannot stop at the firs
 counts. Each of their poses includes building their tree, as python-fcl cannot refit one; ours
 is built once for the set. All tools are given the same poses within one run, so their ratios hold
 where the machine's speed drifts from run to run.
+
+The fields of a row:
+
+vertices, poses : size of the meshes, and how many were timed
+tool : "lcollision", "python-fcl" or "coal"
+threads : that the tool used
+mode : "all" finds every pair with its depth, "first" stops at the first
+ms_per_pose : a peer's median over the poses; ours is the median over `ROUNDS` batches of
+    the batch's time over its size
+agrees : whether its set of pairs equals ours on every pose (verdicts, in mode "first")
 """
 
 from __future__ import annotations
@@ -12,14 +22,14 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from app.benchmarks.timing import Row
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.meshes import PoseSet
@@ -41,33 +51,9 @@ ROUNDS = 5
 BATCH_POSES_PER_THREAD = 32
 
 
-@dataclass(frozen=True, slots=True)
-class DetectionTiming:
-    """One row of ``lcollision benchmark detection``.
-
-    Attributes
-    ----------
-    vertices, poses : size of the meshes, and how many were timed
-    tool : "lcollision", "python-fcl" or "coal"
-    threads : that the tool used
-    mode : "all" finds every pair with its depth, "first" stops at the first
-    ms_per_pose : a peer's median over the poses; ours is the median over `ROUNDS` batches of
-        the batch's time over its size
-    agrees : whether its set of pairs equals ours on every pose (verdicts, in mode "first")
-    """
-
-    vertices: int
-    poses: int
-    tool: str
-    threads: int
-    mode: Literal["all", "first"]
-    ms_per_pose: float
-    agrees: bool
-
-
 def time_detection(
     poses: PoseSet, n_poses: int, threads: int, progress: Progress = no_progress
-) -> list[DetectionTiming]:
+) -> list[Row]:
     """Time all tools on evenly spaced poses of one set.
 
     Parameters
@@ -95,18 +81,16 @@ def time_detection(
             agrees[name] &= _disjoint_pairs(contacts, poses.faces) == expected
         progress(done + 1, len(vertices))
 
-    def row(
-        tool: str, n_threads: int, mode: Literal["all", "first"], seconds: list[float], agreed: bool
-    ) -> DetectionTiming:
-        return DetectionTiming(
-            vertices=poses.topology.n_vertices,
-            poses=len(vertices),
-            tool=tool,
-            threads=n_threads,
-            mode=mode,
-            ms_per_pose=1e3 * statistics.median(seconds),
-            agrees=agreed,
-        )
+    def row(tool: str, n_threads: int, mode: str, seconds: list[float], agreed: bool) -> Row:
+        return {
+            "vertices": poses.topology.n_vertices,
+            "poses": len(vertices),
+            "tool": tool,
+            "threads": n_threads,
+            "mode": mode,
+            "ms_per_pose": 1e3 * statistics.median(seconds),
+            "agrees": agreed,
+        }
 
     # Many poses per thread, so that start-up and idling at the end hardly count.
     repeats = -(-BATCH_POSES_PER_THREAD * threads // len(vertices))

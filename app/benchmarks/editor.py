@@ -1,4 +1,22 @@
-"""The editor as its user experiences it, model by model, each in a separate process."""
+"""The editor as its user experiences it, model by model, each in a separate process.
+
+The fields of a row; times are medians unless they say otherwise:
+
+model, vertices : what was open
+decode_ms, predict_ms : one pose alone; the second is None without a predictor
+update_ms : of an event, all until drawing begins: slider, document, thread, panels, colours
+render_ms : drawing one picture
+event_p50_ms, event_p95_ms : from a slider's move until the window shows it
+burst_lag_seconds : from the last of 250 moves within two seconds to the picture that shows it
+idle_cpu : fraction of one core while nothing happens, once the library's pictures are drawn
+start_seconds : from the command to a window that shows the pose, with warm caches
+memory_mb : the most that the process held at once
+actions : random actions done after that
+exceptions : that they raised, in the window or in a thread behind it
+errors : the text of the first
+leak_mb : memory after them, less that after each kind once and the first tenth
+mesh_is_right : whether the mesh drawn at the end is, to the bit, the model's of that pose
+"""
 
 from __future__ import annotations
 
@@ -9,10 +27,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from app.benchmarks.timing import Row
 from app.window.editor import why_no_window
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Progress, no_progress
@@ -25,50 +42,9 @@ _MOST_SECONDS, _MOST_SECONDS_AN_ACTION = 900.0, 10.0
 """Seconds until an editor counts as hanging: many times what a slow machine needs."""
 
 
-@dataclass(frozen=True, slots=True)
-class EditorTiming:
-    """One row of ``lcollision benchmark editor``. Times are medians unless they say otherwise.
-
-    Attributes
-    ----------
-    model, vertices : what was open
-    decode_ms, predict_ms : one pose alone; the second is None without a predictor
-    update_ms : of an event, all until drawing begins: slider, document, thread, panels, colours
-    render_ms : drawing one picture
-    event_p50_ms, event_p95_ms : from a slider's move until the window shows it
-    burst_lag_seconds : from the last of 250 moves within two seconds to the picture that shows it
-    idle_cpu : fraction of one core while nothing happens, once the library's pictures are drawn
-    start_seconds : from the command to a window that shows the pose, with warm caches
-    memory_mb : the most that the process held at once
-    actions : random actions done after that
-    exceptions : that they raised, in the window or in a thread behind it
-    errors : the text of the first
-    leak_mb : memory after them, less that after each kind once and the first tenth
-    mesh_is_right : whether the mesh drawn at the end is, to the bit, the model's of that pose
-    """
-
-    model: str
-    vertices: int
-    decode_ms: float
-    predict_ms: float | None
-    update_ms: float
-    render_ms: float
-    event_p50_ms: float
-    event_p95_ms: float
-    burst_lag_seconds: float
-    idle_cpu: float
-    start_seconds: float
-    memory_mb: float
-    actions: int
-    exceptions: int
-    errors: list[str]
-    leak_mb: float
-    mesh_is_right: bool
-
-
 def time_editor(
     models: Sequence[str], n_actions: int, progress: Progress = no_progress
-) -> list[EditorTiming]:
+) -> list[Row]:
     """Open the editor on each model and use it.
 
     Parameters
@@ -96,11 +72,11 @@ def time_editor(
             is_last = start == _STARTS - 1
             answer = _run(find_model(model), n_actions if is_last else -1)
             progress(index * _STARTS + start + 1, len(models) * _STARTS)
-        rows.append(EditorTiming(**answer))
+        rows.append(answer)
     return rows
 
 
-def _run(model: Path, n_actions: int) -> dict[str, Any]:
+def _run(model: Path, n_actions: int) -> Row:
     """Run one editor with separate settings, log, sessions and library; -1 only starts it."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {

@@ -62,7 +62,7 @@ class Session(QObject):
         sys.excepthook = self._on_exception
 
     def measure(self, n_actions: int) -> dict[str, Any]:
-        """Return all but the first and the last columns of `EditorTiming`."""
+        """Return the fields of a row but for start and memory, see `app.benchmarks.editor`."""
         self.settle()
         idle_cpu = self.idle_cpu()
         updates, renders, events = zip(*self.events(), strict=True)

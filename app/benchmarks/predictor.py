@@ -4,20 +4,40 @@ The exact check stops at a pose's first pair and spreads the poses over all core
 Table 3 lets its peer do; it needs the mesh, so decoding counts as its cost. python-fcl cannot stop
 at the first pair that counts (faces that share a vertex touch), so it finds all; it is timed on
 few poses and one core, and its time is scaled as if it spread over all cores without loss.
+
+The fields of a row, one for each device; times are of poses from latent codes:
+
+device : "cpu" or "cuda"
+preset : of the predictor
+batch : poses predicted at a time
+cores : that the CPU's times may use, except `gradient_ms`
+us_per_pose : prediction in such batches, microseconds, median of the rounds
+gradient_ms : logit and gradient of one pose, on one core or the GPU, median
+exact_ms_per_pose : exact verdict of a decoded pose, on all cores
+decode_ms_per_pose : decoding, on all cores
+speedup : (decode + exact) over predicted
+gemm_fraction : the network's multiplications per second over those of one large matrix
+    product on the device
+table_poses : 15 000, of the paper's Table 3
+predicted_seconds : for as many, measured
+exact_seconds : for as many, decoding included, scaled up from `exact_poses`
+exact_poses : poses that the exact check was timed on
+colliding_share : of these
+fcl_seconds : for as many, without decoding, scaled up from one core and `fcl_poses` poses
+    without any loss; None without python-fcl
+fcl_poses : poses that python-fcl was timed on
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from app.benchmarks.detection import contacts_of_fcl, missing_peers
-from app.benchmarks.timing import median_seconds
-from lcollision_core.contact import CollisionDetector
+from app.benchmarks.timing import Row, median_seconds
 from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.model import PoseModel
@@ -35,69 +55,13 @@ FCL_POSES = 8
 GEMM_SIZE = 1024
 
 
-@dataclass(frozen=True, slots=True)
-class PredictorTiming:
-    """One device's row of ``lcollision benchmark predictor``; times of poses from latent codes.
-
-    Attributes
-    ----------
-    device : "cpu" or "cuda"
-    preset : of the predictor
-    batch : poses predicted at a time
-    cores : that the CPU's times may use, except `gradient_ms`
-    us_per_pose : prediction in such batches, microseconds, median of the rounds
-    gradient_ms : logit and gradient of one pose, on one core or the GPU, median
-    exact_ms_per_pose : exact verdict of a decoded pose, on all cores
-    decode_ms_per_pose : decoding, on all cores
-    speedup : (decode + exact) over predicted
-    gemm_fraction : the network's multiplications per second over those of one large matrix
-        product on the device
-    table_poses : 15 000, of the paper's Table 3
-    predicted_seconds : for as many, measured
-    exact_seconds : for as many, decoding included, scaled up from `exact_poses`
-    exact_poses : poses that the exact check was timed on
-    colliding_share : of these
-    fcl_seconds : for as many, without decoding, scaled up from one core and `fcl_poses` poses
-        without any loss; None without python-fcl
-    fcl_poses : poses that python-fcl was timed on
-    """
-
-    device: str
-    preset: str
-    batch: int
-    cores: int
-    us_per_pose: float
-    gradient_ms: float
-    exact_ms_per_pose: float
-    decode_ms_per_pose: float
-    speedup: float
-    gemm_fraction: float
-    table_poses: int
-    predicted_seconds: float
-    exact_seconds: float
-    exact_poses: int
-    colliding_share: float
-    fcl_seconds: float | None
-    fcl_poses: int
-
-
-@dataclass(frozen=True)
-class _Exact:
-    """What decoding and the exact check cost, per pose in seconds."""
-
-    decode: float
-    check: float
-    colliding_share: float
-    fcl: float | None
-
-
 def time_predictor(
     model: PoseModel,
     predictor: CollisionPredictor,
     n_poses: int,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
-) -> list[PredictorTiming]:
+) -> list[Row]:
     """Time a model's predictor on the CPU and, where there is one, on the GPU.
 
     Parameters
@@ -113,10 +77,7 @@ def time_predictor(
     latent = drawn_poses(model, TABLE_POSES)
     exact = _time_exact(model, latent[:n_poses], progress, cancel or CancelToken())
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    return [
-        _time_on(device, predictor.on(device), latent, exact, min(n_poses, TABLE_POSES))
-        for device in devices
-    ]
+    return [_time_on(device, predictor.on(device), latent, exact) | exact for device in devices]
 
 
 def drawn_poses(model: PoseModel, n_poses: int) -> npt.NDArray[np.float32]:
@@ -128,10 +89,9 @@ def drawn_poses(model: PoseModel, n_poses: int) -> npt.NDArray[np.float32]:
 
 def _time_exact(
     model: PoseModel, latent: npt.NDArray[np.float32], progress: Progress, cancel: CancelToken
-) -> _Exact:
-    detector = CollisionDetector(
-        model.topology, model.reference, near_exclusion=model.near_exclusion
-    )
+) -> Row:
+    """Return the fields of decoding and the exact check, which are those of every device."""
+    detector = model.detector
     # Compiling and building the trees are not timed.
     first = model.decode(latent[:BATCH])
     detector.are_colliding(first[:8])
@@ -152,16 +112,21 @@ def _time_exact(
         faces = np.asarray(model.faces)
         fcl = median_seconds([partial(contacts_of_fcl, pose, faces) for pose in first[:FCL_POSES]])
     count = len(latent)
-    return _Exact(decode / count, check / count, n_colliding / count, fcl)
+    return {
+        "exact_ms_per_pose": 1e3 * check / count,
+        "decode_ms_per_pose": 1e3 * decode / count,
+        "table_poses": TABLE_POSES,
+        "exact_seconds": TABLE_POSES * (decode + check) / count,
+        "exact_poses": count,
+        "colliding_share": n_colliding / count,
+        "fcl_seconds": None if fcl is None else fcl * TABLE_POSES / available_cores(),
+        "fcl_poses": 0 if fcl is None else FCL_POSES,
+    }
 
 
 def _time_on(
-    device: str,
-    predictor: CollisionPredictor,
-    latent: npt.NDArray[np.float32],
-    exact: _Exact,
-    n_exact: int,
-) -> PredictorTiming:
+    device: str, predictor: CollisionPredictor, latent: npt.NDArray[np.float32], exact: Row
+) -> Row:
     import torch
 
     batch = latent[:BATCH]
@@ -179,27 +144,17 @@ def _time_on(
         gradient = median_seconds([lambda: predictor.logit_and_gradient(one)] * GRADIENT_ROUNDS)
     finally:
         torch.set_num_threads(n_threads)
-    cores = available_cores()
-    exact_seconds = exact.decode + exact.check
-    return PredictorTiming(
-        device=device,
-        preset=predictor.preset,
-        batch=BATCH,
-        cores=cores,
-        us_per_pose=1e6 * predicted,
-        gradient_ms=1e3 * gradient,
-        exact_ms_per_pose=1e3 * exact.check,
-        decode_ms_per_pose=1e3 * exact.decode,
-        speedup=exact_seconds / predicted,
-        gemm_fraction=predictor.flops(BATCH) / (BATCH * predicted) / _gemm_rate(device),
-        table_poses=len(latent),
-        predicted_seconds=predicted_all,
-        exact_seconds=exact_seconds * len(latent),
-        exact_poses=n_exact,
-        colliding_share=exact.colliding_share,
-        fcl_seconds=None if exact.fcl is None else exact.fcl * len(latent) / cores,
-        fcl_poses=0 if exact.fcl is None else FCL_POSES,
-    )
+    return {
+        "device": device,
+        "preset": predictor.preset,
+        "batch": BATCH,
+        "cores": available_cores(),
+        "us_per_pose": 1e6 * predicted,
+        "gradient_ms": 1e3 * gradient,
+        "speedup": exact["exact_seconds"] / TABLE_POSES / predicted,
+        "gemm_fraction": predictor.flops(BATCH) / (BATCH * predicted) / _gemm_rate(device),
+        "predicted_seconds": predicted_all,
+    }
 
 
 def _gemm_rate(device: str) -> float:

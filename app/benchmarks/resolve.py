@@ -3,6 +3,19 @@
 Each solver runs twice on each pose, on one core: alone, for the paper's figures of merit (whether
 the point that it returns is feasible for the classifier, and how much of the exact energy is
 gone), and with the whole ladder, for time, distances and the exact check.
+
+The fields of a row, means over the poses:
+
+solver : the name of a `Solver`, or "bisection"
+poses : colliding ones that were resolved
+median_ms, p95_ms : of a whole resolve, on one core
+feasible_rate : of the poses that the predictor calls colliding, how many the solver alone
+    brings to a point that it calls free; None for the baseline
+exactly_free_rate : at the end, by the exact check
+free_before_walk_back : exactly free without the ladder's last step; None for the baseline
+energy_decrease : mean fraction of the exact energy that is gone at the solver's feasible points
+latent_distance : mean ||Z - Z*|| / ||Z*||
+vertex_distance : mean distance over vertices, in normalised lengths
 """
 
 from __future__ import annotations
@@ -14,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from app.benchmarks.timing import Row
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, RigidTransform
@@ -26,36 +40,6 @@ BASELINE = "bisection"
 """Halving the segment to the first pose that is stored as free: no learning."""
 
 HALVINGS = 12
-
-
-@dataclass(frozen=True, slots=True)
-class ResolveScore:
-    """One row of ``lcollision benchmark resolve``: means over the poses.
-
-    Attributes
-    ----------
-    solver : the name of a `Solver`, or "bisection"
-    poses : colliding ones that were resolved
-    median_ms, p95_ms : of a whole resolve, on one core
-    feasible_rate : of the poses that the predictor calls colliding, how many the solver alone
-        brings to a point that it calls free; None for the baseline
-    exactly_free_rate : at the end, by the exact check
-    free_before_walk_back : exactly free without the ladder's last step; None for the baseline
-    energy_decrease : mean fraction of the exact energy that is gone at the solver's feasible points
-    latent_distance : mean ||Z - Z*|| / ||Z*||
-    vertex_distance : mean distance over vertices, in normalised lengths
-    """
-
-    solver: str
-    poses: int
-    median_ms: float
-    p95_ms: float
-    feasible_rate: float | None
-    exactly_free_rate: float
-    free_before_walk_back: float | None
-    energy_decrease: float | None
-    latent_distance: float
-    vertex_distance: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +99,7 @@ def real_poses(
     )
 
 
-def score_baseline(model: PoseModel, poses: CollidingPoses) -> ResolveScore:
+def score_baseline(model: PoseModel, poses: CollidingPoses) -> Row:
     """Bisect towards the first known free pose.
 
     Raises
@@ -143,20 +127,20 @@ def score_baseline(model: PoseModel, poses: CollidingPoses) -> ResolveScore:
         np.linalg.norm(model.decode(free, 1) - model.decode(target, 1), axis=1).mean()
         for free, target in zip(latents, poses.latents, strict=True)
     ]
-    return ResolveScore(
-        solver=BASELINE,
-        poses=len(latents),
-        median_ms=_milliseconds(seconds, 0.5),
-        p95_ms=_milliseconds(seconds, 0.95),
-        feasible_rate=None,
-        exactly_free_rate=1.0 - float(_are_colliding(model, np.stack(latents)).mean()),
-        free_before_walk_back=None,
-        energy_decrease=None,
-        latent_distance=float(
+    return {
+        "solver": BASELINE,
+        "poses": len(latents),
+        "median_ms": _milliseconds(seconds, 0.5),
+        "p95_ms": _milliseconds(seconds, 0.95),
+        "feasible_rate": None,
+        "exactly_free_rate": 1.0 - float(_are_colliding(model, np.stack(latents)).mean()),
+        "free_before_walk_back": None,
+        "energy_decrease": None,
+        "latent_distance": float(
             (np.linalg.norm(moved, axis=1) / np.linalg.norm(poses.latents, axis=1)).mean()
         ),
-        vertex_distance=float(np.mean(distances)) / model.body_size,
-    )
+        "vertex_distance": float(np.mean(distances)) / model.body_size,
+    }
 
 
 def score_solver(
@@ -166,7 +150,7 @@ def score_solver(
     metric: str,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
-) -> tuple[ResolveScore, SolverRuns]:
+) -> tuple[Row, SolverRuns]:
     """Run one solver alone and with its ladder on all poses, on the calling thread.
 
     Parameters
@@ -198,18 +182,18 @@ def score_solver(
     before_fall_back = [
         bool(result.exactly_free) and result.step != Step.FALL_BACK for result in whole
     ]
-    score = ResolveScore(
-        solver=str(solver),
-        poses=len(whole),
-        median_ms=_milliseconds(seconds, 0.5),
-        p95_ms=_milliseconds(seconds, 0.95),
-        feasible_rate=float(feasible.sum() / called.sum()) if called.any() else None,
-        exactly_free_rate=float(np.mean([bool(result.exactly_free) for result in whole])),
-        free_before_walk_back=float(np.mean(before_fall_back)),
-        energy_decrease=-float(change.mean()) if len(change) else None,
-        latent_distance=float(np.mean([result.latent_distance for result in whole])),
-        vertex_distance=float(np.mean([result.vertex_distance_mean for result in whole])),
-    )
+    score = {
+        "solver": str(solver),
+        "poses": len(whole),
+        "median_ms": _milliseconds(seconds, 0.5),
+        "p95_ms": _milliseconds(seconds, 0.95),
+        "feasible_rate": float(feasible.sum() / called.sum()) if called.any() else None,
+        "exactly_free_rate": float(np.mean([bool(result.exactly_free) for result in whole])),
+        "free_before_walk_back": float(np.mean(before_fall_back)),
+        "energy_decrease": -float(change.mean()) if len(change) else None,
+        "latent_distance": float(np.mean([result.latent_distance for result in whole])),
+        "vertex_distance": float(np.mean([result.vertex_distance_mean for result in whole])),
+    }
     shown = called if called.any() else ~called
     runs = SolverRuns(
         solver=str(solver),

@@ -1,10 +1,14 @@
-"""How long calls take."""
+"""How long calls take, and the rows that tell of it."""
 
 from __future__ import annotations
 
 import statistics
 import time
 from collections.abc import Callable, Iterable
+from typing import Any
+
+Row = dict[str, Any]
+"""One row of a benchmark, as it stands in its JSON and is printed."""
 
 
 def median_seconds(calls: Iterable[Callable[[], object]]) -> float:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,10 +13,14 @@ from app.cli.models import measured_model, measured_model_sentence
 from app.cli.results import note_near_exclusion
 from lcollision_core.errors import LCollisionError
 
+if TYPE_CHECKING:
+    from app.benchmarks.timing import Row
+
 app = typer.Typer(help="Measure what docs/results.md quotes.", no_args_is_help=True)
 
 ModelOption = Annotated[str, typer.Option("--model", metavar="M", help="A model with a predictor.")]
 
+_MISSING = "is not installed and left out; pip install 'lcollision[bench]' brings it"
 _PREDICTOR_IN_PAPER = (
     "the paper, on other machines: SCAPE 83 s by FCL on 15 threads, 3.99 s predicted on 4 cores, "
     "1.02 s on a GTX 1080 Ti; jumping 319 s, 4.23 s and 1.13 s"
@@ -52,16 +54,16 @@ def detection(
     from lcollision_core.meshes import read_pose_set
 
     for peer in missing_peers():
-        note(f"{peer} is not installed and left out; pip install 'lcollision[bench]' brings it")
-    rows: list[dict[str, Any]] = []
+        note(f"{peer} {_MISSING}")
+    rows: list[Row] = []
     ratios: list[float] = []
     for path in data or [bundled_file("poses", "body.npz")]:
         poses = read_pose_set(path)
         with progress_bar(f"Timing {path.name}") as progress:
             timings = time_detection(poses, n_poses, available_cores(), progress)
-        rows += [asdict(timing) for timing in timings]
+        rows += timings
         # The first row of each set is ours on one thread.
-        ratios += [timing.ms_per_pose / timings[0].ms_per_pose for timing in timings]
+        ratios += [row["ms_per_pose"] / timings[0]["ms_per_pose"] for row in timings]
     if as_json:
         print_json(rows)
         return
@@ -88,12 +90,12 @@ def predictor(
     with cancel_on_interrupt() as cancel, progress_bar("Timing exact checks") as progress:
         rows = time_predictor(model, trained, n_poses, progress, cancel)
     if as_json:
-        print_json([measured_model(model) | asdict(row) for row in rows])
+        print_json([measured_model(model) | row for row in rows])
         return
     tell(f"{model.name}: {measured_model_sentence(model)}")
-    print_table([asdict(row) for row in rows])
-    if rows[0].fcl_seconds is None:
-        note("python-fcl is not installed and left out; pip install 'lcollision[bench]' brings it")
+    print_table(rows)
+    if rows[0]["fcl_seconds"] is None:
+        note(f"python-fcl {_MISSING}")
     note(_PREDICTOR_IN_PAPER)
 
 
@@ -155,9 +157,9 @@ def resolve(
             draw_histograms(run, figure)
         note(f"drew {2 * len(runs)} histograms into {figure}")
     if as_json:
-        print_json([asdict(row) | {"near_exclusion": model.near_exclusion} for row in rows])
+        print_json([row | {"near_exclusion": model.near_exclusion} for row in rows])
         return
-    print_table([asdict(row) for row in rows])
+    print_table(rows)
     note_near_exclusion(model)
     note(_RESOLVE_IN_PAPER)
 
@@ -178,14 +180,14 @@ def editor(
     from app.benchmarks.editor import time_editor
 
     with progress_bar("Using the editor") as progress:
-        rows = [asdict(row) for row in time_editor(model_names or ["body"], n_actions, progress)]
+        rows = time_editor(model_names or ["body"], n_actions, progress)
     if as_json:
         print_json(rows)
     else:
         print_table(rows)
 
 
-def print_table(rows: Sequence[Mapping[str, Any]]) -> None:
+def print_table(rows: list[Row]) -> None:
     """Print measurements that have the same fields, a column each, the fields down the side."""
     from rich.console import Console
     from rich.table import Table

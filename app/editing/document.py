@@ -22,11 +22,11 @@ from app.work.frames import ExactVerdict, LiveFrame
 from app.work.live_pose import LivePose
 from app.work.long_work import Job, LongWork
 from app.work.threads import Failure
-from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
 
 if TYPE_CHECKING:
     from lcollision_core.meshes import FileStamp
-    from lcollision_core.model import MirroredPose, NamedPose, PoseModel
+    from lcollision_core.model import MirroredPose, NamedPose, OtherModelError, PoseModel
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
@@ -75,9 +75,9 @@ class PoseDocument(CodeEditing):
     message : str, one sentence for the status bar
     failed : Failure, one sentence and its details, for a dialog
     opened : Path, the file of poses or of a model that is in now
-    wrong_scale : WrongScale, where a mesh to import is in another unit
+    wrong_scale : Path and WrongScaleError, where a mesh to import is in another unit
     imported : Path, the mesh that has become the pose
-    of_other_model : OtherModel, a file of poses that could not be opened with this model
+    of_other_model : OtherModelError, where a file of poses needs another model that is known
     recovered : Path, the poses file that `recover` has put in
     """
 
@@ -92,7 +92,7 @@ class PoseDocument(CodeEditing):
     opened = Signal(object)
     imported = Signal(object)
     of_other_model = Signal(object)
-    wrong_scale = Signal(object)
+    wrong_scale = Signal(object, object)
     recovered = Signal(object)
 
     def __init__(
@@ -448,8 +448,8 @@ class PoseDocument(CodeEditing):
         self.message.emit(f"Opened {opened.model.name}")
         self.opened.emit(Path(opened.file))
 
-    def _on_poses(self, read: jobs.ReadPoses | jobs.OtherModel) -> None:
-        if isinstance(read, jobs.OtherModel):
+    def _on_poses(self, read: jobs.ReadPoses | OtherModelError) -> None:
+        if isinstance(read, LCollisionError):
             self.of_other_model.emit(read)
             return
         if read.opened is not None:
@@ -473,12 +473,12 @@ class PoseDocument(CodeEditing):
         self.message.emit(f"Saved the body parts in {self.model.name}")
 
     def _on_recovered(
-        self, name: str, file: Path | None, read: jobs.ReadPoses | jobs.OtherModel
+        self, name: str, file: Path | None, read: jobs.ReadPoses | OtherModelError
     ) -> None:
         from lcollision_core.meshes import file_stamp
 
-        if isinstance(read, jobs.OtherModel):
-            self.failed.emit(read.failure)
+        if isinstance(read, LCollisionError):
+            self.failed.emit(Failure.of(read))
             return
         if read.opened is not None:
             self._put_in(read.opened)
@@ -496,9 +496,9 @@ class PoseDocument(CodeEditing):
         if not self._closed:
             self.failed.emit(Failure.of(error))
 
-    def _on_encoded(self, path: Path, pose: NamedPose | jobs.WrongScale) -> None:
-        if isinstance(pose, jobs.WrongScale):
-            self.wrong_scale.emit(pose)
+    def _on_encoded(self, path: Path, pose: NamedPose | WrongScaleError) -> None:
+        if isinstance(pose, WrongScaleError):
+            self.wrong_scale.emit(path, pose)
             return
         self._load(f"Import {pose.name}", pose, Source.MESH)
         error = fit_error(pose.fit_error_mean, pose.fit_error_max)

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
     from app.view.viewport import Viewport
-    from app.work.jobs import OtherModel, WrongScale
+    from lcollision_core.errors import WrongScaleError
+    from lcollision_core.model import OtherModelError
 
 POSES_SUFFIX = ".json"
 MODEL_SUFFIX = ".safetensors"
@@ -328,9 +329,10 @@ class FileActions(QObject):
         self._told = sentence
 
     @Slot(object)
-    def _on_other_model(self, found: OtherModel) -> None:
-        if ask_to_switch(self._window, found.path.name, found.model.name):
-            self._document.open_poses(found.path, found.model.path)
+    def _on_other_model(self, found: OtherModelError) -> None:
+        assert found.model is not None
+        if ask_to_switch(self._window, Path(found.where).name, found.model.name):
+            self._document.open_poses(found.where, found.model.path)
 
     @Slot()
     def _on_model(self) -> None:
@@ -345,11 +347,11 @@ class FileActions(QObject):
     def _remember(self, path: Path) -> None:
         self._settings.remember_file(str(path.resolve()))
 
-    @Slot(object)
-    def _offer_scale(self, found: WrongScale) -> None:
+    @Slot(object, object)
+    def _offer_scale(self, path: Path, found: WrongScaleError) -> None:
         """Ask whether a mesh in another unit is to be scaled, and import it then."""
-        if ask_about_scale(self._window, found):
-            self._document.import_mesh(found.path, found.factor)
+        if ask_about_scale(self._window, path.name, found):
+            self._document.import_mesh(path, found.factor)
 
     def _folder(self) -> Path:
         folder = Path(self._settings["last_folder"] or Path.home())

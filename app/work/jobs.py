@@ -15,13 +15,18 @@ import numpy.typing as npt
 
 from app.wording import counted, mirrored_name
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
-from app.work.threads import Failure
 from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
     from lcollision_core.meshes import FileStamp, RigidTransform
-    from lcollision_core.model import ListedModel, MirroredPose, NamedPose, PoseFile, PoseModel
+    from lcollision_core.model import (
+        MirroredPose,
+        NamedPose,
+        OtherModelError,
+        PoseFile,
+        PoseModel,
+    )
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 Float32Array = npt.NDArray[np.float32]
@@ -52,22 +57,6 @@ class ReadPoses:
     held: PoseFile
     stamp: FileStamp | None
     opened: OpenedModel | None
-
-
-@dataclass(frozen=True)
-class OtherModel:
-    """A poses file that belongs to another model than the one that is open.
-
-    Attributes
-    ----------
-    path : the file
-    model : that the poses belong to
-    failure : for the user
-    """
-
-    path: Path
-    model: ListedModel
-    failure: Failure
 
 
 @dataclass(frozen=True)
@@ -121,10 +110,10 @@ def read_poses(
     path: Path,
     progress: Progress,
     cancel: CancelToken,
-) -> ReadPoses | OtherModel:
+) -> ReadPoses | OtherModelError:
     """Read a poses file of a model, which is opened first where it is None.
 
-    Returns `OtherModel` where the file belongs to another model that is known.
+    Where the file belongs to another model that is known, the error that names it comes back.
     """
     from lcollision_core.meshes import file_stamp
     from lcollision_core.model import OtherModelError, read_pose_file
@@ -139,35 +128,20 @@ def read_poses(
     except OtherModelError as error:
         if error.model is None:
             raise
-        return OtherModel(path, error.model, Failure.of(error))
+        return error
     cancel.raise_if_cancelled()
     if not held.all_poses:
         raise ModelFileError("holds no poses", "open a file that has some", where=path)
     return ReadPoses(path, held, stamp, opened)
 
 
-@dataclass(frozen=True)
-class WrongScale:
-    """A mesh that is in another unit than the model.
-
-    Attributes
-    ----------
-    path : its file
-    what : the problem
-    factor : what brings it into the model's unit
-    """
-
-    path: Path
-    what: str
-    factor: float
-
-
 def encode(
     model: PoseModel, path: Path, scale: float, _: Progress, cancel: CancelToken
-) -> NamedPose | WrongScale:
+) -> NamedPose | WrongScaleError:
     """Read a mesh of a model's topology as a latent pose, named after its file.
 
-    `scale` brings it into the model's unit. Without the right one it comes back as `WrongScale`.
+    `scale` brings it into the model's unit. Without the right one, the error that names it comes
+    back.
     """
     from lcollision_core.model import encode_mesh, read_model_mesh
 
@@ -176,7 +150,7 @@ def encode(
     try:
         return encode_mesh(mesh, model, scale, cancel)
     except WrongScaleError as error:
-        return WrongScale(path, error.headline, error.factor)
+        return error
 
 
 def mirror_poses(

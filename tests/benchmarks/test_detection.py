@@ -39,16 +39,16 @@ def crossing_sheets() -> PoseSet:
 def test_peers_find_the_same_pairs(crossing_sheets: PoseSet) -> None:
     assert detection.missing_peers() == []
     rows = detection.time_detection(crossing_sheets, n_poses=3, threads=2)
-    assert [(row.tool, row.threads, row.mode) for row in rows] == [
+    assert [(row["tool"], row["threads"], row["mode"]) for row in rows] == [
         ("lcollision", 1, "all"),
         ("lcollision", 2, "all"),
         ("lcollision", 1, "first"),
         ("python-fcl", 1, "all"),
         ("coal", 1, "all"),
     ]
-    assert all(row.agrees for row in rows)
-    assert all(row.ms_per_pose > 0 for row in rows)
-    assert {(row.vertices, row.poses) for row in rows} == {(162, 3)}
+    assert all(row["agrees"] for row in rows)
+    assert all(row["ms_per_pose"] > 0 for row in rows)
+    assert {(row["vertices"], row["poses"]) for row in rows} == {(162, 3)}
 
 
 def test_a_peer_that_differs_is_exposed(
@@ -57,7 +57,7 @@ def test_a_peer_that_differs_is_exposed(
     find = detection._PEERS["coal"]
     monkeypatch.setitem(detection._PEERS, "coal", lambda *mesh: find(*mesh)[:-1:2])
     rows = detection.time_detection(crossing_sheets, n_poses=3, threads=1)
-    assert {row.tool: row.agrees for row in rows} == {
+    assert {row["tool"]: row["agrees"] for row in rows} == {
         "lcollision": True,
         "python-fcl": True,
         "coal": False,

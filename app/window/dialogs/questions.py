@@ -15,7 +15,7 @@ from app.wording import menu_text, one_line, with_capital
 
 if TYPE_CHECKING:
     from app.editing.recovery import LostPose
-    from app.work.jobs import WrongScale
+    from lcollision_core.errors import WrongScaleError
 
 _WIDTH = 400
 """Least width, so that no title is cut."""
@@ -89,12 +89,12 @@ def ask_to_switch(parent: QWidget, file: str, model: str) -> bool:
     return _ask(parent, "Poses of another model", text, note, buttons) is Choice.SAVE
 
 
-def ask_about_scale(parent: QWidget, found: WrongScale) -> bool:
+def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
     """Offer to import a mesh that is in another unit; whether it is to be scaled."""
-    text = f"“{found.path.name}” seems to be in another unit."
+    text = f"“{file}” seems to be in another unit."
     note = (
-        f"{with_capital(found.what)}. Scaled by {found.factor:.6g} it fits; exported, it has its "
-        f"own size again."
+        f"{with_capital(found.headline)}. Scaled by {found.factor:.6g} it fits; exported, it has "
+        f"its own size again."
     )
     buttons = ("Scale and import", "", "Cancel")
     return _ask(parent, "Another unit", text, note, buttons) is Choice.SAVE

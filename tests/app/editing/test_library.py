@@ -313,8 +313,8 @@ def test_a_file_of_another_model_offers_that_model(
     with qtbot.waitSignal(document.of_other_model) as told:
         document.open_poses(path)
     (found,) = told.args
-    assert (found.path, found.model.name) == (path, "snake")
-    assert snake.fingerprint not in f"{found.failure.headline} {found.failure.next_step}"
+    assert (found.where, found.model.name) == (str(path), "snake")
+    assert snake.fingerprint not in str(found)
     assert document.latent is before
     with qtbot.waitSignal(document.opened):
         document.open_poses(path, found.model.path)
