@@ -171,7 +171,12 @@ class DomainRow(HoverRow):
         if energy is not None:
             # The root of an energy is a depth.
             fraction = math.sqrt(max(energy, 0.0)) / FULL_PREDICTED
-            self.bar.setValue(round(_BAR_STEPS * min(fraction, 1.0)))
+            step = round(_BAR_STEPS * min(fraction, 1.0))
+            if step != self.bar.value():
+                # Or else Qt would paint the whole window at once, for each bar again.
+                self.bar.setUpdatesEnabled(False)
+                self.bar.setValue(step)
+                self.bar.setUpdatesEnabled(True)
             self.setToolTip(plain_tip(f"{self._name}: predicted overlap {overlap_text(energy)}"))
 
 

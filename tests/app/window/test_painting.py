@@ -1,0 +1,42 @@
+"""When a window is painted while a pose changes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from pytestqt.qtbot import QtBot
+
+from app.window.main_window import MainWindow
+from app.work import live_pose
+from lcollision_core.model import sample_poses
+from tests.app.windows import PATIENCE, rest
+
+
+def test_the_window_is_painted_only_once_all_follows_the_pose(
+    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_pose, "_QUICK_SECONDS", math.inf)
+    monkeypatch.setattr(live_pose, "_PATIENCE_SECONDS", PATIENCE / 1e3)
+    document, canvas = window.document, window.viewport.canvas
+    assert canvas is not None
+    bars = [row.bar for row in window.collision.prediction.rows]
+    free = np.array(document.latent)
+    colliding = sample_poses(document.model, 1, 0, colliding=True)[0]
+    # After the first of these frames the next is known to be quick.
+    document.blend_towards(0.5 * colliding, 1.0)
+    rest(qtbot, window)
+    done: list[str] = []
+    # Connected last, it is called when all panels have followed.
+    document.frame_changed.connect(lambda: done.append("followed"))
+    canvas.frameSwapped.connect(lambda: done.append("painted"))
+    for latent in (colliding, free):
+        before = [bar.value() for bar in bars]
+        done.clear()
+        document.blend_towards(latent, 1.0)
+        qtbot.waitUntil(lambda: "painted" in done, timeout=PATIENCE)
+        assert done[:2] == ["followed", "painted"]
+        assert window.viewport.shown_frame is document.frame
+        assert [bar.value() for bar in bars] != before
+        rest(qtbot, window)
