@@ -55,30 +55,26 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except _UsageError as error:
             _refuse_usage(error)
-        except CancelledError:
+        except (CancelledError, KeyboardInterrupt, BrokenPipeError) as error:
+            if isinstance(error, KeyboardInterrupt):
+                note("interrupted")
+            if isinstance(error, BrokenPipeError):
+                # The reader closed the pipe, as `head` does; typer's status 1 would mean a result.
+                _drop_what_is_buffered()
             raise typer.Exit(ExitStatus.INTERRUPTED) from None
         except LCollisionError as error:
-            note(str(error))
-            raise typer.Exit(ExitStatus.BAD_INPUT) from None
-        except KeyboardInterrupt:
-            note("interrupted")
-            raise typer.Exit(ExitStatus.INTERRUPTED) from None
+            sentence = str(error)
         except MemoryError:
-            note("out of memory; give it smaller meshes or fewer poses")
-            raise typer.Exit(ExitStatus.BAD_INPUT) from None
-        except BrokenPipeError:
-            # The reader closed the pipe, as `head` does; typer's status 1 would mean a result.
-            _drop_what_is_buffered()
-            raise typer.Exit(ExitStatus.INTERRUPTED) from None
+            sentence = "out of memory; give it smaller meshes or fewer poses"
         except OSError as error:
-            if error.errno != errno.ENOSPC:
-                if error.filename is None:
-                    raise
-                note(f"{error.filename}: {error.strerror}; choose another name or place")
-                raise typer.Exit(ExitStatus.BAD_INPUT) from None
-            _drop_what_is_buffered()
-            note("the answer cannot be written: the disk is full")
-            raise typer.Exit(ExitStatus.BAD_INPUT) from None
+            sentence = f"{error.filename}: {error.strerror}; choose another name or place"
+            if error.errno == errno.ENOSPC:
+                _drop_what_is_buffered()
+                sentence = "the answer cannot be written: the disk is full"
+            elif error.filename is None:
+                raise
+        note(sentence)
+        raise typer.Exit(ExitStatus.BAD_INPUT)
 
 
 def _drop_what_is_buffered() -> None:

@@ -47,12 +47,11 @@ def mirror(
             found.append(model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel))
             progress(len(found), len(named))
     images = [p.mirrored(m) for p, m in zip(named, found, strict=True)]
-    written = write_result(destination, model, images)
-    written.note()
+    written, *_ = write_result(destination, model, images)
     sources = [f"{poses}: {pose.name}" for pose in named]
     if as_json:
         rows = zip(sources, found, strict=True)
-        print_json([_row(model, source, written.output, mirrored) for source, mirrored in rows])
+        print_json([_row(model, source, written, mirrored) for source, mirrored in rows])
     else:
         for source, mirrored in zip(sources, found, strict=True):
             tell(f"{source}: {mirrored_text(mirrored)}")

@@ -69,10 +69,9 @@ def encode(
         poses = [
             replace(unfinished.finished[index][0], name=name) for index, name in enumerate(names)
         ]
-        written = write_result(destination, model, poses)
+        write_result(destination, model, poses)
     for pose in poses:
         tell(f"{pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}")
-    written.note()
 
 
 def decode(
@@ -112,7 +111,7 @@ def decode(
     model = PoseModel.load(model_name)
     named = read_poses(poses, model)
     require_format_holds(destination, model, named, mesh_format)
-    write_result(destination, model, named, mesh_format, axes=axes, scale=scale).note()
+    write_result(destination, model, named, mesh_format, axes=axes, scale=scale)
 
 
 def sample(
@@ -134,4 +133,4 @@ def sample(
         latent = sample_poses(model, count, seed, colliding, progress)
     width = len(str(count))
     poses = [NamedPose(f"sample {index + 1:0{width}d}", row) for index, row in enumerate(latent)]
-    write_result(destination, model, poses).note()
+    write_result(destination, model, poses)

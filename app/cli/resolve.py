@@ -169,7 +169,7 @@ def resolve(
                 keep=keep,
             )
         detailed = _detailed(model, requests, results) if keep_detail else [None] * len(requests)
-        written = write_result(
+        files = write_result(
             target,
             model,
             [replace(r.pose, latent=f.latent) for r, f in zip(requests, results, strict=True)],
@@ -179,15 +179,13 @@ def resolve(
                 for result, mesh in zip(results, detailed, strict=True)
             ],
         )
-    written.note()
     rows: list[dict[str, Any]] = []
-    for request, result, file, mesh in zip(requests, results, written.files, detailed, strict=True):
+    for request, result, file, mesh in zip(requests, results, files, detailed, strict=True):
         if result.note:
             note(f"{request.source}: {result.note}")
-        named = {"source": request.source, "output": str(file)}
-        rows.append(named | _facts(result) | {"near_exclusion": model.near_exclusion})
-        for untold in ("converged", "note"):
-            del rows[-1][untold]
+        row = {"source": request.source, "output": str(file), **_facts(result)}
+        del row["converged"], row["note"]
+        rows.append(row | {"near_exclusion": model.near_exclusion})
         if not as_json:
             tell(f"{request.source}: {_sentence(request, result, mesh is not None)}")
     if as_json:

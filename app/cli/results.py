@@ -58,30 +58,6 @@ class Output:
     before: FileStamp | None
 
 
-@dataclass(frozen=True)
-class WrittenPoses:
-    """The files that poses were written to.
-
-    Attributes
-    ----------
-    output : as it was named
-    files : of each pose; one file may have several
-    n_replaced : how many of the files were there before
-    """
-
-    output: Path
-    files: tuple[Path, ...]
-    n_replaced: int
-
-    def note(self) -> None:
-        """Say so on standard error."""
-        told = f"wrote {counted(len(self.files), 'pose')} to {self.output}"
-        if self.n_replaced:
-            replaced = counted(self.n_replaced, "file of the same name", "files of the same names")
-            told += f", in place of {replaced}"
-        note(told)
-
-
 def require_output(path: Path, suffix: str) -> Output:
     """Refuse an output that is not one file of a format, before the work for it is done.
 
@@ -189,11 +165,11 @@ def write_result(
     model: PoseModel,
     poses: Sequence[NamedPose],
     mesh_format: MeshFormat = "obj",
-    vertices: Sequence[npt.NDArray[np.floating] | None] | None = None,
+    vertices: Sequence[npt.NDArray[np.floating]] | None = None,
     axes: str = "model",
     scale: float | None = None,
-) -> WrittenPoses:
-    """Write poses as a .json file, one pose as a mesh, or each as a mesh of a folder.
+) -> list[Path]:
+    """Write poses as a .json file, one pose as a mesh, or each as a mesh of a folder, and say so.
 
     All of them come into a folder, or none. A file that others have written since the command
     began stays, and the poses go beside it.
@@ -204,8 +180,12 @@ def write_result(
     model : of the poses
     poses : a pose with a placement returns to it
     mesh_format : of the meshes in a folder
-    vertices : of each pose, (V, 3) to write in the place of what it decodes to, or None
+    vertices : of each pose, (V, 3) to write; what the poses decode to where None
     axes, scale : of meshes, see `export_frame`
+
+    Returns
+    -------
+    files : of each pose; one file may have several
 
     Raises
     ------
@@ -213,15 +193,12 @@ def write_result(
     """
     from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, unused_name
     from lcollision_core.model import export_frame, export_mesh, write_poses
-    from lcollision_core.posing import exported_vertices
 
     require_one_mesh(output, len(poses))
-    given = [None] * len(poses) if vertices is None else vertices
+    decoded = (model.exported_vertices(pose.latent, pose.placement) for pose in poses)
 
     def write(files: Sequence[Path]) -> None:
-        for file, pose, mesh in zip(files, poses, given, strict=True):
-            if mesh is None:
-                mesh = exported_vertices(model.decode(pose.latent), pose.placement)
+        for file, pose, mesh in zip(files, poses, vertices or decoded, strict=True):
             # OBJ and OFF would get short decimals of float32, which are other numbers in float64.
             frame = export_frame(model, axes, file, scale)
             export_mesh(file, model, mesh.astype(float), pose.placement, frame)
@@ -232,7 +209,8 @@ def write_result(
         n_replaced = sum((path / name).exists() for name in names)
         with atomic_files(path) as unfinished:
             write([unfinished / name for name in names])
-        return WrittenPoses(path, tuple(path / name for name in names), n_replaced)
+        _tell_written(path, len(poses), n_replaced)
+        return [path / name for name in names]
     with locked(path):
         n_replaced = int(path.exists())
         if n_replaced and file_stamp(path) != output.before:
@@ -245,4 +223,13 @@ def write_result(
             write_poses(path, model, poses)
         else:
             write([path])
-    return WrittenPoses(path, (path,) * len(poses), n_replaced)
+    _tell_written(path, len(poses), n_replaced)
+    return [path] * len(poses)
+
+
+def _tell_written(output: Path, n_poses: int, n_replaced: int) -> None:
+    told = f"wrote {counted(n_poses, 'pose')} to {output}"
+    if n_replaced:
+        replaced = counted(n_replaced, "file of the same name", "files of the same names")
+        told += f", in place of {replaced}"
+    note(told)

@@ -123,9 +123,8 @@ def _accepted(setting: Setting, value: Any) -> Any:
     try:
         if isinstance(default, bool):
             # An ini file keeps words.
-            accepted: Any = (
-                value if isinstance(value, bool) else {"true": True, "false": False}[value]
-            )
+            words = {"true": True, "false": False}
+            accepted: Any = value if isinstance(value, bool) else words[value]
         elif isinstance(default, tuple):
             # QSettings gives a list of one back as its item.
             items = [value] if isinstance(value, str) else list(value or ())

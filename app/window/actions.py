@@ -156,7 +156,7 @@ def make_action(spec: Spec, parent: QObject) -> QAction:
 
 
 def make_choices(
-    specs: Mapping[Any, Spec], chosen: Any, slot: Callable[[QAction], None], parent: QObject
+    specs: Mapping[Any, Spec], chosen: Any, choose: Callable[[Any], None], parent: QObject
 ) -> list[QAction]:
     """Make exclusive actions; each carries its key as data.
 
@@ -164,14 +164,14 @@ def make_choices(
     ----------
     specs : by key
     chosen : key of the one that is on at first
-    slot : called with the action that the user chooses
+    choose : called with the key that the user chooses
     """
     group = QActionGroup(parent)
     for key, spec in specs.items():
         action = group.addAction(make_action(replace(spec, checkable=chosen is not None), parent))
         action.setData(key)
         action.setChecked(key == chosen)
-    group.triggered.connect(slot)
+    group.triggered.connect(lambda action: choose(action.data()))
     return group.actions()
 
 

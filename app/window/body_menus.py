@@ -112,9 +112,8 @@ class BodyMenus(QObject):
         return menu
 
     def _new_menu(self) -> QMenu:
-        menu = QMenu(self._window)
+        menu = QMenu(self._window, toolTipsVisible=True)
         menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
-        menu.setToolTipsVisible(True)
         return menu
 
     def _add(self, menu: QMenu, text: str, act: Callable[..., object], *values: object) -> QAction:

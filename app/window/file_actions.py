@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -270,24 +271,23 @@ class FileActions(QObject):
 
     def _listing(self, title: str, fill: Callable[[], None]) -> QMenu:
         """Make a menu that is refilled whenever it is about to be shown."""
-        menu = QMenu(title, self._window)
-        menu.setToolTipsVisible(True)
+        menu = QMenu(title, self._window, toolTipsVisible=True)
         menu.aboutToShow.connect(fill)
         return menu
 
-    def _list(self, menu: QMenu, text: str, path: str) -> QAction:
+    def _list(self, menu: QMenu, text: str, path: Path) -> QAction:
         """Add a file to a menu, to be opened by a click."""
         action = menu.addAction(text)
-        action.setData(path)
-        action.setToolTip(plain_tip(path))
-        action.triggered.connect(self._on_listed)
+        action.setToolTip(plain_tip(str(path)))
+        action.triggered.connect(lambda: self._attempt(partial(self.open_path, path)))
         return action
 
     @Slot()
     def _fill_recent(self) -> None:
         self.recent_menu.clear()
         for index, name in enumerate(self._settings["recent_files"], start=1):
-            self._list(self.recent_menu, f"&{index}  {menu_text(Path(name).name)}", name)
+            path = Path(name)
+            self._list(self.recent_menu, f"&{index}  {menu_text(path.name)}", path)
         if self.recent_menu.isEmpty():
             self.recent_menu.addAction("No files yet").setEnabled(False)
 
@@ -297,16 +297,9 @@ class FileActions(QObject):
 
         self.models_menu.clear()
         for model in list_models():
-            action = self._list(self.models_menu, menu_text(model.name), str(model.path))
+            action = self._list(self.models_menu, menu_text(model.name), model.path)
             action.setCheckable(True)
             action.setChecked(model.path.absolute() == Path(self._document.model_file))
-
-    @Slot()
-    def _on_listed(self) -> None:
-        action = self.sender()
-        if isinstance(action, QAction):
-            path = Path(action.data())
-            self._attempt(lambda: self.open_path(path))
 
     @Slot()
     def _on_file(self) -> None:

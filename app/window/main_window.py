@@ -119,7 +119,7 @@ class MainWindow(QMainWindow):
         library_actions = LibraryActions(self, document, self.library, self.files, act)
         ghost, reset_camera = act["ghost"], act["reset_camera"]
         views = ViewActions(self, document, settings, self.viewport, ghost, reset_camera)
-        themes = actions.make_choices(THEMES, settings["theme"], self._on_theme_chosen, self)
+        themes = actions.make_choices(THEMES, settings["theme"], self.set_theme, self)
         self.menus = fill_menus(
             self,
             act,
@@ -406,10 +406,6 @@ class MainWindow(QMainWindow):
         action = self.sender()
         if isinstance(action, QAction):
             self.attempt(self._acts[action.objectName()])
-
-    @Slot(QAction)
-    def _on_theme_chosen(self, action: QAction) -> None:
-        self.set_theme(action.data())
 
     def _toggle_full_screen(self) -> None:
         if self.isFullScreen():

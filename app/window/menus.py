@@ -78,10 +78,8 @@ def make_bar(
     actions: Mapping[str, QAction], shadings: Sequence[QAction], cameras: QMenu
 ) -> QToolBar:
     """Make the tool bar: files and edits, the shadings in the middle, the camera at the end."""
-    bar = QToolBar("Tool bar")
+    bar = QToolBar("Tool bar", iconSize=QSize(ICON_SIZE, ICON_SIZE), movable=False)
     bar.setObjectName("bar")
-    bar.setIconSize(QSize(ICON_SIZE, ICON_SIZE))
-    bar.setMovable(False)
     bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
     for key in _BAR:
         if key == SEPARATOR:
@@ -98,13 +96,12 @@ def make_bar(
         bar.addWidget(button)
     bar.addWidget(_spring())
     bar.addAction(actions["ghost"])
-    camera = QToolButton()
+    camera = QToolButton(popupMode=QToolButton.ToolButtonPopupMode.InstantPopup)
     camera.setMenu(cameras)
     give_icon(camera, "camera")
     camera.setObjectName("cameras")
     camera.setToolTip("Camera view")
     camera.setAccessibleName("Camera view")
-    camera.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
     bar.addWidget(camera)
     bar.addAction(actions["screenshot"])
     for button in bar.findChildren(QToolButton):

@@ -55,8 +55,8 @@ class ViewActions(QObject):
             "reset_camera": lambda: viewport.set_camera(CAMERAS[0]),
         }
         shading = Shading[settings["shading"].upper()]
-        self.shadings = make_choices(SHADINGS, shading, self._on_shading_chosen, window)
-        self.cameras = make_choices(CAMERA_ACTIONS, None, self._on_camera_chosen, window)
+        self.shadings = make_choices(SHADINGS, shading, viewport.set_shading, window)
+        self.cameras = make_choices(CAMERA_ACTIONS, None, viewport.set_camera, window)
         self.shading_menu = make_menu("C&olour by", self.shadings, window)
         self.camera_menu = make_menu("&Camera view", self.cameras, window)
         viewport.shading_changed.connect(self._on_shading)
@@ -87,11 +87,3 @@ class ViewActions(QObject):
         for action in self.shadings:
             action.setChecked(action.data() is shading)
         self._settings["shading"] = shading.name.lower()
-
-    @Slot(QAction)
-    def _on_shading_chosen(self, action: QAction) -> None:
-        self._viewport.set_shading(action.data())
-
-    @Slot(QAction)
-    def _on_camera_chosen(self, action: QAction) -> None:
-        self._viewport.set_camera(action.data())

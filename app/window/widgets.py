@@ -449,9 +449,7 @@ def labelled(text: str, style: str = "", wraps: bool = False) -> QLabel:
     style : its object name in the style sheet: title, caption, verdict, headline, aside, refusal
     wraps : whether it takes as many lines as it needs
     """
-    label = QLabel(text)
-    label.setWordWrap(wraps)
-    label.setTextFormat(Qt.TextFormat.PlainText)
+    label = QLabel(text, wordWrap=wraps, textFormat=Qt.TextFormat.PlainText)
     label.setObjectName(style)
     return label
 
@@ -467,9 +465,8 @@ def show_verdict(widget: QWidget, verdict: str) -> None:
 def scrolling(page: QWidget) -> QScrollArea:
     """Return an area that scrolls a page up and down, never sideways."""
     page.setObjectName("page")
-    area = QScrollArea()
+    area = QScrollArea(widgetResizable=True)
     area.setWidget(page)
-    area.setWidgetResizable(True)
     area.setFrameShape(QFrame.Shape.NoFrame)
     area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
     area.setFocusPolicy(Qt.FocusPolicy.NoFocus)

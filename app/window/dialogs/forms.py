@@ -89,9 +89,7 @@ class Form(QDialog):
         self._refused = False
         self._fields: dict[str, QWidget] = {}
         self._readers: dict[str, Callable[[], Any]] = {}
-        self._form = QFormLayout()
-        self._form.setHorizontalSpacing(WIDE)
-        self._form.setVerticalSpacing(NORMAL)
+        self._form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=NORMAL)
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
         accept = buttons.addButton(action, QDialogButtonBox.ButtonRole.AcceptRole)
         self._refusal = labelled("", "refusal", wraps=True)

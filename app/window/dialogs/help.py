@@ -93,10 +93,8 @@ class ShortcutsDialog(QDialog):
         self.setWindowTitle("Keyboard and mouse")
         self.resize(560, min(620, self.screen().availableSize().height() - _TITLE_BAR))
         page = QWidget()
-        form = QFormLayout(page)
+        form = QFormLayout(page, horizontalSpacing=WIDE * 2, verticalSpacing=CLOSE - 2)
         form.setContentsMargins(0, 0, NORMAL, 0)
-        form.setHorizontalSpacing(WIDE * 2)
-        form.setVerticalSpacing(CLOSE - 2)
         native = QKeySequence.SequenceFormat.NativeText
         for title, actions in menus:
             form.addRow(labelled(title, "title"))

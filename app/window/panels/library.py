@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PySide6.QtCore import QItemSelectionModel, QPoint, QSize, Qt, QTimer, Signal, Slot
+from PySide6.QtCore import QItemSelectionModel, QPoint, QSize, Qt, Signal, Slot
 from PySide6.QtGui import QAction, QIcon, QImage, QPixmap
 from PySide6.QtWidgets import (
     QButtonGroup,
@@ -26,6 +26,7 @@ from app.window.panels.pose_grid import THUMBNAIL, PoseGrid
 from app.window.panels.thumbnail import draw_pose
 from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, silent, vbox
 from app.wording import menu_text, one_line
+from app.work.threads import single_shot
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -75,24 +76,19 @@ class LibraryPanel(QWidget):
         self._wanted: list[NamedPose] = []
         self._evaluator: FrameEvaluator | None = None
         self._may_draw = False
-        self._due = QTimer(self)
-        self._due.setSingleShot(True)
-        self._due.setInterval(_PAUSE)
+        self._due = single_shot(self, _PAUSE, self._draw_next)
         self.list = PoseGrid()
         self.list.setAccessibleName("Poses")
         self._sources = QButtonGroup(self)
         self.training = self._source_button("Training", "The poses that the model learned from")
         self.own = self._source_button("Library", "Your own poses of this model")
         self.of_file = self._source_button("This file", "The poses of the file that is open")
-        self.search = QLineEdit()
-        self.search.setPlaceholderText("Find a pose")
-        self.search.setClearButtonEnabled(True)
+        self.search = QLineEdit(placeholderText="Find a pose", clearButtonEnabled=True)
         self.search.setAccessibleName("Find a pose by name or tag")
         self.search.setMinimumWidth(70)
         self.search.setMaximumWidth(240)
-        self.tags = QToolButton()
+        self.tags = QToolButton(popupMode=QToolButton.ToolButtonPopupMode.InstantPopup)
         self.tags.setObjectName("filter")
-        self.tags.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
         self.tags.setToolTip("Show the poses with one tag only")
         self._tag_menu = QMenu(self.tags)
         self.tags.setMenu(self._tag_menu)
@@ -109,7 +105,6 @@ class LibraryPanel(QWidget):
         )
         self._lay_out()
         self.training.setChecked(True)
-        self._due.timeout.connect(self._draw_next)
         self._sources.buttonToggled.connect(self._on_source)
         self.search.textChanged.connect(self._filter)
         self._tag_menu.triggered.connect(self._on_tag)

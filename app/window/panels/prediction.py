@@ -121,9 +121,7 @@ class DomainRow(HoverRow):
         colour = document.model.domain_colours[domain]
         super().__init__(domain, colour, TIGHT)
         self._name = heading(document.model.domain_names[domain])
-        self.bar = QProgressBar()
-        self.bar.setTextVisible(False)
-        self.bar.setRange(0, _BAR_STEPS)
+        self.bar = QProgressBar(textVisible=False, maximum=_BAR_STEPS)
         self.bar.setMinimumWidth(_BAR_WIDTH)
         self.bar.setStyleSheet(bar_style(colour))
         # Or else the locks of a model that does not predict would follow the names.

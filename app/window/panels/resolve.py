@@ -97,8 +97,7 @@ class ResolveCard(Card):
         self.options.setToolTip("Choose how Resolve works")
         self.cancel = QPushButton("Cancel")
         self.cancel.setToolTip("Stop Resolve and leave the pose as it is (Escape)")
-        self.bar = QProgressBar()
-        self.bar.setTextVisible(False)
+        self.bar = QProgressBar(textVisible=False)
         self.working = QWidget()
         progress = vbox(ElidedLabel("Searching for a pose…"), self.bar, spacing=TIGHT)
         self.working.setLayout(hbox(progress, self.cancel, spacing=NORMAL))
@@ -149,11 +148,9 @@ class ResolveCard(Card):
             "The search, and the wait before it: what it needs is loaded and compiled once"
         )
         self._note = labelled("", "caption", wraps=True)
-        numbers = QFormLayout()
+        top = Qt.AlignmentFlag.AlignTop
+        numbers = QFormLayout(horizontalSpacing=CLOSE, verticalSpacing=2, labelAlignment=top)
         numbers.setContentsMargins(0, TIGHT, 0, TIGHT)
-        numbers.setHorizontalSpacing(CLOSE)
-        numbers.setVerticalSpacing(2)
-        numbers.setLabelAlignment(Qt.AlignmentFlag.AlignTop)
         numbers.addRow(labelled("Overlap", "caption"), self._energy)
         numbers.addRow(labelled("Moved", "caption"), self._moved)
         numbers.addRow(labelled("Took", "caption"), self._took)
