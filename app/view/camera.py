@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+Pixel = tuple[float, float]
 
 CAMERAS = ("Three-quarter", "Front", "Back", "Left", "Right", "Top")
 """Names of the preset views; left and right are the body's own."""
@@ -17,6 +18,10 @@ VIEW_ANGLE = 24.0
 """Degrees from the picture's bottom to its top: narrow, so that near limbs do not swell."""
 
 _MARGIN = 1.2
+_ALONG_SIGHT = 0.3
+"""Sine of the angle to the line of sight below which an axis counts as seen from its end."""
+_STEEPEST = 89.0
+"""Degrees above or below the horizon to which the camera is turned by hand."""
 _NEAREST, _FARTHEST = 0.05, 15.0
 """Limits of zooming, in body sizes."""
 
@@ -157,6 +162,104 @@ def zoomed(
     depths = (vertices - position) @ sight
     depth = float(np.clip(factor * depth, depths.min(), depths.max()))
     return View(position, position + max(depth, 0.5 * near) * sight, view.up)
+
+
+def turned(view: View, across: float, upwards: float) -> View:
+    """Turn a camera round its focus; it stays upright.
+
+    Parameters
+    ----------
+    across, upwards : degrees by which the scene turns to the right, and its top to the viewer
+    """
+    from scipy.spatial.transform import Rotation
+
+    arm = view.position - view.focus
+    length = float(np.linalg.norm(arm))
+    steepness = np.degrees(np.arcsin(np.clip(arm @ view.up / length, -1.0, 1.0)))
+    steeper = np.clip(steepness + upwards, -_STEEPEST, _STEEPEST) - steepness
+    sideways = np.cross(view.up, arm)
+    sideways /= max(float(np.linalg.norm(sideways)), 1e-12)
+    turn = Rotation.from_rotvec(np.radians(-across) * view.up)
+    tilt = Rotation.from_rotvec(np.radians(-steeper) * sideways)
+    return View(view.focus + turn.apply(tilt.apply(arm)), view.focus, view.up)
+
+
+def shifted(view: View, start: Pixel, end: Pixel, size: Pixel) -> View:
+    """Shift a camera so that what is as deep as its focus follows the pointer.
+
+    Parameters
+    ----------
+    start, end : of the pointer; see `seen_at`
+    size : of the picture
+    """
+    motion = seen_at(view, start, size, view.focus) - seen_at(view, end, size, view.focus)
+    return View(view.position + motion, view.focus + motion, view.up)
+
+
+def turn_about(axis: FloatArray, view: View) -> FloatArray:
+    """Return the direction on the picture in which what is before an axis moves as it turns.
+
+    Parameters
+    ----------
+    axis : (3,) array of length 1; what it turns, turns anticlockwise seen from its tip
+
+    Returns
+    -------
+    direction : (2,) array of length 1, to the right and down
+    """
+    right, upward, forward = _axes(view)
+    motion = np.cross(axis, -forward)
+    across = np.array([motion @ right, -(motion @ upward)])
+    length = float(np.linalg.norm(across))
+    if length < _ALONG_SIGHT:
+        # Seen from its end, where the upper rim goes left as it turns towards the viewer.
+        return np.array([np.sign(axis @ forward) or 1.0, 0.0])
+    direction: FloatArray = across / length
+    return direction
+
+
+def seen_at(view: View, place: Pixel, size: Pixel, deep_as: FloatArray) -> FloatArray:
+    """Return the (3,) point that is seen at a place of the picture, as deep as another point.
+
+    Parameters
+    ----------
+    place : in pixels from the picture's left and top
+    size : width and height of the picture, in the same pixels
+    deep_as : (3,) array, in the data's unit
+    """
+    axes = _axes(view)
+    depth = float((deep_as - view.position) @ axes[2])
+    pixel = _pixel(depth, size[1])
+    away = np.array([place[0] - 0.5 * size[0], 0.5 * size[1] - place[1]]) * pixel
+    point: FloatArray = view.position + away @ axes[:2] + depth * axes[2]
+    return point
+
+
+def places_of(view: View, points: npt.NDArray[Any], size: Pixel) -> FloatArray:
+    """Return where points are seen: (N, 2), in pixels from the picture's left and top.
+
+    Parameters
+    ----------
+    points : (N, 3) array, in the data's unit, before the camera
+    size : width and height of the picture
+    """
+    right, upward, depth = _axes(view) @ (points - view.position).T
+    pixel = _pixel(np.maximum(depth, 1e-9), size[1])
+    return np.stack([0.5 * size[0] + right / pixel, 0.5 * size[1] - upward / pixel], axis=1)
+
+
+def _axes(view: View) -> FloatArray:
+    """Return the camera's right, up and forward, each of length 1, as the rows of a matrix."""
+    forward = view.focus - view.position
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, view.up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(right, forward), forward])
+
+
+def _pixel(depth: Any, height: float) -> Any:
+    """Return how long one pixel of a picture is at a depth, in the data's unit."""
+    return 2.0 * depth * np.tan(np.radians(0.5 * VIEW_ANGLE)) / height
 
 
 def between(start: View, end: View, fraction: float) -> View:

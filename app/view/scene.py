@@ -9,13 +9,16 @@ import numpy.typing as npt
 import pyvista as pv
 
 from app.view.camera import VIEW_ANGLE, View
+from app.view.marks import Marks
 from app.view.outline import Outline, PartShape
+from app.view.patch import Patch
 from app.view.shading import COLLIDING_FACE
 from app.view.surface import Surface, actor_of
 
 if TYPE_CHECKING:
     from app.view.palettes import Theme
     from lcollision_core.model import PoseModel
+    from lcollision_core.posing import Grip
 
 _GHOST_OPACITY = 0.4
 _GHOST_NEAR, _GHOST_FAR = 0.004, 0.015
@@ -84,6 +87,10 @@ class Scene:
         for actor in (self._floor, self._shadow, self.body, nearer, self._ghost_actor, through):
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)
+        self._patch = Patch(
+            self.body, self.surface.polydata, model.topology, model.embedding.rest_vertices
+        )
+        self.marks = Marks(self._renderer)
         self.set_theme(theme)
 
     def set_theme(self, theme: Theme) -> None:
@@ -91,6 +98,7 @@ class Scene:
         self._renderer.set_background(theme.sky_bottom, top=theme.sky_top)
         self._floor.prop.color, self._shadow.prop.color = theme.floor, theme.shadow
         self._ghost.colours[:, :3] = pv.Color(theme.ghost).int_rgb
+        self._patch.set_colour(theme.accent)
 
     def show_floor(self, shown: bool) -> None:
         """Draw or hide the floor and the shadow on it."""
@@ -155,8 +163,17 @@ class Scene:
         shape = None if domain is None else PartShape.of(self._mask, self._faces, domain)
         self.outline.show(shape)
 
-    def fit_outline(self, sharpness: float) -> None:
-        """Let the outline follow the pose and the camera, just before a picture.
+    def show_grip(self, grip: Grip | None) -> bool:
+        """Paint the patch of a grip over the colours of the mesh, or none.
+
+        Returns
+        -------
+        changed : whether that is another one than before
+        """
+        return self._patch.show(grip)
+
+    def fit_to_screen(self, sharpness: float) -> None:
+        """Let outline, patch and marks follow the pose and the camera, just before a picture.
 
         Parameters
         ----------
@@ -165,6 +182,8 @@ class Scene:
         # Plain arrays: pyvista takes what is cut from its own for the whole.
         vertices, normals = np.asarray(self.surface.vertices), np.asarray(self.surface.normals)
         self.outline.fit(vertices, normals, sharpness)
+        self._patch.fit(sharpness)
+        self.marks.fit(self.view, sharpness)
 
     def look_like(self, other: Scene) -> None:
         """Show what another scene of the same mesh shows, from where it is looked at."""

@@ -354,7 +354,7 @@ class Viewport(QWidget):
             exact = self._document.exact
             shown = self.shading is Shading.EXACT and exact is not None
             scene.show_crossing(exact.pairs if exact is not None and shown else None)
-        scene.fit_outline(self.devicePixelRatioF())
+        scene.fit_to_screen(self.devicePixelRatioF())
 
     def _put(self, scene: Scene, frame: LiveFrame) -> None:
         before, self.shown_frame = self.shown_frame, frame

@@ -1,0 +1,118 @@
+"""The patch of the surface that would be taken hold of, painted by the graphics card."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse.csgraph import dijkstra
+from vtkmodules.vtkCommonDataModel import vtkDataObject
+
+from app.view.shading import rgb
+from lcollision_core.meshes.topology import length_graph
+
+if TYPE_CHECKING:
+    import pyvista as pv
+    from scipy.sparse import csr_matrix
+
+    from lcollision_core.meshes import Topology
+    from lcollision_core.posing import Grip
+
+_ALONG = 0.85
+"""Edges make way along the surface longer: this share of it is the least that it can be."""
+
+_FAR, _BEYOND = 3.0, 1.5
+"""Radii from the middle of what is not painted, and as far as distances are measured."""
+
+_FRAGMENT = """//VTK::Light::Impl
+  float straight = distance(patchVC.xyz, patchMiddle.xyz) / patchMiddle.w;
+  float fromMiddle = max(straight, patchVC.w);
+  float pixel = clamp(fwidth(fromMiddle), 1e-6, 2.0 * fwidth(straight) + 1e-6);
+  float inward = (1.0 - fromMiddle) / pixel / patchLook.w;
+  if (patchMiddle.w > 0.0 && inward > -2.0) {
+    float falloff = clamp(1.0 - fromMiddle * fromMiddle, 0.0, 1.0);
+    vec3 lit = fragOutput0.rgb;
+    // White is seen on any body part's colour, the theme's accent on skin.
+    float tint = max(lit.r, max(lit.g, lit.b)) - min(lit.r, min(lit.g, lit.b));
+    vec3 fill = mix(patchLook.rgb, vec3(1.0), smoothstep(0.12, 0.3, tint));
+    lit = mix(lit, fill, inward > 0.0 ? 0.15 + 0.55 * falloff * falloff : 0.0);
+    lit = mix(lit, vec3(0.08, 0.09, 0.11), clamp(2.0 - abs(inward), 0.0, 1.0));
+    lit = mix(lit, vec3(1.0), clamp(1.7 - abs(inward - 1.7), 0.0, 1.0));
+    fragOutput0.rgb = lit;
+  }
+"""
+"""A fill that falls off as the weights do, and a rim, white within dark, of constant width."""
+
+
+class Patch:
+    """Paints a grip on a surface over whatever its colours say, smooth at any size of its faces.
+
+    Distances are those of the reference, in which grips are made.
+
+    Parameters
+    ----------
+    actor : draws the surface
+    polydata : the surface
+    topology : of the surface
+    rest_vertices : (V, 3) array, the reference, in normalised length
+    """
+
+    def __init__(
+        self,
+        actor: pv.Actor,
+        polydata: pv.PolyData,
+        topology: Topology,
+        rest_vertices: npt.NDArray[Any],
+    ) -> None:
+        self._polydata = polydata
+        self._graph: csr_matrix | None = None
+        self._topology, self._rest = topology, rest_vertices
+        polydata.point_data["patch"] = np.column_stack(
+            [rest_vertices, np.full(len(rest_vertices), _FAR)]
+        ).astype(np.float32)
+        self._along = polydata.point_data["patch"]
+        actor.mapper.MapDataArrayToVertexAttribute(
+            "patchMC", "patch", vtkDataObject.FIELD_ASSOCIATION_POINTS, -1
+        )
+        shading = actor.GetShaderProperty()
+        for replace, block, text in (
+            (shading.AddVertexShaderReplacement, "Dec", "in vec4 patchMC;\nout vec4 patchVC;\n"),
+            (shading.AddVertexShaderReplacement, "Impl", "  patchVC = patchMC;\n"),
+            (shading.AddFragmentShaderReplacement, "Dec", "in vec4 patchVC;\n"),
+        ):
+            place = f"//VTK::Normal::{block}"
+            replace(place, True, f"{place}\n{text}", False)
+        shading.AddFragmentShaderReplacement("//VTK::Light::Impl", True, _FRAGMENT, False)
+        self._uniforms = shading.GetFragmentCustomUniforms()
+        self._look = [0.0, 0.0, 0.0, 1.0]
+        self._grip: Grip | None = None
+        self._uniforms.SetUniform4f("patchMiddle", [0.0, 0.0, 0.0, 0.0])
+        self.fit(1.0)
+
+    def set_colour(self, colour: str) -> None:
+        """Fill with a colour, "#rrggbb", where the surface has none of its own."""
+        self._look[:3] = (rgb(colour) / 255.0).tolist()
+
+    def show(self, grip: Grip | None) -> bool:
+        """Paint a grip, or none; return whether that is another one than before."""
+        if grip is self._grip:
+            return False
+        self._grip = grip
+        middle = [0.0, 0.0, 0.0, 0.0]
+        if grip is not None:
+            if self._graph is None:
+                self._graph = length_graph(self._topology.edges, self._rest)
+            middle = [*self._along[grip.vertex, :3].tolist(), grip.radius]
+            # Somewhat beyond the rim, which lies between two vertices.
+            beyond = _BEYOND * grip.radius
+            along = dijkstra(self._graph, directed=False, indices=grip.vertex, limit=beyond)
+            self._along[:, 3] = np.minimum(_ALONG * along / grip.radius, _FAR)
+            self._polydata.Modified()
+        self._uniforms.SetUniform4f("patchMiddle", middle)
+        return True
+
+    def fit(self, sharpness: float) -> None:
+        """Draw the rim for a screen, given its device pixels per device-independent one."""
+        self._look[3] = sharpness
+        self._uniforms.SetUniform4f("patchLook", self._look)
