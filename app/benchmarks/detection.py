@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
@@ -66,53 +67,39 @@ def time_detection(
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(n_poses, len(poses))).astype(int))
     vertices = poses.vertices[chosen].astype(np.float64)
     detector = CollisionDetector(poses.topology, vertices[0])
-    peers = {name: find for name, find in _PEERS.items() if find_spec(_MODULES[name])}
+    expected = [set(map(tuple, detector.detect(pose).pairs.tolist())) for pose in vertices]
+    # By tool, threads and mode: seconds for a pose, and whether the answer was right.
+    runs: dict[tuple[str, int, str], list[tuple[float, bool]]] = defaultdict(list)
 
-    n_expected = []
-    theirs: dict[str, list[float]] = {name: [] for name in peers}
-    agrees = dict.fromkeys(peers, True)
-    for done, pose in enumerate(vertices):
-        found = detector.detect(pose)
-        n_expected.append(len(found.pairs))
-        expected = set(map(tuple, found.pairs.tolist()))
+    # Many poses per thread, so that start-up and idling at the end hardly count.
+    repeats = -(-BATCH_POSES_PER_THREAD * threads // len(vertices))
+    batch = np.tile(vertices, (repeats, 1, 1))
+    n_pairs = np.tile([len(pairs) for pairs in expected], repeats)
+    for _ in range(ROUNDS):
+        for count in sorted({1, threads}):
+            seconds, collisions = _timed(partial(detector.detect_batch, batch, workers=count))
+            agrees = bool((collisions.n_pairs == n_pairs).all())
+            runs["lcollision", count, "all"].append((seconds / len(batch), agrees))
+        seconds, verdicts = _timed(partial(detector.are_colliding, batch, workers=1))
+        agrees = bool((verdicts == (n_pairs > 0)).all())
+        runs["lcollision", 1, "first"].append((seconds / len(batch), agrees))
+    peers = {name: find for name, find in _PEERS.items() if find_spec(_MODULES[name])}
+    for done, (pose, pairs) in enumerate(zip(vertices, expected, strict=True), 1):
         for name, find in peers.items():
             seconds, contacts = _timed(partial(find, pose, poses.faces))
-            theirs[name].append(seconds)
-            agrees[name] &= _disjoint_pairs(contacts, poses.faces) == expected
-        progress(done + 1, len(vertices))
-
-    def row(tool: str, n_threads: int, mode: str, seconds: list[float], agreed: bool) -> Row:
-        return {
+            runs[name, 1, "all"].append((seconds, _disjoint_pairs(contacts, poses.faces) == pairs))
+        progress(done, len(vertices))
+    return [
+        {
             "vertices": poses.topology.n_vertices,
             "poses": len(vertices),
             "tool": tool,
             "threads": n_threads,
             "mode": mode,
-            "ms_per_pose": 1e3 * statistics.median(seconds),
-            "agrees": agreed,
+            "ms_per_pose": 1e3 * statistics.median(seconds for seconds, _ in timed),
+            "agrees": all(agrees for _, agrees in timed),
         }
-
-    # Many poses per thread, so that start-up and idling at the end hardly count.
-    repeats = -(-BATCH_POSES_PER_THREAD * threads // len(vertices))
-    batch = np.tile(vertices, (repeats, 1, 1))
-    n_pairs = np.tile(n_expected, repeats)
-    thread_counts = [1] if threads == 1 else [1, threads]
-    ours: dict[int, list[float]] = {count: [] for count in thread_counts}
-    first: list[float] = []
-    same = dict.fromkeys(thread_counts, True)
-    same_verdicts = True
-    for _ in range(ROUNDS):
-        for count in thread_counts:
-            seconds, collisions = _timed(partial(detector.detect_batch, batch, workers=count))
-            ours[count].append(seconds / len(batch))
-            same[count] &= bool((collisions.n_pairs == n_pairs).all())
-        seconds, verdicts = _timed(partial(detector.are_colliding, batch, workers=1))
-        first.append(seconds / len(batch))
-        same_verdicts &= bool((verdicts == (n_pairs > 0)).all())
-    return [
-        *(row("lcollision", count, "all", ours[count], same[count]) for count in thread_counts),
-        row("lcollision", 1, "first", first, same_verdicts),
-        *(row(name, 1, "all", theirs[name], agrees[name]) for name in peers),
+        for (tool, n_threads, mode), timed in runs.items()
     ]
 
 

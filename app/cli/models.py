@@ -14,6 +14,8 @@ from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from lcollision_core.model import PoseModel
 
 _ERRORS = ("level1_mean", "mean", "max", "held_out_mean", "held_out_max", "pca_held_out_mean")
@@ -104,9 +106,6 @@ def domains(
     ] = None,
 ) -> None:
     """List the domains of a model, or rename them."""
-    from lcollision_core.model import PoseModel, change_model, find_model
-
-    path = find_model(model_name)
     renamings: dict[int, str] = {}
     for request in names or []:
         number, _, name = request.partition("=")
@@ -115,12 +114,8 @@ def domains(
                 "does not name a domain", "write K=NAME, such as 3=tail", where=f"{request!r}"
             )
         renamings[int(number) - 1] = name
-    if renamings:
-        _refuse_bundled(path)
-        model = change_model(path, lambda model: model.edit_domains(renamings))
-    else:
-        model = PoseModel.load(path)
-    _print_domains(describe(model))
+    rename = (lambda model: model.edit_domains(renamings)) if renamings else None
+    _print_domains(describe(_changed(model_name, rename)))
 
 
 def upright(
@@ -130,26 +125,25 @@ def upright(
     ] = None,
 ) -> None:
     """Say which axis of a model is up, or change it in the model's file."""
-    from lcollision_core.model import PoseModel, change_model, find_model
-
-    path = find_model(model_name)
-    if up is None:
-        model = PoseModel.load(path)
-    else:
-        _refuse_bundled(path)
-        model = change_model(path, lambda model: model.turned_upright("xyz".index(up)))
+    turn = None if up is None else lambda model: model.turned_upright("xyz".index(up))
+    model = _changed(model_name, turn)
     typer.echo(f"{model.name}: {'xyz'[model.up_axis]} is up")
 
 
-def _refuse_bundled(path: Path) -> None:
-    from lcollision_core.model import list_models
+def _changed(name: str, change: Callable[[PoseModel], PoseModel] | None) -> PoseModel:
+    """Load a model; change it first, in its file, which is not a bundled one."""
+    from lcollision_core.model import PoseModel, change_model, find_model, list_models
 
+    path = find_model(name)
+    if change is None:
+        return PoseModel.load(path)
     if any(listed.bundled and listed.path == path for listed in list_models()):
         raise LCollisionError(
             "is a bundled model and stays as it is",
             f"copy {path} and name the copy",
             where=path.stem,
         )
+    return change_model(path, change)
 
 
 def describe(model: PoseModel) -> dict[str, Any]:

@@ -165,24 +165,22 @@ class FileActions(QObject):
             raise LCollisionError(
                 f"Couldn't open {path}: {kind}", "choose a file of poses, a mesh or a model"
             )
-        if suffix == POSES_SUFFIX:
-            if not self.may_lose_changes():
-                return
-            self._document.open_poses(path)
-        elif suffix == MODEL_SUFFIX:
-            if not self.may_lose_changes():
-                return
-            self._document.open_model(path)
-        elif suffix in _mesh_suffixes():
-            self._document.import_mesh(path)
-        else:
+        document, meshes = self._document, _mesh_suffixes()
+        openers: dict[str, Callable[[Path], None]] = {
+            POSES_SUFFIX: document.open_poses,
+            MODEL_SUFFIX: document.open_model,
+        }
+        if suffix not in (*openers, *meshes):
             raise LCollisionError(
                 f"isn't supported ({path.name})",
-                f"open poses ({POSES_SUFFIX}), a mesh ({', '.join(_mesh_suffixes())}) or a "
-                f"model ({MODEL_SUFFIX})",
+                f"open poses ({POSES_SUFFIX}), a mesh ({', '.join(meshes)}) or a model "
+                f"({MODEL_SUFFIX})",
                 where=_kind(path),
             )
-        self._settings["last_folder"] = str(path.resolve().parent)
+        # A mesh is a step that can be undone.
+        if suffix in meshes or self.may_lose_changes():
+            openers.get(suffix, document.import_mesh)(path)
+            self._settings["last_folder"] = str(path.resolve().parent)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:
         """Open the first of some files that can be opened, and report the others afterwards.

@@ -46,24 +46,24 @@ _MISSING = (
 
 
 class ProbabilityMeter(QWidget):
-    """A bar from 0 to 1 with a line at even odds and a mark where the pose stands."""
+    """A bar from 0 to 1 with a line at even odds and a mark where the pose stands.
+
+    Attributes
+    ----------
+    probability : what is shown, None for nothing
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self._probability: float | None = None
+        self.probability: float | None = None
         self._is_aside = False
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
         self.setAccessibleName("Probability of a collision")
 
-    @property
-    def probability(self) -> float | None:
-        """What is shown; None for nothing."""
-        return self._probability
-
     def show_probability(self, probability: float | None, is_aside: bool = False) -> None:
         """Move the mark; once the exact check is known it is grey."""
-        if (probability, is_aside) != (self._probability, self._is_aside):
-            self._probability, self._is_aside = probability, is_aside
+        if (probability, is_aside) != (self.probability, self._is_aside):
+            self.probability, self._is_aside = probability, is_aside
             self.update()
 
     def sizeHint(self) -> QSize:  # noqa: N802
@@ -80,10 +80,10 @@ class ProbabilityMeter(QWidget):
         painter.setBrush(QColor(theme.track))
         painter.drawRoundedRect(bar, 4, 4)
         middle = bar.left() + EVEN_ODDS * bar.width()
-        if self._probability is not None:
-            verdict = theme.colliding if self._probability > EVEN_ODDS else theme.free
+        if self.probability is not None:
+            verdict = theme.colliding if self.probability > EVEN_ODDS else theme.free
             ink = QColor(theme.muted if self._is_aside else verdict)
-            mark = bar.left() + self._probability * bar.width()
+            mark = bar.left() + self.probability * bar.width()
             filled = QColor(ink)
             filled.setAlpha(130)
             painter.setBrush(filled)

@@ -31,48 +31,39 @@ _WAITED = 0.5
 _SIGNS = {True: ("check", "free"), False: ("error", "colliding"), None: ("info", "muted")}
 """Icon and colour for yes, no and not known."""
 
+_CHECKED = {True: "No collisions (checked)", False: "Still colliding", None: "Not checked"}
+
 
 class Fact(QWidget):
-    """One of the three facts of an outcome: yes, no or not known.
+    """One of the three facts of an outcome, with the sign of yes, no or not known.
 
     Parameters
     ----------
-    sentences : for yes, no and not known
     tip : what the fact means
     is_aside : small and grey, whatever it says
+
+    Attributes
+    ----------
+    answer : yes, no or not known
+    sign : shows it
     """
 
-    def __init__(self, sentences: tuple[str, str, str], tip: str, is_aside: bool = False) -> None:
+    def __init__(self, tip: str, is_aside: bool = False) -> None:
         super().__init__()
         self._is_aside = is_aside
-        self._sentences = dict(zip((True, False, None), sentences, strict=True))
         self.answer: bool | None = None
-        self._sign = Sign(18)
+        self.sign = Sign(18)
         self._text = labelled("", "aside" if is_aside else "", wraps=True)
         if is_aside:
             show_verdict(self._text, "aside")
         self.setToolTip(tip)
-        self.setLayout(hbox(self._sign, self._text, wide=self._text))
+        self.setLayout(hbox(self.sign, self._text, wide=self._text))
 
-    @property
-    def sign(self) -> str:
-        """The icon that is shown: "check", "error" or "info"."""
-        return self._sign.name
-
-    def show_answer(
-        self, answer: bool | None, instead: str = "", looks: bool | None = None
-    ) -> None:
-        """Say yes, no, or that it is not known.
-
-        Parameters
-        ----------
-        answer : None while not known
-        instead : said in place of the fact's own sentence, where another fact outweighs this one
-        looks : the answer that `instead` looks like
-        """
+    def say(self, sentence: str, answer: bool | None) -> None:
+        """Show a sentence that says yes, no, or that it is not known."""
         self.answer = answer
-        self._sign.show_icon(*_SIGNS[None if self._is_aside else looks if instead else answer])
-        self._text.setText(instead or self._sentences[answer])
+        self.sign.show_icon(*_SIGNS[None if self._is_aside else answer])
+        self._text.setText(sentence)
 
 
 class ResolveCard(Card):
@@ -129,19 +120,16 @@ class ResolveCard(Card):
 
     def _make_outcome(self) -> None:
         self.converged = Fact(
-            ("The search finished", "The search stopped early", "No search was needed"),
             "Whether the search ended by itself; the exact check alone decides whether the pose "
-            "collides",
+            "collides"
         )
         self.predicted_free = Fact(
-            ("Estimate: probably clear", "Estimate: probably colliding", "No estimate"),
             "The model's instant estimate of the pose: where the exact check finds otherwise, the "
             "check is right",
             is_aside=True,
         )
         self.exactly_free = Fact(
-            ("No collisions (checked)", "Still colliding", "Not checked"),
-            "The exact check of the mesh: this alone tells whether the pose collides",
+            "The exact check of the mesh: this alone tells whether the pose collides"
         )
         self._energy, self._moved, self._took = (labelled("", wraps=True) for _ in range(3))
         self._took.setToolTip(
@@ -209,21 +197,22 @@ class ResolveCard(Card):
 
         ran = result.solver_status != "not run"
         exactly_free, predicted_free = result.exactly_free, result.predicted_free
-        self.exactly_free.show_answer(exactly_free)
-        # A search that was cut short has done its work where its pose is free.
-        instead, looks = "", None
+        self.exactly_free.say(_CHECKED[exactly_free], exactly_free)
         if ran and exactly_free:
-            instead, looks = "The search found a pose without collisions", True
-        elif not ran and ALL_LOCKED in (result.note or ""):
-            instead = "No search: all body parts are locked"
-        elif not ran and result.step != Step.UNCHANGED:
-            instead = "No search: the time limit came first"
-        self.converged.show_answer(result.converged if ran else None, instead, looks)
-        overruled = exactly_free is not None and exactly_free != predicted_free
-        word = "clear" if predicted_free else "colliding"
-        self.predicted_free.show_answer(
-            predicted_free, f"Estimate: probably {word}, overruled" if overruled else ""
-        )
+            # One that was cut short has done its work where its pose is free.
+            search = "The search found a pose without collisions"
+        elif ran:
+            search = "The search finished" if result.converged else "The search stopped early"
+        elif ALL_LOCKED in (result.note or ""):
+            search = "No search: all body parts are locked"
+        elif result.step != Step.UNCHANGED:
+            search = "No search: the time limit came first"
+        else:
+            search = "No search was needed"
+        self.converged.say(search, bool(exactly_free or result.converged) if ran else None)
+        estimate = "Estimate: probably clear" if predicted_free else "Estimate: probably colliding"
+        overruled = exactly_free not in (None, predicted_free)
+        self.predicted_free.say(estimate + ", overruled" * overruled, predicted_free)
         if result.energy_before is None or result.energy_after is None:
             self._energy.setText("not measured")
         else:

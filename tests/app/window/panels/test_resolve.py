@@ -55,7 +55,7 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
     assert not resolve(qtbot, window).exactly_free
     assert LOCKED in texts(card)
     assert "No search was needed" not in texts(card)
-    assert card.converged.sign == "info"
+    assert card.converged.sign.name == "info"
     # A free pose needs none, locked or not.
     document.load_pose(NamedPose("mean", np.zeros_like(colliding)))
     assert resolve(qtbot, window).exactly_free
