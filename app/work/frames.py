@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -101,26 +99,14 @@ class FrameEvaluator:
         request_id : of the frame
         """
         start = time.perf_counter()
-        predictor = self.model.predictor if self.predicts else None
-        ahead = None
-        if predictor is not None and not predictor.needs_torch:
-            # On another core, while this one decodes.
-            ahead = _beside().submit(self._predict, latent)
-        try:
-            vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
-            normals = self.normals(vertices)
-        finally:
-            if ahead is not None:
-                wait([ahead])
-        prediction = None
-        if predictor is not None:
-            prediction = self._predict(latent) if ahead is None else ahead.result()
+        vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
+        predicts = self.predicts and self.model.predictor is not None
         return LiveFrame(
             request_id=request_id,
             latent=latent,
             vertices=_frozen(vertices),
-            normals=_frozen(normals),
-            prediction=prediction,
+            normals=_frozen(self.normals(vertices)),
+            prediction=self._predict(latent) if predicts else None,
             seconds=time.perf_counter() - start,
         )
 
@@ -148,12 +134,6 @@ class FrameEvaluator:
         from lcollision_core.meshes.normals import vertex_normals
 
         return vertex_normals(vertices, self.model.faces)
-
-
-@cache
-def _beside() -> ThreadPoolExecutor:
-    """Return the process's one thread that predicts while another decodes."""
-    return ThreadPoolExecutor(1, "prediction")
 
 
 def keep_torch_to_one_thread(model: PoseModel) -> None:
