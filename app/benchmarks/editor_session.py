@@ -237,7 +237,8 @@ class Session(QObject):
     def is_shown(self) -> bool:
         """Whether the picture on the screen is of the pose."""
         frame = self._window.viewport.shown_frame
-        return frame is not None and frame.latent is self._document.latent
+        document = self._document
+        return frame is not None and frame.latent is document.latent and not document.moving
 
     def is_settled(self) -> bool:
         """Whether no work is pending."""

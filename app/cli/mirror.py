@@ -46,7 +46,7 @@ def mirror(
         for pose in named:
             found.append(model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel))
             progress(len(found), len(named))
-    images = [p.mirrored(m) for p, m in zip(named, found, strict=True)]
+    images = [p.mirrored(m, model.pose_mirror.symmetry) for p, m in zip(named, found, strict=True)]
     written, *_ = write_result(destination, model, images)
     sources = [f"{poses}: {pose.name}" for pose in named]
     if as_json:

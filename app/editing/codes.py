@@ -53,7 +53,7 @@ class CodeEditing(PoseHistory):
         index : from 0, in the latent's order
         value : beyond the sliders' range too, as in poses that came in as meshes
         """
-        if not np.isfinite(value) or value == self.latent[index]:
+        if not np.isfinite(value) or value == self._wanted[index]:
             return
         self._set_codes(f"Move {self.code_name(index)}", index, value, run=index)
 
@@ -85,7 +85,7 @@ class CodeEditing(PoseHistory):
 
         Locked domains stay as they are.
         """
-        start = self._gesture[1].pose.latent if self._gesture else self.latent
+        start = self._gesture.before.pose.latent if self._gesture else self.latent
         target = np.asarray(latent, dtype=np.float64)
         blended = target.copy() if fraction == 1.0 else start + fraction * (target - start)
         self._edit("Blend", self._with_locked(blended))
@@ -102,9 +102,14 @@ class CodeEditing(PoseHistory):
         self._set_codes(f"Reset {self.model.domain_names[domain]}", codes, 0.0)
 
     def _set_codes(self, label: str, codes: Any, value: float, run: int | None = None) -> None:
-        latent = self.latent.copy()
+        latent = self._wanted.copy()
         latent[codes] = value
         self._edit(label, latent, run)
+
+    @property
+    def _wanted(self) -> FloatArray:
+        """(D,) codes that an edit of some of them begins with."""
+        return self.latent
 
     def set_locked(self, domain: int, locked: bool) -> None:
         """Lock a domain against Resolve, Randomise, Reset all and blending, or unlock it."""

@@ -13,13 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
-from app.editing.codes import CodeEditing
 from app.editing.commands import DocumentState, Source
 from app.editing.history import UNNAMED, read_only
+from app.editing.live_editing import LiveEditing
 from app.wording import counted, fit_error, heading, height_text, mirrored_text
 from app.work import jobs
-from app.work.frames import ExactVerdict, LiveFrame
-from app.work.live_pose import LivePose
 from app.work.long_work import Job, LongWork
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
@@ -31,11 +29,8 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
-REST_MILLISECONDS = 60
-"""How long a pose must be unchanged before it is checked exactly."""
 
-
-class PoseDocument(CodeEditing):
+class PoseDocument(LiveEditing):
     """One model, one working pose of it, the user's library, and their history.
 
     Lives in the thread of the window and computes nothing there: each change asks two workers,
@@ -45,7 +40,8 @@ class PoseDocument(CodeEditing):
     Every change of the pose or of the library is one step of `undo_stack`. Between
     `begin_gesture` and `end_gesture` changes show at once but make one step together, and none
     where they end as they began. A step on a slider outside a gesture, as from the keyboard,
-    merges with the one before when it is the same slider within a second.
+    merges with the one before when it is the same slider within a second. With Solid on the worker
+    moves the pose, which becomes what that has reached; the step is made when it has settled.
 
     Parameters
     ----------
@@ -55,8 +51,6 @@ class PoseDocument(CodeEditing):
     Attributes
     ----------
     model_file : that the model was read from, or the name of one that was not
-    frame : the newest computed one; while a slider moves, an instant behind `latent`
-    exact : the exact check of `latent`; None until then
     may_replace : asked before a model or a file comes in over edits made while it was read
 
     Signals
@@ -66,6 +60,7 @@ class PoseDocument(CodeEditing):
         `library_changed` covers `poses` and `file_poses`, `file_changed` covers `file`,
         `pose_name` and `changed`
     frame_changed, exact_changed : `frame`, `exact` are new, or None as they are not yet known
+    solid_changed, grip_radius_changed, pins_changed : look again
     pose_loaded : the pose has come in whole, from the library or a file, not by sliders
     modified_changed : bool
     outcome_changed : `outcome` is new, or None as the pose has been changed since
@@ -82,13 +77,10 @@ class PoseDocument(CodeEditing):
     """
 
     model_changed = Signal()
-    frame_changed = Signal()
-    exact_changed = Signal()
     solve_started = Signal()
     solve_progressed = Signal(object)
     solve_finished = Signal(object)
     busy_changed = Signal(str)
-    failed = Signal(object)
     opened = Signal(object)
     imported = Signal(object)
     of_other_model = Signal(object)
@@ -105,20 +97,12 @@ class PoseDocument(CodeEditing):
         self._library_folder = library_folder
         self.model_file = ""
         self._file_stamp: FileStamp | None = None
-        self._predicts = False
-        self.frame: LiveFrame | None = None
-        self.exact: ExactVerdict | None = None
-
         self._solve: int | None = None
         self._solve_began = 0.0
         self._mirroring = self._mirroring_poses = self._incoming = self._loading = 0
         self._exports: list[int] = []
         self._closed = False
         self.may_replace: Callable[[], bool] = lambda: True
-        self._live = LivePose(REST_MILLISECONDS, self)
-        self._live.frame_computed.connect(self._on_frame_computed)
-        self._live.verdict_computed.connect(self._on_verdict_computed)
-        self._live.failed.connect(self.failed)
         self._long = LongWork(self)
         self._long.busy_changed.connect(self.busy_changed)
         self._long.progressed.connect(self._on_progressed)
@@ -169,7 +153,7 @@ class PoseDocument(CodeEditing):
         from lcollision_core.resolve import ResolveOptions
 
         _ = self.model.pose_mirror
-        self.end_gesture()
+        self._close_gesture()
         self._long.cancel(self._mirroring)
         pose, options = self.pose, ResolveOptions(locked_domains=self.locked_domains)
         work = partial(self.model.mirror, pose.latent, pose.placement, pose.mirror_of, options)
@@ -215,7 +199,7 @@ class PoseDocument(CodeEditing):
         others = (self._mirroring, self._mirroring_poses, self._incoming, self._loading)
         for number in others:
             self._long.cancel(number)
-        self.frame = self.exact = self._gesture = self.file = None
+        self.frame = self.exact = self._gesture = self._drag = self.file = None
         self.file_poses = ()
         folder = self._library_folder or user_poses_folder()
         self._library = PoseLibrary(opened.model, folder, self._tell_of_library)
@@ -238,6 +222,7 @@ class PoseDocument(CodeEditing):
             self.ghost_changed,
             self.outcome_changed,
             self.locks_changed,
+            self.pins_changed,
             self.library_changed,
             self.file_changed,
         ):
@@ -312,7 +297,7 @@ class PoseDocument(CodeEditing):
         from lcollision_core.meshes import file_stamp
         from lcollision_core.model import name_of_file, write_poses
 
-        self.end_gesture()
+        self._close_gesture()
         target = Path(path) if path is not None else self.file
         if target is None:
             raise ModelFileError("the pose has no file yet", "save it under a name")
@@ -387,7 +372,7 @@ class PoseDocument(CodeEditing):
             raise ModelFileError(
                 "cannot resolve, as it has no predictor", "train one for it", where=self.model.name
             )
-        self.end_gesture()
+        self._close_gesture()
         self.cancel_resolve()
         chosen = replace(options or ResolveOptions(), locked_domains=self.locked_domains)
         work = partial(jobs.resolve, self.model, self.latent, self.placement, chosen)
@@ -428,16 +413,6 @@ class PoseDocument(CodeEditing):
 
     # The results of the workers.
 
-    @Slot(object)
-    def _on_frame_computed(self, frame: LiveFrame) -> None:
-        self.frame = frame
-        self.frame_changed.emit()
-
-    @Slot(object)
-    def _on_verdict_computed(self, verdict: ExactVerdict) -> None:
-        self.exact = verdict
-        self.exact_changed.emit()
-
     @Slot(int, object)
     def _on_progressed(self, number: int, status: object) -> None:
         if number == self._solve:
@@ -465,7 +440,7 @@ class PoseDocument(CodeEditing):
         if changed.model.fingerprint != self.model.fingerprint:
             return
         # The slider that is being dragged goes with its old name.
-        self.end_gesture()
+        self._close_gesture()
         self._model, self.model_file = changed.model, changed.file
         self._live.follow(self.model, self.latent, self._predicts)
         self._load_predictor()
@@ -506,8 +481,8 @@ class PoseDocument(CodeEditing):
         self.imported.emit(path)
 
     def _on_mirrored(self, image: MirroredPose) -> None:
-        self.end_gesture()
-        pose = self.pose.mirrored(image)
+        self._close_gesture()
+        pose = self.pose.mirrored(image, self.model.pose_mirror.symmetry)
         pose = replace(pose, latent=read_only(np.array(pose.latent, dtype=np.float64)))
         after = replace(self._state, pose=pose, ghost=None, outcome=image.resolution)
         if image.resolution is not None:
@@ -543,7 +518,7 @@ class PoseDocument(CodeEditing):
         result, ghost = found
         self._solve = None
         seconds = time.monotonic() - self._solve_began
-        self.end_gesture()
+        self._close_gesture()
         if np.array_equal(result.latent, self.latent):
             # Nothing to undo, but the reasons are worth seeing.
             self._amend(replace(self._state, ghost=None, outcome=result, outcome_seconds=seconds))
@@ -575,7 +550,7 @@ class PoseDocument(CodeEditing):
         known = self._held
 
         def arrive(value: Any) -> None:
-            self.end_gesture()
+            self._close_gesture()
             if not ask or known is None or self._state.same_as(known) or self.may_replace():
                 done(value)
 
@@ -593,7 +568,4 @@ class PoseDocument(CodeEditing):
     def _follow_latent(self) -> None:
         self.cancel_resolve()
         self._long.cancel(self._mirroring)
-        self._live.follow(self.model, self.latent, self._predicts)
-        if self.exact is not None:
-            self.exact = None
-            self.exact_changed.emit()
+        super()._follow_latent()

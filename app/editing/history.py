@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,22 @@ UNDO_STEPS = 1000
 """Most steps kept: a few kilobytes each, and two meshes for a Resolve."""
 
 
+@dataclass(frozen=True, eq=False)
+class Gesture:
+    """A drag that has begun.
+
+    Attributes
+    ----------
+    label : of its step of undo
+    before : the state that it began with
+    run : see `ChangeState`
+    """
+
+    label: str
+    before: DocumentState
+    run: int | None = None
+
+
 class PoseHistory(QObject):
     """The working pose and the user's library, and their history.
 
@@ -54,12 +70,13 @@ class PoseHistory(QObject):
     file_changed = Signal()
     library_changed = Signal()
     pose_loaded = Signal()
+    pins_changed = Signal()
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
         self._held: DocumentState | None = None
         self._library: PoseLibrary | None = None
-        self._gesture: tuple[str, DocumentState] | None = None
+        self._gesture: Gesture | None = None
         self.file: Path | None = None
         self.file_poses: tuple[NamedPose, ...] = ()
         self._saved: NamedPose | None = None
@@ -156,34 +173,38 @@ class PoseHistory(QObject):
 
     def begin_gesture(self, label: str) -> None:
         """Start a drag: what follows until `end_gesture` is one step of undo."""
-        self.end_gesture()
-        self._gesture = (label, self._state)
+        self._close_gesture()
+        self._gesture = Gesture(label, self._state)
 
     def end_gesture(self) -> None:
         """End a drag; does nothing if none has begun."""
-        if self._gesture is None:
+        self._close_gesture()
+
+    def _close_gesture(self) -> None:
+        """Make one step of what the gesture has done so far, as before another action."""
+        gesture, self._gesture = self._gesture, None
+        if gesture is None:
             return
-        label, before = self._gesture
-        self._gesture = None
-        if not before.same_as(self._state):
-            self.undo_stack.push(ChangeState(label, self._apply, before, self._state))
+        before, after = gesture.before, self._state
+        if not before.same_as(after):
+            step = ChangeState(gesture.label, self._apply, before, after, gesture.run)
+            self.undo_stack.push(step)
         self._tell_modified()
 
     def cancel_gesture(self) -> None:
         """Cancel a drag and restore its start, as for Escape."""
-        if self._gesture is not None:
-            _, before = self._gesture
-            self._gesture = None
-            self._apply(before)
+        gesture, self._gesture = self._gesture, None
+        if gesture is not None:
+            self._apply(gesture.before)
 
     def undo(self) -> None:
         """Undo the last step; a drag that has not ended is that step."""
-        self.end_gesture()
+        self._close_gesture()
         self.undo_stack.undo()
 
     def redo(self) -> None:
         """Redo the last undone step."""
-        self.end_gesture()
+        self._close_gesture()
         self.undo_stack.redo()
 
     def load_pose(self, pose: NamedPose) -> None:
@@ -385,7 +406,7 @@ class PoseHistory(QObject):
         """
         from lcollision_core.model import LibraryChange
 
-        self.end_gesture()
+        self._close_gesture()
         if not changes:
             return
         held = list(self.poses)
@@ -402,9 +423,12 @@ class PoseHistory(QObject):
         self.pose_loaded.emit()
 
     def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
+        self._push(label, self._with_latent(read_only(latent)), run)
+
+    def _with_latent(self, latent: FloatArray) -> DocumentState:
         # The fit error of a mesh does not apply to another pose.
-        pose = replace(self.pose, latent=read_only(latent), fit_error_mean=None, fit_error_max=None)
-        self._push(label, replace(self._state, pose=pose, ghost=None, outcome=None), run)
+        pose = replace(self.pose, latent=latent, fit_error_mean=None, fit_error_max=None)
+        return replace(self._state, pose=pose, ghost=None, outcome=None)
 
     def _push(self, label: str, state: DocumentState, run: int | None = None) -> None:
         """Go to another state, as a step of its own or as part of the gesture."""
@@ -469,6 +493,8 @@ class PoseHistory(QObject):
         if state.pose.latent is not before.pose.latent:
             self._follow_latent()
             self.latent_changed.emit()
+        if state.pose.pins != before.pose.pins:
+            self.pins_changed.emit()
         if state.ghost is not before.ghost:
             self.ghost_changed.emit()
         if state.outcome is not before.outcome:

@@ -199,6 +199,7 @@ class Autosave(QObject):
         for changed in (
             document.latent_changed,
             document.locks_changed,
+            document.pins_changed,
             document.library_changed,
             document.file_changed,
         ):

@@ -39,6 +39,7 @@ SETTINGS: dict[str, Setting] = {
     "theme": Setting("system", choices=("system", "light", "dark")),
     "shading": Setting("domains", choices=("plain", "domains", "predicted", "exact", "movement")),
     "show_ghost": Setting(True),
+    "solid": Setting(True),
     "model": Setting("body"),
     "recent_files": Setting(()),
     "recent_files_kept": Setting(8, 1, 30),

@@ -155,6 +155,7 @@ class Viewport(QWidget):
             self.canvas is not None
             and self.shown_frame is not None
             and self.shown_frame.latent is self._document.latent
+            and not self._document.moving
             and not self._transition.is_running
             and not self._turn.is_running
             and self.canvas.is_settled

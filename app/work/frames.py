@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import statistics
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +12,21 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
+    from lcollision_core.contact import SelfCollisions
     from lcollision_core.model import PoseModel
+    from lcollision_core.posing import DragStep, PoseDragger
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
+
+_QUICK_CHECK_SECONDS = 0.006
+"""An exact check that takes less accompanies every frame; others wait until the pose rests."""
+
+_CHECKS = 5
+"""Recent checks whose median time counts."""
+
+_NO_CONTACTS: FloatArray = np.empty((0, 3))
+_NO_CONTACTS.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,28 +41,6 @@ class PosePrediction:
 
     domain_energy: FloatArray
     collision_probability: float
-
-
-@dataclass(frozen=True, eq=False)
-class LiveFrame:
-    """One pose as it is drawn; all of it belongs to one latent.
-
-    Attributes
-    ----------
-    request_id : rises from frame to frame
-    latent : (D,) float64 array, read-only
-    vertices : (V, 3) float32 array, read-only, in the data's unit, in the reference's frame
-    normals : (V, 3) float32 array, read-only, of length 1, area-weighted
-    prediction : None for a model without a predictor
-    seconds : taken by decoding, normals and prediction
-    """
-
-    request_id: int
-    latent: FloatArray
-    vertices: Float32Array
-    normals: Float32Array
-    prediction: PosePrediction | None
-    seconds: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +64,49 @@ class ExactVerdict:
     vertex_energy: FloatArray
     colliding: bool
 
+    @classmethod
+    def of(cls, found: SelfCollisions, request_id: int) -> ExactVerdict:
+        """Keep what was found of a frame."""
+        return cls(
+            request_id=request_id,
+            pairs=_frozen(found.pairs),
+            n_near_pairs=len(found.near_pairs),
+            energy=found.energy,
+            vertex_energy=_frozen(found.vertex_energy),
+            colliding=found.colliding,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """One pose as it is drawn; all of it belongs to one latent.
+
+    Attributes
+    ----------
+    request_id : rises from frame to frame
+    latent : (D,) float64 array, read-only
+    vertices : (V, 3) float32 array, read-only, in the data's unit, in the reference's frame
+    normals : (V, 3) float32 array, read-only, of length 1, area-weighted
+    prediction : None for a model without a predictor
+    seconds : taken by all of it
+    verdict : the exact check, where it came at once
+    contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
+        the pose from going on towards its target
+    miss : what is left to the target: normalised length, radians of a twist
+    settled : whether the same target would lead no further
+    """
+
+    request_id: int
+    latent: FloatArray
+    vertices: Float32Array
+    normals: Float32Array
+    prediction: PosePrediction | None
+    seconds: float
+    verdict: ExactVerdict | None
+    contacts: FloatArray
+    miss: float = 0.0
+    settled: bool = True
+
 
 class FrameEvaluator:
     """Computes frames and exact checks of one model; for one thread at a time.
@@ -89,6 +123,7 @@ class FrameEvaluator:
     def __init__(self, model: PoseModel) -> None:
         self.model = model
         self.predicts = True
+        self._checks: deque[float] = deque(maxlen=_CHECKS)
 
     def frame(self, latent: FloatArray, request_id: int) -> LiveFrame:
         """Decode, shade and predict one pose.
@@ -100,6 +135,34 @@ class FrameEvaluator:
         """
         start = time.perf_counter()
         vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
+        return self._evaluated(latent, vertices, request_id, start)
+
+    def dragged(self, dragger: PoseDragger, target: FloatArray, request_id: int) -> LiveFrame:
+        """Drag a pose towards a target, and shade and predict where it has come.
+
+        Parameters
+        ----------
+        dragger : of this model, whose drag has begun
+        target : see `PoseDragger.move`
+        request_id : of the frame
+        """
+        start = time.perf_counter()
+        step = dragger.move(target)
+        return self._evaluated(step.latent, step.vertices, request_id, start, step)
+
+    def _evaluated(
+        self,
+        latent: FloatArray,
+        vertices: Float32Array,
+        request_id: int,
+        start: float,
+        step: DragStep | None = None,
+    ) -> LiveFrame:
+        verdict = None
+        if step is not None and step.found is not None:
+            verdict = ExactVerdict.of(step.found, request_id)
+        elif self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS:
+            verdict = self._checked(vertices, request_id)
         predicts = self.predicts and self.model.predictor is not None
         return LiveFrame(
             request_id=request_id,
@@ -107,6 +170,10 @@ class FrameEvaluator:
             vertices=_frozen(vertices),
             normals=_frozen(self.normals(vertices)),
             prediction=self._predict(latent) if predicts else None,
+            verdict=verdict,
+            contacts=_NO_CONTACTS if step is None else _frozen(step.contacts),
+            miss=0.0 if step is None else step.miss,
+            settled=step is None or step.settled,
             seconds=time.perf_counter() - start,
         )
 
@@ -119,15 +186,13 @@ class FrameEvaluator:
 
     def verdict(self, frame: LiveFrame) -> ExactVerdict:
         """Check the vertices of a frame exactly."""
-        found = self.model.detector.detect(frame.vertices)
-        return ExactVerdict(
-            request_id=frame.request_id,
-            pairs=_frozen(found.pairs),
-            n_near_pairs=len(found.near_pairs),
-            energy=found.energy,
-            vertex_energy=_frozen(found.vertex_energy),
-            colliding=found.colliding,
-        )
+        return self._checked(frame.vertices, frame.request_id)
+
+    def _checked(self, vertices: Float32Array, request_id: int) -> ExactVerdict:
+        start = time.perf_counter()
+        found = self.model.detector.detect(vertices)
+        self._checks.append(time.perf_counter() - start)
+        return ExactVerdict.of(found, request_id)
 
     def normals(self, vertices: Float32Array) -> Float32Array:
         """Return the (V, 3) float32 normals of (V, 3) float32 vertices."""

@@ -89,11 +89,16 @@ def open_model(name_or_path: str | Path, _: Progress, cancel: CancelToken) -> Op
 
 def warm_up(model: PoseModel) -> None:
     """Compute once, in another thread, what a first drag needs apart from predictions."""
+    from lcollision_core.posing import make_grip
+
     evaluator = FrameEvaluator(model)
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
     evaluator.verdict(evaluator.frame(latent, 0))
+    dragger = model.dragger()
+    dragger.begin(latent, make_grip(model.pose_space, 0))
+    dragger.move(model.reference[0])
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
 
 
@@ -163,7 +168,7 @@ def mirror_poses(
     for done, pose in enumerate(poses, 1):
         image = model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel)
         name = mirrored_name(pose.name)[:MAX_POSE_NAME_LENGTH]
-        images.append((replace(pose.mirrored(image), name=name), image))
+        images.append((replace(pose.mirrored(image, model.pose_mirror.symmetry), name=name), image))
         progress(done, len(poses))
     return images
 

@@ -22,6 +22,7 @@ from lcollision_core.model.model_store import (
 )
 from lcollision_core.model.naming import MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.model.pose_file import (
+    MAX_PINS,
     MAX_TAGS,
     NamedPose,
     OtherModelError,

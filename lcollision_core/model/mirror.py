@@ -15,7 +15,7 @@ from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.model.matching import sorted_faces
 
 if TYPE_CHECKING:
-    from lcollision_core.posing import ExactCheck
+    from lcollision_core.posing import ExactCheck, Pin
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,6 +52,13 @@ class Symmetry:
         moved = placement.apply(shift)
         turned = flip[:, None] * placement.rotation * flip
         return RigidTransform(turned, flip * moved + shift, placement.scale)
+
+    def image_of_pin(self, pin: Pin) -> Pin:
+        """Return the pin of the partner's patch in the mirrored place."""
+        position = list(pin.position)
+        position[self.axis] = 2.0 * self.offset - position[self.axis]
+        x, y, z = position
+        return replace(pin, vertex=int(self.partner[pin.vertex]), position=(x, y, z))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,9 @@ import json
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,14 @@ from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes import RigidTransform, atomic_write
 from lcollision_core.model.latent_identity import find_latent_space
-from lcollision_core.model.mirror import MirroredPose, MirrorSource, pose_bytes
+from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry, pose_bytes
 from lcollision_core.model.model_store import ListedModel, user_models_folder
 from lcollision_core.model.naming import MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.regular_files import read_regular
+
+if TYPE_CHECKING:
+    from lcollision_core.posing import Pin
 
 POSES_FORMAT = "lcollision-poses"
 POSES_VERSION = 2
@@ -31,6 +34,8 @@ MAX_FILE_BYTES = 2**28
 """Of some 80 000 poses of 110 numbers; reading takes some four times that in memory."""
 
 MAX_TAGS = 50
+
+MAX_PINS = 50
 
 _NOT_ROTATED = 1e-6
 _LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e30
@@ -53,6 +58,7 @@ class NamedPose:
     tags : to find it by in a library
     mirror_of : of a mirror image the pose that it was made from, which mirroring it again, while
         it is unchanged, gives back to the bit
+    pins : patches that stay in their places while others are dragged
     """
 
     name: str
@@ -62,13 +68,21 @@ class NamedPose:
     fit_error_max: float | None = None
     tags: tuple[str, ...] = ()
     mirror_of: MirrorSource | None = None
+    pins: tuple[Pin, ...] = ()
 
     def same_as(self, other: NamedPose) -> bool:
-        """Whether both have the same latent and placement, to the bit, whatever their names."""
-        return pose_bytes(self.latent, self.placement) == pose_bytes(other.latent, other.placement)
+        """Whether latents, placements and pins are equal, to the bit, whatever the names."""
+        mine, others = (pose_bytes(pose.latent, pose.placement) for pose in (self, other))
+        return mine == others and self.pins == other.pins
 
-    def mirrored(self, image: MirroredPose) -> NamedPose:
-        """Return the mirror image of this pose as a pose with the same name and tags."""
+    def mirrored(self, image: MirroredPose, symmetry: Symmetry) -> NamedPose:
+        """Return the mirror image of this pose as a pose with the same name and tags.
+
+        Parameters
+        ----------
+        image : of the latent
+        symmetry : of the model, which also mirrors the pins
+        """
         return replace(
             self,
             latent=image.latent,
@@ -76,6 +90,7 @@ class NamedPose:
             fit_error_mean=None if image.restored else image.fit_error_mean,
             fit_error_max=None if image.restored else image.fit_error_max,
             mirror_of=image.source,
+            pins=tuple(map(symmetry.image_of_pin, self.pins)),
         )
 
 
@@ -157,7 +172,7 @@ def write_poses(
     entries = [to_json(pose) for pose in held]
     for pose, entry in zip(held, entries, strict=True):
         try:
-            _from_json(entry, model.latent_size)
+            _from_json(entry, model)
         except ValueError as error:
             raise ModelFileError.unwritable(
                 path, f"of the pose {pose.name[:80]!r}, {error}", "repair that pose"
@@ -257,7 +272,7 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> Pos
 
     def pose(entry: Any, location: str) -> NamedPose:
         try:
-            return _from_json(entry, model.latent_size)
+            return _from_json(entry, model)
         except ValueError as error:
             raise DamagedPosesError.because(
                 path, f"is damaged at {location}", error, "repair or remove that pose"
@@ -304,6 +319,8 @@ def to_json(pose: NamedPose) -> dict[str, Any]:
         entry["fit_error"] = {"mean": pose.fit_error_mean, "max": pose.fit_error_max}
     if pose.tags:
         entry["tags"] = list(pose.tags)
+    if pose.pins:
+        entry["pins"] = [asdict(pin) for pin in pose.pins]
     source = pose.mirror_of
     if source is not None and source.is_of(pose.latent, pose.placement):
         entry["mirror_of"] = _placed_to_json(source) | {"image": source.image}
@@ -322,13 +339,13 @@ def _placed_to_json(pose: NamedPose | MirrorSource) -> dict[str, Any]:
     return entry
 
 
-def _from_json(entry: Any, latent_size: int) -> NamedPose:
+def _from_json(entry: Any, model: PoseModel) -> NamedPose:
     pose = _object(entry, "entry")
     name = pose.get("name")
     reason = why_no_name(name if isinstance(name, str) else "")
     if reason or not isinstance(name, str):
         raise ValueError(reason)
-    latent, placement = _placed_from_json(pose, latent_size)
+    latent, placement = _placed_from_json(pose, model.latent_size)
     mean = largest = source = None
     if "fit_error" in pose:
         errors = _object(pose["fit_error"], "fit error")
@@ -338,11 +355,12 @@ def _from_json(entry: Any, latent_size: int) -> NamedPose:
         held = _object(pose["mirror_of"], "mirror_of")
         if not isinstance(held.get("image"), str):
             raise ValueError("its mirror_of must have an image, which is a text")
-        found = MirrorSource(*_placed_from_json(held, latent_size), held["image"])
+        found = MirrorSource(*_placed_from_json(held, model.latent_size), held["image"])
         # A pose that was changed by hand is no longer that image.
         source = found if found.is_of(latent, placement) else None
     tags = _tags(pose.get("tags", []))
-    return NamedPose(name, latent, placement, mean, largest, tags, source)
+    pins = _pins(pose.get("pins", []), model.n_vertices)
+    return NamedPose(name, latent, placement, mean, largest, tags, source, pins)
 
 
 def _placed_from_json(
@@ -372,6 +390,28 @@ def _tags(value: Any) -> tuple[str, ...]:
                 f"each of its tags must be a text of 1 to {MAX_POSE_NAME_LENGTH} characters"
             )
     return tuple(dict.fromkeys(value))
+
+
+def _pins(value: Any, n_vertices: int) -> tuple[Pin, ...]:
+    from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Pin
+
+    if not isinstance(value, list) or len(value) > MAX_PINS:
+        raise ValueError(f"its pins must be a list of at most {MAX_PINS}")
+    pins = []
+    for entry in value:
+        held = _object(entry, "pin")
+        vertex = held.get("vertex")
+        if not isinstance(vertex, int) or isinstance(vertex, bool) or not 0 <= vertex < n_vertices:
+            raise ValueError(f"the vertex of each of its pins must be 0 to {n_vertices - 1}")
+        radius = float(_numbers(held.get("radius"), (), "pin's radius", LARGEST_RADIUS))
+        if radius < LEAST_RADIUS:
+            raise ValueError(
+                f"the radius of each of its pins must be {LEAST_RADIUS:g} to {LARGEST_RADIUS:g}"
+            )
+        place = _numbers(held.get("position"), (3,), "pin's position", _LARGEST_PLACE)
+        x, y, z = place.tolist()
+        pins.append(Pin(vertex, radius, (x, y, z)))
+    return tuple(pins)
 
 
 def _object(value: Any, name: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.contacts import ContactRegions, Contacts, least_step
 from lcollision_core.posing.exact import ExactCheck, exported_vertices
-from lcollision_core.posing.goals import CodesGoal, Decoded, Goal, PatchGoal, TwistGoal
+from lcollision_core.posing.goals import CODES_REACH, CodesGoal, Decoded, Goal, PatchGoal, TwistGoal
 from lcollision_core.posing.grip import Grip, Pin, Twist, make_grip
 
 MAX_STEPS = 3
@@ -194,6 +194,12 @@ class PoseDragger:
         low, high = self._low, self._high
         hessian, gradient = goal.cost(self._here, aim)
         if isinstance(goal, CodesGoal):
+            # Like the pose itself, its target may lie beyond the bounds.
+            is_free = low < high
+            low = np.where(is_free, np.minimum(low, aim), low)
+            high = np.where(is_free, np.maximum(high, aim), high)
+            if self._may_land(goal, aim, low, high) and self._goes(aim):
+                return True
             stays = (aim == self._start) & (here == self._start)
             low, high = np.where(stays, here, low), np.where(stays, here, high)
         else:
@@ -215,6 +221,20 @@ class PoseDragger:
         if there is None or not solid:
             return False
         return any(self._goes(here + cut * (there - here)) for cut in CUTS)
+
+    def _may_land(
+        self, goal: CodesGoal, aim: FloatArray, low: FloatArray, high: FloatArray
+    ) -> bool:
+        """Whether codes are one step away, and nothing is known to be in the way.
+
+        The quadratic program would leave its tolerance.
+        """
+        contacts = self._contacts
+        return bool(
+            0.0 < goal.miss(self._here, aim) <= CODES_REACH
+            and ((low <= aim) & (aim <= high)).all()
+            and (contacts.normals @ aim <= contacts.offsets).all()
+        )
 
     def _is_still(self, there: FloatArray) -> bool:
         way = there - self._here.codes

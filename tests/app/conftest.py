@@ -63,6 +63,8 @@ def compiled_body() -> None:
 def document(qtbot: QtBot, editor_model: PoseModel) -> Iterator[PoseDocument]:
     """Return a document, its pose all zeros, predicted and checked; its threads end with it."""
     held = PoseDocument()
+    # Poses are then what the tests set, at once.
+    held.set_solid(False)
     held.set_model(editor_model)
     held.reset_all()
     held.undo_stack.clear()

@@ -32,7 +32,10 @@ PATIENCE = 30_000
 
 def settings_in(folder: Path) -> Settings:
     """Return settings that nothing else reads."""
-    return Settings(QSettings(str(folder / "editor.ini"), QSettings.Format.IniFormat))
+    settings = Settings(QSettings(str(folder / "editor.ini"), QSettings.Format.IniFormat))
+    # Poses are then what the tests set, at once.
+    settings["solid"] = False
+    return settings
 
 
 def open_window(
@@ -40,6 +43,7 @@ def open_window(
 ) -> MainWindow:
     """Show a window of a document that has a model, and wait until it has drawn the pose."""
     apply_theme(application(), wanted_theme(settings["theme"]))
+    document.set_solid(settings["solid"])
     window = MainWindow(document, settings)
     window.resize(*size)
     window.show()

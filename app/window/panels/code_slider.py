@@ -118,6 +118,10 @@ class CodeRow(HoverRow):
     index : from 0 in its group
     domain : of its group, None for the whole body's
     name_width : width of the name before the slider gets more than its least
+
+    Attributes
+    ----------
+    number : that is shown
     """
 
     def __init__(
@@ -126,6 +130,7 @@ class CodeRow(HoverRow):
         model = document.model
         moved = model.code_effects[code].domain if domain is None else domain
         super().__init__(moved)
+        self._document = document
         self.menu_of = (domain, code)
         self.code = code
         self._name = name = heading(model.code_names[code])
@@ -159,19 +164,25 @@ class CodeRow(HoverRow):
         self.slider.drag_started.connect(lambda: document.begin_gesture(gesture))
         self.slider.drag_ended.connect(document.end_gesture)
         self.slider.drag_abandoned.connect(document.cancel_gesture)
-        self.slider.valueChanged.connect(lambda: document.set_code(code, self.slider.number))
+        self.slider.valueChanged.connect(lambda: self._move(self.slider.number))
         self.slider.reset_wanted.connect(lambda: document.reset_code(code))
-        self.field.valueChanged.connect(lambda number: document.set_code(code, number))
+        self.field.valueChanged.connect(self._move)
         self.field.refused.connect(lambda told: document.message.emit(f"{name}: {told}"))
 
     def show_number(self, number: float) -> None:
         """Follow the document, also beyond what can be typed."""
+        self.number = number
         self.slider.show_number(number)
         low, high = self._limits
         with silent(self.field):
             self.field.setRange(min(low, number), max(high, number))
             self.field.setValue(number)
         self._explain(number)
+
+    def _move(self, number: float) -> None:
+        # The pose may stop before, at contact, and then this is not what it has.
+        self.number = number
+        self._document.set_code(self.code, number)
 
     @property
     def is_outside(self) -> bool:

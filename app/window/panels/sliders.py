@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-import numpy as np
 from PySide6.QtCore import QPoint, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import QMouseEvent
 from PySide6.QtWidgets import QLineEdit, QToolButton, QWidget
@@ -172,7 +171,7 @@ class SlidersPanel(QWidget):
         self.document = document
         self.groups: list[SliderGroup] = []
         self._fingerprint = ""
-        self._shown = np.zeros(0)
+        self._latent_size = 0
         self.filter = QLineEdit()
         self.filter.setPlaceholderText("Filter sliders, such as “thigh”")
         self.filter.setToolTip("Show only the sliders whose names contain these words")
@@ -245,20 +244,18 @@ class SlidersPanel(QWidget):
             self._column.insertWidget(index, group)
             QWidget.setTabOrder(before, group.header.button)
             before = group.header.button
-        self._shown = np.array(self.document.latent)
+        self._latent_size = model.latent_size
         for group, is_open in zip(self.groups, opened, strict=False):
             group.set_open(is_open)
         self._on_filter(self.filter.text())
 
     def _on_latent(self) -> None:
         latent = self.document.latent
-        if len(latent) != len(self._shown):
+        if len(latent) != self._latent_size:
             return  # the model's own signal follows
-        changed = latent != self._shown
-        self._shown = np.array(latent)
         for group in self.groups:
             for row in group.rows:
-                if changed[row.code]:
+                if row.number != latent[row.code]:
                     row.show_number(float(latent[row.code]))
 
     def _on_filter(self, text: str) -> None:

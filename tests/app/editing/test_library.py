@@ -28,6 +28,7 @@ def of_library(document: PoseDocument, name: str) -> NamedPose:
 def in_file(document: PoseDocument) -> dict[str, bytes]:
     """Return what another editor that starts now would have as the library."""
     other = PoseDocument(document.model)
+    other.set_solid(False)
     found = {pose.name: pose.latent.tobytes() for pose in other.poses}
     assert other.close()
     return found
@@ -182,6 +183,7 @@ def test_the_library_stays_from_start_to_start_and_from_model_to_model(
 def test_what_another_editor_keeps_is_seen_and_never_lost(document: PoseDocument) -> None:
     document.add_pose_to_library("mine")
     other = PoseDocument(document.model)
+    other.set_solid(False)
     other.add_pose_to_library("theirs")
     document.refresh_library()
     assert names(document) == ["mine", "theirs"]
@@ -207,6 +209,7 @@ def test_a_pose_of_a_library_that_cannot_be_written_is_still_to_be_saved(
     blocked = tmp_path / "blocked"
     blocked.write_text("a file, where the folder should be")
     other = PoseDocument(document.model, library_folder=blocked)
+    other.set_solid(False)
     other.set_code(0, 0.5)
     with qtbot.waitSignal(other.failed) as told:
         other.add_pose_to_library("A")
@@ -227,6 +230,7 @@ def test_what_the_library_could_not_write_is_written_before_it_goes(
     blocked = tmp_path / "blocked"
     blocked.write_text("a file, where the folder should be")
     other = PoseDocument(document.model, library_folder=blocked)
+    other.set_solid(False)
     with qtbot.waitSignal(other.failed):
         other.add_pose_to_library("A")
     blocked.unlink()

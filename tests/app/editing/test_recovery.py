@@ -25,6 +25,7 @@ from app.editing.recovery import Autosave
 
 application = QGuiApplication(sys.argv)
 document = PoseDocument()
+document.set_solid(False)
 autosave = Autosave(document, Path(sys.argv[2]), seconds=0.1)
 autosave.written.connect(lambda: print("written", flush=True))
 autosave.failed.connect(lambda failure: print(failure.headline, flush=True))

@@ -114,6 +114,7 @@ def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
 def test_a_verdict_of_a_pose_that_has_moved_on_is_not_told(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("app.work.frames._QUICK_CHECK_SECONDS", 0.0)
     checking, go_on = threading.Event(), threading.Event()
     check = FrameEvaluator.verdict
 
@@ -271,9 +272,25 @@ def test_a_live_worker_that_fails_tells_once_and_goes_on(
     assert document.frame.latent[0] == 0.4
 
 
+def test_a_quick_check_comes_with_its_frame_and_a_slow_one_when_the_pose_rests(
+    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for most_seconds, comes_with_frame in ((10.0, True), (0.0, False)):
+        monkeypatch.setattr("app.work.frames._QUICK_CHECK_SECONDS", most_seconds)
+        for value in (0.1, 0.2):
+            document.set_code(0, value + most_seconds)
+            assert document.exact is None
+            with qtbot.waitSignal(document.frame_changed):
+                pass
+            assert (document.frame.verdict is not None) == comes_with_frame
+            settle(qtbot, document)
+            assert document.exact.request_id == document.frame.request_id
+
+
 def test_a_verdict_that_fails_from_pose_to_pose_is_told_once(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("app.work.frames._QUICK_CHECK_SECONDS", 0.0)
     failures = []
     document.failed.connect(failures.append)
     checked = []

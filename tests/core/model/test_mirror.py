@@ -230,6 +230,11 @@ def test_what_is_no_pose_is_refused(body: PoseModel) -> None:
             body.mirror(wrong)
 
 
+def mirror_image(body: PoseModel, pose: NamedPose) -> NamedPose:
+    image = body.mirror(pose.latent, pose.placement, pose.mirror_of)
+    return pose.mirrored(image, body.pose_mirror.symmetry)
+
+
 @pytest.fixture
 def images(body: PoseModel, samples: np.ndarray) -> list[NamedPose]:
     placement = RigidTransform(random_rotation(np.random.default_rng(8)), np.ones(3))
@@ -237,7 +242,7 @@ def images(body: PoseModel, samples: np.ndarray) -> list[NamedPose]:
         NamedPose("here", samples[0], tags=("kept",)),
         NamedPose("there", samples[4], placement, 0.01, 0.02),
     ]
-    return [p.mirrored(body.mirror(p.latent, p.placement, p.mirror_of)) for p in poses]
+    return [mirror_image(body, pose) for pose in poses]
 
 
 def test_a_file_of_poses_remembers_what_they_were_mirrored_from(
@@ -249,7 +254,7 @@ def test_a_file_of_poses_remembers_what_they_were_mirrored_from(
     assert read[0].tags == ("kept",)
     assert read[1].fit_error_mean == images[1].fit_error_mean
     for pose, latent in zip(read, samples[[0, 4]], strict=True):
-        back = pose.mirrored(body.mirror(pose.latent, pose.placement, pose.mirror_of))
+        back = mirror_image(body, pose)
         assert back.latent.tobytes() == latent.tobytes()
         assert back.fit_error_mean is None
         assert (back.placement is None) == (pose.placement is None)

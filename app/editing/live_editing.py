@@ -1,0 +1,341 @@
+"""Edits that go through the worker: drags by hand, pins, and codes that stop at contact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QObject, Signal, Slot
+
+from app.editing.codes import CodeEditing
+from app.editing.history import Gesture, read_only
+from app.wording import counted
+from app.work.frames import ExactVerdict, LiveFrame
+from app.work.live_pose import DragSession, LivePose
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lcollision_core.posing import Grip, Pin, Twist
+
+FloatArray = npt.NDArray[np.float64]
+
+REST_MILLISECONDS = 60
+"""How long a pose must be unchanged before it is checked exactly, where its frame came without."""
+
+
+@dataclass(eq=False)
+class Drag:
+    """What the worker moves.
+
+    Attributes
+    ----------
+    session : of the worker
+    pin : index and patch of the pin that comes along, None if none does
+    codes : (D,) that are wanted, of a session without a grip
+    has_ended : the hand has let go; the step is made when the pose has settled
+    """
+
+    session: DragSession
+    pin: tuple[int, Grip] | None = None
+    codes: FloatArray | None = None
+    has_ended: bool = False
+
+
+class LiveEditing(CodeEditing):
+    """Moves the working pose in the worker; see `PoseDocument` for the signals.
+
+    A drag is a gesture: its frames are adopted as the pose as they come, and nothing is computed
+    twice. With Solid on, edits of the codes are such gestures too: the codes wanted are the
+    target, and the pose becomes what the worker reached. What an edit has reached is its step of
+    undo, when it has settled or another action begins.
+
+    Attributes
+    ----------
+    frame : the newest computed one; while a slider moves, an instant behind `latent`
+    exact : the exact check of `latent`; None until then
+    solid : drags and edits of the codes keep the pose out of itself
+    """
+
+    frame_changed = Signal()
+    exact_changed = Signal()
+    solid_changed = Signal()
+    grip_radius_changed = Signal()
+    failed = Signal(object)
+
+    def __init__(self, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self.frame: LiveFrame | None = None
+        self.exact: ExactVerdict | None = None
+        self.solid = True
+        self._predicts = False
+        self._drag: Drag | None = None
+        self._adopted: FloatArray | None = None
+        self._grip_radius: float | None = None
+        self._last_grip: Grip | None = None
+        self._live = LivePose(REST_MILLISECONDS, self)
+        self._live.frame_computed.connect(self._on_frame_computed)
+        self._live.dragged.connect(self._on_dragged)
+        self._live.settled.connect(self._on_settled)
+        self._live.verdict_computed.connect(self._on_verdict_computed)
+        self._live.failed.connect(self.failed)
+
+    # Drags.
+
+    def set_solid(self, solid: bool) -> None:
+        """Let no later drag or edit of the codes move the pose into itself, or let it."""
+        if solid != self.solid:
+            self.solid = solid
+            self.solid_changed.emit()
+
+    @property
+    def grip_radius(self) -> float:
+        """Of the patch that is taken, in normalised length along the surface."""
+        from lcollision_core.posing import GRIP_RADIUS
+
+        return GRIP_RADIUS if self._grip_radius is None else self._grip_radius
+
+    def set_grip_radius(self, radius: float) -> None:
+        """Take larger or smaller patches; put between the least and the largest radius."""
+        from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS
+
+        radius = min(max(radius, LEAST_RADIUS), LARGEST_RADIUS)
+        if radius != self.grip_radius:
+            self._grip_radius = radius
+            self.grip_radius_changed.emit()
+
+    def grip_at(self, vertex: int) -> Grip:
+        """Return the patch round a vertex, of the present radius.
+
+        Raises
+        ------
+        LCollisionError : there is no such vertex.
+        """
+        from lcollision_core.posing import make_grip
+
+        held = self._last_grip
+        if held is None or (held.vertex, held.radius) != (vertex, self.grip_radius):
+            held = self._last_grip = make_grip(self.model.pose_space, vertex, self.grip_radius)
+        return held
+
+    @property
+    def dragging(self) -> bool:
+        """Whether the hand holds the body."""
+        drag = self._drag
+        return drag is not None and drag.session.grip is not None and not drag.has_ended
+
+    @property
+    def moving(self) -> bool:
+        """Whether a pose is wanted that the worker has not settled on yet."""
+        return self._drag is not None and self._live.is_dragging
+
+    def begin_drag(self, grip: Grip | Twist, label: str) -> None:
+        """Take hold of a patch, or of a body part to twist; pins and locked body parts stay.
+
+        Parameters
+        ----------
+        label : of the step of undo
+        """
+        self.begin_gesture(label)
+        self._drag = self._begun(grip, self.pose.pins)
+
+    def begin_pin_drag(self, index: int) -> None:
+        """Take hold of a pinned patch; the pin comes along, and the other pins stay."""
+        from lcollision_core.posing import make_grip
+
+        pins = self.pose.pins
+        pin = pins[index]
+        grip = make_grip(self.model.pose_space, pin.vertex, pin.radius)
+        self.begin_gesture(f"Move pin on {self._part_at(pin.vertex)}")
+        self._drag = self._begun(grip, pins[:index] + pins[index + 1 :])
+        self._drag.pin = index, grip
+
+    def drag_to(self, target: npt.ArrayLike) -> None:
+        """Go on towards a target; the newest one counts. Does nothing without a drag.
+
+        Parameters
+        ----------
+        target : (3,) point in the data's unit, in the model's frame; of a twist (1,) the angle in
+            radians since the start
+        """
+        if self._drag is not None and self.dragging:
+            aim = read_only(np.array(target, dtype=np.float64).reshape(-1))
+            self._live.drag(self._drag.session, aim, self._predicts)
+
+    def end_drag(self) -> None:
+        """Let go: the pose goes to the newest target by one more event at most."""
+        if self.dragging:
+            self.end_gesture()
+
+    def cancel_drag(self) -> None:
+        """Let go and put everything back, to the bit."""
+        if self.dragging:
+            self.cancel_gesture()
+
+    def end_gesture(self) -> None:
+        """End a drag; where the worker still moves the pose, the step is made when it settles."""
+        if self._drag is not None and self._live.is_dragging:
+            self._drag.has_ended = True
+            if self._drag.session.grip is not None:
+                self._live.finish_drag()
+        else:
+            self._close_gesture()
+
+    def cancel_gesture(self) -> None:
+        """Cancel a drag and restore its start, as for Escape."""
+        self._end_drag()
+        super().cancel_gesture()
+
+    def undo(self) -> None:
+        """Undo the last step; a drag or an edit that has not ended is that step."""
+        gesture, was_moving = self._gesture, self.moving
+        if was_moving and gesture is not None and gesture.before.same_as(self._state):
+            # It has moved nothing yet: undoing it leaves the pose, and the step before stays.
+            self._close_gesture()
+        else:
+            super().undo()
+
+    def _close_gesture(self) -> None:
+        self._end_drag()
+        super()._close_gesture()
+
+    def _end_drag(self) -> None:
+        if self._drag is not None:
+            self._drag = None
+            self._live.end_drag()
+
+    def _begun(self, grip: Grip | Twist | None, pins: tuple[Pin, ...] = ()) -> Drag:
+        from lcollision_core.posing import DragOptions
+
+        # What a code's target leaves as it was stays, so that locks need no more than that.
+        locked = frozenset() if grip is None else self.locked_domains
+        options = DragOptions(solid=self.solid, locked_domains=locked)
+        return Drag(
+            DragSession(self.model, self.latent, grip, pins, options, self.placement),
+        )
+
+    # Edits of the codes.
+
+    @property
+    def _wanted(self) -> FloatArray:
+        codes = self._drag.codes if self._drag is not None and self._live.is_dragging else None
+        return self.latent if codes is None else codes
+
+    def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
+        if not self.solid:
+            super()._edit(label, latent, run)
+            return
+        held, drag = self._gesture, self._drag
+        if drag is not None and (
+            drag.session.grip is not None
+            or (drag.has_ended and (run is None or held is None or held.run != run))
+        ):
+            self._close_gesture()
+        if self._drag is None:
+            is_own = self._gesture is None
+            if is_own and latent.tobytes() == self.latent.tobytes():
+                return
+            if is_own:
+                self._gesture = Gesture(label, self._state, run)
+            self._drag = self._begun(None)
+            self._drag.has_ended = is_own
+        self._drag.codes = read_only(latent)
+        self._live.drag(self._drag.session, latent, self._predicts)
+
+    # Pins.
+
+    @property
+    def pins(self) -> tuple[Pin, ...]:
+        """Patches that stay where they are while others are dragged."""
+        return self.pose.pins
+
+    def pin(self, grip: Grip) -> None:
+        """Pin a patch where it is."""
+        self.pin_grips([grip], f"Pin {self._part_at(grip.vertex)}")
+
+    def pin_grips(self, grips: Sequence[Grip], label: str) -> None:
+        """Pin patches where they are, as one step; a pin on the same vertex is replaced."""
+        from lcollision_core.model import MAX_PINS
+        from lcollision_core.posing import Pin
+
+        if self.frame is None:
+            return
+        added = {grip.vertex: Pin.of(grip, self.frame.vertices) for grip in grips}
+        kept = [pin for pin in self.pins if pin.vertex not in added]
+        pins = (*kept, *added.values())
+        if len(pins) > MAX_PINS:
+            self.message.emit(f"A pose has at most {counted(MAX_PINS, 'pin')}")
+            return
+        self._set_pins(label, pins)
+
+    def unpin(self, index: int) -> None:
+        """Remove one pin."""
+        label = f"Unpin {self._part_at(self.pins[index].vertex)}"
+        self._set_pins(label, self.pins[:index] + self.pins[index + 1 :])
+
+    def unpin_all(self) -> None:
+        """Remove all pins."""
+        self._set_pins("Unpin all", ())
+
+    def _set_pins(self, label: str, pins: tuple[Pin, ...]) -> None:
+        self._close_gesture()
+        self._push(label, replace(self._state, pose=replace(self.pose, pins=pins)))
+
+    def _part_at(self, vertex: int) -> str:
+        domain = int(self.model.pose_space.vertex_domain[vertex])
+        return self.model.domain_names[domain]
+
+    # The results of the worker.
+
+    @Slot(object)
+    def _on_frame_computed(self, frame: LiveFrame) -> None:
+        self.frame = frame
+        self.frame_changed.emit()
+        if frame.verdict is not None and frame.latent is self.latent:
+            self._on_verdict_computed(frame.verdict)
+
+    @Slot(object)
+    def _on_verdict_computed(self, verdict: ExactVerdict) -> None:
+        self.exact = verdict
+        self.exact_changed.emit()
+
+    @Slot(object)
+    def _on_dragged(self, frame: LiveFrame) -> None:
+        """Adopt what a drag has reached as the pose."""
+        from lcollision_core.posing import Pin
+
+        drag = self._drag
+        if drag is None:
+            return
+        state = self._state
+        if frame.latent.tobytes() == self.latent.tobytes():
+            state = replace(state, pose=replace(self.pose, latent=frame.latent))
+        else:
+            state = self._with_latent(frame.latent)
+            if drag.pin is not None:
+                index, grip = drag.pin
+                pins = list(self.pins)
+                pins[index] = Pin.of(grip, frame.vertices)
+                state = replace(state, pose=replace(state.pose, pins=tuple(pins)))
+        self.frame, self.exact = frame, frame.verdict
+        self._adopted = frame.latent
+        self._apply(state)
+        self.frame_changed.emit()
+        self.exact_changed.emit()
+
+    @Slot()
+    def _on_settled(self) -> None:
+        if self._drag is not None and self._drag.has_ended:
+            self._close_gesture()
+
+    def _follow_latent(self) -> None:
+        adopted, self._adopted = self._adopted, None
+        if self.latent is adopted:
+            return
+        self._drag = None
+        self._live.follow(self.model, self.latent, self._predicts)
+        if self.exact is not None:
+            self.exact = None
+            self.exact_changed.emit()
