@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QKeyEvent, QMouseEvent
 
@@ -121,7 +122,7 @@ class CodeRow(HoverRow):
 
     Attributes
     ----------
-    number : that is shown
+    number : of the pose that is shown, NaN while the user changes it
     """
 
     def __init__(
@@ -180,8 +181,8 @@ class CodeRow(HoverRow):
         self._explain(number)
 
     def _move(self, number: float) -> None:
-        # The pose may stop before, at contact, and then this is not what it has.
-        self.number = number
+        # Whatever the pose gets, which may stop before at contact, is shown again.
+        self.number = np.nan
         self._document.set_code(self.code, number)
 
     @property

@@ -121,6 +121,7 @@ def test_the_estimate_steps_back_once_the_check_has_spoken(
     right: bool,
 ) -> None:
     document, card, headline = window.document, window.collision.prediction, window.collision.exact
+    monkeypatch.setattr("app.work.frames._QUICK_CHECK_SECONDS", 0.0)
     told = PosePrediction(np.zeros(2), 0.99 if collides == right else 0.01)
     monkeypatch.setattr(FrameEvaluator, "_predict", lambda *_: told)
     said = "Probably colliding" if collides == right else "Probably clear"
