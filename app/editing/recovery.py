@@ -12,7 +12,6 @@ import logging
 import shutil
 import time
 import uuid
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -135,18 +134,15 @@ def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
     ----------
     parent : the folder of all sessions; the user's own by default
     """
-    found = list(_lost(sessions_folder() if parent is None else parent))
-    return sorted(found, key=lambda lost: lost.saved, reverse=True)
-
-
-def _lost(parent: Path) -> Iterator[LostPose]:
+    parent = parent or sessions_folder()
+    found = []
     for folder in parent.iterdir() if parent.is_dir() else ():
         session = Session.held(folder) if folder.is_dir() else None
         if session is None:
             continue
         try:
             held = parse_json(read_regular(folder / _SESSION, _MAX_SESSION_BYTES))
-            yield LostPose(
+            lost = LostPose(
                 session=session,
                 model=str(held["model"]),
                 pose_name=str(held["pose_name"]),
@@ -154,9 +150,11 @@ def _lost(parent: Path) -> Iterator[LostPose]:
                 locked=tuple(map(int, held.get("locked", ()))),
                 saved=(folder / _POSES).stat().st_mtime,
             )
+            found.append(lost)
         except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
             _log.info("nothing to recover in %s: %s", folder, error)
             session.discard()
+    return sorted(found, key=lambda lost: lost.saved, reverse=True)
 
 
 class Autosave(QObject):

@@ -7,7 +7,7 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QObject, QTimer, Slot
+from PySide6.QtCore import QObject, Qt, QTimer, Slot
 
 from app.window.dialogs.questions import Choice, ask_about_recovery
 from app.window.file_actions import MODEL_SUFFIX
@@ -31,6 +31,7 @@ _POLL_MILLISECONDS = 500
 """Milliseconds between two chances for Python to handle signals, which Qt's loop prevents."""
 
 _LATER_MILLISECONDS = 300
+_ONCE = Qt.ConnectionType.SingleShotConnection
 
 
 class StartUp(QObject):
@@ -52,8 +53,7 @@ class StartUp(QObject):
         self._document = window.document
         self._path = path
         self._model: str | Path = model_name or last_model(window.settings["model"])
-        self._poll = QTimer(self)
-        self._poll.setInterval(_POLL_MILLISECONDS)
+        self._poll = QTimer(self, interval=_POLL_MILLISECONDS)
         self._poll.timeout.connect(lambda: None)
 
     def begin(self) -> None:
@@ -63,18 +63,18 @@ class StartUp(QObject):
         self._poll.start()
         if self._path is not None and self._path.suffix.lower() == MODEL_SUFFIX:
             self._model, self._path = self._path, None
-        self._document.model_changed.connect(self._on_model)
+        self._document.model_changed.connect(self._on_model, _ONCE)
         self._document.open_model(self._model)
 
     @Slot()
     def _on_model(self) -> None:
         from app.editing.recovery import Autosave
 
-        self._document.model_changed.disconnect(self._on_model)
         self._window.set_autosave(Autosave(self._document))
         # The document is about to load its own pose.
         QTimer.singleShot(0, self, self._on_first_pose)
-        self._document.pose_loaded.connect(self._on_pose_loaded)
+        # Later ones are seen as the user chose to look.
+        self._document.pose_loaded.connect(self._window.viewport.frame_pose, _ONCE)
         self._document.recovered.connect(self._window.viewport.frame_pose)
         self._window.ready.connect(self._on_ready)
 
@@ -86,12 +86,6 @@ class StartUp(QObject):
             return
         # What the program does is no change to save or undo.
         self._document.begin_with(opening_pose(self._document.model))
-
-    @Slot()
-    def _on_pose_loaded(self) -> None:
-        # Later ones are seen as the user chose to look.
-        self._document.pose_loaded.disconnect(self._on_pose_loaded)
-        self._window.viewport.frame_pose()
 
     @Slot()
     def _on_ready(self) -> None:

@@ -30,7 +30,6 @@ from app.work.threads import single_shot
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from app.work.frames import FrameEvaluator
     from lcollision_core.model import NamedPose
 
 _PAUSE = 25
@@ -74,7 +73,6 @@ class LibraryPanel(QWidget):
         self._tag = ""
         self._pictures: dict[bytes, QIcon] = {}
         self._wanted: list[NamedPose] = []
-        self._evaluator: FrameEvaluator | None = None
         self._may_draw = False
         self._due = single_shot(self, _PAUSE, self._draw_next)
         self.list = PoseGrid()
@@ -358,24 +356,18 @@ class LibraryPanel(QWidget):
         self._due.start()
 
     def _picture(self, pose: NamedPose) -> QIcon:
-        from app.work.frames import FrameEvaluator
-
         model = self._document.model
-        if self._evaluator is None or self._evaluator.model is not model:
-            self._evaluator = FrameEvaluator(model)
         sharpness = self.devicePixelRatioF()
         side = round(THUMBNAIL * sharpness)
         vertices = model.decode(pose.latent, 1).astype(np.float32)
         pixels = draw_pose(
             vertices,
-            self._evaluator.normals(vertices),
             model.faces,
             preset_view("Three-quarter", vertices, model.up_axis, model.front, 1.0),
             side,
             _SKIN[current_theme().is_dark],
         )
-        image = QImage(side, side, QImage.Format.Format_RGBA8888)
-        np.frombuffer(image.bits(), dtype=np.uint8)[:] = pixels.ravel()
+        image = QImage(pixels.data, side, side, QImage.Format.Format_RGBA8888)
         image.setDevicePixelRatio(sharpness)
         drawn = QPixmap.fromImage(image)
         picture = QIcon()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QEvent, QPoint, QPointF, QRectF, QSize, Qt, Signal
@@ -229,18 +228,13 @@ class PredictionCard(Card):
             self._rows.removeWidget(row)
             row.deleteLater()
         model = self._document.model
-        self.rows = []
-        name_width = longest_name(self, map(heading, model.domain_names))
-        for domain in range(len(model.domain_names)):
-            row = DomainRow(self._document, domain, name_width)
+        width = longest_name(self, map(heading, model.domain_names))
+        self.rows = [DomainRow(self._document, k, width) for k in range(len(model.domain_names))]
+        for domain in model.domain_order:
+            row = self.rows[domain]
             row.hovered.connect(self.domain_hovered)
             row.menu_wanted.connect(self.menu_wanted)
-            self.rows.append(row)
-        shown = [self.rows[domain] for domain in model.domain_order]
-        for row in shown:
             self._rows.addWidget(row)
-        for before, after in pairwise(shown):
-            QWidget.setTabOrder(before.lock, after.lock)
         predicts = self._document.can_resolve
         for widget in (self.meter, self.verdict, self.percent):
             widget.setVisible(predicts)

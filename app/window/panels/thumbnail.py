@@ -23,7 +23,6 @@ _AMBIENT = 0.42
 
 def draw_pose(
     vertices: npt.NDArray[Any],
-    normals: npt.NDArray[Any],
     faces: npt.NDArray[np.int32],
     view: View,
     side: int,
@@ -33,7 +32,7 @@ def draw_pose(
 
     Parameters
     ----------
-    vertices, normals : (V, 3) arrays, in the data's unit; of length 1
+    vertices : (V, 3) array, in the data's unit
     faces : (F, 3) array
     view : from where; the perspective is left out
     side : of the picture, in pixels
@@ -43,6 +42,9 @@ def draw_pose(
     -------
     pixels : (side, side, 4) uint8 array, red, green, blue and alpha, which is 0 beside the mesh
     """
+    # Loads the compiler: not before the window is on the screen.
+    from lcollision_core.meshes.normals import vertex_normals
+
     arm = view.position - view.focus
     distance = float(np.linalg.norm(arm))
     towards = arm / distance
@@ -51,7 +53,8 @@ def draw_pose(
     n_dots = side * _FINENESS
     points *= 0.5 * n_dots / (distance * math.tan(math.radians(0.5 * VIEW_ANGLE)))
     lamp = np.array([-0.35, 0.5, 0.8])
-    light = np.clip(normals @ axes.T @ (lamp / np.linalg.norm(lamp)), 0.0, 1.0)
+    lit = vertex_normals(vertices, faces) @ axes.T @ (lamp / np.linalg.norm(lamp))
+    light = np.clip(lit, 0.0, 1.0)
     a, b, c = (points[corner] for corner in faces.T)
     turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0.0
     seen = faces[turned]
