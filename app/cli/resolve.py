@@ -201,12 +201,9 @@ def resolve(
         )
     if failed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
-    if not all(_ended_free(result) for result in results):
+    ends = (r.predicted_free if r.exactly_free is None else r.exactly_free for r in results)
+    if not all(ends):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
-
-
-def _ended_free(result: ResolveResult) -> bool:
-    return result.predicted_free if result.exactly_free is None else result.exactly_free
 
 
 def _domain(model: PoseModel, name: str) -> int:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from html import escape
 from typing import TypeVar
 
-from PySide6.QtCore import QEvent, QObject, QPoint, QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtCore import QEvent, QPoint, QPointF, QRectF, QSignalBlocker, QSize, Qt, Signal
 from PySide6.QtGui import (
     QColor,
     QContextMenuEvent,
@@ -41,6 +40,9 @@ HANDLE = 7.0
 
 SWATCH = 12
 """Side of a body part's square of colour, in device-independent pixels."""
+
+silent = QSignalBlocker
+"""Lets a widget follow the document without its own signals: ``with silent(widget):``."""
 
 Margins = tuple[int, int, int, int]
 Box = TypeVar("Box", QHBoxLayout, QVBoxLayout)
@@ -270,21 +272,20 @@ class Sign(QLabel):
     Parameters
     ----------
     size : side in device-independent pixels
+
+    Attributes
+    ----------
+    name : which icon is shown
     """
 
     def __init__(self, size: int) -> None:
         super().__init__()
         self.setFixedSize(size, size)
-        self._drawing = ("wait", "waiting")
-
-    @property
-    def name(self) -> str:
-        """Which icon is shown."""
-        return self._drawing[0]
+        self.name, self._ink = "wait", "waiting"
 
     def show_icon(self, name: str, ink: str) -> None:
         """Show an icon in a colour of the theme."""
-        self._drawing = (name, ink)
+        self.name, self._ink = name, ink
         colour = getattr(current_theme(), ink)
         self.setPixmap(pixmap(name, colour, self.width(), self.devicePixelRatioF()))
 
@@ -292,7 +293,7 @@ class Sign(QLabel):
         """Draw it again in the new theme."""
         super().changeEvent(event)
         if event.type() is QEvent.Type.StyleChange:
-            self.show_icon(*self._drawing)
+            self.show_icon(self.name, self._ink)
 
 
 class Slider(QSlider):
@@ -427,17 +428,6 @@ QProgressBar::chunk {{
 def plain_tip(text: str) -> str:
     """Return a tool tip that shows a text literally, even if it looks like HTML."""
     return f"<span>{escape(text)}</span>" if "<" in text else text
-
-
-@contextmanager
-def silent(*widgets: QObject) -> Iterator[None]:
-    """Change widgets without their signals, as they follow the document."""
-    before = [widget.blockSignals(True) for widget in widgets]
-    try:
-        yield
-    finally:
-        for widget, blocked in zip(widgets, before, strict=True):
-            widget.blockSignals(blocked)
 
 
 def labelled(text: str, style: str = "", wraps: bool = False) -> QLabel:

@@ -203,8 +203,6 @@ class BodyPartsDialog(QDialog):
 
     @Slot(int)
     def _on_row(self, row: int) -> None:
-        for button in (self.rename, self.colour):
-            button.setEnabled(row >= 0)
         self.up.setEnabled(row > 0)
         self.down.setEnabled(0 <= row < self.list.count() - 1)
 
