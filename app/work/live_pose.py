@@ -27,7 +27,7 @@ _QUICK_SECONDS = 0.012
 _PATIENCE_SECONDS = 0.016
 """but at most this long, a picture of a screen that draws 60 in a second."""
 
-_MOST_IDLE = 10
+_MOST_IDLE = 5
 """Events towards one target, none of which came nearer, after which a drag counts as settled."""
 
 _NEARER = 0.999

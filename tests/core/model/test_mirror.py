@@ -20,6 +20,7 @@ from lcollision_core.model import (
     write_poses,
 )
 from lcollision_core.model.mirror import find_symmetry
+from lcollision_core.posing import Pin, make_grip
 from lcollision_core.resolve import ResolveOptions
 from tests.core.shapes import random_rotation
 
@@ -258,6 +259,21 @@ def test_a_file_of_poses_remembers_what_they_were_mirrored_from(
         assert back.latent.tobytes() == latent.tobytes()
         assert back.fit_error_mean is None
         assert (back.placement is None) == (pose.placement is None)
+
+
+def test_pins_are_mirrored_to_the_other_side(body: PoseModel, samples: np.ndarray) -> None:
+    symmetry, vertices = body.pose_mirror.symmetry, body.decode(samples[0])
+    grips = [make_grip(body.pose_space, vertex) for vertex in (5, 1200)]
+    pose = NamedPose("pinned", samples[0], pins=tuple(Pin.of(grip, vertices) for grip in grips))
+    image = mirror_image(body, pose)
+    reflected = symmetry.image(vertices)
+    for pin, grip in zip(image.pins, grips, strict=True):
+        partner = make_grip(body.pose_space, pin.vertex, pin.radius)
+        assert pin.vertex == symmetry.partner[grip.vertex] != grip.vertex
+        np.testing.assert_allclose(
+            pin.position, partner.position(reflected), atol=1e-3 * body.body_size
+        )
+    assert [pin.vertex for pin in mirror_image(body, image).pins] == [5, 1200]
 
 
 def test_a_pose_that_was_changed_forgets_it(

@@ -28,7 +28,8 @@ from lcollision_core.model import (
     write_poses,
 )
 from lcollision_core.model.latent_identity import find_latent_space
-from lcollision_core.model.pose_file import POSES_VERSION
+from lcollision_core.model.pose_file import MAX_PINS, POSES_VERSION
+from lcollision_core.posing import Pin
 from tests.core.shapes import random_rotation
 
 
@@ -37,13 +38,16 @@ def model(tube_model: PoseModel) -> PoseModel:
     return tube_model
 
 
+PINS = (Pin(3, 0.03, (0.1, 1.0 / 3.0, -2e5)), Pin(0, 0.25, (0.0, -1e-9, 7.0)))
+
+
 def _poses(model: PoseModel) -> list[NamedPose]:
     rng = np.random.default_rng(6)
     placement = RigidTransform(random_rotation(rng), rng.normal(0, 100, 3))
     return [
         NamedPose("à la „plage“", rng.normal(size=model.latent_size)),
         NamedPose("mesh 2", rng.normal(size=model.latent_size), placement, 0.001, 0.02),
-        NamedPose("1/3", np.full(model.latent_size, 1.0 / 3.0), placement),
+        NamedPose("1/3", np.full(model.latent_size, 1.0 / 3.0), placement, pins=PINS),
     ]
 
 
@@ -63,7 +67,8 @@ def _same(a: NamedPose, b: NamedPose) -> bool:
         and np.array_equal(a.placement.translation, b.placement.translation)
     )
     errors = (a.fit_error_mean, a.fit_error_max) == (b.fit_error_mean, b.fit_error_max)
-    return placed and errors and a.name == b.name and np.array_equal(a.latent, b.latent)
+    same = errors and a.pins == b.pins
+    return placed and same and a.name == b.name and np.array_equal(a.latent, b.latent)
 
 
 def test_poses_come_back_to_the_last_bit(model: PoseModel, path: Path) -> None:
@@ -149,9 +154,25 @@ def test_what_commands_write_stays_of_the_first_version(path: Path) -> None:
     document = json.loads(path.read_text())
     assert document["format_version"] == 1
     assert document.keys() == {"format", "format_version", "model", "poses"}
+    assert document["poses"][0].keys() == {"name", "latent"}
 
 
-def _broken(document: Any) -> list[tuple[str, Any]]:
+def test_pins_are_of_a_pose_whatever_its_latent(model: PoseModel, path: Path) -> None:
+    *_, pinned = read_poses(path, model)
+    assert pinned.pins == PINS
+    assert not pinned.same_as(replace(pinned, pins=PINS[:1]))
+    record = json.loads(path.read_text())["poses"][2]["pins"][0]
+    assert record == {"vertex": 3, "radius": 0.03, "position": [0.1, 1.0 / 3.0, -2e5]}
+
+
+def test_pins_that_no_file_holds_are_not_written(model: PoseModel, path: Path) -> None:
+    for pins in (PINS[:1] * (MAX_PINS + 1), (replace(PINS[0], vertex=model.n_vertices),)):
+        pose = NamedPose("pinned", _poses(model)[0].latent, pins=pins)
+        with pytest.raises(ModelFileError, match=r"'pinned'.*pin"):
+            write_poses(path, model, [pose])
+
+
+def _broken(document: Any, n_vertices: int) -> list[tuple[str, Any]]:
     """Return documents that must be refused, each with what the sentence says."""
     first, second = document["poses"][:2]
     turned = second["placement"]["rotation"]
@@ -162,7 +183,25 @@ def _broken(document: Any) -> list[tuple[str, Any]]:
     def with_rotation(rotation: Any) -> dict[str, Any]:
         return with_first(placement={"rotation": rotation, "translation": [0, 0, 0]})
 
+    def with_pin(**change: Any) -> dict[str, Any]:
+        return with_first(pins=[{**document["poses"][2]["pins"][0], **change}])
+
     return [
+        ("pose 0.*pins", with_first(pins={})),
+        ("pose 0.*pins", with_first(pins=[3] * (MAX_PINS + 1))),
+        ("pose 0.*pin", with_first(pins=[3])),
+        ("pose 0.*vertex", with_first(pins=[{}])),
+        ("pose 0.*vertex", with_pin(vertex=n_vertices)),
+        ("pose 0.*vertex", with_pin(vertex=-1)),
+        ("pose 0.*vertex", with_pin(vertex=True)),
+        ("pose 0.*vertex", with_pin(vertex=1.0)),
+        ("pose 0.*radius", with_pin(radius=0.0)),
+        ("pose 0.*radius", with_pin(radius=0.3)),
+        ("pose 0.*radius", with_pin(radius=-0.03)),
+        ("pose 0.*radius", with_pin(radius="0.03")),
+        ("pose 0.*position", with_pin(position=[0.0, 0.0])),
+        ("pose 0.*position", with_pin(position=[0.0, 0.0, 1e31])),
+        ("pose 0.*position", with_pin(position=None)),
         ("not an LCollision pose file", []),
         ("not an LCollision pose file", {"poses": []}),
         ("not an LCollision pose file", {**document, "format": "other"}),
@@ -202,7 +241,7 @@ def _broken(document: Any) -> list[tuple[str, Any]]:
 
 
 def test_documents_that_do_not_fit_are_refused(model: PoseModel, path: Path) -> None:
-    for sentence, document in _broken(json.loads(path.read_text())):
+    for sentence, document in _broken(json.loads(path.read_text()), model.n_vertices):
         path.write_text(json.dumps(document))
         with pytest.raises(ModelFileError, match=rf"{path}.*{sentence}"):
             read_poses(path, model)
