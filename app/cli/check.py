@@ -54,8 +54,7 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
 
     start = time.perf_counter()
     mesh = read_mesh(path)
-    audit = audit_mesh(mesh.topology, mesh.vertices)
-    for remark in (*mesh.notes, *audit.problems):
+    for remark in (*mesh.notes, *audit_mesh(mesh.topology, mesh.vertices)):
         note(f"{path}: {remark}")
     try:
         detector = CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=near_exclusion)
@@ -70,7 +69,7 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
         "file": str(path),
         "vertices": mesh.topology.n_vertices,
         "faces": mesh.topology.n_faces,
-        "watertight": audit.watertight,
+        "watertight": mesh.topology.is_watertight,
         "pairs": found.n_pairs,
         "near_pairs": found.n_near_pairs,
         "coincident_pairs": found.n_coincident_pairs,

@@ -27,12 +27,12 @@ def check(
     """
     from lcollision_core.contact import CollisionDetector
     from lcollision_core.errors import MeshFileError, ShapeError
-    from lcollision_core.meshes import inspect_pose_set
+    from lcollision_core.meshes import degenerate_faces, inspect_pose_set
 
     with progress_bar("Reading poses") as progress:
         inspection = inspect_pose_set(path, progress)
     poses = inspection.pose_set
-    if poses is None or inspection.audit is None:
+    if poses is None:
         raise inspection.defects[0]
     for remark in poses.notes:
         note(f"{path}: {remark}")
@@ -49,7 +49,7 @@ def check(
         "vertices": poses.topology.n_vertices,
         "faces": poses.topology.n_faces,
         "same_topology": inspection.same_topology,
-        "watertight": inspection.audit.watertight,
+        "watertight": poses.topology.is_watertight,
         "colliding_poses": int(found.colliding.sum()),
         "problems": list(inspection.problems),
         "near_exclusion": exclusion,
@@ -71,8 +71,8 @@ def check(
         _print(path, report, up_sentence(guess))
         if not guess.is_sure:
             note("`train embedding` takes that, unless --up x|y|z says otherwise")
-    usable = len(poses) == inspection.n_found and not len(inspection.audit.degenerate_faces)
-    if not usable:
+    flat = degenerate_faces(poses.topology, poses.vertices[0])
+    if len(poses) < inspection.n_found or len(flat):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 

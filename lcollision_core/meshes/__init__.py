@@ -9,12 +9,7 @@ from lcollision_core.meshes.atomic import (
     require_writable,
     unused_name,
 )
-from lcollision_core.meshes.audit import (
-    MeshAudit,
-    PoseSetInspection,
-    audit_mesh,
-    inspect_pose_set,
-)
+from lcollision_core.meshes.audit import audit_mesh, inspect_pose_set
 from lcollision_core.meshes.file_names import file_stem, file_stems, has_known_suffix
 from lcollision_core.meshes.files import (
     READABLE_SUFFIXES,
@@ -26,6 +21,8 @@ from lcollision_core.meshes.files import (
 from lcollision_core.meshes.locks import locked
 from lcollision_core.meshes.pose_set import (
     PoseSet,
+    PoseSetInspection,
+    degenerate_faces,
     mesh_files,
     read_pose_set,
     write_pose_set,

@@ -70,10 +70,6 @@ class Alignment:
     translations: FloatArray
     weights: FloatArray
 
-    def transform(self, pose: int) -> RigidTransform:
-        """Return what moved one pose into the reference's frame."""
-        return RigidTransform(self.rotations[pose], self.translations[pose])
-
 
 def fit_rigid(
     vertices: npt.NDArray[Any],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +13,11 @@ import numpy.typing as npt
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.formats.polygons import first_at_each_position
-from lcollision_core.meshes.pose_set import PoseSet, collect_poses, degenerate_faces
+from lcollision_core.meshes.pose_set import PoseSetInspection, collect_poses, degenerate_faces
 from lcollision_core.meshes.topology import Topology
 
 
-@dataclass(frozen=True, eq=False)
-class MeshAudit:
-    """The state of one mesh.
-
-    Attributes
-    ----------
-    watertight : every edge has two faces that run along it in opposite directions
-    degenerate_faces : indices of the faces without area, int32
-    problems : a sentence for each kind of defect; several parts are no defect
-    """
-
-    watertight: bool
-    degenerate_faces: npt.NDArray[np.int32]
-    problems: tuple[str, ...]
-
-
-def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
+def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> tuple[str, ...]:
     """Find the defects that make a collision check, or a deformation, unreliable.
 
     Parameters
@@ -43,7 +27,7 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
 
     Returns
     -------
-    the counts and the sentences
+    problems : a sentence for each kind of defect; several parts are no defect
 
     Raises
     ------
@@ -52,7 +36,6 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
     points = np.asarray(vertices)
     if points.shape != (topology.n_vertices, 3):
         raise ShapeError.must_be("vertices", f"({topology.n_vertices}, 3)", points.shape)
-    degenerate = degenerate_faces(topology, points)
     first = first_at_each_position(points)
     duplicates = np.flatnonzero(first != np.arange(len(first)))
     open_edges, crowded_edges = topology.boundary_edges, topology.non_manifold_edges
@@ -77,7 +60,12 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
             "vertices are",
             "{} in no face, the first is vertex {}",
         ),
-        (degenerate, "face has", "faces have", "{} no area, the first is face {}"),
+        (
+            degenerate_faces(topology, points),
+            "face has",
+            "faces have",
+            "{} no area, the first is face {}",
+        ),
         (
             duplicates,
             "vertex lies",
@@ -95,36 +83,7 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> MeshAudit:
     ]
     if not (topology.is_watertight or len(open_edges) or len(crowded_edges)):
         problems.append("the mesh has neighbouring faces that are wound in opposite senses")
-    return MeshAudit(topology.is_watertight, degenerate, tuple(problems))
-
-
-@dataclass(frozen=True, eq=False)
-class PoseSetInspection:
-    """Result of reading a path that should hold a pose set.
-
-    Attributes
-    ----------
-    pose_set : the poses that agree with the first readable one; None if none can be used
-    n_found : the poses that are there, usable or not
-    same_topology : whether all readable poses share their vertex count and faces
-    audit : the state of the reference, pose 0; None without poses
-    defects : of the set and its poses, in the order found
-    """
-
-    pose_set: PoseSet | None
-    n_found: int
-    same_topology: bool
-    audit: MeshAudit | None
-    defects: tuple[LCollisionError, ...]
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """A sentence for each defect, those of the reference among them."""
-        found = [str(defect) for defect in self.defects]
-        if self.pose_set is not None and self.audit is not None:
-            name = self.pose_set.names[0]
-            found += [f"pose 0 ({name}): {problem}" for problem in self.audit.problems]
-        return tuple(found)
+    return tuple(problems)
 
 
 def inspect_pose_set(
@@ -149,9 +108,10 @@ def inspect_pose_set(
     CancelledError : `cancel` was set.
     """
     defects: list[LCollisionError] = []
-    collected = collect_poses(Path(path), defects.append, progress, cancel)
-    pose_set = collected.pose_set
-    audit = None if pose_set is None else audit_mesh(pose_set.topology, pose_set.vertices[0])
-    return PoseSetInspection(
-        pose_set, collected.n_found, collected.same_topology, audit, tuple(defects)
-    )
+    found = collect_poses(Path(path), defects.append, progress, cancel)
+    problems = [str(defect) for defect in defects]
+    if found.pose_set is not None:
+        where = f"pose 0 ({found.pose_set.names[0]})"
+        reference = audit_mesh(found.pose_set.topology, found.pose_set.vertices[0])
+        problems += [f"{where}: {problem}" for problem in reference]
+    return replace(found, defects=tuple(defects), problems=tuple(problems))

@@ -196,19 +196,23 @@ def read_pose_set(
 
 
 @dataclass(frozen=True, eq=False)
-class Collected:
-    """What `collect_poses` found.
+class PoseSetInspection:
+    """Result of reading a path that should hold a pose set.
 
     Attributes
     ----------
-    pose_set : the poses that fit together, None if there are none
-    n_found : the poses that were there, usable or not
-    same_topology : whether all that could be read share their faces
+    pose_set : the poses that agree with the first readable one; None if none can be used
+    n_found : the poses that are there, usable or not
+    same_topology : whether all readable poses share their vertex count and faces
+    defects : of the set and its poses, in the order found
+    problems : a sentence for each defect, those of the reference, pose 0, among them
     """
 
     pose_set: PoseSet | None
-    n_found: int
-    same_topology: bool
+    n_found: int = 0
+    same_topology: bool = False
+    defects: tuple[LCollisionError, ...] = ()
+    problems: tuple[str, ...] = ()
 
 
 def collect_poses(
@@ -216,7 +220,7 @@ def collect_poses(
     report: Callable[[LCollisionError], None],
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
-) -> Collected:
+) -> PoseSetInspection:
     """Read all poses that fit together and report each defect.
 
     Parameters
@@ -229,7 +233,7 @@ def collect_poses(
         is_folder, exists = path.is_dir(), path.exists()
     except OSError as error:
         report(MeshFileError.unreadable(path, error, "check the name"))
-        return Collected(None, 0, same_topology=False)
+        return PoseSetInspection(None)
     if is_folder:
         return _without_outliers(_collect_folder(path, report, progress, cancel), report)
     suffix = path.suffix.lower()
@@ -242,7 +246,7 @@ def collect_poses(
     else:
         what, next_step = "is not a pose set", "name a folder of meshes or an .npz file"
     report(MeshFileError(what, next_step, where=path))
-    return Collected(None, 0, same_topology=False)
+    return PoseSetInspection(None)
 
 
 def _too_far_to_compute(where: str, vertices: npt.NDArray[Any]) -> PoseSetError | None:
@@ -257,7 +261,9 @@ def _too_far_to_compute(where: str, vertices: npt.NDArray[Any]) -> PoseSetError 
     return PoseSetError(what, "remove or scale that pose", where=where)
 
 
-def _without_outliers(collected: Collected, report: Callable[[LCollisionError], None]) -> Collected:
+def _without_outliers(
+    collected: PoseSetInspection, report: Callable[[LCollisionError], None]
+) -> PoseSetInspection:
     """Leave out the poses that are another body, or the same in another unit."""
     poses = collected.pose_set
     outliers = {} if poses is None else outlier_poses(poses.topology, poses.vertices)
@@ -304,12 +310,12 @@ def _collect_folder(
     report: Callable[[LCollisionError], None],
     progress: Progress,
     cancel: CancelToken | None,
-) -> Collected:
+) -> PoseSetInspection:
     try:
         files, others = mesh_files(path)
     except MeshFileError as error:
         report(error)
-        return Collected(None, 0, same_topology=False)
+        return PoseSetInspection(None)
     formats = Counter(file.suffix.lower() for file in files)
     if len(formats) != 1:
         held = ", ".join(f"{count} {suffix}" for suffix, count in sorted(formats.items()))
@@ -318,7 +324,7 @@ def _collect_folder(
             what = f"holds meshes of several formats ({held})"
             next_step = "keep one format in a folder"
         report(MeshFileError(what, next_step, where=path))
-        return Collected(None, len(files), same_topology=False)
+        return PoseSetInspection(None, len(files))
     notes: Counter[str] = Counter()
     names: list[str] = []
     topology: Topology | None = None
@@ -337,7 +343,7 @@ def _collect_folder(
                 too_large = _too_large(path, len(files), topology.n_vertices)
                 if too_large is not None:
                     report(too_large)
-                    return Collected(None, len(files), same_topology=False)
+                    return PoseSetInspection(None, len(files))
                 vertices = np.empty((len(files), topology.n_vertices, 3), dtype=np.float64)
             where = f"pose {pose} ({file.name})"
             if (defect := _disagreement(where, mesh.topology, topology)) is not None:
@@ -353,7 +359,7 @@ def _collect_folder(
                 notes.update(mesh.notes)
         progress(pose + 1, len(files))
     if topology is None:
-        return Collected(None, len(files), same_topology=False)
+        return PoseSetInspection(None, len(files))
     sentences = [
         note if times == len(names) else f"{note} (in {times} of {len(names)} files)"
         for note, times in notes.items()
@@ -365,7 +371,7 @@ def _collect_folder(
     pose_set = PoseSet(
         vertices[: len(names)], topology, tuple(names), path, tuple(sentences), up_axis=up_axis
     )
-    return Collected(pose_set, len(files), same_topology)
+    return PoseSetInspection(pose_set, len(files), same_topology)
 
 
 def _disagreement(where: str, found: Topology, expected: Topology) -> PoseSetError | None:
@@ -403,7 +409,7 @@ def _too_large(path: Path, n_poses: int, n_vertices: int) -> MeshFileError | Non
 
 def _collect_npz(
     path: Path, report: Callable[[LCollisionError], None], progress: Progress
-) -> Collected:
+) -> PoseSetInspection:
     try:
         arrays, held = read_npz(path, (*_MESH_ARRAYS, *((name,) for name in _EXTRA_ARRAYS)))
         vertices, faces = _meshes_of(arrays, held)
@@ -413,7 +419,7 @@ def _collect_npz(
         pose_set = PoseSet(vertices, topology, source=path, **extras)
     except LCollisionError as error:
         report(MeshFileError.because(path, "cannot be read as a pose set", error))
-        return Collected(None, 0, same_topology=False)
+        return PoseSetInspection(None)
     kept = []
     for pose, mesh in enumerate(vertices):
         where = f"pose {pose} ({pose_set.names[pose]}) of {path}"
@@ -424,7 +430,7 @@ def _collect_npz(
         else:
             kept.append(pose)
     progress(len(vertices), len(vertices))
-    return Collected(_only(pose_set, kept), len(vertices), same_topology=True)
+    return PoseSetInspection(_only(pose_set, kept), len(vertices), same_topology=True)
 
 
 def _meshes_of(
@@ -446,39 +452,39 @@ def _meshes_of(
 
 
 def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> dict[str, Any]:
-    def scalar(name: str, kinds: str) -> Any:
-        value = arrays[name]
-        if value.shape != () or value.dtype.kind not in kinds:
-            raise MeshFileError.must_be(name, "one number", f"{value.dtype} {value.shape}")
-        return value.item()
-
-    def strings(name: str, length: int) -> list[str]:
-        value = arrays[name]
-        if value.shape != (length,) or value.dtype.kind != "U":
-            raise MeshFileError.must_be(
-                name, f"({length},) strings", f"{value.dtype} {value.shape}"
-            )
-        native = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("="))
-        if (native.view(np.uint32) > sys.maxunicode).any():
-            raise MeshFileError("holds a character that does not exist", where=name)
-        texts = native.tolist()
-        # A lone surrogate, from an undecodable file name, cannot be printed.
-        return [text[:_MAX_TEXT_LENGTH].encode(errors="replace").decode() for text in texts]
-
+    """Return the arguments of `PoseSet` that are held beside (N, V, 3) vertices."""
     extras: dict[str, Any] = {}
-    if "format_version" in arrays and scalar("format_version", "iu") > FORMAT_VERSION:
-        raise MeshFileError.too_new("it", scalar("format_version", "iu"), FORMAT_VERSION)
-    if "names" in arrays:
-        extras["names"] = tuple(strings("names", shape[0]))
-    if "notes" in arrays:
-        extras["notes"] = tuple(strings("notes", arrays["notes"].size))
-    if "near_exclusion" in arrays:
-        extras["near_exclusion"] = float(scalar("near_exclusion", "fiu"))
-    if "up_axis" in arrays:
-        extras["up_axis"] = scalar("up_axis", "iu")
-    if "vertex_labels" in arrays:
-        extras["vertex_labels"] = np.array(strings("vertex_labels", shape[1]))
+    for name, kinds, needed in (
+        ("format_version", "iu", ()),
+        ("near_exclusion", "fiu", ()),
+        ("up_axis", "iu", ()),
+        ("names", "U", shape[:1]),
+        ("notes", "U", (np.size(arrays.get("notes", ())),)),
+        ("vertex_labels", "U", shape[1:2]),
+    ):
+        value = arrays.get(name)
+        if value is None:
+            continue
+        if value.shape != needed or value.dtype.kind not in kinds:
+            expected = f"{needed} strings" if kinds == "U" else "one number"
+            raise MeshFileError.must_be(name, expected, f"{value.dtype} {value.shape}")
+        convert = float if "f" in kinds else int
+        extras[name] = _texts(value, name) if kinds == "U" else convert(value)
+    if (version := extras.pop("format_version", FORMAT_VERSION)) > FORMAT_VERSION:
+        raise MeshFileError.too_new("it", version, FORMAT_VERSION)
+    if "vertex_labels" in extras:
+        extras["vertex_labels"] = np.array(extras["vertex_labels"])
     return extras
+
+
+def _texts(value: npt.NDArray[np.str_], name: str) -> tuple[str, ...]:
+    native = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("="))
+    if (native.view(np.uint32) > sys.maxunicode).any():
+        raise MeshFileError("holds a character that does not exist", where=name)
+    # A lone surrogate, from an undecodable file name, cannot be printed.
+    return tuple(
+        text[:_MAX_TEXT_LENGTH].encode(errors="replace").decode() for text in native.tolist()
+    )
 
 
 def _require_labels(vertex_labels: npt.NDArray[np.str_]) -> None:

@@ -111,7 +111,7 @@ def test_transforms_follow_the_stated_convention() -> None:
     for pose in range(3):
         moved = poses[pose] @ alignment.rotations[pose].T + alignment.translations[pose]
         assert np.abs(moved - alignment.vertices[pose]).max() < 1e-14
-        transform = alignment.transform(pose)
+        transform = RigidTransform(alignment.rotations[pose], alignment.translations[pose])
         assert np.abs(transform.apply(poses[pose]) - moved).max() < 1e-14
         back = transform.inverse().apply(alignment.vertices[pose])
         assert np.abs(back - poses[pose]).max() < 1e-13

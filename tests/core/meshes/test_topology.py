@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import PoseSetError, ShapeError
-from lcollision_core.meshes import Topology, audit_mesh
+from lcollision_core.meshes import Topology, degenerate_faces
 from tests.core.shapes import sphere
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -150,5 +150,5 @@ def test_faces_without_area_are_found_far_from_the_origin() -> None:
     ball = sphere()
     vertices = np.concatenate([ball.vertices, [[0, 0, 2], [0, 0, 3], [0, 0, 4]]]) + 2.0**24
     faces = np.concatenate([ball.faces, [np.arange(3) + len(ball.vertices)]])
-    flat = audit_mesh(Topology(faces, len(vertices)), vertices).degenerate_faces
+    flat = degenerate_faces(Topology(faces, len(vertices)), vertices)
     assert flat.tolist() == [len(ball.faces)]
