@@ -31,6 +31,7 @@ fcl_poses : poses that python-fcl was timed on
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -77,7 +78,10 @@ def time_predictor(
     latent = drawn_poses(model, TABLE_POSES)
     exact = _time_exact(model, latent[:n_poses], progress, cancel or CancelToken())
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    return [_time_on(device, predictor.on(device), latent, exact) | exact for device in devices]
+    return [
+        _time_on(device, replace(predictor, device=device), latent, exact) | exact
+        for device in devices
+    ]
 
 
 def drawn_poses(model: PoseModel, n_poses: int) -> npt.NDArray[np.float32]:
@@ -146,7 +150,7 @@ def _time_on(
         torch.set_num_threads(n_threads)
     return {
         "device": device,
-        "preset": predictor.preset,
+        "preset": predictor.config.preset,
         "batch": BATCH,
         "cores": available_cores(),
         "us_per_pose": 1e6 * predicted,

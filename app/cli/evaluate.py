@@ -63,7 +63,7 @@ def evaluate(
         print_json(measured_model(model) | measured | {"threshold": threshold} | asdict(metrics))
         return
     called = "" if threshold == 0.5 else f", decision threshold {threshold:g}"
-    tell(f"{model.name}, preset {trained.preset}{called}: {scores_sentence(metrics)}")
+    tell(f"{model.name}, preset {trained.config.preset}{called}: {scores_sentence(metrics)}")
     tell(
         f"  {measured_model_sentence(model)}; {_percent(rows.colliding.mean())} of these "
         f"{counted(len(rows), 'sample')} collide"

@@ -107,7 +107,7 @@ class PredictorRecord:
 
     config: PredictorConfig
     facts: TrainingFacts
-    metrics: PredictorMetrics | None
+    metrics: PredictorMetrics | None = None
 
     @classmethod
     def of_section(cls, section: Section, embedding: Embedding) -> PredictorRecord:
@@ -124,7 +124,7 @@ class PredictorRecord:
             fit the embedding.
         """
         metadata = section.metadata
-        preset, measured = metadata.get("preset"), metadata.get("metrics")
+        preset = metadata.get("preset")
         if not isinstance(preset, str) or preset not in PRESETS:
             raise ModelFileError(
                 "the model's predictor has an unknown preset",
@@ -133,27 +133,25 @@ class PredictorRecord:
                 got=quoted(preset),
             )
         try:
-            config = from_json(PredictorConfig, metadata.get("config"), "config")
-            if config.preset != preset:
-                raise ValueError(f"config.preset must be {preset!r}, got {quoted(config.preset)}")
-            facts = from_json(TrainingFacts, metadata.get("facts", {}), "facts")
-            metrics = None
-            if measured is not None:
-                metrics = from_json(PredictorMetrics, measured, "metrics")
-            require_network(section.arrays, embedding, preset, config.by_domain)
+            record = from_json(cls, metadata, "predictor")
+            if record.config.preset != preset:
+                got = quoted(record.config.preset)
+                raise ValueError(f"config.preset must be {preset!r}, got {got}")
+            require_network(section.arrays, embedding, preset, record.config.by_domain)
         except (ValueError, LCollisionError) as error:
             what, next_step = "does not fit its latent space", "train the predictor again"
             raise ModelFileError.because("the model's predictor", what, error, next_step) from error
-        return cls(config, facts, metrics)
+        return record
 
 
+@dataclass(frozen=True, eq=False)
 class CollisionPredictor:
     """Predicts energy per domain and collision from latent codes.
 
     Immutable, and safe to share between threads. Made by `train_predictor` or `from_section`. The
     default preset computes in single precision on the CPU, where it needs no torch.
 
-    Parameters
+    Attributes
     ----------
     embedding : whose latent codes come in
     arrays : the network's state dict
@@ -163,38 +161,17 @@ class CollisionPredictor:
     device : that is to predict, "cpu" or "cuda"
     """
 
-    def __init__(
-        self,
-        embedding: Embedding,
-        arrays: Mapping[str, npt.NDArray[Any]],
-        config: PredictorConfig,
-        facts: TrainingFacts,
-        metrics: PredictorMetrics | None = None,
-        device: str = "cpu",
-    ) -> None:
-        self.config, self.facts, self.metrics = config, facts, metrics
-        self.device = device
-        self._embedding, self._arrays = embedding, dict(arrays)
-
-    @property
-    def n_domains(self) -> int:
-        """K."""
-        return self._embedding.n_domains
-
-    @property
-    def latent_size(self) -> int:
-        """D."""
-        return self._embedding.latent_size
+    embedding: Embedding
+    arrays: Mapping[str, npt.NDArray[Any]]
+    config: PredictorConfig
+    facts: TrainingFacts
+    metrics: PredictorMetrics | None = None
+    device: str = "cpu"
 
     @property
     def needs_torch(self) -> bool:
         """Whether predictions need torch."""
         return self._compiled is None
-
-    @property
-    def preset(self) -> str:
-        """The network's name: "default" or "paper"."""
-        return self.config.preset
 
     def predict(self, latent: npt.NDArray[Any]) -> Prediction:
         """Predict the collisions of latent poses.
@@ -209,8 +186,9 @@ class CollisionPredictor:
         """
         scaled, logit = self.scaled_outputs(latent)
         domain_energy = np.maximum(scaled, 0.0) * self.facts.energy_scale
-        if domain_energy.shape[1] != self.n_domains:
-            domain_energy = np.repeat(domain_energy / self.n_domains, self.n_domains, axis=1)
+        n_domains = self.embedding.n_domains
+        if domain_energy.shape[1] != n_domains:
+            domain_energy = np.repeat(domain_energy / n_domains, n_domains, axis=1)
         results = (domain_energy, domain_energy.sum(axis=1), logit, expit(logit))
         for array in results:
             array.flags.writeable = False
@@ -294,30 +272,13 @@ class CollisionPredictor:
         from torch.utils.flop_counter import FlopCounterMode
 
         with torch.no_grad(), FlopCounterMode(display=False) as counter:
-            self._network(torch.zeros((n_rows, self.latent_size), device=self.device))
+            self._network(torch.zeros((n_rows, self.embedding.latent_size), device=self.device))
         return int(counter.get_total_flops())
-
-    def on(self, device: str) -> CollisionPredictor:
-        """Return the same predictor on a device, "cuda" or "cpu"."""
-        return CollisionPredictor(
-            self._embedding, self._arrays, self.config, self.facts, self.metrics, device
-        )
-
-    def with_metrics(self, metrics: PredictorMetrics) -> CollisionPredictor:
-        """Return the same predictor with its metrics."""
-        return CollisionPredictor(
-            self._embedding, self._arrays, self.config, self.facts, metrics, self.device
-        )
 
     def to_section(self) -> Section:
         """Return the section of the model file: the weights in float32, and JSON values."""
-        metadata = {
-            "preset": self.preset,
-            "config": asdict(self.config),
-            "facts": asdict(self.facts),
-            "metrics": self.metrics and asdict(self.metrics),
-        }
-        return Section(self._arrays, metadata)
+        record = PredictorRecord(self.config, self.facts, self.metrics)
+        return Section(self.arrays, {"preset": self.config.preset, **asdict(record)})
 
     @classmethod
     def from_section(cls, section: Section, embedding: Embedding) -> CollisionPredictor:
@@ -333,7 +294,7 @@ class CollisionPredictor:
         ModelFileError : the preset is unknown, or the weights do not fit the embedding.
         """
         record = PredictorRecord.of_section(section, embedding)
-        return cls(embedding, section.arrays, record.config, record.facts, record.metrics)
+        return cls(embedding, dict(section.arrays), record.config, record.facts, record.metrics)
 
     def __getstate__(self) -> dict[str, Any]:
         networks = ("_compiled", "_network", "_exact_network")
@@ -342,9 +303,9 @@ class CollisionPredictor:
     @cached_property
     def _compiled(self) -> CompiledNetwork | None:
         """The network for the CPU, without torch; None for the preset `paper` and on a GPU."""
-        if self.preset != "default" or self.device != "cpu":
+        if self.config.preset != "default" or self.device != "cpu":
             return None
-        return CompiledNetwork(self._embedding, self._arrays)
+        return CompiledNetwork(self.embedding, self.arrays)
 
     @cached_property
     def _network(self) -> PredictorNetwork:
@@ -352,8 +313,8 @@ class CollisionPredictor:
 
         from lcollision_core.predictor.presets import NETWORKS
 
-        state = {name: torch.tensor(array) for name, array in self._arrays.items()}
-        network = NETWORKS[self.preset].restore(self._embedding, self.config, state)
+        state = {name: torch.tensor(array) for name, array in self.arrays.items()}
+        network = NETWORKS[self.config.preset].restore(self.embedding, self.config, state)
         return network.to(self.device).requires_grad_(False).eval()
 
     @cached_property
@@ -364,9 +325,9 @@ class CollisionPredictor:
         return deepcopy(self._network).double()
 
     def _require(self, latent: npt.NDArray[Any]) -> None:
-        if np.ndim(latent) != 2 or np.shape(latent)[1] != self.latent_size:
+        if np.ndim(latent) != 2 or np.shape(latent)[1] != self.embedding.latent_size:
             raise ShapeError.must_be(
-                "latent", f"of shape (B, {self.latent_size})", np.shape(latent)
+                "latent", f"of shape (B, {self.embedding.latent_size})", np.shape(latent)
             )
         if not np.isfinite(latent).all():
             raise ShapeError("a latent pose has a number that is not finite")

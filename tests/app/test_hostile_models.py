@@ -82,7 +82,7 @@ def _whole(bare: PoseModel, preset: str) -> Sections:
     )
     arrays = {name: array.numpy() for name, array in network.state_dict().items()}
     predictor = CollisionPredictor(embedding, arrays, PRESETS[preset], facts)
-    predictor = predictor.with_metrics(evaluate_predictor(predictor, rows))
+    predictor = replace(predictor, metrics=evaluate_predictor(predictor, rows))
     card = replace(bare.card, provenance={"command": ["train"], "seconds": 3.5})
     model = PoseModel("whole", embedding, card).with_predictor(predictor)
     model = model.with_free_poses(0.1 * bare.training_latent[:3])

@@ -105,6 +105,5 @@ def train_predictor(
         logit = predictor.scaled_outputs(chosen_by.latent)[1]
         limit = balanced_logit(logit, chosen_by.colliding)
         if limit != 0.0:
-            facts = replace(facts, logit_shift=-limit)
-            predictor = CollisionPredictor(embedding, arrays, config, facts)
-    return predictor.with_metrics(evaluate_predictor(predictor, rows.taken(split.held_out)))
+            predictor = replace(predictor, facts=replace(facts, logit_shift=-limit))
+    return replace(predictor, metrics=evaluate_predictor(predictor, rows.taken(split.held_out)))

@@ -385,7 +385,7 @@ def test_the_benchmark_times_the_predictor_beside_the_exact_check(
 def test_floating_point_operations_are_those_of_the_layers(trained: Path) -> None:
     predictor = PoseModel.load(trained).predictor
     assert predictor is not None
-    size, codes = predictor.latent_size, 3
+    size, codes = predictor.embedding.latent_size, 3
     encoder = size * 512 + 512 * 256 + 256 * 256
     each = (256 + codes) * 512 + 512 * 256 + 256 * 256 + 256 * 128 + 128
     assert predictor.flops(7) == 7 * 2 * (encoder + 2 * each + 2 * 64 + 64)

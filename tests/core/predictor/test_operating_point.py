@@ -149,7 +149,9 @@ def test_a_trained_predictor_calls_from_there(
     )
     section = trained.to_section()
     facts = {**section.metadata["facts"], "logit_shift": float("nan")}
-    with pytest.raises(ModelFileError, match=r"latent space: facts.logit_shift must be a finite"):
+    with pytest.raises(
+        ModelFileError, match=r"latent space: predictor.facts.logit_shift must be a finite"
+    ):
         CollisionPredictor.from_section(
             Section(section.arrays, {**section.metadata, "facts": facts}), embedding
         )

@@ -244,7 +244,7 @@ def test_files_of_earlier_versions_are_read(
 
 
 def test_wrong_latents_are_refused(predictor: CollisionPredictor) -> None:
-    size = predictor.latent_size
+    size = predictor.embedding.latent_size
     for call in (predictor.predict, predictor.logit_and_gradient):
         with pytest.raises(ShapeError, match=rf"shape \(B, {size}\), got \({size},\)"):
             call(np.zeros(size))
