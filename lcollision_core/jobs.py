@@ -13,8 +13,8 @@ Progress = Callable[[int, int], None]
 """Called with (done, total), in items of the work's own unit, from the thread that works."""
 
 
-def no_progress(done: int, total: int) -> None:
-    """Ignore the progress: the default of functions that take a `Progress`."""
+def no_progress(*_: object) -> None:
+    """Ignore the progress: the default of functions that report theirs."""
 
 
 def available_cores() -> int:

@@ -142,15 +142,10 @@ def predictor(
     run that was stopped or killed go on when it is started again; it is removed at the end. To use
     several devices or machines, start it with `torchrun -m app train predictor ...`.
     """
+    from lcollision_core.jobs import no_progress
     from lcollision_core.meshes import file_stamp, require_writable
     from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
-    from lcollision_core.predictor import (
-        PRESETS,
-        has_begun,
-        no_status,
-        patches_path,
-        train_predictor,
-    )
+    from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
     from lcollision_core.resolve import find_free_poses
 
     destination = model_destination(output)
@@ -163,7 +158,7 @@ def predictor(
     config = PRESETS[preset].with_loss(loss)
     # torchrun starts this command many times; the first process writes for all.
     leads = os.environ.get("RANK", "0") == "0"
-    bar = status_bar("reading rows", told_of_predictor) if leads else nullcontext(no_status)
+    bar = status_bar("reading rows", told_of_predictor) if leads else nullcontext(no_progress)
     with _resumable(checkpoint, has_begun, leads) as cancel, bar as progress:
         trained = train_predictor(
             store.load(n_rows),

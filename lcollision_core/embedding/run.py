@@ -38,10 +38,6 @@ class TrainingStatus:
 StatusCallback = Callable[[TrainingStatus], None]
 
 
-def no_status(status: TrainingStatus) -> None:
-    """Ignore the progress."""
-
-
 class Run:
     """The stages of one training run, each resumed from its checkpoint.
 

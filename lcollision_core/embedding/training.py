@@ -19,9 +19,9 @@ from lcollision_core.embedding.fitting import Decoder, fit_latent
 from lcollision_core.embedding.latent_box import LatentBox
 from lcollision_core.embedding.masks import judge_masks
 from lcollision_core.embedding.metrics import EmbeddingMetrics, feature_pca, vertex_distances
-from lcollision_core.embedding.run import Run, StatusCallback, no_status
+from lcollision_core.embedding.run import Run, StatusCallback
 from lcollision_core.errors import PoseSetError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes.alignment import align_rigid
 from lcollision_core.meshes.pose_set import PoseSet
 from lcollision_core.meshes.precision import can_hold
@@ -37,7 +37,7 @@ def train_embedding(
     config: EmbeddingConfig | None = None,
     *,
     checkpoint: Path | None = None,
-    progress: StatusCallback = no_status,
+    progress: StatusCallback = no_progress,
     cancel: CancelToken | None = None,
     seed: int = 0,
 ) -> Embedding:

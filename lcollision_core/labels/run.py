@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lcollision_core.errors import LabelStoreError
-from lcollision_core.jobs import CancelToken, available_cores
+from lcollision_core.jobs import CancelToken, available_cores, no_progress
 from lcollision_core.labels.cluster import label_on_cluster
 from lcollision_core.labels.identity import StoreIdentity
 from lcollision_core.labels.labeller import Labeller, LabelRows
@@ -57,10 +57,6 @@ class LabelStatus:
 StatusCallback = Callable[[LabelStatus], None]
 
 
-def no_status(status: LabelStatus) -> None:
-    """Ignore the progress."""
-
-
 def label_poses(
     labeller: Labeller,
     path: str | os.PathLike[str],
@@ -69,7 +65,7 @@ def label_poses(
     seed: int = 0,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: StatusCallback = no_status,
+    progress: StatusCallback = no_progress,
     cancel: CancelToken | None = None,
 ) -> LabelStatus:
     """Extend a store to at least `n_rows` labelled samples of a model's latent box.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,7 +29,8 @@ def vertex_normals(
     """
     normals = np.zeros_like(vertices)
     _add_face_normals(vertices, faces, normals)
-    _normalise(normals)
+    lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
+    np.divide(normals, lengths, out=normals, where=lengths > 0.0)
     return normals
 
 
@@ -46,12 +46,3 @@ def _add_face_normals(vertices: Array, faces: npt.NDArray[np.integer], normals: 
             normals[vertex, 0] += nx
             normals[vertex, 1] += ny
             normals[vertex, 2] += nz
-
-
-@compiled
-def _normalise(vectors: Array) -> None:
-    for v in range(len(vectors)):
-        x, y, z = vectors[v, 0], vectors[v, 1], vectors[v, 2]
-        length = math.sqrt(x * x + y * y + z * z)
-        if length > 0.0:
-            vectors[v, 0], vectors[v, 1], vectors[v, 2] = x / length, y / length, z / length

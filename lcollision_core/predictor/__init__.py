@@ -14,7 +14,6 @@ from lcollision_core.predictor.training.status import (
     PredictorStatus,
     StatusCallback,
     has_begun,
-    no_status,
     patches_path,
 )
 from lcollision_core.predictor.training.train import train_predictor

@@ -218,7 +218,7 @@ def contact_field_backward(
     dtype = frame.dtype.type
     zero, one, two, three, six = dtype(0.0), dtype(1.0), dtype(2.0), dtype(3.0), dtype(6.0)
     behind, sharpness = dtype(BEHIND), dtype(1.0 / FADE)
-    inner, outer = dtype(STEEPNESS[0]), dtype(STEEPNESS[1])
+    steepness = (dtype(STEEPNESS[0]), dtype(STEEPNESS[1]))
     ordered = np.empty((6, n_ordered), dtype=frame.dtype)
     grad_ordered = np.empty((6, n_ordered), dtype=frame.dtype)
     boxes = np.empty((6, n_ordered // BLOCK), dtype=frame.dtype)
@@ -236,17 +236,18 @@ def contact_field_backward(
         grad_ordered[:] = zero
         for slot in range(n_points):
             if slot % BLOCK == 0:
-                n_gathered = _gather(slot // BLOCK, ordered, boxes, outer, near, gathered)
+                n_gathered = _gather(slot // BLOCK, ordered, boxes, steepness[1], near, gathered)
                 grad_gathered[:, :n_gathered] = zero
             p = order[slot]
             _copy_blocks(pairs, BLOCK * slot, n_ordered, near, n_gathered, hidden)
             px, py, pz = ordered[0, slot], ordered[1, slot], ordered[2, slot]
             own_x, own_y, own_z = ordered[3, slot], ordered[4, slot], ordered[5, slot]
             _sums_backward(frame[b, p], field[p, b], grad_field[p, b], given, grad_frame[b, p])
-            w0, h0, x0, y0 = given[0, 0], given[0, 1], given[0, 2], given[0, 3]
-            z0, a0, b0, c0 = given[0, 4], given[0, 5], given[0, 6], given[0, 7]
-            w1, h1, x1, y1 = given[1, 0], given[1, 1], given[1, 2], given[1, 3]
-            z1, a1, b1, c1 = given[1, 4], given[1, 5], given[1, 6], given[1, 7]
+            inner, outer = given[0], given[1]
+            grad_sums = (
+                (inner[0], inner[1], inner[2], inner[3], inner[4], inner[5], inner[6], inner[7]),
+                (outer[0], outer[1], outer[2], outer[3], outer[4], outer[5], outer[6], outer[7]),
+            )
             # By the point's position and normal.
             at_x, at_y, at_z, own_a, own_b, own_c = zero, zero, zero, zero, zero, zero
             for q in range(n_gathered):
@@ -258,32 +259,25 @@ def contact_field_backward(
                 s = s if s < one else one
                 facing = s * s * (three - two * s)
                 above = dx * qx + dy * qy + dz * qz
-                t = one - squared * inner
-                t = t if t > zero else zero
-                cube = t * t * t
-                weight = facing * cube
-                grad_weight = w0 - h0 * above + x0 * dx + y0 * dy + z0 * dz
-                grad_weight += a0 * qx + b0 * qy + c0 * qz
-                grad_facing = grad_weight * cube
-                grad_squared = grad_weight * t * t * inner
-                grad_above = weight * h0
-                grad_dx, grad_dy, grad_dz = weight * x0, weight * y0, weight * z0
-                grad_qx, grad_qy, grad_qz = weight * a0, weight * b0, weight * c0
-                t = one - squared * outer
-                t = t if t > zero else zero
-                cube = t * t * t
-                weight = facing * cube
-                grad_weight = w1 - h1 * above + x1 * dx + y1 * dy + z1 * dz
-                grad_weight += a1 * qx + b1 * qy + c1 * qz
-                grad_facing += grad_weight * cube
-                grad_squared += grad_weight * t * t * outer
-                grad_above += weight * h1
-                grad_dx += weight * x1
-                grad_dy += weight * y1
-                grad_dz += weight * z1
-                grad_qx += weight * a1
-                grad_qy += weight * b1
-                grad_qz += weight * c1
+                grad_facing = grad_squared = grad_above = zero
+                grad_dx = grad_dy = grad_dz = grad_qx = grad_qy = grad_qz = zero
+                for k in range(2):
+                    of_weight, of_height, of_x, of_y, of_z, of_nx, of_ny, of_nz = grad_sums[k]
+                    t = one - squared * steepness[k]
+                    t = t if t > zero else zero
+                    cube = t * t * t
+                    weight = facing * cube
+                    grad_weight = of_weight - of_height * above + of_x * dx + of_y * dy
+                    grad_weight += of_z * dz + of_nx * qx + of_ny * qy + of_nz * qz
+                    grad_facing += grad_weight * cube
+                    grad_squared += grad_weight * t * t * steepness[k]
+                    grad_above += weight * of_height
+                    grad_dx += weight * of_x
+                    grad_dy += weight * of_y
+                    grad_dz += weight * of_z
+                    grad_qx += weight * of_nx
+                    grad_qy += weight * of_ny
+                    grad_qz += weight * of_nz
                 # Of t cubed; and the slope of the smooth step.
                 radial = -six * facing * grad_squared
                 grad_ahead = grad_facing * six * s * (one - s) * sharpness

@@ -1,4 +1,4 @@
-"""The three losses of Tan et al. 2021, section "Collision Predictor Based on Penetration".
+"""The losses of Tan et al. 2021, section "Collision Predictor Based on Penetration".
 
 Each returns a value for every row or pair, not yet averaged: processes that share a batch divide
 their sums by the whole batch's count. Energies are scaled: divided by the mean PDe-sum of the
@@ -57,21 +57,3 @@ def ranked_pairs(energy: torch.Tensor) -> int:
     """Count the pairs of `rank_loss` whose energies differ."""
     n_pairs = len(energy) // 2
     return int((energy[1 : 2 * n_pairs : 2] != energy[0 : 2 * n_pairs : 2]).sum())
-
-
-def entropy_loss(logit: torch.Tensor, colliding: torch.Tensor) -> torch.Tensor:
-    """L_entropy: cross entropy of the classifier, from its logit.
-
-    Parameters
-    ----------
-    logit : (B,) of the probability of a collision
-    colliding : (B,) 1 where the pose collides, else 0
-
-    Returns
-    -------
-    losses : (B,)
-    """
-    losses: torch.Tensor = torch.nn.functional.binary_cross_entropy_with_logits(
-        logit, colliding, reduction="none"
-    )
-    return losses

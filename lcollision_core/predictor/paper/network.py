@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import torch
 from torch import nn
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.labels import LabelRows
@@ -18,7 +19,7 @@ from lcollision_core.predictor.network import (
     StackedLinear,
     Targets,
 )
-from lcollision_core.predictor.paper.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
+from lcollision_core.predictor.paper.losses import depth_loss, rank_loss, ranked_pairs
 from lcollision_core.predictor.stored_network import (
     CLASSIFIER_SIZE,
     ENCODER_SIZES,
@@ -108,7 +109,11 @@ class PaperNetwork(PredictorNetwork):
         """Sum up this process's share of the batch's mean loss: the paper's three terms."""
         own = batch.part(*part)
         n_rows = len(batch.energy)
-        total = config.entropy_weight / n_rows * entropy_loss(output.logit, own.colliding).sum()
+        total = (
+            config.entropy_weight
+            / n_rows
+            * binary_cross_entropy_with_logits(output.logit, own.colliding, reduction="sum")
+        )
         if config.depth_weight:
             divided = own.domain_energy if config.by_domain else own.domain_energy[:, :0]
             losses = depth_loss(output.domain_energy, divided, own.energy)

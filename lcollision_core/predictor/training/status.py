@@ -32,10 +32,6 @@ class PredictorStatus:
 StatusCallback = Callable[[PredictorStatus], None]
 
 
-def no_status(status: PredictorStatus) -> None:
-    """Ignore a status."""
-
-
 def patches_path(checkpoint: Path) -> Path:
     """Return the file beside a checkpoint that keeps the labelled patches."""
     return checkpoint.with_name(f"{checkpoint.name}.patches")

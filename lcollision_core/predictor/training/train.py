@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.labels import LabelRows, StoreIdentity
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.metrics import mean_difference
@@ -19,7 +19,7 @@ from lcollision_core.predictor.predictor import (
 )
 from lcollision_core.predictor.training.operating_point import balanced_logit
 from lcollision_core.predictor.training.row_split import split_rows
-from lcollision_core.predictor.training.status import StatusCallback, no_status
+from lcollision_core.predictor.training.status import StatusCallback
 
 
 def train_predictor(
@@ -30,7 +30,7 @@ def train_predictor(
     store: StoreIdentity | None = None,
     device: str = "auto",
     checkpoint: Path | None = None,
-    progress: StatusCallback = no_status,
+    progress: StatusCallback = no_progress,
     cancel: CancelToken | None = None,
     seed: int = 0,
 ) -> CollisionPredictor:

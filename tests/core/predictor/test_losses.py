@@ -12,7 +12,7 @@ import torch
 from lcollision_core.predictor import PRESETS
 from lcollision_core.predictor.metrics import mean_difference, measure
 from lcollision_core.predictor.network import NetworkOutput, Targets
-from lcollision_core.predictor.paper.losses import depth_loss, entropy_loss, rank_loss, ranked_pairs
+from lcollision_core.predictor.paper.losses import depth_loss, rank_loss, ranked_pairs
 from lcollision_core.predictor.paper.network import PaperNetwork
 
 
@@ -63,13 +63,6 @@ def test_rank_loss_wants_the_larger_to_lead_by_the_margin() -> None:
     assert losses.tolist() == pytest.approx([0.8, 1.2, 0.0, 0.0])
     assert ranked_pairs(energy) == 3
     _require_gradient(lambda values: rank_loss(values, energy, 1.0), predicted)
-
-
-def test_entropy_loss_is_minus_the_log_of_the_right_answer_s_probability() -> None:
-    logit, colliding = _double(math.log(3.0), math.log(3.0), -800.0), _double(1.0, 0.0, 1.0)
-    expected = [-math.log(0.75), -math.log(0.25), 800.0]
-    assert entropy_loss(logit, colliding).tolist() == pytest.approx(expected)
-    _require_gradient(lambda values: entropy_loss(values, colliding[:2]), logit[:2])
 
 
 def test_the_paper_s_hybrid_loss_weighs_the_means_of_all_three() -> None:

@@ -19,7 +19,7 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, ShapeError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.model import PoseModel
 from lcollision_core.model_file import read_model_file
@@ -37,7 +37,7 @@ from lcollision_core.predictor.training import loop
 from lcollision_core.predictor.training.loop import rate_at
 from lcollision_core.predictor.training.patch_labels import PatchLabeller
 from lcollision_core.predictor.training.row_split import split_rows
-from lcollision_core.predictor.training.status import has_begun, no_status, patches_path
+from lcollision_core.predictor.training.status import has_begun, patches_path
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import PAPER, colliding_latent, config, made_up_rows, weights_of
 
@@ -229,7 +229,7 @@ def test_patches_are_not_labelled_again(
     seen: list[PredictorStatus] = []
     resumed, whole = (
         train_predictor(rows, embedding, chosen, checkpoint=path, progress=progress)
-        for path, progress in ((checkpoint, seen.append), (None, no_status))
+        for path, progress in ((checkpoint, seen.append), (None, no_progress))
     )
     assert all(status.preparing is None for status in seen)
     assert not patches.exists()
