@@ -20,7 +20,7 @@ from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.inference import field_kernels, network_kernels
 from lcollision_core.predictor.inference.field_kernels import UNITS
-from lcollision_core.predictor.inference.network_kernels import Workspace, multiply
+from lcollision_core.predictor.inference.network_kernels import Workspace
 from lcollision_core.predictor.inference.skin import CompiledSkin, PosedSkin
 from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
 
@@ -188,7 +188,7 @@ class _Networks:
             before, after = (
                 workspace.empty(f"{self._name}{number} {what}", *shape) for what in ("in", "out")
             )
-            values.append(multiply(inputs, weight, before))
+            values.append(np.matmul(inputs, weight, out=before))
             network_kernels.add_and_silu(before, bias, after)
             inputs = after
         return values
@@ -199,8 +199,7 @@ class _Networks:
         for number, weight in reversed(list(enumerate(self._back))):
             if number < len(values) - 1:
                 network_kernels.silu_backward(values[number].reshape(-1), grad.reshape(-1))
-            shape = len(weight), grad.shape[1], weight.shape[2]
-            grad = multiply(grad, weight, np.empty(shape, dtype=np.float32))
+            grad = grad @ weight
         return grad
 
 

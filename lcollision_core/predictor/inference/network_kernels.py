@@ -1,4 +1,4 @@
-"""The compiled loops of small networks side by side: products and activations."""
+"""The compiled loops of small networks side by side: their activations."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.compiled import compiled, compiled_sums
+from lcollision_core.compiled import compiled_sums
 
 Array = npt.NDArray[np.float32]
 
@@ -15,14 +15,8 @@ _LOG2_E = np.float32(1.0 / math.log(2.0))
 _POWER = tuple(np.float32(math.log(2.0) ** n / math.factorial(n)) for n in range(6, -1, -1))
 """Taylor's coefficients of 2^r, the highest first: enough for single precision up to 1/2."""
 
-_AT_ONCE = 4
-"""Inputs whose products are summed up before the outputs are touched again."""
-
 _SMALL = 2**15
 """Size of an array up to which new memory is cheap."""
-
-_FEW_ROWS = 8
-"""Up to so many, reading the weights takes the time, and a library's threads would take more."""
 
 
 class Workspace:
@@ -39,59 +33,6 @@ class Workspace:
         if name not in self._memory or self._memory[name].size < size:
             self._memory[name] = np.empty(size, dtype=np.float32)
         return self._memory[name][:size].reshape(shape)
-
-
-def multiply(inputs: Array, weight: Array, outputs: Array) -> Array:
-    """Fill in and return n products: (n, B, n_in) inputs times (n, n_in, n_out) weights."""
-    if inputs.shape[1] <= _FEW_ROWS:
-        _multiply_few(inputs, weight, outputs)
-    else:
-        np.matmul(inputs, weight, out=outputs)
-    return outputs
-
-
-def multiply_back(grad_outputs: Array, weight: Array) -> Array:
-    """Pull derivatives by the outputs of `multiply` back to its inputs."""
-    n, n_rows, _ = grad_outputs.shape
-    grad_inputs = np.empty((n, n_rows, weight.shape[1]), dtype=np.float32)
-    if n_rows > _FEW_ROWS:
-        np.matmul(grad_outputs, weight.transpose(0, 2, 1), out=grad_inputs)
-    else:
-        _multiply_few_back(grad_outputs, weight, grad_inputs)
-    return grad_inputs
-
-
-@compiled
-def _multiply_few(inputs: Array, weight: Array, outputs: Array) -> None:
-    n_in, n_out = weight.shape[1:]
-    whole = n_in - n_in % _AT_ONCE
-    for n in range(weight.shape[0]):
-        for b in range(inputs.shape[1]):
-            for j in range(n_out):
-                outputs[n, b, j] = np.float32(0.0)
-        for i in range(0, whole, _AT_ONCE):
-            for b in range(inputs.shape[1]):
-                x0, x1 = inputs[n, b, i], inputs[n, b, i + 1]
-                x2, x3 = inputs[n, b, i + 2], inputs[n, b, i + 3]
-                for j in range(n_out):
-                    w0, w1 = weight[n, i, j], weight[n, i + 1, j]
-                    w2, w3 = weight[n, i + 2, j], weight[n, i + 3, j]
-                    outputs[n, b, j] += x0 * w0 + x1 * w1 + x2 * w2 + x3 * w3
-        for i in range(whole, n_in):
-            for b in range(inputs.shape[1]):
-                for j in range(n_out):
-                    outputs[n, b, j] += inputs[n, b, i] * weight[n, i, j]
-
-
-@compiled_sums
-def _multiply_few_back(grad_outputs: Array, weight: Array, grad_inputs: Array) -> None:
-    for n in range(weight.shape[0]):
-        for i in range(weight.shape[1]):
-            for b in range(grad_outputs.shape[1]):
-                total = np.float32(0.0)
-                for j in range(weight.shape[2]):
-                    total += grad_outputs[n, b, j] * weight[n, i, j]
-                grad_inputs[n, b, i] = total
 
 
 @compiled_sums

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.predictor.inference import skin_kernels
-from lcollision_core.predictor.inference.network_kernels import Workspace, multiply, multiply_back
+from lcollision_core.predictor.inference.network_kernels import Workspace
 from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
 
 Float32Array = npt.NDArray[np.float32]
@@ -48,19 +48,18 @@ class CompiledSkin:
     """
 
     def __init__(self, geometry: SkinGeometry, weight: Float32Array, origin: Float32Array) -> None:
-        self._geometry, self._weight, self._origin = geometry, weight[None], origin
+        self._geometry, self._weight, self._origin = geometry, weight, origin
 
     def forward(self, codes: Float32Array, workspace: Workspace) -> PosedSkin:
         """Pose the skin by (B, D) codes, in a workspace's memory."""
         geometry, n_rows, empty = self._geometry, len(codes), workspace.empty
         (n_skin, _), (n_sites, n_members) = geometry.offset.shape, geometry.members.shape
-        products = []
-        for number, group in enumerate(geometry.groups):
-            own = np.ascontiguousarray(codes[None, :, group.codes])
-            out = empty(f"group {number}", 1, n_rows, group.table.shape[1])
-            products.append(multiply(own, group.table[None], out)[0])
         outputs = empty("outputs", n_rows, N_FEATURES * len(geometry.target))
-        np.tanh(np.concatenate(products, axis=1, out=outputs), out=outputs)
+        stop = 0
+        for group in geometry.groups:
+            start, stop = stop, stop + group.table.shape[1]
+            np.matmul(codes[:, group.codes], group.table, out=outputs[:, start:stop])
+        np.tanh(outputs, out=outputs)
         outputs = outputs.reshape(n_rows, -1, N_FEATURES)
         features = empty("features", n_rows, n_skin, N_FEATURES)
         skin_kernels.add_features(
@@ -70,8 +69,8 @@ class CompiledSkin:
         frame = empty("frame", n_rows, *geometry.rest_frame.shape)
         rows = empty("rows", n_rows, 3, n_skin, 3)
         skin_kernels.deform(features, turns, geometry.rest_frame, frame, rows)
-        own = rows[:, :, : geometry.n_points].reshape(1, 3 * n_rows, -1)
-        moved = multiply(own, self._weight, empty("moved", 1, 3 * n_rows, geometry.n_points))
+        own = rows[:, :, : geometry.n_points].reshape(3 * n_rows, -1)
+        moved = np.matmul(own, self._weight, out=empty("moved", 3 * n_rows, geometry.n_points))
         positions = moved.reshape(n_rows, 3, -1) + self._origin
         folds = empty("folds", n_sites, n_rows, N_FEATURES * n_members)
         skin_kernels.fold_view(frame, rows, geometry.members, folds)
@@ -87,7 +86,7 @@ class CompiledSkin:
         """Pull derivatives by frames, positions and folds back to (B, D) codes; adds to frames."""
         geometry, n_rows = self._geometry, len(skin.frame)
         grad_rows = np.zeros_like(skin.rows)
-        grad_own = multiply_back(grad_positions.reshape(1, 3 * n_rows, -1), self._weight)
+        grad_own = grad_positions.reshape(3 * n_rows, -1) @ self._weight.T
         grad_rows[:, :, : geometry.n_points] = grad_own.reshape(n_rows, 3, -1, 3)
         skin_kernels.fold_view_backward(
             skin.frame, skin.rows, geometry.members, grad_folds, grad_frame, grad_rows
@@ -103,7 +102,6 @@ class CompiledSkin:
         grad_codes, start = [], 0
         for group in geometry.groups:
             stop = start + group.table.shape[1]
-            own = np.ascontiguousarray(grad_products[None, :, start:stop])
-            grad_codes.append(multiply_back(own, group.table[None])[0])
+            grad_codes.append(grad_products[:, start:stop] @ group.table.T)
             start = stop
         return np.concatenate(grad_codes, axis=1)
