@@ -6,7 +6,6 @@ import os
 import re
 import secrets
 import shutil
-import stat
 import sys
 import time
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from typing import BinaryIO
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.locks import is_named, lock_open_file, locked, shortened
+from lcollision_core.regular_files import require_regular
 
 _MAX_NAME_BYTES = 100
 """Most bytes of a temporary name without its marks."""
@@ -175,16 +175,11 @@ def require_writable(path: str | os.PathLike[str]) -> None:
 def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
     target = Path(os.path.realpath(path))
     try:
-        mode = target.stat().st_mode
-    except (FileNotFoundError, NotADirectoryError):
-        mode = None
+        # Renaming over a device such as /dev/null would replace it by a plain file.
+        with suppress(FileNotFoundError, NotADirectoryError):
+            require_regular(target)
     except OSError as error:
         raise MeshFileError.unwritable(path, error, "choose another name") from error
-    if mode is not None and stat.S_ISDIR(mode):
-        raise MeshFileError.unwritable(path, "it is a folder", "add a file name")
-    # Renaming over a device such as /dev/null would replace it by a plain file.
-    if mode is not None and not stat.S_ISREG(mode):
-        raise MeshFileError.unwritable(path, "it is not a plain file", "choose another")
     if not target.parent.is_dir():
         raise MeshFileError.unwritable(
             path, f"there is no folder {target.parent}", "create it first"

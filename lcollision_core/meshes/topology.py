@@ -168,20 +168,15 @@ class Topology:
         return int(count), np.asarray(labels, dtype=np.int32)
 
     @cached_property
-    def _is_used(self) -> npt.NDArray[np.bool_]:
-        used = np.zeros(self.n_vertices, dtype=np.bool_)
-        used[self.faces] = True
-        return used
+    def used_vertices(self) -> IntArray:
+        """Indices of the vertices that some face names."""
+        return np.unique(self.faces)
 
     @cached_property
     def unused_vertices(self) -> IntArray:
         """Indices of the vertices that no face names."""
-        return np.flatnonzero(~self._is_used).astype(np.int32)
-
-    @cached_property
-    def used_vertices(self) -> IntArray:
-        """Indices of the vertices that some face names."""
-        return np.flatnonzero(self._is_used).astype(np.int32)
+        everyone = np.arange(self.n_vertices, dtype=np.int32)
+        return np.setdiff1d(everyone, self.used_vertices, assume_unique=True)
 
     @cached_property
     def picked(self) -> slice | IntArray:

@@ -102,7 +102,7 @@ def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
 
     Raises
     ------
-    ModelFileError : another extension, no such folder, or the user's folder cannot be made.
+    ModelFileError : another extension, or the user's folder cannot be made.
     """
     path = Path(name_or_path)
     if len(path.parts) == 1 and not has_known_suffix(path):
@@ -120,10 +120,4 @@ def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
             f"a model is a {MODEL_SUFFIX} file",
             "rename it, or give a name alone to store it with your models",
         )
-    if not path.parent.is_dir():
-        raise ModelFileError.unwritable(
-            path, f"there is no folder {path.parent}", "create it first"
-        )
-    if path.is_dir():
-        raise ModelFileError.unwritable(path, "it is a folder", "add a file name")
     return path

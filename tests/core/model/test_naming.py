@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.meshes import require_writable
 from lcollision_core.model import (
     checkpoint_path,
     find_model,
@@ -254,8 +255,8 @@ def test_destinations_that_cannot_be_are_refused(folder: Path, tmp_path: Path) -
         (tmp_path / "none" / "m.safetensors", "no folder"),
         (tmp_path / "taken.safetensors", "it is a folder"),
     ):
-        with pytest.raises(ModelFileError, match=reason):
-            model_destination(destination)
+        with pytest.raises(LCollisionError, match=reason):
+            require_writable(model_destination(destination))
     folder.parent.write_bytes(b"a file where the folder should be")
     with pytest.raises(LCollisionError, match="cannot be made"):
         model_destination("tail")
