@@ -128,7 +128,7 @@ def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Sectio
         {
             "format_version": FORMAT_VERSION,
             "sections": json.loads(described),
-            "sha256": _digest(FORMAT_VERSION, described, tensors),
+            "sha256": digest_of(f"{FORMAT_VERSION}\n{described}\n", tensors),
         }
     )
     encoded = save(tensors, metadata={_METADATA_KEY: document})
@@ -160,7 +160,8 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
         described = _canonical_json(document["sections"])
     except (RecursionError, ValueError) as error:  # too deep, or a number beyond those of JSON
         _refuse_damaged(path, error)
-    if _digest(document["format_version"], described, tensors) != document["sha256"]:
+    text = f"{document['format_version']}\n{described}\n"
+    if digest_of(text, tensors) != document["sha256"]:
         _refuse_damaged(path)
     arrays: dict[str, dict[str, npt.NDArray[Any]]] = {name: {} for name in document["sections"]}
     for full_name, array in tensors.items():
@@ -269,9 +270,9 @@ def _require_storable(full_name: str, name: str, array: npt.NDArray[Any]) -> Non
         )
 
 
-def _digest(version: int, described: str, tensors: Mapping[str, npt.NDArray[Any]]) -> str:
-    """Return the SHA-256 of the file's content, independent of the order of its parts."""
-    digest = hashlib.sha256(f"{version}\n{described}\n".encode())
+def digest_of(text: str, tensors: Mapping[str, npt.NDArray[Any]]) -> str:
+    """Return the SHA-256 of a text and of arrays by name, whatever their order."""
+    digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         array = tensors[name]
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())

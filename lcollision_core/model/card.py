@@ -53,49 +53,33 @@ class ModelCard:
     domain_order: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        names, colours, order = self.domain_names, self.domain_colours, self.domain_order
-        texts = (*self.pose_names, self.source, self.licence)
-        allowed = f"use 1 to {MAX_NAME_LENGTH} printable characters"
-        for sound, problem, next_step in (
-            (
-                _LEAST_BODY_SIZE <= self.height <= 1.0 / _LEAST_BODY_SIZE,
-                f"its body size (height) must be from {_LEAST_BODY_SIZE:g} to "
-                f"{1.0 / _LEAST_BODY_SIZE:g}",
-                "",
-            ),
-            (self.up_axis in (0, 1, 2), "its up_axis must be 0, 1 or 2", ""),
-            (0.0 <= self.near_exclusion < 1.0, "its near_exclusion must be from 0 to below 1", ""),
-            (
-                all(len(text) <= _MAX_TEXT_LENGTH for text in texts),
-                f"its names, source and licence must be at most {_MAX_TEXT_LENGTH} characters",
-                "",
-            ),
-            *((_is_name(name), f"{name[:80]!r} cannot name a domain", allowed) for name in names),
-            *(
-                (
-                    names.count(name) == 1,
-                    f"two domains would be called {name!r}",
-                    "choose another name",
-                )
-                for name in names
-            ),
-            (len(colours) == len(names), "it must have one colour for each domain", ""),
-            *(
-                (
-                    bool(re.fullmatch("#[0-9a-f]{6}", colour)),
-                    f"{quoted(colour)} is not a colour",
-                    "write it as in #0077bb",
-                )
-                for colour in colours
-            ),
-            (
-                not order or sorted(order) == list(range(len(names))),
-                f"{quoted(list(order))} is not an order of the {len(names)} domains",
-                "name each once",
-            ),
-        ):
-            if not sound:
-                raise ModelFileError(problem, next_step)
+        names, order, largest = self.domain_names, self.domain_order, 1.0 / _LEAST_BODY_SIZE
+        if not _LEAST_BODY_SIZE <= self.height <= largest:
+            raise ModelFileError(
+                f"its body size (height) must be from {_LEAST_BODY_SIZE:g} to {largest:g}"
+            )
+        if self.up_axis not in (0, 1, 2):
+            raise ModelFileError("its up_axis must be 0, 1 or 2")
+        if not 0.0 <= self.near_exclusion < 1.0:
+            raise ModelFileError("its near_exclusion must be from 0 to below 1")
+        if max(map(len, (*self.pose_names, self.source, self.licence))) > _MAX_TEXT_LENGTH:
+            raise ModelFileError(
+                f"its names, source and licence must be at most {_MAX_TEXT_LENGTH} characters"
+            )
+        for name in names:
+            if not 0 < len(name) <= MAX_NAME_LENGTH or not name.isprintable():
+                allowed = f"use 1 to {MAX_NAME_LENGTH} printable characters"
+                raise ModelFileError(f"{name[:80]!r} cannot name a domain", allowed)
+            if names.count(name) > 1:
+                raise ModelFileError(f"two domains would be called {name!r}", "choose another name")
+        if len(self.domain_colours) != len(names):
+            raise ModelFileError("it must have one colour for each domain")
+        for colour in self.domain_colours:
+            if not re.fullmatch("#[0-9a-f]{6}", colour):
+                raise ModelFileError(f"{quoted(colour)} is not a colour", "write it as in #0077bb")
+        if order and sorted(order) != list(range(len(names))):
+            what = f"{quoted(list(order))} is not an order of the {len(names)} domains"
+            raise ModelFileError(what, "name each once")
 
     def to_metadata(self) -> dict[str, Any]:
         """Return JSON values for `from_metadata`."""
@@ -117,7 +101,3 @@ class ModelCard:
         except (ValueError, ModelFileError) as error:
             reason = getattr(error, "headline", error)
             raise ModelFileError.because(_CARD, "is damaged", reason, _ADVICE) from error
-
-
-def _is_name(name: str) -> bool:
-    return 0 < len(name) <= MAX_NAME_LENGTH and name.isprintable()

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.embedding.latent_box import BOX_ARRAYS
 from lcollision_core.errors import ModelFileError
 from lcollision_core.model.model_store import ListedModel, list_models
-from lcollision_core.model_file import read_section
+from lcollision_core.model_file import digest_of, read_section
 
 EMBEDDING = "embedding"
 """The section of a model file with its latent space."""
@@ -26,12 +24,8 @@ def fingerprint_of(arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str
     ----------
     arrays, metadata : of `Embedding.to_arrays`, or of a model file's section
     """
-    digest = hashlib.sha256(json.dumps(metadata["scaling"], sort_keys=True).encode())
-    for name in sorted(arrays.keys() - BOX_ARRAYS):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()[:16]
+    weights = {name: arrays[name] for name in arrays.keys() - BOX_ARRAYS}
+    return digest_of(json.dumps(metadata["scaling"], sort_keys=True), weights)[:16]
 
 
 def find_latent_space(fingerprint: str, name: str = "") -> ListedModel | None:

@@ -17,7 +17,7 @@ from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.labels import StoreIdentity
 from lcollision_core.model import PoseModel
-from lcollision_core.model_file import FORMAT_VERSION, Section, _digest, read_model_file
+from lcollision_core.model_file import FORMAT_VERSION, Section, digest_of, read_model_file
 from lcollision_core.predictor import (
     PRESETS,
     CollisionPredictor,
@@ -103,10 +103,8 @@ def _write(path: Path, sections: Sections) -> None:
     }
     metadata = {name: dict(section.metadata) for name, section in sections.items()}
     described = as_json(metadata)
-    document = (
-        f'{{"format_version":{FORMAT_VERSION},"sections":{described},'
-        f'"sha256":"{_digest(FORMAT_VERSION, described, tensors)}"}}'
-    )
+    checksum = digest_of(f"{FORMAT_VERSION}\n{described}\n", tensors)
+    document = f'{{"format_version":{FORMAT_VERSION},"sections":{described},"sha256":"{checksum}"}}'
     path.write_bytes(save(tensors, metadata={"lcollision": document}))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Literal
 
@@ -30,18 +31,7 @@ MIN_VERTICES, MAX_VERTICES = 500, 12000
 
 UP_AXIS = 2
 
-_PARTS = {
-    "lumbar 1": "belly",
-    "lumbar 2": "belly",
-    "lumbar 3": "belly",
-    "thorax 1": "chest",
-    "thorax 2": "chest",
-    "neck 1": "neck",
-    "neck 2": "neck",
-    "neck 3": "neck",
-    "left collar": "left shoulder",
-    "right collar": "right shoulder",
-}
+_PARTS = {"lumbar": "belly", "thorax": "chest", "collar": "shoulder"}
 
 
 def make_body(
@@ -166,7 +156,8 @@ def _varied(figure: Figure, generator: np.random.Generator) -> Figure:
 
 def _part_of_vertex(weights: FloatArray) -> npt.NDArray[np.str_]:
     """Name the part of the body of each vertex: bones that move one part are merged."""
-    part_of = [_PARTS.get(bone, bone.removesuffix(" end")) for bone in BONES]
+    words = [re.sub(" end| [0-9]", "", bone).split() for bone in BONES]
+    part_of = [" ".join(_PARTS.get(word, word) for word in of_bone) for of_bone in words]
     names, part = np.unique(part_of, return_inverse=True)
     merged = weights @ np.eye(len(names))[part]
     labels: npt.NDArray[np.str_] = names[merged.argmax(axis=1)]
