@@ -6,6 +6,8 @@ model, vertices : what was open
 decode_ms, predict_ms : one pose alone; the second is None without a predictor
 update_ms : of an event, all until drawing begins: slider, document, thread, panels, colours
 render_ms : drawing one picture
+compose_ms : that Qt takes to put the window together of the picture and the panels
+overhead_p50_ms : of an event, everything but these two
 event_p50_ms, event_p95_ms : from a slider's move until the window shows it
 burst_lag_seconds : from the last of 250 moves within two seconds to the picture that shows it
 idle_cpu : fraction of one core while nothing happens, once the library's pictures are drawn

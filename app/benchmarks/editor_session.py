@@ -56,8 +56,13 @@ class Session(QObject):
         self._code = self._document.model.latent_space.groups[1].codes.start
         self._slider = window.sliders.row_of(self._code).slider
         self._last_paint = (0.0, 0.0)
+        self._composing = self._last_swap = 0.0
         self._errors: list[str] = []
-        window.viewport.painted.connect(self._on_painted)
+        canvas = window.viewport.canvas
+        assert canvas is not None
+        canvas.painted.connect(self._on_painted)
+        canvas.aboutToCompose.connect(self._on_composing)
+        canvas.frameSwapped.connect(self._on_swapped)
         self._document.failed.connect(self._on_failed)
         sys.excepthook = self._on_exception
 
@@ -65,7 +70,7 @@ class Session(QObject):
         """Return the fields of a row but for start and memory, see `app.benchmarks.editor`."""
         self.settle()
         idle_cpu = self.idle_cpu()
-        updates, renders, events = zip(*self.events(), strict=True)
+        updates, renders, composings, events = map(np.array, zip(*self.events(), strict=True))
         lag = self.burst()
         errors, leak = self.act(n_actions)
         self.settle()
@@ -73,6 +78,8 @@ class Session(QObject):
             **self._core_times(),
             "update_ms": 1e3 * statistics.median(updates),
             "render_ms": 1e3 * statistics.median(renders),
+            "compose_ms": 1e3 * statistics.median(composings),
+            "overhead_p50_ms": 1e3 * statistics.median(events - renders - composings),
             "event_p50_ms": 1e3 * statistics.median(events),
             "event_p95_ms": 1e3 * float(np.percentile(events, 95)),
             "burst_lag_seconds": lag,
@@ -84,22 +91,22 @@ class Session(QObject):
             "mesh_is_right": self.mesh_is_right(),
         }
 
-    def events(self) -> list[tuple[float, float, float]]:
+    def events(self) -> list[tuple[float, float, float, float]]:
         """Move a slider time after time.
 
         Returns
         -------
-        seconds : of each move, until its picture is begun, that the picture takes, and until the
-            window with it is on the screen
+        seconds : of each move, until its picture is begun, that the picture takes, that composing
+            the window of it and the panels takes, and until that is on the screen
         """
         seconds = []
         for value in random.Random(0).sample(range(self._slider.maximum()), _EVENTS):
             start = time.perf_counter()
             self._slider.setValue(value)
             self.wait_for(self.is_shown)
-            seen = time.perf_counter()
             ended, render = self._last_paint
-            seconds.append((ended - render - start, render, seen - start))
+            compose = self._last_swap - self._composing
+            seconds.append((ended - render - start, render, compose, self._last_swap - start))
             self.settle()
         return seconds
 
@@ -272,6 +279,14 @@ class Session(QObject):
     @Slot(float)
     def _on_painted(self, seconds: float) -> None:
         self._last_paint = (time.perf_counter(), seconds)
+
+    @Slot()
+    def _on_composing(self) -> None:
+        self._composing = time.perf_counter()
+
+    @Slot()
+    def _on_swapped(self) -> None:
+        self._last_swap = time.perf_counter()
 
     @Slot(object)
     def _on_failed(self, failure: Failure) -> None:

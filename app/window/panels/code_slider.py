@@ -142,7 +142,7 @@ class CodeRow(HoverRow):
         label.setMaximumWidth(name_width)
         self.slider = CodeSlider(low, high, model.domain_colours[moved])
         beyond = _BEYOND * (high - low)
-        self._limits = low - beyond, high + beyond
+        self._limits = self._field_limits = low - beyond, high + beyond
         self.field = NumberBox(3, *self._limits)
         self.field.setObjectName("code")
         self.field.setSingleStep((high - low) / 100)
@@ -176,7 +176,11 @@ class CodeRow(HoverRow):
         self.slider.show_number(number)
         low, high = self._limits
         with silent(self.field):
-            self.field.setRange(min(low, number), max(high, number))
+            limits = min(low, number), max(high, number)
+            if limits != self._field_limits:
+                # Each time, Qt lays out the panel anew.
+                self.field.setRange(*limits)
+                self._field_limits = limits
             self.field.setValue(number)
         self._explain(number)
 

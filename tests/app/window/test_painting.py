@@ -6,12 +6,24 @@ import math
 
 import numpy as np
 import pytest
+from PySide6.QtCore import QEvent, QObject
+from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.window.main_window import MainWindow
 from app.work import live_pose
 from lcollision_core.model import sample_poses
 from tests.app.windows import PATIENCE, rest
+
+
+class LayoutCounter(QObject):
+    """Counts how often the watched widgets are asked to lay out what is in them."""
+
+    n_asked = 0
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: ARG002, N802
+        self.n_asked += event.type() is QEvent.Type.LayoutRequest
+        return False
 
 
 def test_the_window_is_painted_only_once_all_follows_the_pose(
@@ -40,3 +52,15 @@ def test_the_window_is_painted_only_once_all_follows_the_pose(
         assert window.viewport.shown_frame is document.frame
         assert [bar.value() for bar in bars] != before
         rest(qtbot, window)
+
+
+def test_a_row_is_laid_out_only_where_its_number_may_need_more_width(window: MainWindow) -> None:
+    row = window.sliders.row_of(0)
+    typed = row.field.minimum(), row.field.maximum()
+    counter = LayoutCounter()
+    row.installEventFilter(counter)
+    for number, n_asked in ((0.1, 0), (-0.1, 0), (10 * typed[1], 1), (0.1, 2), (0.2, 2)):
+        row.show_number(number)
+        QApplication.sendPostedEvents(None, QEvent.Type.LayoutRequest)
+        assert counter.n_asked == n_asked
+    assert (row.field.minimum(), row.field.maximum()) == typed
