@@ -85,7 +85,7 @@ class CodeEditing(PoseHistory):
 
         Locked domains stay as they are.
         """
-        start = self._gesture.before.pose.latent if self._gesture else self.latent
+        start = self._gesture_start
         target = np.asarray(latent, dtype=np.float64)
         blended = target.copy() if fraction == 1.0 else start + fraction * (target - start)
         self._edit("Blend", self._with_locked(blended))
@@ -110,6 +110,11 @@ class CodeEditing(PoseHistory):
     def _wanted(self) -> FloatArray:
         """(D,) codes that an edit of some of them begins with."""
         return self.latent
+
+    @property
+    def _gesture_start(self) -> FloatArray:
+        """(D,) codes that the gesture began with; without one the wanted ones."""
+        return self._gesture.before.pose.latent if self._gesture else self._wanted
 
     def set_locked(self, domain: int, locked: bool) -> None:
         """Lock a domain against Resolve, Randomise, Reset all and blending, or unlock it."""

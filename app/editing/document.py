@@ -538,7 +538,8 @@ class PoseDocument(LiveEditing):
     def _on_predictor(self, model: PoseModel) -> None:
         if model is self._model:
             self._predicts = True
-            self._live.follow(self.model, self.latent, self._predicts)
+            if self._drag is None:
+                self._live.follow(self.model, self.latent, self._predicts)
 
     def _bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:
         """Start work that replaces the pose; the newest request wins, also over Resolve.

@@ -205,6 +205,9 @@ class LiveEditing(CodeEditing):
         if self._drag is not None:
             self._drag = None
             self._live.end_drag()
+            if self._predicts and self.frame is not None and self.frame.prediction is None:
+                # The predictor has come in the middle of the drag.
+                self._live.follow(self.model, self.latent, self._predicts)
 
     def _begun(self, grip: Grip | Twist | None, pins: tuple[Pin, ...] = ()) -> Drag:
         from lcollision_core.posing import DragOptions
@@ -222,6 +225,11 @@ class LiveEditing(CodeEditing):
     def _wanted(self) -> FloatArray:
         codes = self._drag.codes if self._drag is not None and self._live.is_dragging else None
         return self.latent if codes is None else codes
+
+    @property
+    def _gesture_start(self) -> FloatArray:
+        has_ended = self._drag is not None and self._drag.has_ended
+        return self._wanted if has_ended else super()._gesture_start
 
     def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
         if not self.solid:

@@ -11,6 +11,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.work.frames import FrameEvaluator
+from app.work.threads import Failure
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Grip, Twist
 
@@ -211,6 +212,66 @@ def test_undo_of_an_edit_that_has_not_moved_yet_only_drops_it(
     assert solid.undo_stack.count() == 1
 
 
+def test_solid_steps_on_one_slider_merge(qtbot: QtBot, solid: PoseDocument) -> None:
+    start = solid.latent
+    for value in (0.02, 0.04, 0.06):
+        solid.set_code(0, start[0] + value)
+    settle(qtbot, solid)
+    solid.set_code(0, start[0] + 0.08)
+    settle(qtbot, solid)
+    assert solid.latent[0] == start[0] + 0.08
+    assert solid.undo_stack.count() == 1
+    solid.undo()
+    assert solid.latent.tobytes() == start.tobytes()
+
+
+def test_blends_by_the_keyboard_add_up(qtbot: QtBot, solid: PoseDocument) -> None:
+    start, target = solid.latent, solid.model.training_latent[1].astype(np.float64)
+    for _ in range(2):
+        solid.blend_towards(target, 0.1)
+    settle(qtbot, solid)
+    np.testing.assert_allclose(solid.latent, start + 0.19 * (target - start), atol=1e-6)
+
+
+def test_a_drag_that_fails_is_told_once_and_holds_nothing_up(
+    qtbot: QtBot, solid: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures: list[Failure] = []
+    solid.failed.connect(failures.append)
+    before = solid.latent
+    with monkeypatch.context() as broken:
+        broken.setattr(PoseModel, "dragger", lambda *_: 1 / 0)
+        for code in (0, 1):
+            solid.set_code(code, before[code] + 0.1)
+            qtbot.waitUntil(lambda: not solid.moving)
+    assert len(failures) == 1
+    assert "ZeroDivisionError" in failures[0].headline
+    assert solid.latent is before
+    assert solid.undo_stack.count() == 0
+    solid.set_code(0, before[0] + 0.1)
+    settle(qtbot, solid)
+    assert solid.latent[0] == before[0] + 0.1
+
+
+def test_a_predictor_that_comes_in_mid_drag_lets_it_go_on(
+    qtbot: QtBot, solid: PoseDocument
+) -> None:
+    grip, model = end_of(solid), solid.model
+    solid._predicts = False
+    solid._live._worker._evaluator.predicts = False
+    solid.begin_drag(grip, "Drag")
+    solid.drag_to(moved(solid, grip, 0.05))
+    settle(qtbot, solid)
+    assert solid.frame is not None
+    assert solid.frame.prediction is None
+    solid._on_predictor(model)
+    assert solid.dragging
+    solid.end_drag()
+    latent = solid.latent
+    qtbot.waitUntil(lambda: solid.frame is not None and solid.frame.prediction is not None)
+    assert solid.frame.latent is latent is solid.latent
+
+
 def test_edits_that_follow_at_once_are_not_lost(qtbot: QtBot, solid: PoseDocument) -> None:
     start = solid.latent
     for code in (0, 1):
@@ -295,13 +356,14 @@ def test_the_radius_of_grips_has_limits(document: PoseDocument) -> None:
 
 
 @pytest.fixture
-def seen(solid: PoseDocument) -> Iterator[list[bool]]:
-    """Yield whether each frame that is shown collides, by a check of its own."""
-    shown: list[bool] = []
+def seen(solid: PoseDocument) -> Iterator[list[tuple[bool, bool]]]:
+    """Yield of each shown frame whether it collides, by a check of its own, and has contacts."""
+    shown: list[tuple[bool, bool]] = []
 
     def look() -> None:
         assert solid.frame is not None
-        shown.append(solid.model.detector.detect(solid.frame.vertices).colliding)
+        found = solid.model.detector.detect(solid.frame.vertices)
+        shown.append((found.colliding, len(solid.frame.contacts) > 0))
 
     solid.frame_changed.connect(look)
     yield shown
@@ -309,7 +371,7 @@ def seen(solid: PoseDocument) -> Iterator[list[bool]]:
 
 
 def test_no_random_sequence_shows_a_colliding_pose(
-    qtbot: QtBot, solid: PoseDocument, seen: list[bool]
+    qtbot: QtBot, solid: PoseDocument, seen: list[tuple[bool, bool]]
 ) -> None:
     chance = random.Random(5)
     model = solid.model
@@ -321,11 +383,13 @@ def test_no_random_sequence_shows_a_colliding_pose(
             solid.begin_pin_drag(0)
         else:
             solid.begin_drag(solid.grip_at(vertex), "Drag")
+        locked, before = model.embedding.codes_of(solid.locked_domains), solid.latent
         for _ in range(chance.randrange(1, 6)):
             assert solid.frame is not None
             step = np.array([chance.gauss(0.0, 0.3) for _ in range(3)]) * model.body_size
             solid.drag_to(solid.frame.vertices[vertex] + step)
             qtbot.wait(chance.choice((0, 5, 20)))
+            assert (solid.latent[locked] == before[locked]).all()
         chance.choice((solid.end_drag, solid.end_drag, solid.cancel_drag))()
 
     def slide() -> None:
@@ -359,5 +423,7 @@ def test_no_random_sequence_shows_a_colliding_pose(
         solid.redo()
         assert solid.latent.tobytes() == state
     settle(qtbot, solid)
+    collide, touch = zip(*seen, strict=True)
     assert len(seen) > 100
-    assert not any(seen)
+    assert not any(collide)
+    assert any(touch)
