@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPointF, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import (
     QContextMenuEvent,
+    QKeyEvent,
     QMouseEvent,
     QNativeGestureEvent,
     QResizeEvent,
     QWheelEvent,
 )
-from PySide6.QtWidgets import QApplication
 from pyvistaqt import QtInteractor
 from vtkmodules.vtkRenderingCore import vtkActor, vtkCellPicker
 
@@ -27,7 +27,8 @@ _REST_MILLISECONDS = 220
 _HOVER_MILLISECONDS = 30
 _SMOOTH_SAMPLES = 4
 _NOTCH = 120.0  # of a wheel, in eighths of a degree
-_ZOOM_PER_NOTCH = 1.15
+_CLICK = 4
+"""Pixels that the pointer may move in a click."""
 
 _FOR_THE_WINDOW = (
     QEvent.Type.KeyPress,
@@ -83,22 +84,34 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
     n_painted : how many pictures have been drawn
     is_smooth : whether the next one has smooth edges
     is_settled : whether the smooth picture of the scene is drawn, and no other is asked for
+    is_dragging : whether a button is pressed and the pointer has moved since
 
     Signals
     -------
     painted : float, the seconds that drawing one picture took; what it calls must leave widgets
         alone too, or be connected queued
     hovered : QPointF in the widget, or None as the pointer leaves; while no button is pressed
-    camera_moved : the user has turned or shifted
-    zoom_wanted : QPointF in the widget and float, the factor of the distance to what is there
+    drag_began : QPointF where a button was pressed, Qt.MouseButton, and the Qt.KeyboardModifiers;
+        once the pointer has moved too far for a click
+    dragged : QPointF, where the pointer is now
+    drag_ended : bool, whether by Escape
+    double_clicked : QPointF
+    wheel_turned : QPointF, float, in notches, and Qt.KeyboardModifiers
+    pinched : QPointF and float, the factor by which two fingers were spread
     menu_wanted : QPointF in the widget, where it was clicked with the right button
     """
 
     painted = Signal(float)
     hovered = Signal(object)
-    camera_moved = Signal()
-    zoom_wanted = Signal(QPointF, float)
+    drag_began = Signal(QPointF, object, object)
+    dragged = Signal(QPointF)
+    drag_ended = Signal(bool)
+    double_clicked = Signal(QPointF)
+    wheel_turned = Signal(QPointF, float, object)
+    pinched = Signal(QPointF, float)
     menu_wanted = Signal(QPointF)
+
+    is_dragging = False
 
     def __init__(self, before_paint: Callable[[], None], parent: QWidget | None = None) -> None:
         # The default for auto_update draws five times a second for ever.
@@ -114,12 +127,11 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._hover = QTimer(self, singleShot=True, interval=_HOVER_MILLISECONDS)
         self._hover.timeout.connect(self._on_hover)
         self._pointer: QPointF | None = None
-        self._right_press: QPointF | None = None
+        self._press: tuple[QPointF, Qt.MouseButton, Qt.KeyboardModifier] | None = None
         self._picker = vtkCellPicker()
         self._picker.PickFromListOn()
         self._picker.SetTolerance(0.0)
-        self.enable_terrain_style(mouse_wheel_zooms=False, shift_pans=True)
-        # The camera's style would draw at once for each motion of the mouse, and Qt then again.
+        # VTK would draw at once for each change, and Qt then again.
         self._vtk_interactor = self.ren_win.GetInteractor()
         self._vtk_interactor.EnableRenderOff()
         self._observer = self._vtk_interactor.AddObserver("RenderEvent", self._on_render_wanted)
@@ -133,8 +145,10 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._rest.start()
         self.update()
 
-    def pick_vertex(self, position: QPointF, actor: vtkActor) -> int | None:
-        """Return the vertex that is seen at a position.
+    def pick(
+        self, position: QPointF, actor: vtkActor
+    ) -> tuple[int, npt.NDArray[np.float64]] | None:
+        """Return the vertex that is seen at a position and the point of the surface, (3,).
 
         Parameters
         ----------
@@ -147,35 +161,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         x, y = position.x() * ratio, (self.height() - 1 - position.y()) * ratio
         if not self._picker.Pick(x, y, 0.0, self.renderer) or self._picker.GetCellId() < 0:
             return None
-        return int(self._picker.GetPointId())
-
-    def point_at(
-        self, position: QPointF, actor: vtkActor, depth_of: npt.NDArray[Any]
-    ) -> npt.NDArray[np.float64]:
-        """Return the point seen at a position, or beside the mesh a point as deep as another.
-
-        Parameters
-        ----------
-        position : in the widget, in device-independent pixels
-        actor : the mesh
-        depth_of : (3,) array, in the data's unit
-
-        Returns
-        -------
-        point : (3,) array, in the data's unit
-        """
-        if self.pick_vertex(position, actor) is not None:
-            return np.array(self._picker.GetPickPosition())
-        ratio = self.devicePixelRatioF()
-        self.renderer.SetWorldPoint(*np.asarray(depth_of, dtype=np.float64).tolist(), 1.0)
-        self.renderer.WorldToDisplay()
-        depth = self.renderer.GetDisplayPoint()[2]
-        x, y = position.x() * ratio, (self.height() - 1 - position.y()) * ratio
-        self.renderer.SetDisplayPoint(x, y, depth)
-        self.renderer.DisplayToWorld()
-        *point, scale = self.renderer.GetWorldPoint()
-        seen: npt.NDArray[np.float64] = np.array(point) / scale
-        return seen
+        return int(self._picker.GetPointId()), np.array(self._picker.GetPickPosition())
 
     def shut_down(self) -> None:
         """Stop the timers and free what is on the graphics card; nothing is drawn afterwards."""
@@ -219,31 +205,48 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self.redraw()
 
     def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
-        """Begin to turn, to shift, to zoom, or to click."""
-        super().mousePressEvent(event)
-        is_right = event.button() is Qt.MouseButton.RightButton
-        self._right_press = event.position() if is_right else None
+        """Begin a click or a drag; a second button changes nothing."""
+        if self._press is None:
+            self._hover.stop()
+            self._press = (event.position(), event.button(), event.modifiers())
 
     def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
-        """Turn the camera while a button is pressed, signal the pointer otherwise."""
-        if self._right_press is not None:
-            way = (event.position() - self._right_press).manhattanLength()
-            if way < QApplication.startDragDistance():
-                # Still a click, which leaves the camera alone.
-                return
-            self._right_press = None
-        super().mouseMoveEvent(event)
-        if event.buttons() == Qt.MouseButton.NoButton:
-            self._pointer = event.position()
-            if not self._hover.isActive():
+        """Drag while a button is pressed, signal the pointer otherwise."""
+        self._pointer = event.position()
+        if self._press is not None and not event.buttons() & self._press[1]:
+            # It was let go over another window.
+            self._let_go()
+        if self._press is None:
+            if event.buttons() == Qt.MouseButton.NoButton and not self._hover.isActive():
                 self._hover.start()
+            return
+        start, button, keys = self._press
+        if not self.is_dragging:
+            if (event.position() - start).manhattanLength() < _CLICK:
+                return
+            self.is_dragging = True
+            self.drag_began.emit(start, button, keys)
+        self.dragged.emit(event.position())
 
     def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
         """End a drag, or ask for the menu where the right button was only clicked."""
-        super().mouseReleaseEvent(event)
-        clicked, self._right_press = self._right_press, None
+        if self._press is None or event.button() is not self._press[1]:
+            return
+        clicked = None if self.is_dragging else self._press[0]
+        self._let_go()
         if clicked is not None and event.button() is Qt.MouseButton.RightButton:
             self.menu_wanted.emit(clicked)
+
+    def mouseDoubleClickEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
+        """Signal a double click."""
+        if event.button() is Qt.MouseButton.LeftButton and self._press is None:
+            self.double_clicked.emit(event.position())
+
+    def _let_go(self, escaped: bool = False) -> None:
+        was_dragging, self.is_dragging, self._press = self.is_dragging, False, None
+        if was_dragging:
+            self.drag_ended.emit(escaped)
+            self._hover.start()
 
     def contextMenuEvent(self, event: QContextMenuEvent) -> None:  # noqa: N802 - Qt's name
         """Ask for the menu by its key; the right button may yet drag."""
@@ -252,14 +255,20 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
             self.menu_wanted.emit(self._pointer or QPointF(self.rect().center()))
 
     def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802 - Qt's name
-        """Zoom at the pointer, as far as the wheel or two fingers have turned."""
+        """Signal how far the wheel or two fingers have turned; not during a drag."""
         event.accept()
         notches = event.angleDelta().y() / _NOTCH
-        if notches:
-            self.zoom_wanted.emit(event.position(), _ZOOM_PER_NOTCH**-notches)
+        if notches and self._press is None:
+            self.wheel_turned.emit(event.position(), notches, event.modifiers())
 
     def event(self, event: QEvent) -> bool:
-        """Zoom as two fingers on a touchpad are spread; leave keys and files to the window."""
+        """Signal fingers that are spread, and Escape in a drag; leave the rest to the window."""
+        if self.is_dragging and isinstance(event, QKeyEvent) and event.key() == Qt.Key.Key_Escape:
+            # Before the window's shortcut.
+            event.accept()
+            if event.type() is QEvent.Type.KeyPress:
+                self._let_go(escaped=True)
+            return True
         if event.type() in _FOR_THE_WINDOW:
             event.ignore()
             return False
@@ -267,7 +276,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
             isinstance(event, QNativeGestureEvent)
             and event.gestureType() is Qt.NativeGestureType.ZoomNativeGesture
         ):
-            self.zoom_wanted.emit(event.position(), 1.0 / max(1.0 + event.value(), 0.1))
+            self.pinched.emit(event.position(), max(1.0 + event.value(), 0.1))
             return True
         return bool(super().event(event))
 
@@ -289,7 +298,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         if not self.is_settled:
             self._draw_smooth(True)
             self.update()
-        if self.underMouse() and self._pointer is not None:
+        if self.underMouse() and self._pointer is not None and self._press is None:
             # Something else may lie beneath the pointer now.
             self._hover.start()
 
@@ -300,4 +309,3 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
     def _on_render_wanted(self, *_: object) -> None:
         if not self._painting:
             self.redraw()
-            self.camera_moved.emit()

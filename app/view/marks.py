@@ -11,7 +11,7 @@ import pyvista as pv
 from vtkmodules.vtkRenderingCore import vtkActor2D, vtkPolyDataMapper2D
 
 from app.view.camera import Pixel, View, places_of
-from app.view.shading import rgb
+from app.view.shading import CONTACT, rgb
 
 if TYPE_CHECKING:
     from vtkmodules.vtkRenderingCore import vtkRenderer
@@ -21,9 +21,9 @@ FloatArray = npt.NDArray[np.float64]
 PIN_RADIUS = 7.0
 """Of a pin's dot with its rim, in device-independent pixels."""
 
-_CONTACT, _CONTACT_RADIUS = "#ffb000", 6.0
+_CONTACT_RADIUS = 6.0
 _APART = 16.0
-"""Pixels between two marks of contact: what is nearer shares one."""
+"""Pixels between two marks of contact, as what is nearer shares one; of the shortest line."""
 
 _DARK, _LIGHT = "#14171c", "#ffffff"
 _SIDES = 24
@@ -78,23 +78,24 @@ class Marks:
         ----------
         sharpness : device pixels per device-independent one
         """
-        n_marks = len(self.pins) + len(self._contacts) + len(self._lines)
-        self._actor.SetVisibility(n_marks > 0)
-        if not n_marks:
-            return
         width, height = self._renderer.GetSize()
         size = width / sharpness, height / sharpness
         shapes: list[tuple[FloatArray, str]] = []
         for ends in self._lines:
             start, end = places_of(view, ends, size)
+            if np.linalg.norm(end - start) < _APART:
+                continue
             for half, colour in ((2.0, _DARK), (0.9, _LIGHT)):
                 shapes += [(_bar(start, end, half), colour), (_ring(end, 0.0, 2.2 * half), colour)]
         for place in _thinned(places_of(view, self._contacts, size)):
-            for inner, outer, colour in ((2.0, 1.5, _DARK), (3.0, 0.5, _CONTACT)):
+            for inner, outer, colour in ((2.0, 1.5, _DARK), (3.0, 0.5, CONTACT)):
                 shapes.append((_ring(place, inner, _CONTACT_RADIUS + 1.0 - outer), colour))
         for place, own in zip(places_of(view, self.pins, size), self._colours, strict=True):
             for inset, colour in ((0.0, _DARK), (1.3, _LIGHT), (3.0, own)):
                 shapes.append((_ring(place, 0.0, PIN_RADIUS - inset), colour))
+        self._actor.SetVisibility(len(shapes) > 0)
+        if not shapes:
+            return
         corners = np.concatenate([quads for quads, _ in shapes])
         corners[:, :, 1] = size[1] - corners[:, :, 1]
         flat = np.zeros((4 * len(corners), 3), dtype=np.float32)

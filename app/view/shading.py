@@ -23,6 +23,9 @@ FULL_EXACT = 0.006
 COLLIDING_FACE = "#e0191f"
 """Faces that intersect another, in both themes."""
 
+CONTACT = "#ffb000"
+"""Marks of where contact holds the body, in both themes."""
+
 _RAMP_STEPS = 256
 _PATH_STEPS = 16
 """Steps from one colour of a scale to the next, for measuring their perceived difference."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from importlib import import_module
 from threading import Thread
@@ -16,8 +15,9 @@ from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QStackedLayout, QVBoxLayout, QWidget
 
 from app.view.animation import Animation
-from app.view.camera import View, between, kept_in_view, preset_view, zoomed
+from app.view.camera import View, between, kept_in_view, preset_view
 from app.view.legend import DomainTag, LegendStrip
+from app.view.mouse import Mouse
 from app.view.pictures import Pictures
 from app.view.shading import Known, Legend, Shader, Shading
 from app.view.theme import current_theme
@@ -42,11 +42,7 @@ _TRANSITION_MILLISECONDS = 320
 _TURN_MILLISECONDS = 260
 """Milliseconds from one camera to another."""
 
-_ZOOM_SECONDS = 0.5
-"""Seconds within which the wheel zooms towards the same point while the pointer stays."""
-
 Float32Array = npt.NDArray[np.float32]
-FloatArray = npt.NDArray[np.float64]
 
 
 class Viewport(QWidget):
@@ -65,6 +61,7 @@ class Viewport(QWidget):
     shading : what the colours say; see `set_shading`
     shown_frame : the frame that the last picture shows, or is animated towards
     canvas : the widget that draws and takes the mouse; None before the first model is in
+    mouse : what it does to the body and to the camera; likewise
     scene : what stands before the camera; likewise
     hovered_domain : the domain under the pointer, or None
     pictures : makes screenshots and turntable videos
@@ -74,14 +71,16 @@ class Viewport(QWidget):
     -------
     domain_hovered : int, the domain under the pointer, or None
     shading_changed : Shading
-    menu_wanted : int or None, the domain that was clicked with the right button, and QPoint, where
-        on the screen
+    pointed : `pointed_vertex` may be another
+    menu_wanted : int or None, the domain that was clicked with the right button, int or None, the
+        vertex, and QPoint, where on the screen
     painted : float, the seconds that drawing one picture took; see `Canvas.painted`
     """
 
     domain_hovered = Signal(object)
     shading_changed = Signal(object)
-    menu_wanted = Signal(object, QPoint)
+    pointed = Signal()
+    menu_wanted = Signal(object, object, QPoint)
     painted = Signal(float)
 
     def __init__(self, document: PoseDocument, parent: QWidget | None = None) -> None:
@@ -91,6 +90,7 @@ class Viewport(QWidget):
         self._highlight: int | None = None
         self.hovered_domain: int | None = None
         self.canvas: Canvas | None = None
+        self.mouse: Mouse | None = None
         self.scene: Scene | None = None
         self._shader: Shader | None = None
         self._model: PoseModel | None = None
@@ -100,7 +100,6 @@ class Viewport(QWidget):
         self._framed: npt.NDArray[np.float64] | None = None
         self._transition_to: npt.NDArray[np.float64] | None = None
         self._loaded: npt.NDArray[np.float64] | None = None
-        self._zoom_anchor: tuple[QPointF, FloatArray, float] | None = None
 
         self._layout = QStackedLayout()
         self._layout.setStackingMode(QStackedLayout.StackingMode.StackOne)
@@ -160,6 +159,16 @@ class Viewport(QWidget):
             and not self._turn.is_running
             and self.canvas.is_settled
         )
+
+    @property
+    def pointed_vertex(self) -> int | None:
+        """The vertex under the pointer."""
+        return None if self.mouse is None else self.mouse.vertex
+
+    def toggle_pin(self) -> None:
+        """Pin the patch under the pointer, or take its pin away."""
+        if self.mouse is not None:
+            self.mouse.toggle_pin()
 
     def set_shading(self, shading: Shading) -> None:
         """Choose what the colours say."""
@@ -263,11 +272,14 @@ class Viewport(QWidget):
         model = self._document.model
         if self.canvas is None:
             self.canvas = Canvas(self._bring_up_to_date, self)
-            self.canvas.hovered.connect(self._on_hovered)
             self.canvas.painted.connect(self.painted)
-            self.canvas.camera_moved.connect(self._turn.stop)
-            self.canvas.zoom_wanted.connect(self._on_zoom_wanted)
             self.canvas.menu_wanted.connect(self._on_menu_wanted)
+            self.mouse = Mouse(
+                self._document, self.canvas, lambda: self.scene, self._leading_domain
+            )
+            self.mouse.pointed.connect(self._on_pointed)
+            self.mouse.camera_moved.connect(self._on_camera_moved)
+            self.mouse.redraw_wanted.connect(self._redraw)
         view = None
         if self.scene is not None:
             # The same body with other names or colours is looked at as before.
@@ -355,6 +367,9 @@ class Viewport(QWidget):
             exact = self._document.exact
             shown = self.shading is Shading.EXACT and exact is not None
             scene.show_crossing(exact.pairs if exact is not None and shown else None)
+        if self.mouse is not None:
+            self.mouse.mark(scene, frame.vertices)
+        scene.marks.show_contacts(frame.contacts)
         scene.fit_to_screen(self.devicePixelRatioF())
 
     def _put(self, scene: Scene, frame: LiveFrame) -> None:
@@ -443,41 +458,36 @@ class Viewport(QWidget):
             self.scene.view = view
             self.canvas.redraw()
 
-    @Slot(QPointF, float)
-    def _on_zoom_wanted(self, position: QPointF, factor: float) -> None:
-        if self.scene is None or self.canvas is None:
-            return
+    @Slot(object)
+    def _on_camera_moved(self, view: View) -> None:
         self._turn.stop()
-        view, now = self.scene.view, time.monotonic()
-        anchor = self._zoom_anchor
-        if anchor is None or anchor[0] != position or now - anchor[2] > _ZOOM_SECONDS:
-            point = self.canvas.point_at(position, self.scene.body, view.focus)
-        else:
-            point = anchor[1]
-        self._zoom_anchor = (position, point, now)
-        vertices, body_size = self.scene.surface.vertices, self._document.model.body_size
-        self.scene.view = zoomed(view, point, factor, vertices, body_size)
-        self.canvas.redraw()
+        self._on_turned(view)
 
     # The pointer.
 
+    @Slot()
+    def _redraw(self) -> None:
+        if self.canvas is not None:
+            self.canvas.redraw()
+
     @Slot(QPointF)
     def _on_menu_wanted(self, position: QPointF) -> None:
-        if self.canvas is not None:
+        if self.canvas is not None and self.mouse is not None:
+            self.mouse.point_at(position)
             where = self.canvas.mapToGlobal(position.toPoint())
-            self.menu_wanted.emit(self._domain_at(position), where)
+            vertex = self.mouse.vertex
+            self.menu_wanted.emit(self._domain_of(vertex), vertex, where)
 
-    def _domain_at(self, position: QPointF) -> int | None:
-        if self.canvas is None or self.scene is None or self._shader is None:
-            return None
-        vertex = self.canvas.pick_vertex(position, self.scene.body)
-        return None if vertex is None else self._shader.leading_domain(vertex)
+    def _leading_domain(self, vertex: int) -> int:
+        assert self._shader is not None
+        return self._shader.leading_domain(vertex)
+
+    def _domain_of(self, vertex: int | None) -> int | None:
+        return None if vertex is None else self._leading_domain(vertex)
 
     @Slot(object)
-    def _on_hovered(self, position: QPointF | None) -> None:
-        if self.canvas is None:
-            return
-        domain = None if position is None or self.shown_frame is None else self._domain_at(position)
+    def _on_pointed(self, position: QPointF | None) -> None:
+        domain = self._domain_of(self.mouse.vertex) if self.mouse is not None else None
         if domain is None or position is None:
             self._tag.hide()
         else:
@@ -487,6 +497,7 @@ class Viewport(QWidget):
         if domain != self.hovered_domain:
             self.hovered_domain = domain
             self.domain_hovered.emit(domain)
+        self.pointed.emit()
 
 
 def _between_poses(start: Float32Array, end: Float32Array, fraction: float) -> Float32Array:

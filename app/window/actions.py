@@ -64,6 +64,15 @@ ACTIONS: dict[str, Spec] = {
     "filter": Spec("&Find a slider", "Ctrl+F", "Type part of a slider's name", "search"),
     "unlock": Spec("Un&lock all", "Ctrl+L", "Unlock all body parts"),
     "parts": Spec("Body &parts…", "Ctrl+Alt+B", "Rename, recolour and reorder the body parts"),
+    "solid": Spec(
+        "&Solid", "Ctrl+Alt+S", "Keep the body from moving into itself", "solid", checkable=True
+    ),
+    "pin": Spec("&Pin", "P", "Hold the patch under the pointer in its place"),
+    "unpin_all": Spec("&Unpin all", "Shift+P", "Remove all pins"),
+    "pin_feet": Spec("Pin &feet", "Ctrl+Alt+F", "Hold the feet in their places"),
+    "pin_hands": Spec("Pin &hands", "Ctrl+Alt+H", "Hold the hands in their places"),
+    "smaller": Spec("S&maller patch", "[", "Drag a smaller patch of the body"),
+    "larger": Spec("&Larger patch", "]", "Drag a larger patch of the body"),
     "resolve": Spec("&Resolve", "Ctrl+R", "Find the nearest pose without collisions", "resolve"),
     "cancel": Spec("&Cancel", "Escape", "Stop what is being computed", "cancel"),
     "resolve_options": Spec("Resolve &options…", "Ctrl+Shift+R", "Choose how Resolve works"),

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from app.view.viewport import Viewport
     from app.window.panels.sliders import SlidersPanel
 
+_RADII = {"&Small": 0.015, "&Medium": 0.03, "&Large": 0.06, "&Very large": 0.12}
+"""Of the patch that a drag takes, in normalised length."""
+
 
 class BodyMenus(QObject):
     """Opens the menus of body parts and sliders.
@@ -51,18 +54,22 @@ class BodyMenus(QObject):
         self._edit_parts, self._attempt = edit_parts, attempt
         viewport.menu_wanted.connect(self.open_on_body)
 
-    @Slot(object, QPoint)
-    def open_on_body(self, domain: int | None, position: QPoint) -> None:
+    @Slot(object, object, QPoint)
+    def open_on_body(self, domain: int | None, vertex: int | None, position: QPoint) -> None:
         """Open the menu of the part under the pointer, which stays outlined meanwhile.
 
         Parameters
         ----------
         domain : index from 0, None beside the body
+        vertex : under the pointer, likewise
         position : on the screen
         """
         actions = self._actions
-        menu = self._new_menu() if domain is None else self.part_menu(domain, None)
+        menu = self._new_menu()
+        if vertex is not None:
+            self._add_hold(menu, vertex)
         if domain is not None:
+            self._fill(menu, domain, None)
             menu.addSeparator()
             self._viewport.highlight_domain(domain)
             menu.aboutToHide.connect(partial(self._viewport.highlight_domain, None))
@@ -86,8 +93,32 @@ class BodyMenus(QObject):
         domain : index from 0, None for the whole body
         code : index from 0 in the latent, None for the part alone
         """
-        document, actions = self._document, self._actions
         menu = self._new_menu()
+        self._fill(menu, domain, code)
+        return menu
+
+    def _add_hold(self, menu: QMenu, vertex: int) -> None:
+        """Add what can be done with the patch round a vertex."""
+        document = self._document
+        pinned = [pin.vertex for pin in document.pins]
+        if vertex in pinned:
+            self._add(menu, "Un&pin", document.unpin, pinned.index(vertex))
+        else:
+            self._add(menu, "&Pin", lambda: document.pin(document.grip_at(vertex)))
+        menu.addAction(self._actions["unpin_all"])
+        sizes = menu.addMenu("&Grab radius")
+        for text, radius in _RADII.items():
+            size = self._add(
+                sizes, f"{text} ({100 * radius:g} %)", document.set_grip_radius, radius
+            )
+            size.setCheckable(True)
+            size.setChecked(abs(radius - document.grip_radius) < 1e-3)
+        sizes.addSeparator()
+        sizes.addActions([self._actions[key] for key in ("smaller", "larger")])
+        menu.addSeparator()
+
+    def _fill(self, menu: QMenu, domain: int | None, code: int | None) -> None:
+        document, actions = self._document, self._actions
         if code is not None:
             row = self._sliders.row_of(code)
             reset = self._add(menu, "&Reset", document.reset_code, code)
@@ -109,7 +140,6 @@ class BodyMenus(QObject):
         menu.addAction(actions["parts"])
         menu.addSeparator()
         menu.addActions([actions["unlock"], actions["mirror"]])
-        return menu
 
     def _new_menu(self) -> QMenu:
         menu = QMenu(self._window, toolTipsVisible=True)

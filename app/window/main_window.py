@@ -28,6 +28,7 @@ from app.window.actions import ACTIONS, DOCKS, THEMES
 from app.window.body_menus import BodyMenus
 from app.window.dialogs.failure import FailureDialog, open_log_file
 from app.window.dialogs.help import show_about, show_shortcuts
+from app.window.drag_actions import DragActions
 from app.window.edit_actions import EditActions
 from app.window.file_actions import FileActions
 from app.window.library_actions import LibraryActions
@@ -116,6 +117,7 @@ class MainWindow(QMainWindow):
         self._edits = EditActions(
             self, document, settings, self.sliders, self.randomise, self.viewport.pictures, act
         )
+        drags = DragActions(document, settings, self.viewport, act)
         library_actions = LibraryActions(self, document, self.library, self.files, act)
         ghost, reset_camera = act["ghost"], act["reset_camera"]
         views = ViewActions(self, document, settings, self.viewport, ghost, reset_camera)
@@ -144,6 +146,7 @@ class MainWindow(QMainWindow):
             "about": lambda: show_about(document.model if document.has_model else None, self),
             **self.files.acts,
             **self._edits.acts,
+            **drags.acts,
             **library_actions.acts,
             **views.acts,
         }

@@ -23,7 +23,11 @@ MENUS: dict[str, tuple[str, ...]] = {
         *("undo", "redo", SEPARATOR),
         *("reset", "randomise", "mirror", SEPARATOR, "filter", "unlock", "parts"),
     ),
-    "&Pose": ("resolve", "cancel", "resolve_options"),
+    "&Pose": (
+        *("solid", SEPARATOR),
+        *("pin", "pin_feet", "pin_hands", "unpin_all", SEPARATOR, "smaller", "larger", SEPARATOR),
+        *("resolve", "cancel", "resolve_options"),
+    ),
     "&Library": (
         *("load", "blend", SEPARATOR),
         *("rename", "tags", "duplicate", "mirror_poses", "remove", "add", SEPARATOR),
@@ -39,7 +43,10 @@ MENUS: dict[str, tuple[str, ...]] = {
 }
 """Keys of actions, groups and submenus, in order."""
 
-_BAR = (*("open", "save", SEPARATOR, "undo", "redo", SEPARATOR), *("reset", "randomise", "mirror"))
+_BAR = (
+    *("open", "save", SEPARATOR, "undo", "redo", SEPARATOR),
+    *("reset", "randomise", "mirror", SEPARATOR, "solid"),
+)
 
 
 def fill_menus(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import QEvent, QObject, Slot
+from PySide6.QtCore import QEvent, QObject, Qt, Slot
 from PySide6.QtGui import QAction, QKeyEvent, QKeySequence
 from PySide6.QtWidgets import QAbstractSpinBox, QApplication, QDialog, QLineEdit, QWidget
 
 _Key = QKeySequence.StandardKey
 _EDITING = (_Key.Undo, _Key.Redo, _Key.Copy, _Key.Cut, _Key.Paste, _Key.SelectAll, _Key.Delete)
+_Held = Qt.KeyboardModifier
+_COMMANDS = _Held.ControlModifier | _Held.AltModifier | _Held.MetaModifier
 
 
 class WindowShortcuts(QObject):
@@ -37,6 +39,9 @@ class WindowShortcuts(QObject):
         if event.type() is not QEvent.Type.ShortcutOverride or not isinstance(event, QKeyEvent):
             return False
         if any(event.matches(key) for key in _EDITING):
+            return False
+        if event.text().isprintable() and event.text() and not event.modifiers() & _COMMANDS:
+            # A letter is typed.
             return False
         keys = QKeySequence(event.keyCombination())
         if any(keys in action.shortcuts() for action in self._window.findChildren(QAction)):

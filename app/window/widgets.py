@@ -33,6 +33,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.icons import pixmap
+from app.view.shading import CONTACT
 from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE, current_theme, visible_colour
 
 HANDLE = 7.0
@@ -304,7 +305,13 @@ class Slider(QSlider):
     Parameters
     ----------
     colour : "#rrggbb" of the bar, None for that of the theme
+
+    Attributes
+    ----------
+    held_at : fraction of the groove where contact holds what the handle asks for, None for nowhere
     """
+
+    held_at: float | None = None
 
     def __init__(self, colour: str | None = None) -> None:
         super().__init__(Qt.Orientation.Horizontal)
@@ -372,9 +379,10 @@ class Slider(QSlider):
             painter.setBrush(QColor(theme.muted))
             painter.drawRect(QRectF(start - 0.5, middle - 5, 1, 10))
         handle = self._handle_x()
+        reached = handle if self.held_at is None else left + (right - left) * self.held_at
         enabled = self.isEnabled()
         filled = self._colour or theme.accent if enabled else theme.track
-        bar = QRectF(min(start, handle), middle - 2.5, abs(handle - start), 5)
+        bar = QRectF(min(start, reached), middle - 2.5, abs(reached - start), 5)
         if bar.width() > 0.0:
             fill_with(painter, bar, filled, 0.0)
         if self.hasFocus():
@@ -387,6 +395,11 @@ class Slider(QSlider):
         rim = theme.accent if bright else theme.muted if enabled else theme.border
         painter.setPen(QPen(QColor(rim), 1.6))
         painter.drawEllipse(QPointF(handle, middle), HANDLE - 1.2, HANDLE - 1.2)
+        if self.held_at is not None:
+            # Over the handle, where both are in one place.
+            painter.setPen(QPen(QColor(theme.card), 1.0))
+            painter.setBrush(QColor(CONTACT))
+            painter.drawRoundedRect(QRectF(reached - 2.5, middle - 8.5, 5, 17), 2, 2)
 
     def _handle_x(self) -> float:
         fraction = (self.value() - self.minimum()) / max(self.maximum() - self.minimum(), 1)

@@ -9,6 +9,7 @@ import numpy as np
 
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.grip import Grip
+from lcollision_core.posing.parts import long_axis
 from lcollision_core.posing.pose_space import PoseSpace
 
 PIN_WEIGHT = 100.0
@@ -92,7 +93,7 @@ class TwistGoal:
         self._pins = [(self._part, self._part.position(decoded)), *pins]
         self._rows = _rows(space, [self._part, *(pin for pin, _ in self._pins)])
         self._arms = self._arms_of(decoded)
-        self.axis: FloatArray = np.linalg.eigh(self._arms.T @ self._arms)[1][:, -1]
+        self.axis = long_axis(self._arms)
 
     def _arms_of(self, decoded: FloatArray) -> FloatArray:
         arms: FloatArray = decoded[self._part.vertices] - self._part.position(decoded)

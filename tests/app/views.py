@@ -91,6 +91,7 @@ def seen_vertex(viewport: Viewport, domain: int) -> int:
     for vertex in np.argsort(-mask[domain]):
         # Of the pixel that the pointer will be on.
         place = QPointF(place_of(viewport, vertex))
-        if viewport.canvas.pick_vertex(place, viewport.scene.body) == vertex:
+        picked = viewport.canvas.pick(place, viewport.scene.body)
+        if picked is not None and picked[0] == vertex:
             return int(vertex)
     raise AssertionError("no vertex of the domain is seen")

@@ -73,8 +73,14 @@ class ShortcutsDialog(QDialog):
     """
 
     _ELSEWHERE = (
-        ("Drag in the view", "rotate the camera"),
-        ("Middle-drag or Shift-drag", "move the camera"),
+        ("Drag the body", "move the patch under the pointer"),
+        ("Ctrl-drag the body", "twist the body part"),
+        ("Escape while dragging", "put everything back"),
+        ("Double-click the body, or P", "pin the patch, or unpin it"),
+        ("Drag a pin", "move what it holds"),
+        ("[ and ], or Ctrl and wheel", "smaller and larger patch"),
+        ("Drag beside the body, middle-drag or Alt-drag", "turn the camera"),
+        ("Shift-drag", "move the camera"),
         ("Wheel or pinch in the view", "zoom in and out at the pointer"),
         ("Right-drag in the view", "zoom in and out"),
         ("Right-click in the view", "menu of the body part under the pointer"),

@@ -76,6 +76,14 @@ class CodeSlider(Slider):
             self.setValue(round(min(max(fraction, 0.0), 1.0) * _STEPS))
         self.update()
 
+    def show_held(self, number: float | None) -> None:
+        """Mark where contact holds the number, although the handle is elsewhere; None for none."""
+        span = self._high - self._low
+        held = None if number is None else min(max((number - self._low) / span, 0.0), 1.0)
+        if held != self.held_at:
+            self.held_at = held
+            self.update()
+
     @property
     def origin(self) -> float:
         """Zero."""
@@ -112,6 +120,10 @@ class CodeSlider(Slider):
 class CodeRow(HoverRow):
     """Name, slider and number of one code.
 
+    Signals
+    -------
+    asked : float, the number that the user wants; what comes may be less, where contact holds
+
     Parameters
     ----------
     document : changed
@@ -124,6 +136,8 @@ class CodeRow(HoverRow):
     ----------
     number : of the pose that is shown, NaN while the user changes it
     """
+
+    asked = Signal(float)
 
     def __init__(
         self, document: PoseDocument, code: int, index: int, domain: int | None, name_width: int
@@ -141,6 +155,7 @@ class CodeRow(HoverRow):
         label = ElidedLabel(name, Qt.TextElideMode.ElideMiddle)
         label.setMaximumWidth(name_width)
         self.slider = CodeSlider(low, high, model.domain_colours[moved])
+        self._explained: tuple[bool, bool] | None = None
         beyond = _BEYOND * (high - low)
         self._limits = self._field_limits = low - beyond, high + beyond
         self.field = NumberBox(3, *self._limits)
@@ -163,7 +178,7 @@ class CodeRow(HoverRow):
         self.show_number(float(document.latent[code]))
         gesture = f"Move {document.code_name(code)}"
         self.slider.drag_started.connect(lambda: document.begin_gesture(gesture))
-        self.slider.drag_ended.connect(document.end_gesture)
+        self.slider.drag_ended.connect(self._on_drag_ended)
         self.slider.drag_abandoned.connect(document.cancel_gesture)
         self.slider.valueChanged.connect(lambda: self._move(self.slider.number))
         self.slider.reset_wanted.connect(lambda: document.reset_code(code))
@@ -171,9 +186,10 @@ class CodeRow(HoverRow):
         self.field.refused.connect(lambda told: document.message.emit(f"{name}: {told}"))
 
     def show_number(self, number: float) -> None:
-        """Follow the document, also beyond what can be typed."""
+        """Follow the document, also beyond what can be typed; a handle that is held stays."""
         self.number = number
-        self.slider.show_number(number)
+        if not self.slider.isSliderDown():
+            self.slider.show_number(number)
         low, high = self._limits
         with silent(self.field):
             limits = min(low, number), max(high, number)
@@ -187,6 +203,7 @@ class CodeRow(HoverRow):
     def _move(self, number: float) -> None:
         # Whatever the pose gets, which may stop before at contact, is shown again.
         self.number = np.nan
+        self.asked.emit(number)
         self._document.set_code(self.code, number)
 
     @property
@@ -200,14 +217,28 @@ class CodeRow(HoverRow):
         # Half of the last digit, as the end of the range is seldom a round number.
         slack = 0.5 * 10.0 ** -self.field.decimals()
         outside = not low - slack <= number <= high + slack
-        if outside == self.is_outside and self.field.toolTip():
+        held = bool(self.field.property("held"))
+        if (outside, held) == self._explained:
             return
+        self._explained = outside, held
         show_verdict(self.field, "outside" if outside else "")
         least, most, *limits = map(self.field.textFromValue, (low, high, *self._limits))
         words = f"type a number from {limits[0]} to {limits[1]}"
         if outside:
             words += f"; this one is outside the trained range, {least} to {most}"
+        if held:
+            words = f"held by contact; {words}"
         self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
+
+    def show_held(self, number: float | None) -> None:
+        """Mark where contact holds the number, although another was asked for; None for nowhere."""
+        self.slider.show_held(number)
+        self.field.setProperty("held", number is not None)
+        self._explain(self.field.value())
+
+    def _on_drag_ended(self) -> None:
+        self._document.end_gesture()
+        self.slider.show_number(float(self._document.latent[self.code]))
 
     def edit_number(self) -> None:
         """Give the field the keyboard, to type a number."""

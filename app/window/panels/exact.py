@@ -1,4 +1,4 @@
-"""The exact check of the pose, which follows when the pose rests."""
+"""The exact check of the pose, live, or where it takes long as soon as the pose rests."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ _SIGNS = {"free": "check", "colliding": "warning"}
 _SIGN_SIZE = 24
 _SOURCE = "computed on the mesh"
 _BEFORE = "previous pose"
+_HELD = "Held by contact"
+_NO_DEEPER = "Solid keeps it from going deeper; Resolve takes it apart"
 
 
 class ExactCard(Card):
@@ -39,6 +41,7 @@ class ExactCard(Card):
         self.column.addLayout(hbox(self._sign, self.verdict, wide=self.verdict))
         self.column.addWidget(self.details)
         document.exact_changed.connect(self._on_exact)
+        document.frame_changed.connect(self._on_exact)
         document.model_changed.connect(self._on_model)
         self._on_model()
 
@@ -52,7 +55,7 @@ class ExactCard(Card):
         has_model = self._document.has_model
         self._sign.show_icon("wait", "waiting")
         self.verdict.setText("Checking…" if has_model else "No pose yet")
-        self.details.setText("Follows a moment after the pose rests")
+        self.details.setText("Follows when the pose rests")
         if has_model:
             # Folds that do not count are reported on a separate line.
             lines = 2 if self._document.model.near_exclusion else 1
@@ -71,20 +74,23 @@ class ExactCard(Card):
         self._sign.show_icon(_SIGNS[self._kind] if verdict else self._sign.name, self._kind)
 
     def _say(self, verdict: ExactVerdict) -> None:
-        folds = ""
+        document = self._document
+        frame, folds = document.frame, ""
+        is_held = frame is not None and len(frame.contacts) > 0
         if verdict.n_near_pairs:
             folds = f"\n{counted(verdict.n_near_pairs, 'skin fold')} not counted"
         if verdict.colliding:
             self.verdict.setText("Colliding (checked)")
             pairs = counted(len(verdict.pairs), "pair")
-            self.details.setText(
-                f"{pairs} of triangles, overlap {overlap_text(verdict.energy)}{folds}"
-            )
+            said = f"{pairs} of triangles, overlap {overlap_text(verdict.energy)}{folds}"
+            # Why a drag goes no further.
+            self.details.setText(f"{said}\n{_NO_DEEPER}" if is_held else said)
             self.details.setToolTip(
                 "How deep all crossing triangles penetrate each other, combined, in per cent "
                 "of the body size"
             )
         else:
             self.verdict.setText("No collisions (checked)")
-            self.details.setText(f"No triangle crosses another{folds}")
+            said = _HELD if is_held else "No triangle crosses another"
+            self.details.setText(f"{said}{folds}")
             self.details.setToolTip("")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 from PySide6.QtCore import QPoint, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import QMouseEvent
 from PySide6.QtWidgets import QLineEdit, QToolButton, QWidget
@@ -30,7 +33,12 @@ if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from lcollision_core.model import LatentGroup
 
+FloatArray = npt.NDArray[np.float64]
+
 _HEADER_HEIGHT, _ARROW = 28, 16
+
+_LEAST_HELD = 1e-3
+"""Difference from what was asked for that is worth a mark: the last digit of a number."""
 
 
 class GroupHeader(HoverRow):
@@ -138,6 +146,7 @@ class SliderGroup(QWidget):
             row = CodeRow(document, code, index, self._domain, name_width)
             row.hovered.connect(self._panel.domain_hovered)
             row.menu_wanted.connect(self._panel.menu_wanted)
+            row.asked.connect(partial(self._panel.note_asked, row))
             self._column.addWidget(row)
             self.rows.append(row)
             order += [row.slider, row.field]
@@ -172,6 +181,7 @@ class SlidersPanel(QWidget):
         self.groups: list[SliderGroup] = []
         self._fingerprint = ""
         self._latent_size = 0
+        self._asked: tuple[CodeRow, float, FloatArray] | None = None
         self.filter = QLineEdit()
         self.filter.setPlaceholderText("Filter sliders, such as “thigh”")
         self.filter.setToolTip("Show only the sliders whose names contain these words")
@@ -190,6 +200,7 @@ class SlidersPanel(QWidget):
         self.filter.textChanged.connect(self._on_filter)
         document.model_changed.connect(self._on_model)
         document.latent_changed.connect(self._on_latent)
+        document.frame_changed.connect(self._on_frame)
         if document.has_model:
             self._on_model()
 
@@ -227,6 +238,7 @@ class SlidersPanel(QWidget):
         return next(row for row in self.groups[index].rows if row.code == code)
 
     def _on_model(self) -> None:
+        self._asked = None
         for group in self.groups:
             self._column.removeWidget(group)
             group.deleteLater()
@@ -257,6 +269,26 @@ class SlidersPanel(QWidget):
             for row in group.rows:
                 if row.number != latent[row.code]:
                     row.show_number(float(latent[row.code]))
+
+    def note_asked(self, row: CodeRow, number: float) -> None:
+        """Remember what number the user wants, to show where contact holds it."""
+        if self._asked is not None and self._asked[0] is not row:
+            self._asked[0].show_held(None)
+        self._asked = row, number, np.delete(self.document.latent, row.code)
+
+    def _on_frame(self) -> None:
+        frame, latent = self.document.frame, self.document.latent
+        if self._asked is None or frame is None:
+            return
+        row, number, others = self._asked
+        reached = float(latent[row.code])
+        is_held = len(frame.contacts) > 0 and abs(number - reached) > _LEAST_HELD
+        # What else has moved the pose since has its own contacts.
+        is_held = is_held and np.array_equal(np.delete(latent, row.code), others)
+        row.show_held(reached if is_held else None)
+        if frame.settled:
+            # Also where the number has not moved at all.
+            row.show_number(reached)
 
     def _on_filter(self, text: str) -> None:
         words = text.strip().casefold()

@@ -7,9 +7,13 @@ import numpy.typing as npt
 import pytest
 from pytestqt.qtbot import QtBot
 
-from app.view.camera import places_of
+from app.view.camera import View, places_of, preset_view
+from app.view.marks import PIN_RADIUS
+from app.view.offscreen import PoseRenderer
+from app.view.palettes import LIGHT
 from app.view.shading import Shading
 from app.view.viewport import Viewport
+from lcollision_core.model import PoseModel
 from lcollision_core.posing import make_grip
 from tests.app.views import SIDE, changed, seen_vertex, steady_pixels
 
@@ -53,34 +57,34 @@ def test_the_patch_is_painted_where_it_is_and_nowhere_else(
 
 
 def test_pins_and_contacts_have_one_size_near_and_far_and_are_drawn_through_the_body(
-    qtbot: QtBot, viewport: Viewport
+    editor_model: PoseModel,
 ) -> None:
-    scene, canvas = viewport.scene, viewport.canvas
-    assert scene is not None
-    assert canvas is not None
+    renderer = PoseRenderer(editor_model, SIDE, SIDE, LIGHT)
+    scene, vertices = renderer.scene, editor_model.reference
+    scene.show(vertices, np.zeros_like(vertices))
     # Inside the body, where only what is drawn through it is seen.
-    middle = scene.surface.vertices.mean(axis=0, dtype=np.float64)
-    sizes = []
+    middle = vertices.mean(axis=0, dtype=np.float64)[None]
+    nothing = np.zeros((0, 3))
+    front = preset_view("Front", vertices, editor_model.up_axis, editor_model.front, 1.0)
+    drawn_sizes = []
     for zoom in (1.0, 0.6):
-        view = scene.view
-        scene.view = type(view)(
-            view.focus + zoom * (view.position - view.focus), view.focus, view.up
-        )
-        for pins, contacts in (([middle], []), ([], [middle])):
-            scene.marks.show_pins(np.zeros((0, 3)), [])
-            scene.marks.show_contacts(np.zeros((0, 3)))
-            canvas.redraw()
-            before = steady_pixels(qtbot, viewport)
-            scene.marks.show_pins(np.reshape(pins, (-1, 3)), ["#00ff00"] * len(pins))
-            scene.marks.show_contacts(np.reshape(contacts, (-1, 3)))
-            canvas.redraw()
-            drawn = changed(before, steady_pixels(qtbot, viewport))
-            rows, columns = np.nonzero(drawn)
-            centre = _places(viewport, middle[None])[0]
-            np.testing.assert_allclose([columns.mean(), rows.mean()], centre, atol=1.5)
-            sizes.append(np.ptp(columns))
-    assert sizes[:2] == pytest.approx(sizes[2:], abs=1)
-    assert sizes[0] == pytest.approx(14, abs=2)
+        arm = front.position - front.focus
+        scene.view = View(front.focus + zoom * arm, front.focus, front.up)
+        for pins, contacts in ((middle, nothing), (nothing, middle)):
+            pictures = []
+            for shown in ((nothing, nothing), (pins, contacts)):
+                scene.marks.show_pins(shown[0], ["#00ff00"] * len(shown[0]))
+                scene.marks.show_contacts(shown[1])
+                scene.fit_to_screen(1.0)
+                pictures.append(np.asarray(renderer.drawn(), dtype=np.int64))
+            rows, columns = np.nonzero(changed(*pictures))
+            (centre,) = places_of(scene.view, middle, SIZE)
+            found = 0.5 * (columns.min() + columns.max()), 0.5 * (rows.min() + rows.max())
+            np.testing.assert_allclose(found, centre, atol=1.5)
+            drawn_sizes.append(np.ptp(columns))
+    renderer.close()
+    assert drawn_sizes[:2] == pytest.approx(drawn_sizes[2:], abs=1)
+    assert drawn_sizes[0] == pytest.approx(2 * PIN_RADIUS, abs=2)
 
 
 def test_a_pin_is_found_by_its_dot(viewport: Viewport) -> None:

@@ -16,7 +16,7 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.view.camera import CAMERAS, View, framing, sees_all
+from app.view.camera import CAMERAS, View, framing, places_of, sees_all
 from app.view.canvas import Canvas, Smoothness
 from app.view.viewport import Viewport
 from lcollision_core.model import NamedPose
@@ -105,13 +105,18 @@ def test_a_camera_is_turned_to_by_degrees_and_arrives(qtbot: QtBot, viewport: Vi
     np.testing.assert_allclose(directions[0], -directions[1], atol=1e-6)
 
 
-def roll(canvas: Canvas, place: QPoint, notches: float) -> None:
+def roll(
+    canvas: Canvas,
+    place: QPoint,
+    notches: float,
+    keys: Qt.KeyboardModifier = Qt.KeyboardModifier.NoModifier,
+) -> None:
     """Turn the wheel, or move two fingers on a touchpad, over a place of the canvas."""
     turned = QPoint(0, round(120 * notches))
-    no_keys, no_buttons = Qt.KeyboardModifier.NoModifier, Qt.MouseButton.NoButton
+    no_buttons = Qt.MouseButton.NoButton
     phase, where = Qt.ScrollPhase.NoScrollPhase, canvas.mapToGlobal(place)
     event = QWheelEvent(
-        QPointF(place), QPointF(where), QPoint(), turned, no_buttons, no_keys, phase, False
+        QPointF(place), QPointF(where), QPoint(), turned, no_buttons, keys, phase, False
     )
     QApplication.sendEvent(canvas, event)
 
@@ -192,7 +197,7 @@ def test_a_right_click_asks_for_a_menu_and_a_right_drag_does_what_it_did(
     assert scene is not None
     right = Qt.MouseButton.RightButton
     told: list[int | None] = []
-    viewport.menu_wanted.connect(lambda domain, _: told.append(domain))
+    viewport.menu_wanted.connect(lambda domain, *_: told.append(domain))
     before = scene.view
     for domain in (0, 1):
         place = place_of(viewport, seen_vertex(viewport, domain))
@@ -271,23 +276,190 @@ def test_the_canvas_draws_a_drag_as_smoothly_as_the_machine_can(
     assert all(drag())
 
 
-def test_the_mouse_turns_the_camera_upright_and_keys_do_nothing(
-    qtbot: QtBot, viewport: Viewport
+CONTROL, SHIFT, ALT = (
+    Qt.KeyboardModifier.ControlModifier,
+    Qt.KeyboardModifier.ShiftModifier,
+    Qt.KeyboardModifier.AltModifier,
+)
+NO_KEY = Qt.KeyboardModifier.NoModifier
+LEFT, MIDDLE = Qt.MouseButton.LeftButton, Qt.MouseButton.MiddleButton
+
+
+def drag(
+    qtbot: QtBot,
+    viewport: Viewport,
+    start: QPoint,
+    way: QPoint,
+    button: Qt.MouseButton = LEFT,
+    keys: Qt.KeyboardModifier = NO_KEY,
+    let_go: bool = True,
 ) -> None:
+    """Drag with a button, in a few steps, and rest until what is dragged has arrived."""
     canvas = viewport.canvas
     assert canvas is not None
-    assert viewport.scene.view is not None
-    before = viewport.scene.view
-    QTest.mousePress(canvas, Qt.MouseButton.LeftButton, pos=QPoint(200, 200))
-    QTest.mouseMove(canvas, QPoint(240, 215))
-    QTest.mouseMove(canvas, QPoint(280, 230))
-    QTest.mouseRelease(canvas, Qt.MouseButton.LeftButton, pos=QPoint(280, 230))
+    QTest.mousePress(canvas, button, keys, start)
+    for step in range(1, 6):
+        QTest.mouseMove(canvas, start + way * step / 5)
+        qtbot.wait(20)
+    if let_go:
+        qtbot.waitUntil(lambda: not viewport._document.moving, timeout=60_000)
+        QTest.mouseRelease(canvas, button, keys, start + way)
+
+
+def settled(qtbot: QtBot, viewport: Viewport) -> None:
+    """Wait until a drag has arrived on the screen."""
+    qtbot.waitUntil(lambda: not viewport._document.moving, timeout=60_000)
     rest(qtbot, viewport)
-    turned = viewport.scene.view
-    assert np.linalg.norm(turned.position - before.position) > 1.0
-    np.testing.assert_allclose(turned.up, before.up)
-    up = viewport._document.model.up_axis
-    assert turned.up[up] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("button", "keys", "on_body", "shifts"),
+    [
+        (LEFT, NO_KEY, False, False),
+        (LEFT, SHIFT, False, True),
+        (LEFT, SHIFT, True, True),
+        (LEFT, ALT, True, False),
+        (MIDDLE, NO_KEY, True, False),
+        (MIDDLE, SHIFT, True, True),
+    ],
+)
+def test_the_mouse_turns_and_shifts_the_camera(
+    qtbot: QtBot,
+    viewport: Viewport,
+    button: Qt.MouseButton,
+    keys: Qt.KeyboardModifier,
+    on_body: bool,
+    shifts: bool,
+) -> None:
+    canvas, document = viewport.canvas, viewport._document
+    assert canvas is not None
+    assert viewport.scene is not None
+    before, latent = viewport.scene.view, document.latent
+    start = place_of(viewport, seen_vertex(viewport, 0)) if on_body else QPoint(10, 10)
+    drag(qtbot, viewport, start, QPoint(60, 20), button, keys)
+    rest(qtbot, viewport)
+    after = viewport.scene.view
+    arms = [view.position - view.focus for view in (before, after)]
+    assert np.linalg.norm(arms[1]) == pytest.approx(np.linalg.norm(arms[0]))
+    assert bool(np.abs(arms[1] - arms[0]).max() < 1e-9) is shifts
+    assert bool(np.abs(after.focus - before.focus).max() > 1e-3) is shifts
+    np.testing.assert_array_equal(after.up, before.up)
+    assert document.latent is latent
+    assert document.undo_stack.count() == 0
+
+
+WAY = QPoint(0, 20)
+"""In pixels, where the tube's first body part can follow."""
+
+
+def test_the_patch_that_is_dragged_follows_the_pointer_in_one_step_of_undo(
+    qtbot: QtBot, viewport: Viewport
+) -> None:
+    canvas, scene, document = viewport.canvas, viewport.scene, viewport._document
+    assert canvas is not None
+    assert scene is not None
+    vertex = seen_vertex(viewport, 0)
+    place, before = place_of(viewport, vertex), document.latent
+    camera = scene.view.position
+    # A pointer that is there already would not move.
+    for there in (QPoint(3, 3), place):
+        QTest.mouseMove(canvas, there)
+    qtbot.waitUntil(lambda: viewport.pointed_vertex == vertex, timeout=20_000)
+    grip = document.grip_at(vertex)
+    seen = [grip.position(scene.surface.vertices)]
+    drag(qtbot, viewport, place, WAY)
+    settled(qtbot, viewport)
+    seen.append(grip.position(scene.surface.vertices))
+    places = places_of(scene.view, np.array(seen), (canvas.width(), canvas.height()))
+    np.testing.assert_allclose(places[1] - places[0], [WAY.x(), WAY.y()], atol=5.0)
+    np.testing.assert_array_equal(scene.view.position, camera)
+    name = document.model.domain_names[0]
+    assert document.undo_stack.count() == 1
+    assert document.undo_stack.undoText() == f"Drag {name}"
+    document.undo()
+    np.testing.assert_array_equal(document.latent, before)
+
+
+def test_escape_in_a_drag_puts_everything_back_to_the_bit(qtbot: QtBot, viewport: Viewport) -> None:
+    canvas, document = viewport.canvas, viewport._document
+    assert canvas is not None
+    before = document.latent.copy()
+    place = place_of(viewport, seen_vertex(viewport, 1))
+    drag(qtbot, viewport, place, QPoint(25, 0), let_go=False)
+    qtbot.waitUntil(lambda: not np.array_equal(document.latent, before), timeout=60_000)
+    assert document.dragging
+    QTest.keyClick(canvas, Qt.Key.Key_Escape)
+    assert not document.dragging
+    np.testing.assert_array_equal(document.latent, before)
+    # What the hand still does changes nothing.
+    QTest.mouseMove(canvas, place + QPoint(40, 0))
+    QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(40, 0))
+    settled(qtbot, viewport)
+    np.testing.assert_array_equal(document.latent, before)
+    assert document.undo_stack.count() == 0
+
+
+def test_a_ctrl_drag_twists_the_part(qtbot: QtBot, viewport: Viewport) -> None:
+    canvas, document = viewport.canvas, viewport._document
+    assert canvas is not None
+    before = document.latent.copy()
+    place = place_of(viewport, seen_vertex(viewport, 1))
+    drag(qtbot, viewport, place, QPoint(30, 30), keys=CONTROL)
+    settled(qtbot, viewport)
+    assert not np.array_equal(document.latent, before)
+    assert document.undo_stack.undoText() == f"Twist {document.model.domain_names[1]}"
+
+
+def test_the_wheel_with_ctrl_changes_the_patch_and_not_the_camera(
+    qtbot: QtBot, viewport: Viewport
+) -> None:
+    canvas, scene, document = viewport.canvas, viewport.scene, viewport._document
+    assert canvas is not None
+    assert scene is not None
+    place = place_of(viewport, seen_vertex(viewport, 1))
+    # A pointer that is there already would not move.
+    for there in (QPoint(3, 3), place):
+        QTest.mouseMove(canvas, there)
+    qtbot.waitUntil(lambda: viewport.pointed_vertex is not None, timeout=20_000)
+    camera, radius = scene.view.position, document.grip_radius
+    roll(canvas, place, 1.0, CONTROL)
+    assert document.grip_radius == pytest.approx(1.25 * radius)
+    roll(canvas, place, -1.0, CONTROL)
+    assert document.grip_radius == pytest.approx(radius)
+    np.testing.assert_array_equal(scene.view.position, camera)
+    rest(qtbot, viewport)
+
+
+def test_a_double_click_pins_and_unpins_and_a_pin_is_dragged_by_its_dot(
+    qtbot: QtBot, viewport: Viewport
+) -> None:
+    canvas, scene, document = viewport.canvas, viewport.scene, viewport._document
+    assert canvas is not None
+    assert scene is not None
+    vertex = seen_vertex(viewport, 0)
+    place = place_of(viewport, vertex)
+    QTest.mouseDClick(canvas, LEFT, NO_KEY, place)
+    assert [pin.vertex for pin in document.pins] == [vertex]
+    rest(qtbot, viewport)
+    size = float(canvas.width()), float(canvas.height())
+
+    def dot() -> QPoint:
+        (seen,) = places_of(scene.view, np.array([document.pins[0].position]), size)
+        return QPointF(*seen.tolist()).toPoint()
+
+    start = dot()
+    drag(qtbot, viewport, start, WAY)
+    settled(qtbot, viewport)
+    assert (dot() - start - WAY).manhattanLength() <= 6
+    assert "pin" in document.undo_stack.undoText().casefold()
+    QTest.mouseDClick(canvas, LEFT, NO_KEY, dot())
+    assert document.pins == ()
+    settled(qtbot, viewport)
+
+
+def test_keys_do_nothing_in_the_view(qtbot: QtBot, viewport: Viewport) -> None:
+    canvas = viewport.canvas
+    assert canvas is not None
     # Off the body, or the part under the pointer may light up a moment later.
     QTest.mouseMove(canvas, QPoint(2, 2))
     qtbot.waitUntil(lambda: viewport.hovered_domain is None, timeout=20_000)

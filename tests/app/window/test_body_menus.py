@@ -18,7 +18,7 @@ from tests.app.windows import PATIENCE, rest, take_picture
 
 
 def opened(qtbot: QtBot, window: MainWindow, domain: int | None) -> QMenu:
-    window.viewport.menu_wanted.emit(domain, window.mapToGlobal(QPoint(500, 300)))
+    window.viewport.menu_wanted.emit(domain, None, window.mapToGlobal(QPoint(500, 300)))
     found = [menu for menu in window.findChildren(QMenu) if menu.isVisible()]
     qtbot.waitUntil(lambda: bool(found), timeout=PATIENCE)
     return found[0]

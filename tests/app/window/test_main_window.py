@@ -177,9 +177,7 @@ def test_hovering_a_row_lights_its_domain_and_the_mesh_lights_its_row(
         on_screen(canvas, scene.surface.vertices[vertex]).toPoint()
         for vertex in np.flatnonzero(leading == 1)
     ]
-    seen = [
-        point for point in points if canvas.pick_vertex(point.toPointF(), scene.body) is not None
-    ]
+    seen = [point for point in points if canvas.pick(point.toPointF(), scene.body) is not None]
     place = seen[len(seen) // 2]
     with qtbot.waitSignal(window.viewport.domain_hovered) as told:
         QTest.mouseMove(canvas, place)

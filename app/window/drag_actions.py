@@ -1,0 +1,103 @@
+"""The actions of dragging: Solid, pins, the size of the patch that is taken."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, Slot
+from PySide6.QtGui import QAction
+
+from app.view.mouse import RADIUS_STEP
+from app.window.actions import ACTIONS, explain_action
+from app.window.widgets import silent
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.editing.settings import Settings
+    from app.view.viewport import Viewport
+
+_LIMBS = {"pin_feet": ("feet", r"\b(foot|feet)\b"), "pin_hands": ("hands", r"\bhands?\b")}
+"""By the actions' keys: what they pin, and which body parts have one."""
+
+
+class DragActions(QObject):
+    """What can be done with the body besides dragging it.
+
+    Parameters
+    ----------
+    document : changed
+    settings : remember whether the body is solid
+    viewport : knows what is under the pointer
+    actions : by key; whether they can be chosen follows the document and the pointer
+
+    Attributes
+    ----------
+    acts : callables by the actions' keys
+    """
+
+    def __init__(
+        self,
+        document: PoseDocument,
+        settings: Settings,
+        viewport: Viewport,
+        actions: Mapping[str, QAction],
+    ) -> None:
+        super().__init__(viewport)
+        self._document, self._settings = document, settings
+        self._viewport, self._actions = viewport, actions
+        self.acts: dict[str, Callable[[], object]] = {
+            "solid": lambda: document.set_solid(actions["solid"].isChecked()),
+            "pin": viewport.toggle_pin,
+            "unpin_all": document.unpin_all,
+            "pin_feet": lambda: self._pin("pin_feet"),
+            "pin_hands": lambda: self._pin("pin_hands"),
+            "smaller": lambda: document.set_grip_radius(document.grip_radius / RADIUS_STEP),
+            "larger": lambda: document.set_grip_radius(document.grip_radius * RADIUS_STEP),
+        }
+        document.set_solid(settings["solid"])
+        document.solid_changed.connect(self._on_solid)
+        for changed in (document.model_changed, document.pins_changed, viewport.pointed):
+            changed.connect(self._update_actions)
+        self._on_solid()
+        self._update_actions()
+
+    @Slot()
+    def _on_solid(self) -> None:
+        solid = self._document.solid
+        with silent(self._actions["solid"]):
+            self._actions["solid"].setChecked(solid)
+        self._settings["solid"] = solid
+
+    @Slot()
+    def _update_actions(self) -> None:
+        document, actions = self._document, self._actions
+        for key in self.acts:
+            actions[key].setEnabled(document.has_model)
+        if not document.has_model:
+            return
+        vertex = self._viewport.pointed_vertex
+        is_pinned = vertex in [pin.vertex for pin in document.pins]
+        actions["pin"].setText("Un&pin" if is_pinned else ACTIONS["pin"].text)
+        actions["pin"].setEnabled(vertex is not None)
+        actions["unpin_all"].setEnabled(bool(document.pins))
+        for key, (limbs, _) in _LIMBS.items():
+            can = bool(self._domains(key))
+            actions[key].setEnabled(can)
+            tip = ACTIONS[key].tip if can else f"No body part of this model is named after {limbs}"
+            explain_action(actions[key], tip)
+
+    def _domains(self, key: str) -> list[int]:
+        """Return the body parts that an action pins."""
+        names = self._document.model.domain_names
+        return [k for k, name in enumerate(names) if re.search(_LIMBS[key][1], name.casefold())]
+
+    def _pin(self, key: str) -> None:
+        """Pin the far ends of body parts."""
+        from lcollision_core.posing import far_end
+
+        document = self._document
+        space = document.model.pose_space
+        grips = [document.grip_at(far_end(space, domain)) for domain in self._domains(key)]
+        document.pin_grips(grips, f"Pin {_LIMBS[key][0]}")
