@@ -13,7 +13,14 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.contacts import ContactRegions, Contacts, least_step
 from lcollision_core.posing.exact import ExactCheck, exported_vertices
-from lcollision_core.posing.goals import CODES_REACH, CodesGoal, Decoded, Goal, PatchGoal, TwistGoal
+from lcollision_core.posing.goals import (
+    CodesGoal,
+    Decoded,
+    Goal,
+    PatchGoal,
+    TwistGoal,
+    largest_stretch,
+)
 from lcollision_core.posing.grip import Grip, Pin, Twist, make_grip
 
 MAX_STEPS = 3
@@ -31,8 +38,15 @@ DAMPING, HOLD = 0.02, 0.002
 """Prices of the mean squared vertex displacement of a step, and of that since the drag began,
 against the squared miss of the grip."""
 
-IMPLAUSIBLE = 1e-6
+IMPLAUSIBLE = 5e-6
 """Price of the squared Mahalanobis distance from the drag's start: see `PoseSpace.precision`."""
+
+STRETCH = 0.14
+"""The most by which a drag of strength 1 makes an edge longer than it is in any plausible pose."""
+
+_NEAR, _WORTHWHILE, _SETTLED = 0.5, 0.5, 0.01
+"""Of a goal's reach: a miss that the next event takes, the gain of a step that another follows at
+once, and that of one that no other follows."""
 
 _STILL = 1e-5
 """Root of the mean squared vertex displacement, normalised, of a step that is none."""
@@ -45,7 +59,7 @@ class DragOptions:
     Attributes
     ----------
     solid : keep the pose out of itself
-    strength : of the price of implausible poses: 0 for none
+    strength : of the prices of implausible poses and stretched limbs: 0 for none
     locked_domains : body parts whose codes stay
     """
 
@@ -139,6 +153,7 @@ class PoseDragger:
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
         self._allowed: dict[int, tuple[float, float]] = {}
+        self._stretch = self._options.strength * (largest_stretch(space, self._here.vertices) - 1.0)
         if self._options.solid:
             self._found = check.find(check.exported(self._here.vertices))
             self._allowed = self._depths(self._found)
@@ -149,10 +164,11 @@ class PoseDragger:
             )
             for pin in pins
         ]
+        strength = self._options.strength
         if isinstance(grip, Grip):
-            self._goal = PatchGoal(space, grip, held)
+            self._goal = PatchGoal(space, grip, held, strength)
         elif isinstance(grip, Twist):
-            self._goal = TwistGoal(space, grip.domain, held, self._here.vertices)
+            self._goal = TwistGoal(space, grip.domain, held, strength, self._here.vertices)
         else:
             self._goal = CodesGoal(space)
         return self._result(0.0, settled=True)
@@ -177,12 +193,17 @@ class PoseDragger:
             return self._result(float("nan"), settled=True)
         if isinstance(goal, PatchGoal):
             aim /= self._check.body_size
-        settled = False
+        miss, gain = goal.miss(self._here, aim), 0.0
         for _ in range(MAX_STEPS):
-            settled = not self._step(goal, aim)
-            if settled:
+            if not self._step(goal, aim):
+                gain = 0.0
                 break
-        return self._result(goal.miss(self._here, aim), settled)
+            left = goal.miss(self._here, aim)
+            miss, gain = left, miss - left
+            # Further steps are for a pointer that leapt, not for one that is out of reach.
+            if left < _NEAR * goal.reach or gain < _WORTHWHILE * goal.reach:
+                break
+        return self._result(miss, settled=gain < _SETTLED * goal.reach)
 
     def end(self) -> None:
         """End the drag; its contacts are forgotten."""
@@ -206,8 +227,8 @@ class PoseDragger:
             price = self._options.strength * IMPLAUSIBLE * space.precision
             gradient = gradient + (HOLD * space.metric + price) @ (here - self._start)
             hessian = hessian + (DAMPING + HOLD) * space.metric + price
-        solid = self._options.solid
-        for _ in range(ROUNDS if solid else 1):
+        for _ in range(ROUNDS):
+            n_contacts = len(self._contacts.offsets)
             there = least_step(
                 hessian, gradient, here, low, high, self._contacts.normals, self._contacts.offsets
             )
@@ -218,9 +239,9 @@ class PoseDragger:
                 return False
             elif self._goes(there):
                 return True
-        if there is None or not solid:
-            return False
-        return any(self._goes(here + cut * (there - here)) for cut in CUTS)
+            elif len(self._contacts.offsets) == n_contacts:
+                break
+        return there is not None and any(self._goes(here + cut * (there - here)) for cut in CUTS)
 
     def _may_land(
         self, goal: CodesGoal, aim: FloatArray, low: FloatArray, high: FloatArray
@@ -231,7 +252,7 @@ class PoseDragger:
         """
         contacts = self._contacts
         return bool(
-            0.0 < goal.miss(self._here, aim) <= CODES_REACH
+            0.0 < goal.miss(self._here, aim) <= goal.reach
             and ((low <= aim) & (aim <= high)).all()
             and (contacts.normals @ aim <= contacts.offsets).all()
         )
@@ -244,6 +265,11 @@ class PoseDragger:
         """Go to codes if the pose may be there; else remember what is in the way."""
         check = self._check
         decoded = check.decode(there)[0]
+        stretch = 0.0
+        if not isinstance(self._goal, CodesGoal):
+            stretch = self._options.strength * (largest_stretch(self._space, decoded) - 1.0)
+            if stretch > max(STRETCH, self._stretch):
+                return False
         if self._options.solid:
             found = check.find(check.exported(decoded))
             depths, allowed = self._depths(found), self._allowed
@@ -254,7 +280,7 @@ class PoseDragger:
             self._found, self._allowed = found, depths
             if not found.colliding:
                 self._contacts.drop_refuted(there, KEPT_CONTACTS)
-        self._here = Decoded(there, decoded)
+        self._here, self._stretch = Decoded(there, decoded), stretch
         return True
 
     def _depths(self, found: SelfCollisions) -> dict[int, tuple[float, float]]:

@@ -15,14 +15,8 @@ from lcollision_core.posing.pose_space import PoseSpace
 PIN_WEIGHT = 100.0
 """Of the squared drift of a pin, against the squared miss of the grip."""
 
-REACH = 0.06
-"""The most of the way that one step aims at, in normalised length, as the model is linear."""
-
-TURN_REACH = 0.25
-"""The same of a twist, in radians."""
-
-CODES_REACH = 0.02
-"""The same of codes, as root of the mean squared vertex displacement."""
+STRETCH_WEIGHT = 0.01
+"""Of the sum of squares by which edges are longer than in any plausible pose, likewise."""
 
 Held = Sequence[tuple[Grip, FloatArray]]
 """Patches that stay, each with the (3,) normalised place of its mean."""
@@ -42,7 +36,14 @@ class Decoded(NamedTuple):
 
 
 class Goal(Protocol):
-    """A goal of the poses of one drag; lengths are normalised."""
+    """A goal of the poses of one drag; lengths are normalised.
+
+    Attributes
+    ----------
+    reach : the most of the miss that one step aims at, as the cost is modelled by one quadratic
+    """
+
+    reach: float
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
         """Measure what is left to a target."""
@@ -59,10 +60,13 @@ class PatchGoal:
     space : of the poses
     grip : the patch
     pins : that stay
+    strength : of the price of stretched edges
     """
 
-    def __init__(self, space: PoseSpace, grip: Grip, pins: Held) -> None:
-        self._space, self._pins, self._grip = space, pins, grip
+    reach = 0.012
+
+    def __init__(self, space: PoseSpace, grip: Grip, pins: Held, strength: float) -> None:
+        self._space, self._pins, self._grip, self._strength = space, pins, grip, strength
         self._rows = _rows(space, [grip, *(pin for pin, _ in pins)])
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
@@ -71,8 +75,10 @@ class PatchGoal:
 
     def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `Goal.cost`."""
-        way = _shortened(target - self._grip.position(pose.vertices), REACH)
-        return _squares(self._space, pose.codes, self._rows, [way, *_drifts(self._pins, pose)])
+        way = _shortened(target - self._grip.position(pose.vertices), self.reach)
+        return _squares(
+            self._space, pose, self._rows, [way, *_drifts(self._pins, pose)], self._strength
+        )
 
 
 class TwistGoal:
@@ -83,13 +89,18 @@ class TwistGoal:
     space : of the poses
     domain : the body part
     pins : that stay
+    strength : of the price of stretched edges
     decoded : (V, 3) float64 array, the vertices at the drag's start
     """
 
-    def __init__(self, space: PoseSpace, domain: int, pins: Held, decoded: FloatArray) -> None:
+    reach = 0.25
+
+    def __init__(
+        self, space: PoseSpace, domain: int, pins: Held, strength: float, decoded: FloatArray
+    ) -> None:
         inside = np.flatnonzero(space.vertex_domain == domain)
         self._part = Grip(int(inside[0]), 0.0, inside, np.full(len(inside), 1.0 / len(inside)))
-        self._space = space
+        self._space, self._strength = space, strength
         self._pins = [(self._part, self._part.position(decoded)), *pins]
         self._rows = _rows(space, [self._part, *(pin for pin, _ in self._pins)])
         self._arms = self._arms_of(decoded)
@@ -120,8 +131,8 @@ class TwistGoal:
         # The first row is the turn: the mean of the motions across the axis.
         rows[:3] = 0.0
         rows[0, self._part.vertices] = across / (radius * len(arms))
-        way = np.array([radius * np.clip(left, -TURN_REACH, TURN_REACH), 0.0, 0.0])
-        return _squares(self._space, pose.codes, rows, [way, *_drifts(self._pins, pose)])
+        way = np.array([radius * np.clip(left, -self.reach, self.reach), 0.0, 0.0])
+        return _squares(self._space, pose, rows, [way, *_drifts(self._pins, pose)], self._strength)
 
 
 class CodesGoal:
@@ -131,6 +142,8 @@ class CodesGoal:
     ----------
     space : of the poses
     """
+
+    reach = 0.02
 
     def __init__(self, space: PoseSpace) -> None:
         self._space = space
@@ -143,7 +156,7 @@ class CodesGoal:
     def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `Goal.cost`."""
         miss = self.miss(pose, target)
-        way = (target - pose.codes) * min(1.0, CODES_REACH / max(miss, CODES_REACH))
+        way = (target - pose.codes) * min(1.0, self.reach / max(miss, self.reach))
         return self._space.metric, -(self._space.metric @ way)
 
 
@@ -157,7 +170,7 @@ def _rows(space: PoseSpace, patches: Sequence[Grip]) -> FloatArray:
 
 
 def _drifts(pins: Held, pose: Decoded) -> list[FloatArray]:
-    return [_shortened(place - pin.position(pose.vertices), REACH) for pin, place in pins]
+    return [_shortened(place - pin.position(pose.vertices), PatchGoal.reach) for pin, place in pins]
 
 
 def _shortened(way: FloatArray, most: float) -> FloatArray:
@@ -166,11 +179,49 @@ def _shortened(way: FloatArray, most: float) -> FloatArray:
 
 
 def _squares(
-    space: PoseSpace, codes: FloatArray, by_vertices: FloatArray, ways: Sequence[FloatArray]
+    space: PoseSpace,
+    pose: Decoded,
+    by_vertices: FloatArray,
+    ways: Sequence[FloatArray],
+    strength: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Newton of half the squared ways that are left: the first patch's, then pins'."""
-    rows = space.pull_back(codes, by_vertices)
+    """Gauss-Newton of half the squared ways that are left, the first patch's and then the pins'.
+
+    The excess stretch of the edges is one more of them.
+    """
+    excess, slope = _excess_stretch(space, pose.vertices)
+    rows = space.pull_back(pose.codes, np.concatenate([by_vertices, slope[None]]))
     weights = np.full(len(rows), PIN_WEIGHT)
     weights[:3] = 1.0
+    weights[-1] = STRETCH_WEIGHT * strength
     weighted = rows * weights[:, None]
-    return weighted.T @ rows, -(np.concatenate(ways) @ weighted)
+    return weighted.T @ rows, -(np.concatenate([*ways, [-excess]]) @ weighted)
+
+
+def largest_stretch(space: PoseSpace, vertices: FloatArray) -> float:
+    """Return the most that an edge is as long as in the plausible pose where it is longest."""
+    lengths = space.topology.edge_lengths(vertices)
+    return float((lengths / space.longest_edges).max())
+
+
+def _excess_stretch(space: PoseSpace, vertices: FloatArray) -> tuple[float, FloatArray]:
+    """Return the root of the sum of squares of what edges are stretched beyond 1, and its slope.
+
+    Returns
+    -------
+    excess : 0 or more
+    slope : (V, 3) float64 array, by the vertices
+    """
+    start, end = space.topology.edges.T
+    along = vertices[end] - vertices[start]
+    longest = space.longest_edges
+    lengths = np.linalg.norm(along, axis=1)
+    over = np.flatnonzero(lengths > longest)
+    beyond = lengths[over] / longest[over] - 1.0
+    excess = float(np.linalg.norm(beyond))
+    slope = np.zeros_like(vertices)
+    if excess > 0.0:
+        by_end = along[over] * (beyond / (excess * lengths[over] * longest[over]))[:, None]
+        np.add.at(slope, end[over], by_end)
+        np.subtract.at(slope, start[over], by_end)
+    return excess, slope

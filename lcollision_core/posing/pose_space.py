@@ -66,6 +66,10 @@ class PoseSpace(Protocol):
     def precision(self) -> FloatArray:
         """(D, D) symmetric positive definite P: Z^T P Z is D for a typical move between poses."""
 
+    @property
+    def longest_edges(self) -> FloatArray:
+        """(E,) float64 array: how long each of the topology's edges gets in plausible poses."""
+
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes body parts own: (D,)."""
 
@@ -114,6 +118,15 @@ class LatentPoseSpace:
         covariance = latent.T @ latent / len(latent)
         shrunk = _LEAST_VARIANCE * float(covariance.trace()) / len(covariance)
         return np.linalg.inv(covariance + shrunk * np.eye(len(covariance))).astype(np.float64)
+
+    @cached_property
+    def longest_edges(self) -> FloatArray:
+        """(E,) float64 array: the length of each edge in the training pose where it is longest."""
+        longest = np.zeros(len(self.topology.edges))
+        for row in self.embedding.training_latent:
+            lengths = self.topology.edge_lengths(self.decode(row[None])[0])
+            np.maximum(longest, lengths, out=longest)
+        return longest
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes belong to domains: (D,); see `Embedding.codes_of`."""
