@@ -164,6 +164,32 @@ def resolve(
     note(_RESOLVE_IN_PAPER)
 
 
+@app.command("drag")
+def drag(
+    model_name: Annotated[
+        str, typer.Option("--model", metavar="M", help="A model; no predictor needed.")
+    ] = "body",
+    n_targets: Annotated[
+        int, typer.Option("-n", min=1, max=10_000, metavar="N", help="Targets of each grip.")
+    ] = 40,
+    as_json: JsonOption = False,
+) -> None:
+    """Drag hands, feet, head and elbows to scripted targets, plain and solid."""
+    from app.benchmarks.drag import time_drags
+    from lcollision_core.model import PoseModel
+
+    model = PoseModel.load(model_name)
+    with cancel_on_interrupt() as cancel, progress_bar("Dragging") as progress:
+        rows = time_drags(model, n_targets, progress=progress, cancel=cancel)
+    if as_json:
+        print_json(
+            [{"model": model.name, "near_exclusion": model.near_exclusion} | row for row in rows]
+        )
+        return
+    print_table(rows)
+    note_near_exclusion(model)
+
+
 @app.command("editor")
 def editor(
     model_names: Annotated[

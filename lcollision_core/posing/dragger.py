@@ -46,7 +46,7 @@ STRETCH = 0.14
 
 _NEAR, _WORTHWHILE, _SETTLED = 0.5, 0.5, 0.01
 """Of a goal's reach: a miss that the next event takes, the gain of a step that another follows at
-once, and that of one that no other follows."""
+once, and the miss or gain of one that no other follows."""
 
 _STILL = 1e-5
 """Root of the mean squared vertex displacement, normalised, of a step that is none."""
@@ -153,7 +153,6 @@ class PoseDragger:
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
         self._allowed: dict[int, tuple[float, float]] = {}
-        self._stretch = self._options.strength * (largest_stretch(space, self._here.vertices) - 1.0)
         if self._options.solid:
             self._found = check.find(check.exported(self._here.vertices))
             self._allowed = self._depths(self._found)
@@ -165,12 +164,13 @@ class PoseDragger:
             for pin in pins
         ]
         strength = self._options.strength
-        if isinstance(grip, Grip):
-            self._goal = PatchGoal(space, grip, held, strength)
-        elif isinstance(grip, Twist):
-            self._goal = TwistGoal(space, grip.domain, held, strength, self._here.vertices)
-        else:
+        if grip is None:
             self._goal = CodesGoal(space)
+        elif isinstance(grip, Grip):
+            self._goal = PatchGoal(space, grip, held, strength)
+        else:
+            self._goal = TwistGoal(space, grip.domain, held, strength, self._here.vertices)
+        self._stretch = self._stretch_of(self._here.vertices)
         return self._result(0.0, settled=True)
 
     def move(self, target: npt.ArrayLike) -> DragStep:
@@ -203,7 +203,7 @@ class PoseDragger:
             # Further steps are for a pointer that leapt, not for one that is out of reach.
             if left < _NEAR * goal.reach or gain < _WORTHWHILE * goal.reach:
                 break
-        return self._result(miss, settled=gain < _SETTLED * goal.reach)
+        return self._result(miss, settled=min(miss, gain) < _SETTLED * goal.reach)
 
     def end(self) -> None:
         """End the drag; its contacts are forgotten."""
@@ -265,11 +265,9 @@ class PoseDragger:
         """Go to codes if the pose may be there; else remember what is in the way."""
         check = self._check
         decoded = check.decode(there)[0]
-        stretch = 0.0
-        if not isinstance(self._goal, CodesGoal):
-            stretch = self._options.strength * (largest_stretch(self._space, decoded) - 1.0)
-            if stretch > max(STRETCH, self._stretch):
-                return False
+        stretch = self._stretch_of(decoded)
+        if stretch > max(STRETCH, self._stretch):
+            return False
         if self._options.solid:
             found = check.find(check.exported(decoded))
             depths, allowed = self._depths(found), self._allowed
@@ -282,6 +280,12 @@ class PoseDragger:
                 self._contacts.drop_refuted(there, KEPT_CONTACTS)
         self._here, self._stretch = Decoded(there, decoded), stretch
         return True
+
+    def _stretch_of(self, decoded: FloatArray) -> float:
+        """Return the excess length of the longest edge, priced; codes may stretch what they do."""
+        if isinstance(self._goal, CodesGoal) or self._options.strength == 0.0:
+            return 0.0
+        return self._options.strength * (largest_stretch(self._space, decoded) - 1.0)
 
     def _depths(self, found: SelfCollisions) -> dict[int, tuple[float, float]]:
         """Return the depth of each region in contact, and the sum of its pairs' squared depths."""

@@ -1,0 +1,256 @@
+"""Scripted drags of a model's hands, feet, head and elbows, plain and solid.
+
+Each drag starts at the first training pose that is free, takes 45 events to the target and rests
+there for 15. Of each four targets one is where a training pose has the patch, one is on the body,
+one lies beyond the torso and one out of reach. One foot (of the feet, the other one) is pinned in
+every second drag.
+
+The fields of a row:
+
+mode : "plain" or "solid"
+vertices, drags, events : how many
+median_ms, p95_ms, max_ms : of an event, decoding and exact check included, on one core
+exactly_free_rate : of the poses after each event, by the exact check
+confirmed : poses that were compared with all pairs of faces, without a tree; a random hundredth of
+    the solid ones that are free
+confirmed_free_rate : of those
+miss_mean, miss_reachable : mean distance that is left at the end, of all targets and of those that
+    a training pose reaches; normalised
+rest_motion : mean distance of the vertices from the start beyond 0.25 from the patch; normalised
+largest_stretch : the most that an edge is as long as in the training pose where it is longest
+pin_drift, pin_drift_reachable : the most that a pin moved, of all and of those that the target does
+    not contradict, as a training pose reaches it; normalised
+"""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csgraph
+
+from app.benchmarks.timing import Row
+from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
+from lcollision_core.contact.near_exclusion import are_pairs_near, near_vertices
+from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.topology import length_graph
+from lcollision_core.model import PoseModel
+from lcollision_core.posing import DragOptions, Grip, Pin, make_grip
+from lcollision_core.posing.goals import largest_stretch
+
+FloatArray = npt.NDArray[np.float64]
+
+TARGETS = 40
+MOVING_EVENTS, EVENTS = 45, 60
+
+_ELBOW, _REST = 0.22, 0.25
+"""Normalised length along the surface from a hand to its elbow, and from a patch to the rest of
+the body."""
+
+_KINDS = ("reachable", "body", "beyond", "far")
+_FAR = 0.8
+_CONFIRMED = 0.01
+_ROWS_AT_ONCE = 256
+
+
+class _Drag(NamedTuple):
+    """One scripted drag; lengths in the data's unit."""
+
+    grip: Grip
+    pins: tuple[Pin, ...]
+    target: FloatArray
+    kind: str
+
+
+def time_drags(
+    model: PoseModel,
+    n_targets: int = TARGETS,
+    seed: int = 0,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> list[Row]:
+    """Do all drags plain and solid on the calling thread.
+
+    Parameters
+    ----------
+    n_targets : of each grip
+    seed : of the targets, and of the poses that are confirmed
+    progress : in drags
+    cancel : asked before each drag
+
+    Raises
+    ------
+    LCollisionError : no training pose is free.
+    CancelledError : `cancel` was set.
+    """
+    training = model.decode(model.training_latent.astype(np.float64), n_threads=1)
+    free = ~model.detector.are_colliding(training.astype(np.float32))
+    if not free.any():
+        raise LCollisionError("no training pose is free", "name another model", where=model.name)
+    first = int(free.argmax())
+    start = model.training_latent[first].astype(np.float64)
+    drags = _scripted(model, training[first], training, n_targets, np.random.default_rng(seed))
+    return [
+        _time_mode(model, start, drags, solid, np.random.default_rng(seed), done, progress, cancel)
+        for done, solid in ((0, False), (len(drags), True))
+    ]
+
+
+def is_free_by_brute_force(model: PoseModel, vertices: npt.NDArray[np.floating]) -> bool:
+    """Compare all pairs of faces of a (V, 3) pose that share no vertex, without a tree."""
+    faces, size = model.faces, model.body_size
+    near = near_vertices(model.topology, model.reference, model.near_exclusion * size)
+    corners = vertices[faces].astype(np.float64)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    for first in range(0, len(faces), _ROWS_AT_ONCE):
+        rows = slice(first, first + _ROWS_AT_ONCE)
+        touch = (low[rows, None] <= high[None]).all(axis=2)
+        touch &= (low[None] <= high[rows, None]).all(axis=2)
+        a, b = np.nonzero(touch)
+        a += first
+        shared = (faces[a][:, :, None] == faces[b][:, None, :]).any(axis=(1, 2))
+        pairs = np.stack([a, b], axis=1)[~shared & (a < b)]
+        deep = penetration_depth(corners[pairs[:, 0]], corners[pairs[:, 1]]) / size
+        pairs = pairs[deep > DEPTH_TOLERANCE]
+        if len(pairs) and not are_pairs_near(model.topology, pairs, near).all():
+            return False
+    return True
+
+
+def _scripted(
+    model: PoseModel,
+    vertices: FloatArray,
+    training: FloatArray,
+    n_targets: int,
+    generator: np.random.Generator,
+) -> list[_Drag]:
+    places = _places(model, vertices)
+    grips = {name: make_grip(model.pose_space, vertex) for name, vertex in places.items()}
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    drags = []
+    for name, grip in grips.items():
+        start = grip.position(vertices)
+        foot = grips["left foot" if name != "left foot" else "right foot"]
+        for number in range(n_targets):
+            kind = _KINDS[number % len(_KINDS)]
+            if kind == "reachable":
+                target = grip.position(training[generator.integers(len(training))])
+            elif kind == "body":
+                target = vertices[generator.choice(model.topology.used_vertices)]
+            elif kind == "beyond":
+                target = start + generator.uniform(1.2, 2.0) * (middle - start)
+            else:
+                way = generator.normal(size=3)
+                target = start + _FAR * model.body_size * way / np.linalg.norm(way)
+            pins = (Pin.of(foot, vertices),) if number // len(_KINDS) % 2 else ()
+            drags.append(_Drag(grip, pins, np.asarray(target, dtype=np.float64), kind))
+    return drags
+
+
+def _places(model: PoseModel, vertices: FloatArray) -> dict[str, int]:
+    """Return a vertex of each hand, foot, elbow and the head: the far ends of the body.
+
+    The five ends are those that are farthest from each other along the surface.
+    """
+    up = np.eye(3)[model.up_axis]
+    graph = length_graph(model.topology.edges, model.embedding.rest_vertices)
+
+    def along(vertex: int) -> FloatArray:
+        found = csgraph.dijkstra(graph, directed=False, indices=vertex)
+        return np.where(np.isfinite(found), found, -1.0)
+
+    ends = [int((vertices @ up).argmax())]
+    nearest = along(ends[0])
+    for _ in range(4):
+        ends.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, along(ends[-1]))
+    left = np.cross(up, model.front)
+    low = sorted(ends[1:], key=lambda end: float(vertices[end] @ up))[:2]
+    places = {"head": ends[0]}
+    for pair, name in ((low, "foot"), ([end for end in ends[1:] if end not in low], "hand")):
+        right_end, left_end = sorted(pair, key=lambda end: float(vertices[end] @ left))
+        places |= {f"left {name}": left_end, f"right {name}": right_end}
+    for side in ("left", "right"):
+        away = along(places[f"{side} hand"])
+        places[f"{side} elbow"] = int(np.abs(away - _ELBOW).argmin())
+    return places
+
+
+def _time_mode(
+    model: PoseModel,
+    start: FloatArray,
+    drags: list[_Drag],
+    solid: bool,
+    generator: np.random.Generator,
+    done: int,
+    progress: Progress,
+    cancel: CancelToken | None,
+) -> Row:
+    dragger, size = model.dragger(), model.body_size
+    seconds: list[float] = []
+    free: list[bool] = []
+    confirmed: list[bool] = []
+    misses, rest, stretch, drift = [], [], [], []
+    options = DragOptions(solid=solid)
+    before = model.decode(start, n_threads=1)
+    # Compiling and what is made once are not timed.
+    dragger.begin(start, drags[0].grip, drags[0].pins, options)
+    dragger.move(drags[0].target)
+    for number, drag in enumerate(drags):
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        begin = drag.grip.position(before)
+        dragger.begin(start, drag.grip, drag.pins, options)
+        for event in range(1, EVENTS + 1):
+            aim = begin + min(1.0, event / MOVING_EVENTS) * (drag.target - begin)
+            since = time.perf_counter()
+            step = dragger.move(aim)
+            seconds.append(time.perf_counter() - since)
+            is_free = not model.detector.are_colliding(step.vertices[None], workers=1)[0]
+            free.append(is_free)
+            if solid and is_free and generator.random() < _CONFIRMED:
+                confirmed.append(is_free_by_brute_force(model, step.vertices))
+        misses.append(step.miss)
+        after = model.decode(step.latent, n_threads=1)
+        reach = np.linalg.norm(model.reference - model.reference[drag.grip.vertex], axis=1)
+        moved = np.linalg.norm(after - before, axis=1)[reach > _REST * size]
+        rest.append(float(moved.mean()) / size)
+        stretch.append(largest_stretch(model.pose_space, after / size))
+        drift.append(
+            max(
+                (
+                    float(np.linalg.norm(_grip_of(model, pin).position(after) - pin.position))
+                    / size
+                    for pin in drag.pins
+                ),
+                default=0.0,
+            )
+        )
+        progress(done + number + 1, 2 * len(drags))
+    reachable = np.array([drag.kind == "reachable" for drag in drags])
+    milliseconds = 1e3 * np.array(seconds)
+    return {
+        "mode": "solid" if solid else "plain",
+        "vertices": model.n_vertices,
+        "drags": len(drags),
+        "events": len(seconds),
+        "median_ms": float(np.median(milliseconds)),
+        "p95_ms": float(np.quantile(milliseconds, 0.95)),
+        "max_ms": float(milliseconds.max()),
+        "exactly_free_rate": float(np.mean(free)),
+        "confirmed": len(confirmed),
+        "confirmed_free_rate": float(np.mean(confirmed)) if confirmed else None,
+        "miss_mean": float(np.mean(misses)),
+        "miss_reachable": float(np.mean(np.array(misses)[reachable])),
+        "rest_motion": float(np.mean(rest)),
+        "largest_stretch": float(np.max(stretch)),
+        "pin_drift": float(np.max(drift)),
+        "pin_drift_reachable": float(np.max(np.array(drift)[reachable])),
+    }
+
+
+def _grip_of(model: PoseModel, pin: Pin) -> Grip:
+    return make_grip(model.pose_space, pin.vertex, pin.radius)

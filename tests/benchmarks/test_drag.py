@@ -1,0 +1,34 @@
+"""The scripted drags, and the check of all pairs that confirms them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from app.benchmarks.drag import is_free_by_brute_force
+from lcollision_core.model import PoseModel, sample_poses
+from tests.app.support import Lcollision
+
+
+def test_the_command_prints_both_modes(lcollision: Lcollision) -> None:
+    rows = json.loads(lcollision("benchmark", "drag", "-n", "1", "--json").stdout)
+    plain, solid = rows
+    assert [row["mode"] for row in rows] == ["plain", "solid"]
+    assert plain["drags"] == solid["drags"] == 7
+    assert solid["events"] == 60 * 7
+    assert solid["exactly_free_rate"] == 1.0
+    assert solid["confirmed"] > 0
+    assert solid["confirmed_free_rate"] == 1.0
+    assert 0.0 < plain["miss_reachable"] < 0.02
+    assert plain["largest_stretch"] < 1.15
+    assert 0.0 < plain["median_ms"] <= plain["p95_ms"] <= plain["max_ms"]
+
+
+@pytest.mark.parametrize("colliding", [True, False])
+def test_all_pairs_agree_with_the_tree(colliding: bool) -> None:
+    body = PoseModel.load("body")
+    for latent in sample_poses(body, 3, seed=2, colliding=colliding):
+        vertices = body.decode(latent).astype(np.float32)
+        assert is_free_by_brute_force(body, vertices) is not colliding
