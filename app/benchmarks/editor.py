@@ -8,8 +8,10 @@ update_ms : of an event, all until drawing begins: slider, document, thread, pan
 render_ms : drawing one picture
 compose_ms : that Qt takes to put the window together of the picture and the panels
 overhead_p50_ms : of an event, everything but these two
-event_p50_ms, event_p95_ms : from a slider's move until the window shows it
+event_p50_ms, event_p95_ms : from a slider's move until the window shows it, with Solid off
 burst_lag_seconds : from the last of 250 moves within two seconds to the picture that shows it
+drag_event_ms : in a solid drag of 60 events a second, from one until a picture shows it or a later
+drag_lag_ms : by how much what a picture shows is older than the newest event, 95th percentile
 idle_cpu : fraction of one core while nothing happens, once the library's pictures are drawn
 start_seconds : from the command to a window that shows the pose, with warm caches
 memory_mb : the most that the process held at once

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import rich  # noqa: F401 - what the command would have loaded by then, as the next line
 import typer  # noqa: F401
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Slot
@@ -32,6 +33,10 @@ from lcollision_core.errors import LCollisionError
 
 _EVENTS = 60
 _BURST_EVENTS, _BURST_SECONDS = 250, 2.0
+_DRAG_EVENTS, _EVENTS_A_SECOND = 120, 60
+_DRAG_RADIUS = 0.1
+"""Of the circle that a patch is dragged in, in normalised length."""
+
 _IDLE_SECONDS = 5.0
 _IDLE_SHARE = 0.02
 _MOST_PICTURE_SECONDS = 60
@@ -57,6 +62,7 @@ class Session(QObject):
         self._slider = window.sliders.row_of(self._code).slider
         self._last_paint = (0.0, 0.0)
         self._composing = self._last_swap = 0.0
+        self._pictures: list[tuple[float, bytes]] = []
         self._errors: list[str] = []
         canvas = window.viewport.canvas
         assert canvas is not None
@@ -70,8 +76,10 @@ class Session(QObject):
         """Return the fields of a row but for start and memory, see `app.benchmarks.editor`."""
         self.settle()
         idle_cpu = self.idle_cpu()
+        self._document.set_solid(False)
         updates, renders, composings, events = map(np.array, zip(*self.events(), strict=True))
         lag = self.burst()
+        waits, lags = self.drag()
         errors, leak = self.act(n_actions)
         self.settle()
         return {
@@ -83,6 +91,8 @@ class Session(QObject):
             "event_p50_ms": 1e3 * statistics.median(events),
             "event_p95_ms": 1e3 * float(np.percentile(events, 95)),
             "burst_lag_seconds": lag,
+            "drag_event_ms": 1e3 * statistics.median(waits),
+            "drag_lag_ms": 1e3 * float(np.percentile(lags, 95)),
             "idle_cpu": idle_cpu,
             "actions": n_actions,
             "exceptions": len(errors),
@@ -126,6 +136,52 @@ class Session(QObject):
         lag = time.monotonic() - last
         self._document.end_gesture()
         return lag
+
+    def drag(self) -> tuple[list[float], list[float]]:
+        """Drag the outermost patch of the reference in a circle, with Solid on.
+
+        Returns
+        -------
+        waits : seconds of each event until a picture shows it or a later one
+        lags : of each picture, by how many seconds the event that it shows is older than the newest
+        """
+        document, model = self._document, self._document.model
+        document.set_solid(True)
+        document.load_pose(document.training_pose(0))
+        self.settle()
+        assert document.frame is not None
+        outwards = np.linalg.norm(model.reference - model.reference.mean(axis=0), axis=1)
+        grip = document.grip_at(int(outwards.argmax()))
+        home = grip.position(document.frame.vertices)
+        side, up = np.delete(np.eye(3), model.up_axis, axis=0)[0], np.eye(3)[model.up_axis]
+        moved: list[float] = []
+        targets: list[npt.NDArray[np.float64]] = []
+        start = time.perf_counter()
+        document.begin_drag(grip, "Drag")
+        for turn in np.linspace(0.1, 6.0, _DRAG_EVENTS):
+            while time.perf_counter() < start + len(moved) / _EVENTS_A_SECOND:
+                self.pause(0.001)
+            way = (np.cos(turn) - 1.0) * side + np.sin(turn) * up
+            targets.append(home + _DRAG_RADIUS * model.body_size * way)
+            moved.append(time.perf_counter())
+            document.drag_to(targets[-1])
+        self.wait_for(lambda: self._shows(targets[-1]))
+        document.end_drag()
+        numbers = {target.tobytes(): number for number, target in enumerate(targets)}
+        pictures = [(seen, numbers[target]) for seen, target in self._pictures]
+        self._pictures.clear()
+        waits = [
+            next(seen for seen, shown in pictures if shown >= number) - event
+            for number, event in enumerate(moved)
+        ]
+        newest = np.searchsorted(moved, [seen for seen, _ in pictures]) - 1
+        lags = [
+            moved[last] - moved[shown] for last, (_, shown) in zip(newest, pictures, strict=True)
+        ]
+        return waits, lags
+
+    def _shows(self, target: npt.NDArray[np.float64]) -> bool:
+        return bool(self._pictures) and self._pictures[-1][1] == target.tobytes()
 
     def idle_cpu(self) -> float:
         """Do nothing for a while and return the fraction of a core that this took.
@@ -183,6 +239,15 @@ class Session(QObject):
             slider = window.sliders.row_of(chance.randrange(model.latent_size)).slider
             slider.setValue(chance.randrange(slider.maximum() + 1))
 
+        def drag() -> None:
+            vertex = chance.randrange(model.n_vertices)
+            document.begin_drag(document.grip_at(vertex), "Drag")
+            for _ in range(chance.randrange(1, 5)):
+                way = [model.body_size * chance.gauss(0.0, 0.2) for _ in range(3)]
+                document.drag_to(model.reference[vertex] + way)
+                self.pause(chance.choice([0.0, 0.02]))
+            chance.choice([document.end_drag, document.end_drag, document.cancel_drag])()
+
         def load() -> None:
             document.load_pose(document.training_pose(chance.randrange(len(model.pose_names))))
 
@@ -201,7 +266,8 @@ class Session(QObject):
                 document.remove_poses_from_library([document.poses[0].name])
 
         return {
-            slide: 60.0,
+            slide: 50.0,
+            drag: 10.0,
             document.undo: 10.0,
             document.redo: 8.0,
             load: 4.0,
@@ -287,6 +353,9 @@ class Session(QObject):
     @Slot()
     def _on_swapped(self) -> None:
         self._last_swap = time.perf_counter()
+        frame = self._window.viewport.shown_frame
+        if self._document.dragging and frame is not None and frame.target is not None:
+            self._pictures.append((self._last_swap, frame.target.tobytes()))
 
     @Slot(object)
     def _on_failed(self, failure: Failure) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from lcollision_core.contact import SelfCollisions
     from lcollision_core.model import PoseModel
-    from lcollision_core.posing import DragStep, PoseDragger
+    from lcollision_core.posing import PoseDragger
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
@@ -92,6 +92,7 @@ class LiveFrame:
     verdict : the exact check, where it came at once
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
         the pose from going on towards its target
+    target : of the drag that led here, None for a pose that was asked for
     miss : what is left to the target: normalised length, radians of a twist
     settled : whether the same target would lead no further
     """
@@ -104,6 +105,7 @@ class LiveFrame:
     seconds: float
     verdict: ExactVerdict | None
     contacts: FloatArray
+    target: FloatArray | None = None
     miss: float = 0.0
     settled: bool = True
 
@@ -148,7 +150,14 @@ class FrameEvaluator:
         """
         start = time.perf_counter()
         step = dragger.move(target)
-        return self._evaluated(step.latent, step.vertices, request_id, start, step)
+        frame = self._evaluated(step.latent, step.vertices, request_id, start, step.found)
+        return replace(
+            frame,
+            contacts=_frozen(step.contacts),
+            target=target,
+            miss=step.miss,
+            settled=step.settled,
+        )
 
     def _evaluated(
         self,
@@ -156,11 +165,11 @@ class FrameEvaluator:
         vertices: Float32Array,
         request_id: int,
         start: float,
-        step: DragStep | None = None,
+        found: SelfCollisions | None = None,
     ) -> LiveFrame:
         verdict = None
-        if step is not None and step.found is not None:
-            verdict = ExactVerdict.of(step.found, request_id)
+        if found is not None:
+            verdict = ExactVerdict.of(found, request_id)
         elif self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS:
             verdict = self._checked(vertices, request_id)
         predicts = self.predicts and self.model.predictor is not None
@@ -171,9 +180,7 @@ class FrameEvaluator:
             normals=_frozen(self.normals(vertices)),
             prediction=self._predict(latent) if predicts else None,
             verdict=verdict,
-            contacts=_NO_CONTACTS if step is None else _frozen(step.contacts),
-            miss=0.0 if step is None else step.miss,
-            settled=step is None or step.settled,
+            contacts=_NO_CONTACTS,
             seconds=time.perf_counter() - start,
         )
 

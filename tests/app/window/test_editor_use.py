@@ -522,6 +522,8 @@ def test_the_benchmark_measures_a_session_of_its_own(
             "event_p50_ms",
             "event_p95_ms",
             "burst_lag_seconds",
+            "drag_event_ms",
+            "drag_lag_ms",
             "idle_cpu",
             "start_seconds",
         ),
