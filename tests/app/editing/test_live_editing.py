@@ -371,7 +371,10 @@ def seen(solid: PoseDocument) -> Iterator[list[tuple[bool, bool]]]:
 
 
 def test_no_random_sequence_shows_a_colliding_pose(
-    qtbot: QtBot, solid: PoseDocument, seen: list[tuple[bool, bool]]
+    qtbot: QtBot,
+    solid: PoseDocument,
+    colliding: np.ndarray,
+    seen: list[tuple[bool, bool]],
 ) -> None:
     chance = random.Random(5)
     model = solid.model
@@ -400,6 +403,9 @@ def test_no_random_sequence_shows_a_colliding_pose(
     def wander() -> None:
         solid.randomise(chance.random(), chance.randrange(1000))
 
+    def meet() -> None:
+        solid.blend_towards(colliding, 1.0)
+
     def lock() -> None:
         solid.set_locked(chance.randrange(len(model.domain_names)), chance.random() < 0.4)
 
@@ -409,8 +415,8 @@ def test_no_random_sequence_shows_a_colliding_pose(
         else:
             solid.pin(solid.grip_at(chance.randrange(model.n_vertices)))
 
-    acts = [drag, drag, slide, slide, wander, lock, pin, solid.undo, solid.redo, solid.reset_all]
-    for _ in range(120):
+    acts = [drag, drag, slide, slide, wander, meet, meet, lock, pin, solid.undo, solid.redo]
+    for _ in range(150):
         chance.choice(acts)()
         if chance.random() < 0.5:
             settle(qtbot, solid)
