@@ -199,7 +199,8 @@ class PoseDocument(LiveEditing):
         others = (self._mirroring, self._mirroring_poses, self._incoming, self._loading)
         for number in others:
             self._long.cancel(number)
-        self.frame = self.exact = self._gesture = self._drag = self.file = None
+        self.frame = self.exact = self.file = None
+        self._gesture = self._drag = self._last_grip = None
         self.file_poses = ()
         folder = self._library_folder or user_poses_folder()
         self._library = PoseLibrary(opened.model, folder, self._tell_of_library)

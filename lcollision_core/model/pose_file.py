@@ -393,10 +393,12 @@ def _tags(value: Any) -> tuple[str, ...]:
 
 
 def _pins(value: Any, n_vertices: int) -> tuple[Pin, ...]:
-    from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Pin
-
     if not isinstance(value, list) or len(value) > MAX_PINS:
         raise ValueError(f"its pins must be a list of at most {MAX_PINS}")
+    if not value:
+        return ()
+    from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Pin
+
     pins = []
     for entry in value:
         held = _object(entry, "pin")

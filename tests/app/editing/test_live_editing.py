@@ -174,6 +174,15 @@ def test_a_solid_slider_lands_on_a_free_number_to_the_bit(
     assert solid.latent.tobytes() == start.tobytes()
 
 
+def test_a_solid_number_may_lie_beyond_the_slider_as_any_other(
+    qtbot: QtBot, solid: PoseDocument
+) -> None:
+    beyond = solid.model.latent_space.high[3] * 1.1
+    solid.set_code(3, beyond)
+    settle(qtbot, solid)
+    assert solid.latent[3] == beyond
+
+
 def test_a_solid_edit_stops_at_contact_and_its_step_holds_what_was_reached(
     qtbot: QtBot, solid: PoseDocument, colliding: np.ndarray
 ) -> None:
@@ -353,6 +362,9 @@ def test_the_radius_of_grips_has_limits(document: PoseDocument) -> None:
     assert len(document.grip_at(3).vertices) > len(grip.vertices)
     document.set_grip_radius(0.0)
     assert document.grip_radius == LEAST_RADIUS
+    last, model = document.grip_at(3), document.model
+    document.set_model(PoseModel("bare", model.embedding, model.card))
+    assert document.grip_at(3) is not last
 
 
 @pytest.fixture

@@ -104,11 +104,15 @@ def test_an_editor_told_to_end_keeps_its_last_edit(document: PoseDocument, tmp_p
     for edited in (False, True):
         if edited:
             document.set_code(0, 0.5)
+            document.pin(document.grip_at(3))
         autosave = Autosave(document, folder, seconds=1000.0)
         assert autosave.close(keep=True)
         found = find_lost_poses(folder)
         assert len(found) == edited
-    assert read_poses(found[0].poses_file, document.model)[0].latent[0] == 0.5
+    (kept,) = read_poses(found[0].poses_file, document.model)
+    assert kept.latent[0] == 0.5
+    assert [pin.vertex for pin in kept.pins] == [3]
+    assert kept.pins == document.pins
 
 
 def test_the_poses_of_the_file_are_recovered_beside_the_working_pose(
