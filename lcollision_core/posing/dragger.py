@@ -235,9 +235,9 @@ class PoseDragger:
             if there is None:
                 # Contacts seen from different poses contradict each other.
                 self._contacts = Contacts(self._check)
-            elif self._is_still(there):
+            elif (length := self._length(there - here)) < _STILL:
                 return False
-            elif self._goes(there):
+            elif self._goes(here + min(1.0, goal.longest_step / length) * (there - here)):
                 return True
             elif len(self._contacts.offsets) == n_contacts:
                 break
@@ -257,9 +257,9 @@ class PoseDragger:
             and (contacts.normals @ aim <= contacts.offsets).all()
         )
 
-    def _is_still(self, there: FloatArray) -> bool:
-        way = there - self._here.codes
-        return float(way @ self._space.metric @ way) < _STILL**2
+    def _length(self, way: FloatArray) -> float:
+        """Return the root of the mean squared vertex displacement of a change of codes."""
+        return float(np.sqrt(way @ self._space.metric @ way))
 
     def _goes(self, there: FloatArray) -> bool:
         """Go to codes if the pose may be there; else remember what is in the way."""

@@ -40,10 +40,13 @@ class Goal(Protocol):
 
     Attributes
     ----------
-    reach : the most of the miss that one step aims at, as the cost is modelled by one quadratic
+    reach : the most of the miss that one step aims at
+    longest_step : of one step the most of the root of the mean squared vertex displacement, as one
+        quadratic models the cost only so far
     """
 
     reach: float
+    longest_step: float
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
         """Measure what is left to a target."""
@@ -63,7 +66,7 @@ class PatchGoal:
     strength : of the price of stretched edges
     """
 
-    reach = 0.012
+    reach, longest_step = 0.012, 0.01
 
     def __init__(self, space: PoseSpace, grip: Grip, pins: Held, strength: float) -> None:
         self._space, self._pins, self._grip, self._strength = space, pins, grip, strength
@@ -93,7 +96,7 @@ class TwistGoal:
     decoded : (V, 3) float64 array, the vertices at the drag's start
     """
 
-    reach = 0.25
+    reach, longest_step = 0.25, 0.01
 
     def __init__(
         self, space: PoseSpace, domain: int, pins: Held, strength: float, decoded: FloatArray
@@ -143,7 +146,7 @@ class CodesGoal:
     space : of the poses
     """
 
-    reach = 0.02
+    reach = longest_step = 0.02
 
     def __init__(self, space: PoseSpace) -> None:
         self._space = space
