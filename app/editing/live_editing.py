@@ -165,7 +165,7 @@ class LiveEditing(CodeEditing):
             self._live.drag(self._drag.session, aim, self._predicts)
 
     def end_drag(self) -> None:
-        """Let go: the pose goes to the newest target by one more event at most."""
+        """Let go: the pose settles on the newest target, unless another action begins."""
         if self.dragging:
             self.end_gesture()
 
@@ -178,8 +178,6 @@ class LiveEditing(CodeEditing):
         """End a drag; where the worker still moves the pose, the step is made when it settles."""
         if self._drag is not None and self._live.is_dragging:
             self._drag.has_ended = True
-            if self._drag.session.grip is not None:
-                self._live.finish_drag()
         else:
             self._close_gesture()
 

@@ -199,7 +199,6 @@ class LivePose(QObject):
         self._worker.answered.connect(self._on_answered)
         self._model: PoseModel | None = None
         self._session: DragSession | None = None
-        self._goes_on = True
         self._least_miss, self._n_idle = np.inf, 0
         self._next: FrameRequest | DragRequest | None = None
         self._asked: Request | None = None
@@ -235,7 +234,7 @@ class LivePose(QObject):
         predicts : as for `follow`
         """
         self._model, self._session = session.model, session
-        self._goes_on, self._least_miss, self._n_idle = True, np.inf, 0
+        self._least_miss, self._n_idle = np.inf, 0
         self._want(DragRequest(self._next_id(), session, target, predicts))
 
     @property
@@ -245,10 +244,6 @@ class LivePose(QObject):
             isinstance(request, DragRequest) and request.session is self._session
             for request in (self._next, self._asked)
         )
-
-    def finish_drag(self) -> None:
-        """Answer the newest target, and do not go on by itself after that."""
-        self._goes_on = False
 
     def end_drag(self) -> None:
         """End the drag at its newest frame; what still comes of it is dropped."""
@@ -346,5 +341,5 @@ class LivePose(QObject):
         self._n_idle += 1
         if frame.miss < _NEARER * self._least_miss:
             self._least_miss, self._n_idle = frame.miss, 0
-        if self._next is None and self._goes_on and not frame.settled and self._n_idle < _MOST_IDLE:
+        if self._next is None and not frame.settled and self._n_idle < _MOST_IDLE:
             self._next = replace(request, request_id=self._next_id())

@@ -106,16 +106,24 @@ def test_a_rested_pointer_is_followed_until_the_pose_has_settled(
     assert solid.undo_stack.count() == 1
 
 
-def test_letting_go_at_once_still_reaches_for_the_newest_target(
+def test_letting_go_at_once_ends_where_a_rested_pointer_does(
     qtbot: QtBot, solid: PoseDocument
 ) -> None:
     before, grip = solid.latent.tobytes(), end_of(solid)
+    target = moved(solid, grip, 0.2)
     solid.begin_drag(grip, "Drag")
-    solid.drag_to(moved(solid, grip, 0.05))
+    solid.drag_to(target)
+    settle(qtbot, solid)
+    solid.end_drag()
+    rested = solid.latent.tobytes()
+    solid.undo()
+    settle(qtbot, solid)
+    solid.begin_drag(grip, "Drag")
+    solid.drag_to(target)
     solid.end_drag()
     assert not solid.dragging
     settle(qtbot, solid)
-    assert solid.latent.tobytes() != before
+    assert solid.latent.tobytes() == rested != before
     assert solid.undo_stack.count() == 1
 
 
