@@ -88,8 +88,8 @@ class Marks:
             for half, colour in ((2.0, _DARK), (0.9, _LIGHT)):
                 shapes += [(_bar(start, end, half), colour), (_ring(end, 0.0, 2.2 * half), colour)]
         for place in _thinned(places_of(view, self._contacts, size)):
-            for inner, outer, colour in ((2.0, 1.5, _DARK), (3.0, 0.5, CONTACT)):
-                shapes.append((_ring(place, inner, _CONTACT_RADIUS + 1.0 - outer), colour))
+            for inner, inset, colour in ((1.8, -1.2, _DARK), (3.0, 0.0, CONTACT)):
+                shapes.append((_ring(place, inner, _CONTACT_RADIUS - inset), colour))
         for place, own in zip(places_of(view, self.pins, size), self._colours, strict=True):
             for inset, colour in ((0.0, _DARK), (1.3, _LIGHT), (3.0, own)):
                 shapes.append((_ring(place, 0.0, PIN_RADIUS - inset), colour))

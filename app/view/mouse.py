@@ -193,10 +193,9 @@ class Mouse(QObject):
                 self._drag = self._moving(scene, start, self.vertex)
         else:
             self._drag = self._turning(start)
-        if not self._document.dragging:
-            # The patch would be in the way of what is looked at.
-            self._show_patch()
-            self.pointed.emit(None)
+        # A patch that is not dragged would be in the way of what is looked at.
+        self._show_patch()
+        self.pointed.emit(None)
 
     @Slot(QPointF)
     def _on_dragged(self, place: QPointF) -> None:
