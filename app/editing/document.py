@@ -159,6 +159,22 @@ class PoseDocument(LiveEditing):
         work = partial(self.model.mirror, pose.latent, pose.placement, pose.mirror_of, options)
         self._mirroring = self._long.start("Mirroring", work, self._on_mirrored)
 
+    def mirror_part(self, domain: int) -> None:
+        """Pose the body part on the other side as the mirror image of one, in the long worker.
+
+        Raises
+        ------
+        LCollisionError : the model has no two sides.
+        """
+        mirror = self.model.pose_mirror
+        self.end_gesture()
+        self._long.cancel(self._mirroring)
+        name = self.model.domain_names[domain]
+        work = partial(mirror.mirror_part, self.latent, domain)
+        self._mirroring = self._long.start(
+            f"Mirroring {name}", work, lambda latent: self._edit(f"Mirror {name}", latent)
+        )
+
     def mirror_poses(self, poses: Sequence[NamedPose]) -> None:
         """Add the mirror images of poses to the library, in the long worker, as one step.
 

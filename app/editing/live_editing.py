@@ -12,7 +12,7 @@ from PySide6.QtCore import QObject, Signal, Slot
 from app.editing.codes import CodeEditing
 from app.editing.history import Gesture, read_only
 from app.wording import counted
-from app.work.frames import ExactVerdict, LiveFrame
+from app.work.frames import NO_CONTACTS, ExactVerdict, LiveFrame
 from app.work.live_pose import DragSession, LivePose
 
 if TYPE_CHECKING:
@@ -196,8 +196,13 @@ class LiveEditing(CodeEditing):
             super().undo()
 
     def _close_gesture(self) -> None:
+        drag = self._drag
         self._end_drag()
         super()._close_gesture()
+        if drag is not None and drag.session.grip is not None and self.frame is not None:
+            # No hand presses against the contacts any more.
+            self.frame = replace(self.frame, contacts=NO_CONTACTS)
+            self.frame_changed.emit()
 
     def _end_drag(self) -> None:
         if self._drag is not None:

@@ -132,6 +132,7 @@ class BodyMenus(QObject):
             lock.setCheckable(True)
             lock.setChecked(locked)
             self._add(menu, f"R&eset {name}", document.reset_domain, domain).setEnabled(not locked)
+            self._add_mirror(menu, domain)
             if code is None:
                 self._add(menu, "&Show in sliders", self._sliders.show_domain, domain)
             menu.addSeparator()
@@ -140,6 +141,15 @@ class BodyMenus(QObject):
         menu.addAction(actions["parts"])
         menu.addSeparator()
         menu.addActions([actions["unlock"], actions["mirror"]])
+
+    def _add_mirror(self, menu: QMenu, domain: int) -> None:
+        """Offer to mirror a body part, where there is one like it on the other side."""
+        document = self._document
+        other = document.model.pose_mirror.partner(domain) if document.can_mirror else None
+        if other is not None:
+            name = menu_text(document.model.domain_names[other])
+            mirror = self._add(menu, f"M&irror to {name}", document.mirror_part, domain)
+            mirror.setEnabled(other not in document.locked_domains)
 
     def _new_menu(self) -> QMenu:
         menu = QMenu(self._window, toolTipsVisible=True)

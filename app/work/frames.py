@@ -25,8 +25,8 @@ _QUICK_CHECK_SECONDS = 0.006
 _CHECKS = 5
 """Recent checks whose median time counts."""
 
-_NO_CONTACTS: FloatArray = np.empty((0, 3))
-_NO_CONTACTS.flags.writeable = False
+NO_CONTACTS: FloatArray = np.empty((0, 3))
+NO_CONTACTS.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +180,7 @@ class FrameEvaluator:
             normals=_frozen(self.normals(vertices)),
             prediction=self._predict(latent) if predicts else None,
             verdict=verdict,
-            contacts=_NO_CONTACTS,
+            contacts=NO_CONTACTS,
             seconds=time.perf_counter() - start,
         )
 

@@ -23,6 +23,7 @@ _OWN = 0.25
 _TINY = 1e-12
 
 _WAYS = (("up", "down"), ("forward", "back"), ("left", "right"))
+_ASIDE = 2
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,9 @@ class CodeEffect:
     domain : index from 0 of the domain that the name refers to: in the first group, where each
         domain has one code, that domain, however far it moves what is attached to it; in a domain's
         group that domain, unless the code mainly moves another
-    motion : "up", "down", "forward", "back", "left" or "right" for a shift of that domain; "bend
-        up" and so on where it turns, after its far end; "twist" about its long axis; "still" where
-        nothing moves
+    motion : "up", "down", "forward", "back", "left" or "right" for a shift of that domain, "in" or
+        "out" for the last two of one that lies on one side of the body; "bend up" and so on where
+        it turns, after its far end; "twist" about its long axis; "still" where nothing moves
     """
 
     domain: int
@@ -138,10 +139,13 @@ def _effect(
     total = float(weight @ (moved**2).sum(axis=1))
     if total <= _TINY * float(weight @ (positions**2).sum(axis=1)):
         return CodeEffect(domain, "still")
+    arms = positions - weight @ positions
+    # A domain lies on one side where it hardly reaches over the middle.
+    aside = float(axes[2] @ (weight @ positions - positions.mean(axis=0)))
+    side = np.sign(aside) if abs(aside) > np.sqrt(weight @ (arms @ axes[2]) ** 2) else 0.0
     shift = weight @ moved
     if float(shift @ shift) >= _AIMLESS * total:
-        return CodeEffect(domain, _way(axes @ shift))
-    arms = positions - weight @ positions
+        return CodeEffect(domain, _way(axes @ shift, side))
     spread = (weight[:, None] * arms).T @ arms
     inertia = np.trace(spread) * np.eye(3) - spread
     torque = weight @ np.cross(arms, moved - shift)
@@ -158,10 +162,17 @@ def _effect(
     away = long_axis @ (weight @ positions - positions.mean(axis=0))
     half_length = np.sqrt(3.0 * long_axis @ spread @ long_axis)
     outward = long_axis * np.sign((away if abs(away) > half_length else axes[0] @ long_axis) or 1)
-    return CodeEffect(domain, f"bend {_way(axes @ np.cross(turn, outward))}")
+    return CodeEffect(domain, f"bend {_way(axes @ np.cross(turn, outward), side)}")
 
 
-def _way(along: FloatArray) -> str:
-    """Return the word for the largest component of a direction."""
+def _way(along: FloatArray, side: float) -> str:
+    """Return the word for the largest component of a direction.
+
+    Parameters
+    ----------
+    side : 1 for what lies on the body's left, -1 on its right, 0 in the middle
+    """
     way = int(np.abs(along).argmax())
+    if way == _ASIDE and side != 0.0:
+        return "out" if along[way] * side > 0.0 else "in"
     return _WAYS[way][int(along[way] < 0.0)]

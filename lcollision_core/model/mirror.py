@@ -219,6 +219,44 @@ class PoseMirror:
             source=MirrorSource(pose, placement, fingerprint_of_pose(found, image_placement)),
         )
 
+    def partner(self, domain: int) -> int | None:
+        """Return the domain on the other side; None for one in the middle, or unlike any other."""
+        mask = self.embedding.attention_mask
+
+        def image(of: int) -> int:
+            return int((mask @ mask[of, self.symmetry.partner]).argmax())
+
+        other = image(domain)
+        return other if other != domain == image(other) else None
+
+    def mirror_part(
+        self,
+        latent: npt.NDArray[Any],
+        domain: int,
+        progress: Progress = no_progress,  # noqa: ARG002 - it is one step
+        cancel: CancelToken | None = None,
+    ) -> FloatArray:
+        """Give the domain on the other side the codes that it has in the mirror image.
+
+        All other codes stay. As neighbouring domains share their borders, the other side becomes
+        like the mirror image, not equal to it.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        domain : that has a `partner`
+
+        Returns
+        -------
+        latent : (D,) float64 array
+        """
+        size = self.check.body_size
+        image = self.symmetry.image(self.check.decode(latent)[0] * size) / size
+        fit = self.embedding.encode(image, cancel, in_place=True)
+        other = self.partner(domain)
+        own = self.embedding.codes_of([] if other is None else [other])
+        return np.where(own, fit.latent, latent).astype(np.float64)
+
 
 def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int) -> Symmetry | None:
     """Find each vertex's partner on the other side, where the mesh is its own mirror image.

@@ -17,11 +17,12 @@ from lcollision_core.model_file import read_model_file, write_model_file
 FloatArray = npt.NDArray[np.float64]
 UP, FRONT = 2, np.array([0.0, -1.0, 0.0])
 
-# An arm along x, at the body's left, and a column from the ground up.
+# An arm along x, at the body's left, a column from the ground up, and the other arm.
 ARM = np.stack(np.meshgrid(np.linspace(1, 3, 9), [-0.1, 0.1], [1.9, 2.1]), -1).reshape(-1, 3)
 TRUNK = np.stack(np.meshgrid([-0.3, 0.3], [-0.2, 0.2], np.linspace(0, 2, 9)), -1).reshape(-1, 3)
-BODY = np.concatenate([ARM, TRUNK])
-MASK = np.repeat(np.eye(2), [len(ARM), len(TRUNK)], axis=1).astype(np.float32)
+OTHER = ARM * [-1.0, 1.0, 1.0]
+BODY = np.concatenate([ARM, TRUNK, OTHER])
+MASK = np.repeat(np.eye(3), [len(ARM), len(TRUNK), len(OTHER)], axis=1).astype(np.float32)
 
 
 def turned(points: FloatArray, axis: int, angle: float, about: FloatArray) -> FloatArray:
@@ -39,11 +40,11 @@ def effect_of(domain: int, move: Callable[[FloatArray, float], FloatArray]) -> C
     def decode(latent: FloatArray) -> FloatArray:
         return np.stack([move(BODY, float(row[domain])) for row in latent])
 
-    return code_effects(decode, np.ones(2), MASK, (2, 0, 0), UP, FRONT)[domain]
+    return code_effects(decode, np.ones(3), MASK, (3, 0, 0, 0), UP, FRONT)[domain]
 
 
 def moving(domain: int, change: Callable[[FloatArray, float], FloatArray]) -> CodeEffect:
-    part = slice(0, len(ARM)) if domain == 0 else slice(len(ARM), None)
+    part = slice(0, len(ARM)) if domain == 0 else slice(len(ARM), -len(OTHER))
 
     def move(body: FloatArray, share: float) -> FloatArray:
         posed = body.copy()
@@ -67,7 +68,24 @@ def moving(domain: int, change: Callable[[FloatArray, float], FloatArray]) -> Co
 @pytest.mark.parametrize("domain", [0, 1])
 def test_a_shift_is_named_after_its_direction(domain: int, way: list[float], motion: str) -> None:
     found = moving(domain, lambda part, share: part + 0.2 * share * np.array(way))
-    assert found == CodeEffect(domain, motion)
+    # The arm lies on the left.
+    aside = {"left": "out", "right": "in"} if domain == 0 else {}
+    assert found == CodeEffect(domain, aside.get(motion, motion))
+
+
+def test_out_is_away_from_the_middle_on_either_side() -> None:
+    def mirrored(points: FloatArray) -> FloatArray:
+        return points * [-1.0, 1.0, 1.0]
+
+    for sign, motion in ((1.0, "out"), (-1.0, "in")):
+
+        def decode(latent: FloatArray, sign: float = sign) -> FloatArray:
+            poses = np.stack([BODY] * len(latent))
+            poses[:, : len(ARM), 0] += sign * 0.2 * latent[:, :1]
+            return mirrored(poses)
+
+        effects = code_effects(decode, np.ones(3), MASK, (3, 0, 0, 0), UP, FRONT)
+        assert effects[0] == CodeEffect(0, motion)
 
 
 def test_a_turn_about_the_long_axis_is_a_twist_and_another_a_bend() -> None:
@@ -80,6 +98,17 @@ def test_a_turn_about_the_long_axis_is_a_twist_and_another_a_bend() -> None:
     assert moving(1, lambda p, s: turned(p, 1, 0.4 * s, trunk)).motion == "bend left"
     assert moving(0, lambda p, s: turned(p, 1, 0.4 * s, arm)).motion == "bend down"
     assert moving(0, lambda p, s: turned(p, 2, -0.4 * s, arm)).motion == "bend forward"
+    # An upper arm that hangs down at the left.
+    hanging = ARM[:, [2, 1, 0]] + [0.0, 0.0, -2.5]
+    body = np.concatenate([hanging, TRUNK, OTHER])
+
+    def decode(latent: FloatArray) -> FloatArray:
+        lifted = [turned(hanging, 1, -0.4 * row[0], hanging.mean(axis=0)) for row in latent]
+        return np.stack([np.concatenate([arm, TRUNK, OTHER]) for arm in lifted])
+
+    assert np.array_equal(decode(np.zeros((1, 3)))[0], body)
+    effects = code_effects(decode, np.ones(3), MASK, (3, 0, 0, 0), UP, FRONT)
+    assert effects[0] == CodeEffect(0, "bend out")
 
 
 def test_what_does_nothing_is_still() -> None:
@@ -89,25 +118,25 @@ def test_what_does_nothing_is_still() -> None:
 def test_a_domains_own_code_moves_it_unless_it_carries_another_along() -> None:
     def decode(latent: FloatArray) -> FloatArray:
         bodies = np.repeat(BODY[None], len(latent), axis=0)
-        for body, (_, _, own, carrying) in zip(bodies, latent, strict=True):
-            body[len(ARM) :] += [0, 0, 0.6 * own + 0.1 * carrying]
+        for body, (*_, own, carrying) in zip(bodies, latent, strict=True):
+            body[len(ARM) : -len(OTHER)] += [0, 0, 0.6 * own + 0.1 * carrying]
             body[: len(ARM)] += [0, own + carrying, 0]
         return bodies
 
-    found = code_effects(decode, np.ones(4), MASK, (2, 0, 2), UP, FRONT)
-    assert found[2:] == (CodeEffect(1, "up"), CodeEffect(0, "back"))
+    found = code_effects(decode, np.ones(5), MASK, (3, 0, 2, 0), UP, FRONT)
+    assert found[3:] == (CodeEffect(1, "up"), CodeEffect(0, "back"))
 
 
 def test_a_domains_code_of_the_whole_body_is_named_after_it_however_it_swings_others() -> None:
     def decode(latent: FloatArray) -> FloatArray:
         bodies = np.repeat(BODY[None], len(latent), axis=0)
-        for body, (of_arm, of_trunk) in zip(bodies, latent, strict=True):
-            body[len(ARM) :] += [0, 0, 0.1 * of_trunk]
+        for body, (of_arm, of_trunk, _) in zip(bodies, latent, strict=True):
+            body[len(ARM) : -len(OTHER)] += [0, 0, 0.1 * of_trunk]
             body[: len(ARM)] += [0, 0.2 * of_arm + 2.0 * of_trunk, 0]
         return bodies
 
-    found = code_effects(decode, np.ones(2), MASK, (2, 0, 0), UP, FRONT)
-    assert found == (CodeEffect(0, "back"), CodeEffect(1, "up"))
+    found = code_effects(decode, np.ones(3), MASK, (3, 0, 0, 0), UP, FRONT)
+    assert found[:2] == (CodeEffect(0, "back"), CodeEffect(1, "up"))
 
 
 def test_names_within_a_group_differ() -> None:

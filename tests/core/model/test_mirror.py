@@ -309,3 +309,20 @@ def test_a_damaged_source_is_refused(
     path.write_text(json.dumps(document))
     with pytest.raises(ModelFileError, match="damaged at pose 0"):
         read_poses(path, body)
+
+
+def test_a_part_on_the_other_side_becomes_like_the_mirror_image(body: PoseModel) -> None:
+    mirror, names = body.pose_mirror, body.domain_names
+    left, right = names.index("left shin & foot"), names.index("right shin & foot")
+    assert (mirror.partner(left), mirror.partner(right)) == (right, left)
+    assert mirror.partner(names.index("head")) is None
+    pose = body.training_latent[np.abs(body.training_latent).sum(axis=1).argmax()].astype(float)
+    after = mirror.mirror_part(pose, left)
+    changed = after != pose
+    assert changed.any()
+    assert not changed[~body.embedding.codes_of([right])].any()
+    inside = body.pose_space.vertex_domain == right
+    image = mirror.symmetry.image(body.decode(pose))
+    shapes = [vertices[inside] for vertices in (body.decode(pose), body.decode(after), image)]
+    before, now, wanted = (shape - shape.mean(axis=0) for shape in shapes)
+    assert np.linalg.norm(now - wanted) < 0.4 * np.linalg.norm(before - wanted)

@@ -1,0 +1,258 @@
+"""Dragging in a real window: Solid, pins, patches, and what holds a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint, Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QMenu, QToolBar
+from pytestqt.qtbot import QtBot
+
+from app.editing.document import PoseDocument
+from app.editing.settings import SETTINGS
+from app.window.main_window import MainWindow
+from lcollision_core.model import PoseModel
+from tests.app.views import place_of, seen_vertex
+from tests.app.windows import (
+    PATIENCE,
+    close_window,
+    handle,
+    is_open,
+    open_window,
+    rest,
+    settings_in,
+    take_picture,
+)
+
+LEFT, NO_KEY = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
+
+
+@pytest.fixture(scope="module")
+def body(compiled_body: None) -> PoseModel:  # noqa: ARG001
+    return PoseModel.load("body")
+
+
+@pytest.fixture
+def body_window(qtbot: QtBot, body: PoseModel, tmp_path: Path) -> Iterator[MainWindow]:
+    document = PoseDocument(body, library_folder=tmp_path / "library")
+    held = open_window(qtbot, document, settings_in(tmp_path), (1280, 860))
+    document.set_solid(True)
+    rest(qtbot, held)
+    yield held
+    if is_open(held):
+        close_window(held)
+    assert document.close()
+    document.deleteLater()
+
+
+def hover(qtbot: QtBot, window: MainWindow, vertex: int) -> QPoint:
+    """Put the pointer on a vertex that is seen, and wait until the window knows."""
+    canvas = window.viewport.canvas
+    assert canvas is not None
+    place = place_of(window.viewport, vertex)
+    # A pointer that is there already would not move.
+    for there in (QPoint(3, 3), place):
+        QTest.mouseMove(canvas, there)
+    qtbot.waitUntil(lambda: window.viewport.pointed_vertex == vertex, timeout=PATIENCE)
+    return place
+
+
+def arrived(qtbot: QtBot, window: MainWindow) -> None:
+    """Wait until what is dragged goes no further."""
+    qtbot.waitUntil(lambda: not window.document.moving, timeout=2 * PATIENCE)
+
+
+def test_solid_is_a_button_that_is_remembered(window: MainWindow) -> None:
+    document, action = window.document, window.actions_by_key["solid"]
+    assert SETTINGS["solid"].default is True
+    action.trigger()
+    assert action.isChecked()
+    assert document.solid
+    assert action in window.findChild(QToolBar).actions()
+    QTest.keyClick(
+        window,
+        Qt.Key.Key_S,
+        Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.AltModifier,
+    )
+    assert not document.solid
+    assert not action.isChecked()
+    assert window.settings["solid"] is False
+    document.set_solid(True)
+    assert action.isChecked()
+    assert window.settings["solid"] is True
+
+
+def test_a_key_pins_what_is_under_the_pointer_and_types_into_a_field(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    document, pin = window.document, window.actions_by_key["pin"]
+    canvas = window.viewport.canvas
+    assert canvas is not None
+    vertex = seen_vertex(window.viewport, 1)
+    hover(qtbot, window, vertex)
+    assert pin.isEnabled()
+    QTest.keyClick(window, Qt.Key.Key_P)
+    assert [held.vertex for held in document.pins] == [vertex]
+    assert pin.text().replace("&", "") == "Unpin"
+    radius = document.grip_radius
+    QTest.keyClick(window, Qt.Key.Key_BracketRight)
+    assert document.grip_radius > radius
+    QTest.keyClick(window, Qt.Key.Key_BracketLeft)
+    assert document.grip_radius == pytest.approx(radius)
+    window.sliders.filter.setFocus()
+    QTest.keyClicks(window.sliders.filter, "p]")
+    assert window.sliders.filter.text() == "p]"
+    assert len(document.pins) == 1
+    assert document.grip_radius == pytest.approx(radius)
+    window.sliders.filter.clear()
+    window.viewport.setFocus()
+    QTest.keyClick(window, Qt.Key.Key_P)
+    assert document.pins == ()
+    QTest.mouseMove(canvas, QPoint(3, 3))
+    qtbot.waitUntil(lambda: not pin.isEnabled(), timeout=PATIENCE)
+    # The small model's parts are named after neither.
+    for key, word in (("pin_feet", "feet"), ("pin_hands", "hands")):
+        assert not window.actions_by_key[key].isEnabled()
+        assert word in window.actions_by_key[key].toolTip()
+
+
+def test_the_menu_of_the_body_pins_and_chooses_the_patch(qtbot: QtBot, window: MainWindow) -> None:
+    document, canvas = window.document, window.viewport.canvas
+    assert canvas is not None
+    vertex = seen_vertex(window.viewport, 1)
+    place = hover(qtbot, window, vertex)
+
+    def opened() -> QMenu:
+        QTest.mouseClick(canvas, Qt.MouseButton.RightButton, NO_KEY, place)
+        menus = [
+            menu
+            for menu in window.findChildren(
+                QMenu, options=Qt.FindChildOption.FindDirectChildrenOnly
+            )
+            if menu.isVisible()
+        ]
+        assert len(menus) == 1
+        return menus[0]
+
+    def choose(menu: QMenu, text: str) -> None:
+        (found,) = (a for a in menu.actions() if a.text().replace("&", "") == text)
+        found.trigger()
+
+    menu = opened()
+    (sizes,) = (a.menu() for a in menu.actions() if a.text().replace("&", "") == "Grab radius")
+    assert isinstance(sizes, QMenu)
+    choose(sizes, "Large (6 %)")
+    assert document.grip_radius == pytest.approx(0.06)
+    choose(menu, "Pin")
+    assert [(pin.vertex, pin.radius) for pin in document.pins] == [(vertex, 0.06)]
+    menu.close()
+    menu = opened()
+    choose(menu, "Unpin")
+    assert document.pins == ()
+    menu.close()
+
+
+def test_feet_and_hands_are_pinned_in_one_step(qtbot: QtBot, body_window: MainWindow) -> None:
+    document = body_window.document
+    names, space = document.model.domain_names, document.model.pose_space
+    for key, word in (("pin_feet", "foot"), ("pin_hands", "hand")):
+        body_window.actions_by_key[key].trigger()
+        pinned = {names[space.vertex_domain[pin.vertex]] for pin in document.pins}
+        assert pinned == {name for name in names if word in name}
+        assert document.undo_stack.count() == 1
+        document.undo()
+        assert document.pins == ()
+    rest(qtbot, body_window)
+
+
+def test_a_slider_shows_where_contact_holds_it(qtbot: QtBot, body_window: MainWindow) -> None:
+    document = body_window.document
+    code = document.model.code_names.index("right upper arm up")
+    row = body_window.sliders.row_of(code)
+    start = handle(row)
+    QTest.mousePress(row.slider, LEFT, NO_KEY, start)
+    for step in range(1, 21):
+        QTest.mouseMove(row.slider, start - QPoint(6 * step, 0))
+        qtbot.wait(16)
+    arrived(qtbot, body_window)
+    reached = float(document.latent[code])
+    # The handle stays under the pointer, the number says what the pose has.
+    assert row.slider.number < reached - 0.01
+    assert row.slider.held_at is not None
+    assert row.field.value() == pytest.approx(reached, abs=1e-3)
+    assert document.exact is not None
+    assert not document.exact.colliding
+    assert "contact" in body_window.collision.exact.details.text()
+    take_picture(body_window, "held by contact")
+    QTest.mouseRelease(row.slider, LEFT, NO_KEY, start - QPoint(120, 0))
+    assert row.slider.number == pytest.approx(reached, abs=0.01)
+    document.undo()
+    rest(qtbot, body_window)
+    assert row.slider.held_at is None
+    assert "contact" not in body_window.collision.exact.details.text()
+
+
+def test_a_drag_that_starts_colliding_says_why_it_goes_no_deeper(
+    qtbot: QtBot, body_window: MainWindow
+) -> None:
+    document, canvas = body_window.document, body_window.viewport.canvas
+    assert canvas is not None
+    document.set_solid(False)
+    for sample in document.model.latent_space.sample(40, np.random.default_rng(1)):
+        if document.model.detector.detect(document.model.decode(sample)).colliding:
+            break
+    document.blend_towards(sample, 1.0)
+    rest(qtbot, body_window)
+    document.set_solid(True)
+    card = body_window.collision.exact
+    assert document.exact is not None
+    assert document.exact.colliding
+    assert "Solid" not in card.details.text()
+    deeper = None
+    for domain in range(len(document.model.domain_names)):
+        try:
+            place = place_of(body_window.viewport, seen_vertex(body_window.viewport, domain))
+        except AssertionError:
+            continue
+        for way in (QPoint(150, 0), QPoint(-150, 0), QPoint(0, 150), QPoint(0, -150)):
+            QTest.mousePress(canvas, LEFT, NO_KEY, place)
+            for step in range(1, 6):
+                QTest.mouseMove(canvas, place + way * step / 5)
+                qtbot.wait(16)
+            arrived(qtbot, body_window)
+            deeper = card.details.text() if "Solid" in card.details.text() else None
+            QTest.keyClick(canvas, Qt.Key.Key_Escape)
+            QTest.mouseRelease(canvas, LEFT, NO_KEY, place + way)
+            rest(qtbot, body_window)
+            if deeper is not None:
+                break
+        if deeper is not None:
+            break
+    assert deeper is not None
+    assert "Resolve" in deeper
+    assert "Solid" not in card.details.text()
+
+
+def test_a_part_is_mirrored_to_the_other_side_by_the_menu(
+    qtbot: QtBot, body_window: MainWindow
+) -> None:
+    document = body_window.document
+    names = document.model.domain_names
+    left, right = names.index("left shin & foot"), names.index("right shin & foot")
+    raised = np.abs(document.model.training_latent).sum(axis=1).argmax()
+    document.load_pose(document.training_pose(int(raised)))
+    rest(qtbot, body_window)
+    before = document.latent
+    menu = body_window._body_menus.part_menu(left, None)
+    (mirror,) = (a for a in menu.actions() if "irror to" in a.text().replace("&", ""))
+    mirror.trigger()
+    qtbot.waitUntil(lambda: document.undo_stack.undoText().startswith("Mirror"), timeout=PATIENCE)
+    rest(qtbot, body_window)
+    changed = document.latent != before
+    assert changed.any()
+    assert not changed[~document.model.embedding.codes_of([right])].any()
+    assert not document.exact.colliding
