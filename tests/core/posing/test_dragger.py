@@ -121,7 +121,7 @@ def test_many_random_solid_events_never_collide(
 ) -> None:
     """Grips, twists, codes, pins and locks in random order, each drag from where the last ended."""
     generator = np.random.default_rng(0)
-    dragger, size, latent = tube_model.dragger(), tube_model.body_size, free
+    dragger, latent = tube_model.dragger(), free
     held, n_touching = 0, 0
     for _ in range(250):
         vertices = tube_model.decode(latent)
@@ -134,13 +134,17 @@ def test_many_random_solid_events_never_collide(
         options = DragOptions(strength=float(generator.choice([0.0, 1.0])), locked_domains=locked)
         step = dragger.begin(latent, grip, pins, options)
         codes = tube_model.embedding.codes_of(locked)
-        for _ in range(40):
-            if grip is None:
+        for event in range(40):
+            # The pointer rests for a while at each place.
+            if event % 10:
+                pass
+            elif grip is None:
                 target = tube_model.latent_space.sample(1, generator)[0]
             elif isinstance(grip, Twist):
                 target = generator.uniform(-3.0, 3.0, 1)
             else:
-                target = vertices[vertex] + generator.normal(size=3) * size
+                other = generator.integers(tube_model.n_vertices)
+                target = vertices[vertex] + 1.5 * (vertices[other] - vertices[vertex])
             step = dragger.move(target)
             assert not tube_model.detector.are_colliding(step.vertices[None])[0]
             assert step.exactly_free
