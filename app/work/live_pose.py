@@ -276,11 +276,16 @@ class LivePose(QObject):
     @Slot()
     def _on_due(self) -> None:
         self._is_due = False
-        if self._ask() and not isinstance(self._asked, VerdictRequest) and self._is_quick:
-            answer = self._worker.awaited(_PATIENCE_SECONDS)
-            self._is_quick = answer is not None
-            if answer is not None:
-                self._take(answer)
+        is_new = self._ask() and isinstance(self._asked, FrameRequest)
+        answer = self._awaited() if is_new or isinstance(self._asked, DragRequest) else None
+        if answer is not None:
+            self._take(answer)
+
+    def _awaited(self) -> Response | None:
+        """Wait for an answer that is expected to be quick; None if it is not there."""
+        answer = self._worker.awaited(_PATIENCE_SECONDS) if self._is_quick else None
+        self._is_quick = answer is not None
+        return answer
 
     @Slot()
     def _ask(self) -> bool:
@@ -312,11 +317,20 @@ class LivePose(QObject):
             if frame.verdict is None and request is not None:
                 self._unchecked = VerdictRequest(frame.request_id, request.model, frame)
                 self._rested.start()
+        is_late = is_of_drag and self._next is not None
         if isinstance(request, DragRequest) and is_of_drag and frame is not None:
             self._go_on(request, frame)
+        if frame is not None:
+            self._is_quick = frame.seconds < _QUICK_SECONDS
         # The next request is sent before the response is drawn: the worker need not wait.
         # It is not waited for here: its response would be signalled before this one.
         self._ask()
+        if is_late and frame is not None:
+            # But drawing where the pointer was takes longer than going to where it is.
+            later = self._awaited()
+            if later is not None and later.failure is None:
+                self._take(later)
+                return
         if request is None or request.model is not self._model:
             return
         if answer.failure is not None:
@@ -325,7 +339,6 @@ class LivePose(QObject):
                 self.failed.emit(answer.failure)
         elif frame is not None:
             self._reported.pop(type(request), None)
-            self._is_quick = frame.seconds < _QUICK_SECONDS
             if is_of_drag:
                 self.dragged.emit(frame)
             elif isinstance(request, FrameRequest):
