@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import random
+import threading
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.work.frames import FrameEvaluator
+from app.work.frames import FrameEvaluator, LiveFrame
 from app.work.threads import Failure
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Grip, Twist
@@ -104,6 +106,36 @@ def test_a_rested_pointer_is_followed_until_the_pose_has_settled(
     assert misses[-1] < misses[0]
     solid.end_drag()
     assert solid.undo_stack.count() == 1
+
+
+def test_no_frame_of_an_old_target_is_shown_where_that_of_the_newest_is_quick(
+    qtbot: QtBot, solid: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.work.live_pose._QUICK_SECONDS", 10.0)
+    monkeypatch.setattr("app.work.live_pose._PATIENCE_SECONDS", 10.0)
+    begun, go_on = threading.Event(), threading.Event()
+    compute = FrameEvaluator.dragged
+
+    def held(*arguments: Any) -> LiveFrame:
+        begun.set()
+        go_on.wait(10)
+        return compute(*arguments)
+
+    monkeypatch.setattr(FrameEvaluator, "dragged", held)
+    grip = end_of(solid)
+    targets = [moved(solid, grip, way) for way in (0.02, 0.03, 0.04)]
+    shown: list[bytes] = []
+    solid.frame_changed.connect(lambda: shown.append(solid.frame.target.tobytes()))
+    solid.begin_drag(grip, "Drag")
+    solid._live._is_quick = False
+    solid.drag_to(targets[0])
+    qtbot.waitUntil(begun.is_set)
+    for target in targets[1:]:
+        solid.drag_to(target)
+    go_on.set()
+    settle(qtbot, solid)
+    solid.end_drag()
+    assert set(shown) == {targets[-1].tobytes()}
 
 
 def test_letting_go_at_once_ends_where_a_rested_pointer_does(
