@@ -287,11 +287,13 @@ class Viewport(QWidget):
             view = self.scene.view if is_same else None
         self.scene = Scene(self.canvas, model, current_theme())
         self._model = model
-        self._tag.hide()
         self._legend.set_legend(Legend())
         self._shader = self._new_shader()
         self.shown_frame = None
-        self._highlight = self.hovered_domain = None
+        self._highlight = None
+        assert self.mouse is not None
+        # Vertices of the model before are none of this one.
+        self.mouse.point_at(None)
         self._place_camera = view is None
         if view is not None:
             self.scene.view = view

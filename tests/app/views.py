@@ -83,15 +83,34 @@ def place_of(viewport: Viewport, vertex: int) -> QPoint:
     return on_screen(viewport.canvas, viewport.scene.surface.vertices[vertex]).toPoint()
 
 
+def point_at(qtbot: QtBot, viewport: Viewport, vertex: int) -> QPoint:
+    """Put the pointer on a vertex that is seen, until the viewport knows; return where that is."""
+    canvas, place = viewport.canvas, place_of(viewport, vertex)
+    assert canvas is not None
+
+    def is_known() -> bool:
+        # A pointer that is there already, from a test before, does not move.
+        for there in (QPoint(3, 3), place):
+            QTest.mouseMove(canvas, there)
+            qtbot.wait(60)
+        return viewport.pointed_vertex == vertex
+
+    qtbot.waitUntil(is_known, timeout=20_000)
+    return place
+
+
 def seen_vertex(viewport: Viewport, domain: int) -> int:
-    """Return a vertex of a domain that nothing hides."""
-    assert viewport.canvas is not None
-    assert viewport.scene is not None
+    """Return a vertex of a domain that nothing hides, and that is not at the body's very rim."""
+    canvas, scene = viewport.canvas, viewport.scene
+    assert canvas is not None
+    assert scene is not None
     mask = viewport._document.model.attention_mask
+    around = [QPointF(x, y) for x in (-2, 2) for y in (-2, 2)]
     for vertex in np.argsort(-mask[domain]):
         # Of the pixel that the pointer will be on.
         place = QPointF(place_of(viewport, vertex))
-        picked = viewport.canvas.pick(place, viewport.scene.body)
-        if picked is not None and picked[0] == vertex:
+        picked = canvas.pick(place, scene.body)
+        is_inside = all(canvas.pick(place + step, scene.body) is not None for step in around)
+        if picked is not None and picked[0] == vertex and is_inside:
             return int(vertex)
     raise AssertionError("no vertex of the domain is seen")

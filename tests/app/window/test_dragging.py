@@ -16,7 +16,7 @@ from app.editing.document import PoseDocument
 from app.editing.settings import SETTINGS
 from app.window.main_window import MainWindow
 from lcollision_core.model import PoseModel
-from tests.app.views import place_of, seen_vertex
+from tests.app.views import place_of, point_at, seen_vertex
 from tests.app.windows import (
     PATIENCE,
     close_window,
@@ -47,18 +47,6 @@ def body_window(qtbot: QtBot, body: PoseModel, tmp_path: Path) -> Iterator[MainW
         close_window(held)
     assert document.close()
     document.deleteLater()
-
-
-def hover(qtbot: QtBot, window: MainWindow, vertex: int) -> QPoint:
-    """Put the pointer on a vertex that is seen, and wait until the window knows."""
-    canvas = window.viewport.canvas
-    assert canvas is not None
-    place = place_of(window.viewport, vertex)
-    # A pointer that is there already would not move.
-    for there in (QPoint(3, 3), place):
-        QTest.mouseMove(canvas, there)
-    qtbot.waitUntil(lambda: window.viewport.pointed_vertex == vertex, timeout=PATIENCE)
-    return place
 
 
 def arrived(qtbot: QtBot, window: MainWindow) -> None:
@@ -93,7 +81,7 @@ def test_a_key_pins_what_is_under_the_pointer_and_types_into_a_field(
     canvas = window.viewport.canvas
     assert canvas is not None
     vertex = seen_vertex(window.viewport, 1)
-    hover(qtbot, window, vertex)
+    point_at(qtbot, window.viewport, vertex)
     assert pin.isEnabled()
     QTest.keyClick(window, Qt.Key.Key_P)
     assert [held.vertex for held in document.pins] == [vertex]
@@ -124,7 +112,7 @@ def test_the_menu_of_the_body_pins_and_chooses_the_patch(qtbot: QtBot, window: M
     document, canvas = window.document, window.viewport.canvas
     assert canvas is not None
     vertex = seen_vertex(window.viewport, 1)
-    place = hover(qtbot, window, vertex)
+    place = point_at(qtbot, window.viewport, vertex)
 
     def opened() -> QMenu:
         QTest.mouseClick(canvas, Qt.MouseButton.RightButton, NO_KEY, place)
