@@ -151,16 +151,15 @@ class Contacts:
         """Return the vertices of the contacts that (D,) codes have reached."""
         return self.vertices[self.normals @ codes >= self.offsets - CLEARANCE]
 
-    def drop_refuted(self, free: FloatArray, most: int | None = None) -> None:
-        """Forget half-spaces that a free pose lies outside: they were extrapolated too far.
+    def drop_refuted(self, free: FloatArray) -> None:
+        """Forget half-spaces that a free pose lies outside: they were extrapolated too far."""
+        self._keep(np.flatnonzero(self.normals @ free <= self.offsets + CLEARANCE))
 
-        Parameters
-        ----------
-        free : (D,) float64 array
-        most : of those that are left only so many are kept, the latest
-        """
-        kept = np.flatnonzero(self.normals @ free <= self.offsets + CLEARANCE)
-        kept = kept if most is None else kept[-most:]
+    def keep_latest(self, most: int) -> None:
+        """Forget all half-spaces but so many, those that were added last."""
+        self._keep(np.arange(len(self.offsets))[-most:])
+
+    def _keep(self, kept: npt.NDArray[np.intp]) -> None:
         self.normals, self.offsets = self.normals[kept], self.offsets[kept]
         self.vertices = self.vertices[kept]
 

@@ -34,11 +34,15 @@ CUTS = (0.5, 0.25, 0.1)
 
 KEPT_CONTACTS = 18
 
-DAMPING, HOLD = 0.02, 0.002
-"""Prices of the mean squared vertex displacement of a step, and of that since the drag began,
-against the squared miss of the grip."""
+DAMPING = 0.02
+"""Price of the mean squared vertex displacement of a step, against the squared miss of the grip."""
 
-IMPLAUSIBLE = 5e-6
+HOLD, MOVED = 0.2, 0.02
+"""Price of the mean squared displacement since the drag began, part by part: of a part that has
+moved by `MOVED` (root mean square, normalised) half as much, so that few parts move and the rest of
+the body stays: reweighted least squares, as for the group lasso (Yuan and Lin 2006)."""
+
+IMPLAUSIBLE = 3e-6
 """Price of the squared Mahalanobis distance from the drag's start: see `PoseSpace.precision`."""
 
 STRETCH = 0.14
@@ -110,6 +114,8 @@ class PoseDragger:
 
     def __init__(self, check: ExactCheck) -> None:
         self._check, self._space = check, check.space
+        led = np.bincount(check.space.vertex_domain, minlength=check.space.n_domains)
+        self._shares = np.maximum(led, 1) / len(check.space.vertex_domain)
         self._goal: Goal | None = None
 
     def begin(
@@ -193,6 +199,7 @@ class PoseDragger:
             return self._result(float("nan"), settled=True)
         if isinstance(goal, PatchGoal):
             aim /= self._check.body_size
+        self._contacts.keep_latest(KEPT_CONTACTS)
         miss, gain = goal.miss(self._here, aim), 0.0
         for _ in range(MAX_STEPS):
             if not self._step(goal, aim):
@@ -225,8 +232,9 @@ class PoseDragger:
             low, high = np.where(stays, here, low), np.where(stays, here, high)
         else:
             price = self._options.strength * IMPLAUSIBLE * space.precision
-            gradient = gradient + (HOLD * space.metric + price) @ (here - self._start)
-            hessian = hessian + (DAMPING + HOLD) * space.metric + price
+            price += self._hold(here - self._start)
+            gradient = gradient + price @ (here - self._start)
+            hessian = hessian + DAMPING * space.metric + price
         for _ in range(ROUNDS):
             n_contacts = len(self._contacts.offsets)
             there = least_step(
@@ -257,6 +265,14 @@ class PoseDragger:
             and (contacts.normals @ aim <= contacts.offsets).all()
         )
 
+    def _hold(self, moved: FloatArray) -> FloatArray:
+        """Return the (D, D) price of a (D,) change since the start: high for parts that rest."""
+        metrics = self._space.domain_metrics
+        squared = np.einsum("i,kij,j->k", moved, metrics, moved) / self._shares
+        weights = HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / MOVED)
+        price: FloatArray = np.tensordot(weights, metrics, 1)
+        return price
+
     def _length(self, way: FloatArray) -> float:
         """Return the root of the mean squared vertex displacement of a change of codes."""
         return float(np.sqrt(way @ self._space.metric @ way))
@@ -277,7 +293,7 @@ class PoseDragger:
                 return False
             self._found, self._allowed = found, depths
             if not found.colliding:
-                self._contacts.drop_refuted(there, KEPT_CONTACTS)
+                self._contacts.drop_refuted(there)
         self._here, self._stretch = Decoded(there, decoded), stretch
         return True
 

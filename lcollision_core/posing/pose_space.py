@@ -63,6 +63,10 @@ class PoseSpace(Protocol):
         """
 
     @property
+    def domain_metrics(self) -> FloatArray:
+        """(K, D, D): what the vertices that each body part leads add to the metric."""
+
+    @property
     def precision(self) -> FloatArray:
         """(D, D) symmetric positive definite P: Z^T P Z is D for a typical move between poses."""
 
@@ -96,18 +100,30 @@ class LatentPoseSpace:
         self.vertex_domain = embedding.attention_mask.argmax(axis=0)
 
     @cached_property
-    def metric(self) -> FloatArray:
-        """J^T J / V of the decoder's Jacobian J, averaged over evenly spaced training poses."""
+    def domain_metrics(self) -> FloatArray:
+        """J_k^T J_k / V of the decoder's Jacobian, averaged over evenly spaced training poses.
+
+        J_k has the rows of the vertices that domain k leads.
+        """
         embedding = self.embedding
-        latent = embedding.training_latent
+        latent, size = embedding.training_latent, embedding.latent_size
         chosen = np.unique(np.linspace(0, len(latent) - 1, _JACOBIAN_POSES).astype(int))
-        gram = np.zeros((embedding.latent_size, embedding.latent_size))
+        led = [self.vertex_domain == domain for domain in range(self.n_domains)]
+        gram = np.zeros((self.n_domains, size, size))
         for row in latent[chosen]:
             features = embedding.decoder.features(row[None])[0]
             tangents = embedding.decoder.tangents(row)
             moved = embedding.codec.decode_jvp(features, tangents, n_threads=1)
-            by_code = moved.reshape(len(moved), -1)
-            gram += by_code @ by_code.T / (len(chosen) * embedding.topology.n_vertices)
+            for domain, inside in enumerate(led):
+                by_code = moved[:, inside].reshape(size, -1)
+                gram[domain] += by_code @ by_code.T
+        gram /= len(chosen) * embedding.topology.n_vertices
+        return gram
+
+    @cached_property
+    def metric(self) -> FloatArray:
+        """The sum of `domain_metrics`, with a little more on the diagonal."""
+        gram: FloatArray = self.domain_metrics.sum(axis=0)
         gram[np.diag_indices_from(gram)] += _STIFFENING * np.trace(gram) / len(gram)
         return gram
 
