@@ -57,6 +57,7 @@ class LiveEditing(CodeEditing):
     frame : the newest computed one; while a slider moves, an instant behind `latent`
     exact : the exact check of `latent`; None until then
     solid : drags and edits of the codes keep the pose out of itself
+    drag_strength : how strongly drags keep to poses like those of the training, 0 not at all
     """
 
     frame_changed = Signal()
@@ -70,6 +71,7 @@ class LiveEditing(CodeEditing):
         self.frame: LiveFrame | None = None
         self.exact: ExactVerdict | None = None
         self.solid = True
+        self.drag_strength = 1.0
         self._predicts = False
         self._drag: Drag | None = None
         self._adopted: FloatArray | None = None
@@ -217,7 +219,7 @@ class LiveEditing(CodeEditing):
 
         # What a code's target leaves as it was stays, so that locks need no more than that.
         locked = frozenset() if grip is None else self.locked_domains
-        options = DragOptions(solid=self.solid, locked_domains=locked)
+        options = DragOptions(self.solid, self.drag_strength, locked)
         return Drag(
             DragSession(self.model, self.latent, grip, pins, options, self.placement),
         )

@@ -40,6 +40,7 @@ SETTINGS: dict[str, Setting] = {
     "shading": Setting("domains", choices=("plain", "domains", "predicted", "exact", "movement")),
     "show_ghost": Setting(True),
     "solid": Setting(True),
+    "drag_strength": Setting(1.0, 0.0, 100.0),
     "model": Setting("body"),
     "recent_files": Setting(()),
     "recent_files_kept": Setting(8, 1, 30),

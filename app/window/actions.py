@@ -142,6 +142,13 @@ CAMERA_ACTIONS: dict[str, Spec] = {
     for number, name in enumerate(CAMERAS, start=1)
 }
 
+DRAG_STRENGTHS: dict[float, Spec] = {
+    0.0: Spec("&Loose", "", "Let a drag stretch limbs and reach poses unlike any of the training"),
+    1.0: Spec("&Normal", "", "Let a drag stretch limbs hardly"),
+    4.0: Spec("&Firm", "", "Keep drags close to poses like those of the training"),
+}
+"""How strongly drags keep to natural poses, by the setting."""
+
 THEMES: dict[str, Spec] = {
     "system": Spec("Match &system", "F6", "Match the desktop's theme"),
     "light": Spec("&Light", "F7", "Dark text on light"),

@@ -10,7 +10,13 @@ from PySide6.QtCore import QObject, Slot
 from PySide6.QtGui import QAction
 
 from app.view.mouse import RADIUS_STEP
-from app.window.actions import ACTIONS, explain_action
+from app.window.actions import (
+    ACTIONS,
+    DRAG_STRENGTHS,
+    explain_action,
+    make_choices,
+    make_menu,
+)
 from app.window.widgets import silent
 
 if TYPE_CHECKING:
@@ -28,13 +34,14 @@ class DragActions(QObject):
     Parameters
     ----------
     document : changed
-    settings : remember whether the body is solid
+    settings : remember whether the body is solid, and how strongly drags keep to natural poses
     viewport : knows what is under the pointer
     actions : by key; whether they can be chosen follows the document and the pointer
 
     Attributes
     ----------
     acts : callables by the actions' keys
+    strengths_menu : how strongly drags keep to natural poses
     """
 
     def __init__(
@@ -56,12 +63,20 @@ class DragActions(QObject):
             "smaller": lambda: document.set_grip_radius(document.grip_radius / RADIUS_STEP),
             "larger": lambda: document.set_grip_radius(document.grip_radius * RADIUS_STEP),
         }
+        document.drag_strength = settings["drag_strength"]
+        strengths = make_choices(
+            DRAG_STRENGTHS, document.drag_strength, self._set_strength, viewport
+        )
+        self.strengths_menu = make_menu("Keep &natural", strengths, viewport)
         document.set_solid(settings["solid"])
         document.solid_changed.connect(self._on_solid)
         for changed in (document.model_changed, document.pins_changed, viewport.pointed):
             changed.connect(self._update_actions)
         self._on_solid()
         self._update_actions()
+
+    def _set_strength(self, strength: float) -> None:
+        self._document.drag_strength = self._settings["drag_strength"] = strength
 
     @Slot()
     def _on_solid(self) -> None:

@@ -133,6 +133,7 @@ class MainWindow(QMainWindow):
                 "recent": self.files.recent_menu,
                 "models": self.files.models_menu,
                 "cameras": views.camera_menu,
+                "strengths": drags.strengths_menu,
                 "themes": actions.make_menu("&Theme", themes, self),
             },
         )

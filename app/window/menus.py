@@ -25,7 +25,17 @@ MENUS: dict[str, tuple[str, ...]] = {
     ),
     "&Pose": (
         *("solid", SEPARATOR),
-        *("pin", "pin_feet", "pin_hands", "unpin_all", SEPARATOR, "smaller", "larger", SEPARATOR),
+        *(
+            "pin",
+            "pin_feet",
+            "pin_hands",
+            "unpin_all",
+            SEPARATOR,
+            "smaller",
+            "larger",
+            "strengths",
+            SEPARATOR,
+        ),
         *("resolve", "cancel", "resolve_options"),
     ),
     "&Library": (

@@ -74,6 +74,24 @@ def test_solid_is_a_button_that_is_remembered(window: MainWindow) -> None:
     assert window.settings["solid"] is True
 
 
+def test_how_natural_drags_stay_is_chosen_and_remembered(window: MainWindow) -> None:
+    menu = next(
+        action.menu()
+        for action in window.menus["&Pose"].actions()
+        if action.text() == "Keep &natural"
+    )
+    assert isinstance(menu, QMenu)
+    assert [action.isChecked() for action in menu.actions()] == [False, True, False]
+    menu.actions()[0].trigger()
+    assert window.document.drag_strength == window.settings["drag_strength"] == 0.0
+    patch = window.document.grip_at(0)
+    window.document.begin_drag(patch, "Drag")
+    drag = window.document._drag
+    assert drag is not None
+    assert drag.session.options.strength == 0.0
+    window.document.cancel_drag()
+
+
 def test_a_key_pins_what_is_under_the_pointer_and_types_into_a_field(
     qtbot: QtBot, window: MainWindow
 ) -> None:
