@@ -2,8 +2,8 @@
 
 Each drag starts at the first training pose that is free, takes 45 events to the target and rests
 there for 15. Of each four targets one is where a training pose has the patch, one is on the body,
-one lies beyond the torso and one out of reach. One foot (of the feet, the other one) is pinned in
-every second drag.
+one lies beyond the torso and one out of reach. In every second four of a patch a foot is pinned:
+the left one, or the right one while the left is dragged.
 
 The fields of a row:
 

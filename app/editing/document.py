@@ -167,7 +167,7 @@ class PoseDocument(LiveEditing):
         LCollisionError : the model has no two sides.
         """
         mirror = self.model.pose_mirror
-        self.end_gesture()
+        self._close_gesture()
         self._long.cancel(self._mirroring)
         name = self.model.domain_names[domain]
         work = partial(mirror.mirror_part, self.latent, domain)

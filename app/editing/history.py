@@ -419,6 +419,7 @@ class PoseHistory(QObject):
         self.undo_stack.push(ChangeState(label, self._apply, before, state or before, changes=made))
 
     def _load(self, label: str, pose: NamedPose, source: Source) -> None:
+        self._close_gesture()
         self._push(label, DocumentState(_working(pose), Origin(source, pose)))
         self.pose_loaded.emit()
 

@@ -198,13 +198,18 @@ class LiveEditing(CodeEditing):
             super().undo()
 
     def _close_gesture(self) -> None:
-        drag = self._drag
+        drag, was_moving = self._drag, self.moving
         self._end_drag()
         super()._close_gesture()
-        if drag is not None and drag.session.grip is not None and self.frame is not None:
+        if drag is None or self.frame is None:
+            return
+        if drag.session.grip is not None:
             # No hand presses against the contacts any more.
             self.frame = replace(self.frame, contacts=NO_CONTACTS)
-            self.frame_changed.emit()
+        elif not was_moving:
+            return
+        # What shows the wanted codes shows those of the pose again.
+        self.frame_changed.emit()
 
     def _end_drag(self) -> None:
         if self._drag is not None:
@@ -237,15 +242,15 @@ class LiveEditing(CodeEditing):
         return self._wanted if has_ended else super()._gesture_start
 
     def _edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
+        held, drag = self._gesture, self._drag
+        is_same_run = self.solid and run is not None and held is not None and held.run == run
+        if drag is not None and (
+            drag.session.grip is not None or (drag.has_ended and not is_same_run)
+        ):
+            self._close_gesture()
         if not self.solid:
             super()._edit(label, latent, run)
             return
-        held, drag = self._gesture, self._drag
-        if drag is not None and (
-            drag.session.grip is not None
-            or (drag.has_ended and (run is None or held is None or held.run != run))
-        ):
-            self._close_gesture()
         if self._drag is None:
             is_own = self._gesture is None
             if is_own and latent.tobytes() == self.latent.tobytes():
@@ -282,6 +287,18 @@ class LiveEditing(CodeEditing):
             self.message.emit(f"A pose has at most {counted(MAX_PINS, 'pin')}")
             return
         self._set_pins(label, pins)
+
+    def is_pinned(self, vertex: int | None) -> bool:
+        """Whether a pin is on a vertex."""
+        return any(pin.vertex == vertex for pin in self.pins)
+
+    def toggle_pin(self, vertex: int) -> None:
+        """Pin the patch round a vertex, of the present radius, or remove the pin on it."""
+        index = next((i for i, pin in enumerate(self.pins) if pin.vertex == vertex), None)
+        if index is None:
+            self.pin(self.grip_at(vertex))
+        else:
+            self.unpin(index)
 
     def unpin(self, index: int) -> None:
         """Remove one pin."""

@@ -88,6 +88,11 @@ class Mouse(QObject):
         document.grip_radius_changed.connect(self._show_patch)
         document.pins_changed.connect(self.redraw_wanted)
 
+    def let_go(self) -> None:
+        """Forget what is under the pointer and what is dragged, as of another model."""
+        self._drag = self._grip = self._target = None
+        self.point_at(None)
+
     def point_at(self, place: QPointF | None) -> None:
         """Find what is under the pointer, and show the patch that a drag would take."""
         self.vertex = self.pin = None
@@ -108,12 +113,8 @@ class Mouse(QObject):
 
     def toggle_pin(self) -> None:
         """Pin the patch under the pointer, or take its pin away."""
-        document = self._document
-        pinned = [pin.vertex for pin in document.pins]
-        if self.vertex in pinned:
-            document.unpin(pinned.index(self.vertex))
-        elif self.vertex is not None:
-            document.pin(document.grip_at(self.vertex))
+        if self.vertex is not None:
+            self._document.toggle_pin(self.vertex)
 
     def mark(self, scene: Scene, vertices: npt.NDArray[np.float32]) -> None:
         """Bring the marks on the body up to date, just before a picture.
@@ -231,6 +232,11 @@ class Mouse(QObject):
         taken = seen_at(view, _pixel(start), self._size, deep_as)
 
         def move(place: QPointF) -> None:
+            if not document.dragging:
+                # Another action has ended the drag, and the button is still pressed.
+                self._grip = self._target = None
+                self._show_patch()
+                return
             there = seen_at(view, _pixel(place), self._size, deep_as)
             self._target = home + there - taken
             document.drag_to(self._target)

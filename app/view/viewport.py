@@ -293,7 +293,7 @@ class Viewport(QWidget):
         self._highlight = None
         assert self.mouse is not None
         # Vertices of the model before are none of this one.
-        self.mouse.point_at(None)
+        self.mouse.let_go()
         self._place_camera = view is None
         if view is not None:
             self.scene.view = view

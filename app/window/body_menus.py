@@ -100,11 +100,8 @@ class BodyMenus(QObject):
     def _add_hold(self, menu: QMenu, vertex: int) -> None:
         """Add what can be done with the patch round a vertex."""
         document = self._document
-        pinned = [pin.vertex for pin in document.pins]
-        if vertex in pinned:
-            self._add(menu, "Un&pin", document.unpin, pinned.index(vertex))
-        else:
-            self._add(menu, "&Pin", lambda: document.pin(document.grip_at(vertex)))
+        text = "Un&pin" if document.is_pinned(vertex) else "&Pin"
+        self._add(menu, text, document.toggle_pin, vertex)
         menu.addAction(self._actions["unpin_all"])
         sizes = menu.addMenu("&Grab radius")
         for text, radius in _RADII.items():

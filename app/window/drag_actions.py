@@ -93,7 +93,7 @@ class DragActions(QObject):
         if not document.has_model:
             return
         vertex = self._viewport.pointed_vertex
-        is_pinned = vertex in [pin.vertex for pin in document.pins]
+        is_pinned = document.is_pinned(vertex)
         actions["pin"].setText("Un&pin" if is_pinned else ACTIONS["pin"].text)
         actions["pin"].setEnabled(vertex is not None)
         actions["unpin_all"].setEnabled(bool(document.pins))

@@ -138,6 +138,8 @@ class LiveWorker(QObject):
         if evaluator is None or evaluator.model is not request.model:
             self._evaluator = evaluator = FrameEvaluator(request.model)
             evaluator.predicts = False
+            # It holds the model before.
+            self._session = self._dragger = None
         if isinstance(request, VerdictRequest):
             return evaluator.verdict(request.frame)
         if request.predicts and not evaluator.predicts:

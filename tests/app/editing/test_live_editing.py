@@ -261,6 +261,63 @@ def test_undo_of_an_edit_that_has_not_moved_yet_only_drops_it(
     assert solid.undo_stack.count() == 1
 
 
+def test_another_edit_during_a_drag_is_a_step_of_its_own(qtbot: QtBot, solid: PoseDocument) -> None:
+    other = solid.training_pose(1)
+    for is_solid, label, edit in (
+        (False, "Reset all", solid.reset_all),
+        (True, f"Load {other.name}", lambda: solid.load_pose(other)),
+    ):
+        solid.new_pose()
+        solid.set_solid(is_solid)
+        grip = end_of(solid)
+        qtbot.waitUntil(lambda: solid.frame.latent is solid.latent)
+        solid.begin_drag(grip, "Drag")
+        solid.drag_to(moved(solid, grip, 0.05))
+        settle(qtbot, solid)
+        edit()
+        assert not solid.dragging
+        held = solid.latent.tobytes()
+        # What the hand still does changes nothing.
+        solid.drag_to(moved(solid, grip, 0.1))
+        settle(qtbot, solid)
+        assert solid.latent.tobytes() == held
+        texts = [solid.undo_stack.text(index) for index in range(solid.undo_stack.count())]
+        assert texts == ["Drag", label]
+
+
+def test_an_edit_with_solid_off_ends_one_that_still_moves(
+    qtbot: QtBot, solid: PoseDocument
+) -> None:
+    solid.randomise(1.0, 3)
+    assert solid.moving
+    solid.set_solid(False)
+    solid.set_code(0, solid.latent[0] + 0.1)
+    assert solid.undo_stack.undoText().startswith("Move ")
+    settle(qtbot, solid)
+
+
+def test_undo_of_what_has_not_moved_lets_sliders_show_the_pose_again(
+    qtbot: QtBot, solid: PoseDocument
+) -> None:
+    solid.set_code(0, solid.latent[0] + 0.1)
+    assert solid.moving
+    with qtbot.waitSignal(solid.frame_changed, timeout=1000):
+        solid.undo()
+    settle(qtbot, solid)
+
+
+def test_a_worker_keeps_no_drag_of_a_model_that_is_gone(qtbot: QtBot, solid: PoseDocument) -> None:
+    grip, worker = end_of(solid), solid._live._worker
+    solid.begin_drag(grip, "Drag")
+    solid.drag_to(moved(solid, grip, 0.05))
+    settle(qtbot, solid)
+    assert worker._dragger is not None
+    model = solid.model
+    solid.set_model(PoseModel("bare", model.embedding, model.card))
+    settle(qtbot, solid)
+    assert worker._dragger is None
+
+
 def test_solid_steps_on_one_slider_merge(qtbot: QtBot, solid: PoseDocument) -> None:
     start = solid.latent
     for value in (0.02, 0.04, 0.06):

@@ -19,7 +19,7 @@ from app.editing.document import PoseDocument
 from app.view.camera import CAMERAS, View, framing, places_of, sees_all
 from app.view.canvas import Canvas, Smoothness
 from app.view.viewport import Viewport
-from lcollision_core.model import NamedPose
+from lcollision_core.model import NamedPose, PoseModel
 from tests.app.views import (
     SIDE,
     on_screen,
@@ -404,6 +404,41 @@ def test_escape_in_a_drag_puts_everything_back_to_the_bit(qtbot: QtBot, viewport
     settled(qtbot, viewport)
     np.testing.assert_array_equal(document.latent, before)
     assert document.undo_stack.count() == 0
+
+
+def test_a_drag_ends_with_its_model(qtbot: QtBot, viewport: Viewport) -> None:
+    """The patch that is held may have vertices that the next model does not."""
+    canvas, document = viewport.canvas, viewport._document
+    assert canvas is not None
+    place = place_of(viewport, seen_vertex(viewport, 1))
+    drag(qtbot, viewport, place, QPoint(25, 0), let_go=False)
+    assert document.dragging
+    model = document.model
+    document.set_model(PoseModel("bare", model.embedding, model.card))
+    settled(qtbot, viewport)
+    scene, latent = viewport.scene, document.latent
+    assert scene is not None
+    assert not scene.show_grip(None)
+    QTest.mouseMove(canvas, place + QPoint(40, 0))
+    QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(40, 0))
+    settled(qtbot, viewport)
+    assert document.latent is latent
+    assert document.undo_stack.count() == 0
+
+
+def test_a_drag_that_another_action_ends_shows_no_target(qtbot: QtBot, viewport: Viewport) -> None:
+    canvas, scene, document = viewport.canvas, viewport.scene, viewport._document
+    assert canvas is not None
+    assert scene is not None
+    place = place_of(viewport, seen_vertex(viewport, 1))
+    drag(qtbot, viewport, place, QPoint(25, 0), let_go=False)
+    document.undo()
+    QTest.mouseMove(canvas, place + QPoint(40, 0))
+    assert not scene.show_grip(None)
+    settled(qtbot, viewport)
+    assert len(scene.marks._lines) == 0
+    QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(40, 0))
+    settled(qtbot, viewport)
 
 
 def test_a_ctrl_drag_twists_the_part(qtbot: QtBot, viewport: Viewport) -> None:

@@ -255,7 +255,13 @@ def test_a_part_is_mirrored_to_the_other_side_by_the_menu(
     before = document.latent
     menu = body_window._body_menus.part_menu(left, None)
     (mirror,) = (a for a in menu.actions() if "irror to" in a.text().replace("&", ""))
+    # An edit that still moves the pose ends where it is.
+    assert document.model.pose_space.metric.any()
+    document.reset_all()
+    qtbot.waitUntil(lambda: document.latent is not before)
+    assert document.moving
     mirror.trigger()
+    before = document.latent
     qtbot.waitUntil(lambda: document.undo_stack.undoText().startswith("Mirror"), timeout=PATIENCE)
     rest(qtbot, body_window)
     changed = document.latent != before
