@@ -88,24 +88,31 @@ def open_model(name_or_path: str | Path, _: Progress, cancel: CancelToken) -> Op
 
 
 def warm_up(model: PoseModel) -> None:
-    """Compute once, in another thread, what a first drag needs apart from predictions."""
-    from lcollision_core.posing import make_grip
-
+    """Compute once, in another thread, what the first frames need apart from predictions."""
     evaluator = FrameEvaluator(model)
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
     evaluator.verdict(evaluator.frame(latent, 0))
-    dragger = model.dragger()
-    dragger.begin(latent, make_grip(model.pose_space, 0))
-    dragger.move(model.reference[0])
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
+    if not model.has_predictor:
+        _drag_once(model)
+
+
+def _drag_once(model: PoseModel) -> None:
+    """Compile a drag, and compute its metric: the latter takes seconds for a large mesh."""
+    from lcollision_core.posing import make_grip
+
+    dragger = model.dragger()
+    dragger.begin(np.zeros(model.latent_size), make_grip(model.pose_space, 0))
+    dragger.move(model.reference[0])
 
 
 def load_predictor(model: PoseModel, _: Progress, __: CancelToken) -> PoseModel:
-    """Load the predictor and use it once: compiling and importing may take seconds."""
+    """Load the predictor and use it once, then a drag: compiling and importing may take seconds."""
     keep_torch_to_one_thread(model)
     model.predict(np.zeros(model.latent_size))
+    _drag_once(model)
     return model
 
 
