@@ -150,7 +150,7 @@ class LiveEditing(CodeEditing):
         pins = self.pose.pins
         pin = pins[index]
         grip = make_grip(self.model.pose_space, pin.vertex, pin.radius)
-        self.begin_gesture(f"Move pin on {self._part_at(pin.vertex)}")
+        self.begin_gesture(f"Move pin on {self.part_name(pin.vertex)}")
         self._drag = self._begun(grip, pins[:index] + pins[index + 1 :])
         self._drag.pin = index, grip
 
@@ -271,7 +271,7 @@ class LiveEditing(CodeEditing):
 
     def pin(self, grip: Grip) -> None:
         """Pin a patch where it is."""
-        self.pin_grips([grip], f"Pin {self._part_at(grip.vertex)}")
+        self.pin_grips([grip], f"Pin {self.part_name(grip.vertex)}")
 
     def pin_grips(self, grips: Sequence[Grip], label: str) -> None:
         """Pin patches where they are, as one step; a pin on the same vertex is replaced."""
@@ -302,7 +302,7 @@ class LiveEditing(CodeEditing):
 
     def unpin(self, index: int) -> None:
         """Remove one pin."""
-        label = f"Unpin {self._part_at(self.pins[index].vertex)}"
+        label = f"Unpin {self.part_name(self.pins[index].vertex)}"
         self._set_pins(label, self.pins[:index] + self.pins[index + 1 :])
 
     def unpin_all(self) -> None:
@@ -313,9 +313,13 @@ class LiveEditing(CodeEditing):
         self._close_gesture()
         self._push(label, replace(self._state, pose=replace(self.pose, pins=pins)))
 
-    def _part_at(self, vertex: int) -> str:
-        domain = int(self.model.pose_space.vertex_domain[vertex])
-        return self.model.domain_names[domain]
+    def domain_of(self, vertex: int) -> int:
+        """Return the body part that leads a vertex, from 0."""
+        return int(self.model.pose_space.vertex_domain[vertex])
+
+    def part_name(self, vertex: int) -> str:
+        """Return the name of the body part that leads a vertex."""
+        return self.model.domain_names[self.domain_of(vertex)]
 
     # The results of the worker.
 

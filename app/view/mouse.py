@@ -44,7 +44,6 @@ class Mouse(QObject):
     document : whose pose is dragged
     canvas : has the mouse
     scene : returns what is on the canvas, None before there is anything
-    domain_of : returns the body part of a vertex
 
     Attributes
     ----------
@@ -67,11 +66,9 @@ class Mouse(QObject):
         document: PoseDocument,
         canvas: Canvas,
         scene: Callable[[], Scene | None],
-        domain_of: Callable[[int], int],
     ) -> None:
         super().__init__(canvas)
-        self._document, self._canvas = document, canvas
-        self._scene, self._domain_of = scene, domain_of
+        self._document, self._canvas, self._scene = document, canvas, scene
         self.vertex: int | None = None
         self.pin: int | None = None
         self._drag: _Drag | None = None
@@ -98,6 +95,8 @@ class Mouse(QObject):
         self.vertex = self.pin = None
         scene = self._scene()
         if scene is not None and place is not None:
+            # Pins may have changed since the last picture.
+            self._mark_pins(scene)
             self.pin = scene.marks.pin_at(_pixel(place), scene.view, self._size)
             if self.pin is not None:
                 self.vertex = self._document.pins[self.pin].vertex
@@ -124,17 +123,19 @@ class Mouse(QObject):
         scene : that is drawn
         vertices : (V, 3) array, of the pose that is drawn
         """
-        document = self._document
-        colours = document.model.domain_colours
-        pins = document.pins
-        scene.marks.show_pins(
-            np.array([pin.position for pin in pins]).reshape(-1, 3),
-            [colours[self._domain_of(pin.vertex)] for pin in pins],
-        )
+        self._mark_pins(scene)
         lines = []
         if self._grip is not None and self._target is not None:
             lines = [[self._grip.position(vertices), self._target]]
         scene.marks.show_lines(np.array(lines).reshape(-1, 2, 3))
+
+    def _mark_pins(self, scene: Scene) -> None:
+        document, pins = self._document, self._document.pins
+        colours = document.model.domain_colours
+        scene.marks.show_pins(
+            np.array([pin.position for pin in pins]).reshape(-1, 3),
+            [colours[document.domain_of(pin.vertex)] for pin in pins],
+        )
 
     @property
     def _size(self) -> Pixel:
@@ -215,7 +216,7 @@ class Mouse(QObject):
 
     def _moving(self, scene: Scene, start: QPointF, vertex: int) -> _Drag:
         """Move a patch, or the pin under the pointer, in the plane of the picture."""
-        document, name = self._document, self._name_of(vertex)
+        document = self._document
         if self.pin is not None:
             pin = document.pins[self.pin]
             pinned = np.array(pin.position)
@@ -226,7 +227,7 @@ class Mouse(QObject):
             grip = self._grip = document.grip_at(vertex)
             home = grip.position(np.asarray(scene.surface.vertices))
             deep_as = home if picked is None else picked[1]
-            document.begin_drag(grip, f"Drag {name}")
+            document.begin_drag(grip, f"Drag {document.part_name(vertex)}")
         self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
         view = scene.view
         taken = seen_at(view, _pixel(start), self._size, deep_as)
@@ -248,13 +249,13 @@ class Mouse(QObject):
         """Twist a body part about its long axis by the motion across it."""
         from lcollision_core.posing import Twist, long_axis
 
-        document, domain = self._document, self._domain_of(vertex)
+        document, domain = self._document, self._document.domain_of(vertex)
         self._grip = None
         inside = np.asarray(scene.surface.vertices)[
             document.model.pose_space.vertex_domain == domain
         ]
         direction = turn_about(long_axis(inside.astype(np.float64)), scene.view)
-        document.begin_drag(Twist(domain), f"Twist {self._name_of(vertex)}")
+        document.begin_drag(Twist(domain), f"Twist {document.part_name(vertex)}")
         self._canvas.setCursor(Qt.CursorShape.SizeHorCursor)
 
         def twist(place: QPointF) -> None:
@@ -263,9 +264,6 @@ class Mouse(QObject):
             document.drag_to(np.array([_TWIST_PER_PIXEL * along]))
 
         return twist
-
-    def _name_of(self, vertex: int) -> str:
-        return self._document.model.domain_names[self._domain_of(vertex)]
 
     # The camera.
 

@@ -102,11 +102,6 @@ class Shader:
         self.skin = skin
         self._mask = np.ascontiguousarray(attention_mask, dtype=np.float32)
         self._domains = mask_colours(attention_mask, domain_colours)
-        self._leading = self._mask.argmax(axis=0)
-
-    def leading_domain(self, vertex: int) -> int:
-        """Return the domain with the largest weight in a vertex."""
-        return int(self._leading[vertex])
 
     def colours(self, shading: Shading, known: Known) -> ColourArray:
         """Colour each vertex: only by what is shown, so that a scale means one thing.

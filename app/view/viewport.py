@@ -274,9 +274,7 @@ class Viewport(QWidget):
             self.canvas = Canvas(self._bring_up_to_date, self)
             self.canvas.painted.connect(self.painted)
             self.canvas.menu_wanted.connect(self._on_menu_wanted)
-            self.mouse = Mouse(
-                self._document, self.canvas, lambda: self.scene, self._leading_domain
-            )
+            self.mouse = Mouse(self._document, self.canvas, lambda: self.scene)
             self.mouse.pointed.connect(self._on_pointed)
             self.mouse.camera_moved.connect(self._on_camera_moved)
             self.mouse.redraw_wanted.connect(self._redraw)
@@ -480,12 +478,8 @@ class Viewport(QWidget):
             vertex = self.mouse.vertex
             self.menu_wanted.emit(self._domain_of(vertex), vertex, where)
 
-    def _leading_domain(self, vertex: int) -> int:
-        assert self._shader is not None
-        return self._shader.leading_domain(vertex)
-
     def _domain_of(self, vertex: int | None) -> int | None:
-        return None if vertex is None else self._leading_domain(vertex)
+        return None if vertex is None else self._document.domain_of(vertex)
 
     @Slot(object)
     def _on_pointed(self, position: QPointF | None) -> None:

@@ -88,20 +88,18 @@ class DragActions(QObject):
     @Slot()
     def _update_actions(self) -> None:
         document, actions = self._document, self._actions
-        for key in self.acts:
-            actions[key].setEnabled(document.has_model)
-        if not document.has_model:
-            return
-        vertex = self._viewport.pointed_vertex
-        is_pinned = document.is_pinned(vertex)
-        actions["pin"].setText("Un&pin" if is_pinned else ACTIONS["pin"].text)
-        actions["pin"].setEnabled(vertex is not None)
-        actions["unpin_all"].setEnabled(bool(document.pins))
-        for key, (limbs, _) in _LIMBS.items():
-            can = bool(self._domains(key))
-            actions[key].setEnabled(can)
-            tip = ACTIONS[key].tip if can else f"No body part of this model is named after {limbs}"
-            explain_action(actions[key], tip)
+        can = dict.fromkeys(self.acts, document.has_model)
+        if document.has_model:
+            vertex = self._viewport.pointed_vertex
+            is_pinned = document.is_pinned(vertex)
+            actions["pin"].setText("Un&pin" if is_pinned else ACTIONS["pin"].text)
+            can |= {"pin": vertex is not None, "unpin_all": bool(document.pins)}
+            for key, (limbs, _) in _LIMBS.items():
+                can[key] = bool(self._domains(key))
+                missing = f"No body part of this model is named after {limbs}"
+                explain_action(actions[key], ACTIONS[key].tip if can[key] else missing)
+        for key, is_possible in can.items():
+            actions[key].setEnabled(is_possible)
 
     def _domains(self, key: str) -> list[int]:
         """Return the body parts that an action pins."""

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from lcollision_core.posing import DragOptions, Grip, Pin, PoseDragger, Twist
 
 _QUICK_SECONDS = 0.012
-"""A frame that took less is waited for the next time,"""
+"""Seconds of a frame below which the window waits for the next one before it draws."""
 _PATIENCE_SECONDS = 0.016
-"""but at most this long, a picture of a screen that draws 60 in a second."""
+"""The longest such wait: one picture of a screen that draws 60 a second."""
 
 _MOST_IDLE = 5
 """Events towards one target, none of which came nearer, after which a drag counts as settled."""

@@ -13,7 +13,7 @@ from lcollision_core.meshes.topology import FloatArray, length_graph
 from lcollision_core.posing.pose_space import PoseSpace
 
 GRIP_RADIUS = 0.03
-"""Of a patch that nobody chose, in normalised length along the surface."""
+"""The default radius of a patch, in normalised length along the surface."""
 
 LEAST_RADIUS, LARGEST_RADIUS = 0.005, 0.25
 

@@ -451,6 +451,14 @@ def test_a_pin_stays_in_a_drag_and_comes_along_in_its_own(
     assert solid.pins == (held,)
 
 
+def test_a_vertex_belongs_to_the_domain_that_owns_most(document: PoseDocument) -> None:
+    mask = document.model.attention_mask
+    led = [document.domain_of(vertex) for vertex in range(document.model.n_vertices)]
+    assert set(led) == {0, 1}
+    np.testing.assert_array_equal(mask[led, range(len(led))], mask.max(axis=0))
+    assert document.part_name(0) == document.model.domain_names[led[0]]
+
+
 def test_the_radius_of_grips_has_limits(document: PoseDocument) -> None:
     grip = document.grip_at(3)
     assert document.grip_at(3) is grip

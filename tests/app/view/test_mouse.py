@@ -498,6 +498,23 @@ def test_a_double_click_pins_and_unpins_and_a_pin_is_dragged_by_its_dot(
     settled(qtbot, viewport)
 
 
+def test_no_pin_is_found_that_is_gone_since_the_last_picture(
+    qtbot: QtBot, viewport: Viewport
+) -> None:
+    mouse, document = viewport.mouse, viewport._document
+    assert mouse is not None
+    vertex = seen_vertex(viewport, 0)
+    document.pin(document.grip_at(vertex))
+    rest(qtbot, viewport)
+    place = QPointF(place_of(viewport, vertex))
+    mouse.point_at(place)
+    assert mouse.pin == 0
+    document.unpin_all()
+    mouse.point_at(place)
+    assert mouse.pin is None
+    assert mouse.vertex == vertex
+
+
 def test_keys_do_nothing_in_the_view(qtbot: QtBot, viewport: Viewport) -> None:
     canvas = viewport.canvas
     assert canvas is not None

@@ -166,10 +166,6 @@ def test_legends_name_what_is_drawn(shader: Shader) -> None:
     assert exact.ticks[1][1] == "0.3"
 
 
-def test_a_vertex_belongs_to_the_domain_that_owns_most(shader: Shader) -> None:
-    assert [shader.leading_domain(vertex) for vertex in (0, 1, 3)] == [0, 0, 1]
-
-
 def test_each_shading_is_remembered() -> None:
     choices = SETTINGS["shading"].choices
     assert choices == tuple(shading.name.lower() for shading in Shading)
