@@ -17,9 +17,9 @@ confirmed_free_rate : of those
 miss_mean, miss_reachable : mean distance that is left at the end, of all targets and of those that
     a training pose reaches; normalised
 rest_motion : mean distance of the vertices from the start beyond 0.25 from the patch; normalised
-largest_stretch : the most that an edge is as long as in the training pose where it is longest
+largest_stretch : of all edges, the largest ratio of the length to the longest in a training pose
 pin_drift, pin_drift_reachable : the most that a pin moved, of all and of those that the target does
-    not contradict, as a training pose reaches it; normalised
+    not contradict, as a training pose reaches it; normalised; None with fewer than five targets
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ TARGETS = 40
 MOVING_EVENTS, EVENTS = 45, 60
 
 _ELBOW, _REST = 0.22, 0.25
-"""Normalised length along the surface from a hand to its elbow, and from a patch to the rest of
-the body."""
+"""Normalised length along the surface from a hand to its elbow, and distance on the reference from
+a patch beyond which the rest of the body lies."""
 
 _KINDS = ("reachable", "body", "beyond", "far")
 _FAR = 0.8
@@ -193,7 +193,8 @@ def _time_mode(
     seconds: list[float] = []
     free: list[bool] = []
     confirmed: list[bool] = []
-    misses, rest, stretch, drift = [], [], [], []
+    misses, rest, stretch = [], [], []
+    drifts: list[tuple[str, float]] = []
     options = DragOptions(solid=solid)
     before = model.decode(start, n_threads=1)
     # Compiling and what is made once are not timed.
@@ -219,16 +220,9 @@ def _time_mode(
         moved = np.linalg.norm(after - before, axis=1)[reach > _REST * size]
         rest.append(float(moved.mean()) / size)
         stretch.append(largest_stretch(model.pose_space, after / size))
-        drift.append(
-            max(
-                (
-                    float(np.linalg.norm(_grip_of(model, pin).position(after) - pin.position))
-                    / size
-                    for pin in drag.pins
-                ),
-                default=0.0,
-            )
-        )
+        for pin in drag.pins:
+            there = make_grip(model.pose_space, pin.vertex, pin.radius).position(after)
+            drifts.append((drag.kind, float(np.linalg.norm(there - pin.position)) / size))
         progress(done + number + 1, 2 * len(drags))
     reachable = np.array([drag.kind == "reachable" for drag in drags])
     milliseconds = 1e3 * np.array(seconds)
@@ -247,10 +241,6 @@ def _time_mode(
         "miss_reachable": float(np.mean(np.array(misses)[reachable])),
         "rest_motion": float(np.mean(rest)),
         "largest_stretch": float(np.max(stretch)),
-        "pin_drift": float(np.max(drift)),
-        "pin_drift_reachable": float(np.max(np.array(drift)[reachable])),
+        "pin_drift": max((d for _, d in drifts), default=None),
+        "pin_drift_reachable": max((d for kind, d in drifts if kind == "reachable"), default=None),
     }
-
-
-def _grip_of(model: PoseModel, pin: Pin) -> Grip:
-    return make_grip(model.pose_space, pin.vertex, pin.radius)

@@ -278,9 +278,12 @@ class LiveEditing(CodeEditing):
         from lcollision_core.model import MAX_PINS
         from lcollision_core.posing import Pin
 
-        if self.frame is None:
+        frame = self.frame
+        if frame is None:
             return
-        added = {grip.vertex: Pin.of(grip, self.frame.vertices) for grip in grips}
+        is_late = frame.latent is not self.latent
+        vertices = self.model.decode(self.latent, n_threads=1) if is_late else frame.vertices
+        added = {grip.vertex: Pin.of(grip, vertices) for grip in grips}
         kept = [pin for pin in self.pins if pin.vertex not in added]
         pins = (*kept, *added.values())
         if len(pins) > MAX_PINS:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from lcollision_core.posing import Grip
 
 _ALONG = 0.85
-"""Edges make way along the surface longer: this share of it is the least that it can be."""
+"""Factor on the length of a path along edges, which is longer than one across faces."""
 
 _FAR, _BEYOND = 3.0, 1.5
 """Radii from the middle of what is not painted, and as far as distances are measured."""

@@ -425,6 +425,20 @@ def test_pins_are_of_the_pose_and_of_undo(solid: PoseDocument) -> None:
     assert solid.pins[0].vertex == first.vertex
 
 
+def test_a_pin_is_where_the_pose_has_its_patch_though_the_frame_is_late(
+    qtbot: QtBot, solid: PoseDocument
+) -> None:
+    solid.set_solid(False)
+    grip = end_of(solid)
+    solid.load_pose(solid.training_pose(1))
+    assert solid.frame is not None
+    assert solid.frame.latent is not solid.latent
+    solid.pin(grip)
+    settle(qtbot, solid)
+    place = grip.position(solid.frame.vertices)
+    np.testing.assert_allclose(solid.pins[0].position, place, atol=1e-5 * solid.model.body_size)
+
+
 def test_a_pin_stays_in_a_drag_and_comes_along_in_its_own(
     qtbot: QtBot, solid: PoseDocument
 ) -> None:
