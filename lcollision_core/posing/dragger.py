@@ -52,6 +52,9 @@ _NEAR, _WORTHWHILE, _SETTLED = 0.5, 0.5, 0.01
 """Of a goal's reach: a miss that the next event takes, the gain of a step that another follows at
 once, and the miss or gain of one that no other follows."""
 
+_ROUNDING = 1e-6
+"""Fraction by which the squared depths of a contact vary with the rounding of the vertices."""
+
 _STILL = 1e-5
 """Root of the mean squared vertex displacement, normalised, of a step that is none."""
 
@@ -243,13 +246,17 @@ class PoseDragger:
             if there is None:
                 # Contacts seen from different poses contradict each other.
                 self._contacts = Contacts(self._check)
-            elif (length := self._length(there - here)) < _STILL:
+                continue
+            way = there - here
+            length = float(np.sqrt(way @ space.metric @ way))
+            if length < _STILL:
                 return False
-            elif self._goes(here + min(1.0, goal.longest_step / length) * (there - here)):
+            way *= min(1.0, goal.longest_step / length)
+            if self._goes(here + way):
                 return True
-            elif len(self._contacts.offsets) == n_contacts:
+            if len(self._contacts.offsets) == n_contacts:
                 break
-        return there is not None and any(self._goes(here + cut * (there - here)) for cut in CUTS)
+        return there is not None and any(self._goes(here + cut * way) for cut in CUTS)
 
     def _may_land(
         self, goal: CodesGoal, aim: FloatArray, low: FloatArray, high: FloatArray
@@ -273,10 +280,6 @@ class PoseDragger:
         price: FloatArray = np.tensordot(weights, metrics, 1)
         return price
 
-    def _length(self, way: FloatArray) -> float:
-        """Return the root of the mean squared vertex displacement of a change of codes."""
-        return float(np.sqrt(way @ self._space.metric @ way))
-
     def _goes(self, there: FloatArray) -> bool:
         """Go to codes if the pose may be there; else remember what is in the way."""
         check = self._check
@@ -286,12 +289,14 @@ class PoseDragger:
             return False
         if self._options.solid:
             found = check.find(check.exported(decoded))
-            depths, allowed = self._depths(found), self._allowed
-            if any(deep > allowed.get(name, (0.0, 0.0))[1] for name, (_, deep) in depths.items()):
-                may_keep = {name: depth for name, (depth, _) in allowed.items()}
+            depths = self._depths(found)
+            allowed = {name: self._allowed.get(name, (0.0, 0.0)) for name in depths}
+            if any(depths[name][1] > (1.0 + _ROUNDING) * allowed[name][1] for name in depths):
+                may_keep = {name: depth for name, (depth, _) in self._allowed.items()}
                 self._contacts.separate(there, decoded, found, may_keep)
                 return False
-            self._found, self._allowed = found, depths
+            self._found = found
+            self._allowed = {name: min(depths[name], allowed[name]) for name in depths}
             if not found.colliding:
                 self._contacts.drop_refuted(there)
         self._here, self._stretch = Decoded(there, decoded), stretch
