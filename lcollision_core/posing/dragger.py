@@ -296,7 +296,10 @@ class PoseDragger:
                 self._contacts.separate(there, decoded, found, may_keep)
                 return False
             self._found = found
-            self._allowed = {name: min(depths[name], allowed[name]) for name in depths}
+            self._allowed = {
+                name: (min(depth, allowed[name][0]), min(squared, allowed[name][1]))
+                for name, (depth, squared) in depths.items()
+            }
             if not found.colliding:
                 self._contacts.drop_refuted(there)
         self._here, self._stretch = Decoded(there, decoded), stretch
