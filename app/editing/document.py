@@ -199,7 +199,7 @@ class PoseDocument(LiveEditing):
         Parameters
         ----------
         model : may lack a predictor; prefer `open_model`, which compiles and loads in the long
-            worker what a first drag needs
+            worker what the first frames need
         """
         self._put_in(jobs.OpenedModel(model, model.name))
 

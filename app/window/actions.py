@@ -143,8 +143,8 @@ CAMERA_ACTIONS: dict[str, Spec] = {
 }
 
 DRAG_STRENGTHS: dict[float, Spec] = {
-    0.0: Spec("&Loose", "", "Let a drag stretch limbs and reach poses unlike any of the training"),
-    1.0: Spec("&Normal", "", "Let a drag stretch limbs hardly"),
+    0.0: Spec("&Loose", "", "Let drags stretch limbs and reach poses unlike any of the training"),
+    1.0: Spec("&Normal", "", "Keep drags from stretching limbs"),
     4.0: Spec("&Firm", "", "Keep drags close to poses like those of the training"),
 }
 """How strongly drags keep to natural poses, by the setting."""

@@ -77,7 +77,7 @@ class PartEdits:
 
 
 def open_model(name_or_path: str | Path, _: Progress, cancel: CancelToken) -> OpenedModel:
-    """Read a model and use it once, so that nothing is left to compile before the first drag."""
+    """Read a model and use it once, so that nothing is left to compile before the first frame."""
     from lcollision_core.model import PoseModel, find_model
 
     path = find_model(name_or_path).absolute()
