@@ -87,7 +87,7 @@ class LiveEditing(CodeEditing):
     # Drags.
 
     def set_solid(self, solid: bool) -> None:
-        """Let no later drag or edit of the codes move the pose into itself, or let it."""
+        """Choose whether later drags and edits of the codes keep the pose out of itself."""
         if solid != self.solid:
             self.solid = solid
             self.solid_changed.emit()

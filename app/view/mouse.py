@@ -38,6 +38,7 @@ class Mouse(QObject):
 
     Left on the body drags the patch under the pointer in the plane of the picture, with Ctrl it
     twists the body part; left beside it, middle or Alt turn the camera, with Shift they shift it.
+    Right, up and down, zooms, as the wheel does.
 
     Parameters
     ----------

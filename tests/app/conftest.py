@@ -93,6 +93,24 @@ def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[Mai
         close_window(held)
 
 
+@pytest.fixture(scope="session")
+def body(compiled_body: None) -> PoseModel:  # noqa: ARG001
+    """Return the bundled body."""
+    return PoseModel.load("body")
+
+
+@pytest.fixture
+def body_window(qtbot: QtBot, body: PoseModel, tmp_path: Path) -> Iterator[MainWindow]:
+    """Return a window with the bundled body and a document of its own."""
+    document = PoseDocument(body, library_folder=tmp_path / "library")
+    held = open_window(qtbot, document, settings_in(tmp_path), (1280, 860))
+    yield held
+    if is_open(held):
+        close_window(held)
+    assert document.close()
+    document.deleteLater()
+
+
 @pytest.fixture
 def viewport(qtbot: QtBot, document: PoseDocument) -> Iterator[Viewport]:
     """Return a viewport of the document that has drawn its pose, in the light theme."""

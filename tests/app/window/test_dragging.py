@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
 from PySide6.QtCore import QPoint, Qt
@@ -12,41 +9,25 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QMenu, QToolBar
 from pytestqt.qtbot import QtBot
 
-from app.editing.document import PoseDocument
 from app.editing.settings import SETTINGS
 from app.window.main_window import MainWindow
-from lcollision_core.model import PoseModel
 from tests.app.views import place_of, point_at, seen_vertex
 from tests.app.windows import (
     PATIENCE,
-    close_window,
     handle,
-    is_open,
-    open_window,
     rest,
-    settings_in,
     take_picture,
 )
 
 LEFT, NO_KEY = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
 
 
-@pytest.fixture(scope="module")
-def body(compiled_body: None) -> PoseModel:  # noqa: ARG001
-    return PoseModel.load("body")
-
-
 @pytest.fixture
-def body_window(qtbot: QtBot, body: PoseModel, tmp_path: Path) -> Iterator[MainWindow]:
-    document = PoseDocument(body, library_folder=tmp_path / "library")
-    held = open_window(qtbot, document, settings_in(tmp_path), (1280, 860))
-    document.set_solid(True)
-    rest(qtbot, held)
-    yield held
-    if is_open(held):
-        close_window(held)
-    assert document.close()
-    document.deleteLater()
+def body_window(qtbot: QtBot, body_window: MainWindow) -> MainWindow:
+    """Return the window of the body with Solid on."""
+    body_window.document.set_solid(True)
+    rest(qtbot, body_window)
+    return body_window
 
 
 def arrived(qtbot: QtBot, window: MainWindow) -> None:

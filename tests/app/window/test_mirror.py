@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,6 @@ from lcollision_core.model import PoseModel
 from tests.app.windows import (
     PATIENCE,
     close_window,
-    is_open,
     open_window,
     rest,
     settings_in,
@@ -32,20 +30,9 @@ FREE_THAT_COLLIDES_MIRRORED = 1
 """As in the core's tests: the second sample of generator 0."""
 
 
-@pytest.fixture(scope="module")
-def body(compiled_body: None) -> PoseModel:  # noqa: ARG001
-    return PoseModel.load("body")
-
-
 @pytest.fixture
-def window(qtbot: QtBot, body: PoseModel, tmp_path: Path) -> Iterator[MainWindow]:
-    document = PoseDocument(body, library_folder=tmp_path / "library")
-    held = open_window(qtbot, document, settings_in(tmp_path), (1280, 860))
-    yield held
-    if is_open(held):
-        close_window(held)
-    assert document.close()
-    document.deleteLater()
+def window(body_window: MainWindow) -> MainWindow:
+    return body_window
 
 
 def press_mirror(qtbot: QtBot, window: MainWindow) -> str:
