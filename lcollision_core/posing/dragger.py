@@ -37,7 +37,7 @@ KEPT_CONTACTS = 18
 DAMPING = 0.02
 """Price of the mean squared vertex displacement of a step, against the squared miss of the grip."""
 
-HOLD, MOVED = 0.2, 0.02
+HOLD, MOVED = 0.1, 0.02
 """Price of the mean squared displacement since the drag began, part by part: of a part that has
 moved by `MOVED` (root mean square, normalised) half as much, so that few parts move and the rest of
 the body stays: reweighted least squares, as for the group lasso (Yuan and Lin 2006)."""
