@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import SelfCollisions
-from lcollision_core.errors import ShapeError
+from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.contacts import ContactRegions, Contacts, least_step
 from lcollision_core.posing.exact import ExactCheck, exported_vertices
@@ -61,7 +61,7 @@ _STILL = 1e-5
 
 @dataclass(frozen=True)
 class DragOptions:
-    """How a drag goes about it.
+    """What a drag keeps to.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class PoseDragger:
     """Drags poses of one space; for one thread at a time.
 
     After `begin` each `move` is one event of the pointer. A solid drag that starts free stays
-    exactly free; one that starts colliding deepens no contact.
+    exactly free; one that starts colliding deepens the contact of no two body parts.
 
     Parameters
     ----------
@@ -145,9 +145,10 @@ class PoseDragger:
         Raises
         ------
         ShapeError : another shape, or a number that is not finite.
-        LCollisionError : a pin that the mesh does not have.
+        LCollisionError : a pin or a body part to twist that the mesh does not have.
         """
         space, check = self._space, self._check
+        self._goal = None
         self._options = options or DragOptions()
         start: FloatArray = np.array(latent, dtype=np.float64)
         if start.shape != space.low.shape:
@@ -178,6 +179,10 @@ class PoseDragger:
         elif isinstance(grip, Grip):
             self._goal = PatchGoal(space, grip, held, strength)
         else:
+            if not 0 <= grip.domain < space.n_domains:
+                raise LCollisionError.must_be(
+                    "the body part to twist", f"1 to {space.n_domains}", grip.domain + 1
+                )
             self._goal = TwistGoal(space, grip.domain, held, strength, self._here.vertices)
         self._stretch = self._stretch_of(self._here.vertices)
         return self._result(0.0, settled=True)

@@ -202,7 +202,7 @@ def _squares(
 
 
 def largest_stretch(space: PoseSpace, vertices: FloatArray) -> float:
-    """Return the most that an edge is as long as in the plausible pose where it is longest."""
+    """Return the largest ratio of an edge to its longest length in plausible poses."""
     lengths = space.topology.edge_lengths(vertices)
     return float((lengths / space.longest_edges).max())
 

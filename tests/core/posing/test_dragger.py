@@ -324,3 +324,8 @@ def test_bad_poses_are_refused(tube_model: PoseModel, free: FloatArray, tip: Gri
         dragger.begin(np.full_like(free, np.nan), tip)
     with pytest.raises(LCollisionError, match="the vertex to take hold of must be"):
         dragger.begin(free, tip, [Pin(10**6, 0.03, (0.0, 0.0, 0.0))])
+    with pytest.raises(LCollisionError, match="the body part to twist must be 1 to 2, got 100"):
+        dragger.begin(free, Twist(99))
+    # A drag that did not begin does not go on with the one before.
+    with pytest.raises(RuntimeError, match="no drag has begun"):
+        dragger.move(np.zeros(3))
