@@ -143,9 +143,11 @@ CAMERA_ACTIONS: dict[str, Spec] = {
 }
 
 DRAG_STRENGTHS: dict[float, Spec] = {
-    0.0: Spec("&Loose", "", "Let drags stretch limbs and reach poses unlike any of the training"),
-    1.0: Spec("&Normal", "", "Keep drags from stretching limbs"),
-    4.0: Spec("&Firm", "", "Keep drags close to poses like those of the training"),
+    0.0: Spec(
+        "&Loose", "Ctrl+Alt+7", "Let drags stretch limbs and reach poses unlike any of the training"
+    ),
+    1.0: Spec("&Normal", "Ctrl+Alt+8", "Keep drags from stretching limbs"),
+    4.0: Spec("&Firm", "Ctrl+Alt+9", "Keep drags close to poses like those of the training"),
 }
 """How strongly drags keep to natural poses, by the setting."""
 
