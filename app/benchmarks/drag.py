@@ -36,7 +36,6 @@ from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.contact.near_exclusion import are_pairs_near, near_vertices
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes.topology import length_graph
 from lcollision_core.model import PoseModel
 from lcollision_core.posing import DragOptions, Grip, Pin, make_grip
 from lcollision_core.posing.goals import largest_stretch
@@ -156,7 +155,7 @@ def _places(model: PoseModel, vertices: FloatArray) -> dict[str, int]:
     The five ends are those that are farthest from each other along the surface.
     """
     up = np.eye(3)[model.up_axis]
-    graph = length_graph(model.topology.edges, model.embedding.rest_vertices)
+    graph = model.pose_space.surface_graph
 
     def along(vertex: int) -> FloatArray:
         found = csgraph.dijkstra(graph, directed=False, indices=vertex)

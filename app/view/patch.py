@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse.csgraph import dijkstra
 from vtkmodules.vtkCommonDataModel import vtkDataObject
 
 from app.view.shading import rgb
-from lcollision_core.meshes.topology import length_graph
 
 if TYPE_CHECKING:
     import pyvista as pv
-    from scipy.sparse import csr_matrix
 
-    from lcollision_core.meshes import Topology
-    from lcollision_core.posing import Grip
+    from lcollision_core.posing import Grip, PoseSpace
 
 _ALONG = 0.85
 """Factor on the length of a path along edges, which is longer than one across faces."""
@@ -54,20 +50,17 @@ class Patch:
     ----------
     actor : draws the surface
     polydata : the surface
-    topology : of the surface
-    rest_vertices : (V, 3) array, the reference, in normalised length
+    space : of the poses that the surface shows
     """
 
     def __init__(
         self,
         actor: pv.Actor,
         polydata: pv.PolyData,
-        topology: Topology,
-        rest_vertices: npt.NDArray[Any],
+        space: PoseSpace,
     ) -> None:
         self._polydata = polydata
-        self._graph: csr_matrix | None = None
-        self._topology, self._rest = topology, rest_vertices
+        self._space, rest_vertices = space, space.rest_vertices
         polydata.point_data["patch"] = np.column_stack(
             [rest_vertices, np.full(len(rest_vertices), _FAR)]
         ).astype(np.float32)
@@ -101,12 +94,11 @@ class Patch:
         self._grip = grip
         middle = [0.0, 0.0, 0.0, 0.0]
         if grip is not None:
-            if self._graph is None:
-                self._graph = length_graph(self._topology.edges, self._rest)
             middle = [*self._along[grip.vertex, :3].tolist(), grip.radius]
             # Somewhat beyond the rim, which lies between two vertices.
             beyond = _BEYOND * grip.radius
-            along = dijkstra(self._graph, directed=False, indices=grip.vertex, limit=beyond)
+            graph = self._space.surface_graph
+            along = dijkstra(graph, directed=False, indices=grip.vertex, limit=beyond)
             self._along[:, 3] = np.minimum(_ALONG * along / grip.radius, _FAR)
             self._polydata.Modified()
         self._uniforms.SetUniform4f("patchMiddle", middle)

@@ -87,9 +87,7 @@ class Scene:
         for actor in (self._floor, self._shadow, self.body, nearer, self._ghost_actor, through):
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)
-        self._patch = Patch(
-            self.body, self.surface.polydata, model.topology, model.embedding.rest_vertices
-        )
+        self._patch = Patch(self.body, self.surface.polydata, model.pose_space)
         self.marks = Marks(self._renderer)
         self.set_theme(theme)
 

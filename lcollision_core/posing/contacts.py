@@ -56,6 +56,11 @@ class ContactRegions:
         depth = np.bincount(of_pair, depths**3, minlength=len(names)) / squared
         return cls(names, of_pair, depth, squared)
 
+    def by_name(self) -> dict[int, tuple[float, float]]:
+        """Return each region's depth and squared depth."""
+        values = zip(self.depth.tolist(), self.squared_depth.tolist(), strict=True)
+        return dict(zip(self.names.tolist(), values, strict=True))
+
 
 def contact_slopes(
     space: PoseSpace,
@@ -118,7 +123,7 @@ class Contacts:
         decoded = self._check.decode(codes)[0]
         found = self._check.find(self._check.exported(decoded))
         if found.colliding:
-            self.separate(codes, decoded, found)
+            self.separate(codes, decoded, found, ContactRegions.of(self._check.space, found))
         return found.colliding
 
     def separate(
@@ -126,16 +131,16 @@ class Contacts:
         codes: FloatArray,
         decoded: FloatArray,
         found: SelfCollisions,
+        regions: ContactRegions,
         allowed: Mapping[int, float] | None = None,
     ) -> None:
         """Add half-spaces in which the deepest contacts of a pose are gone, to first order.
 
         Parameters
         ----------
-        codes, decoded, found : see `contact_slopes`
+        codes, decoded, found, regions : see `contact_slopes`
         allowed : depths that regions may keep, normalised, by their names
         """
-        regions = ContactRegions.of(self._check.space, found)
         deepest, slopes = contact_slopes(self._check.space, codes, decoded, found, regions)
         may_keep = np.array(
             [(allowed or {}).get(int(name), -CLEARANCE) for name in regions.names[deepest]]

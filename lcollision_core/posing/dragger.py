@@ -165,7 +165,7 @@ class PoseDragger:
         self._allowed: dict[int, tuple[float, float]] = {}
         if self._options.solid:
             self._found = check.find(check.exported(self._here.vertices))
-            self._allowed = self._depths(self._found)
+            self._allowed = ContactRegions.of(space, self._found).by_name()
         held = [
             (
                 make_grip(space, pin.vertex, pin.radius),
@@ -294,11 +294,12 @@ class PoseDragger:
             return False
         if self._options.solid:
             found = check.find(check.exported(decoded))
-            depths = self._depths(found)
+            regions = ContactRegions.of(self._space, found)
+            depths = regions.by_name()
             allowed = {name: self._allowed.get(name, (0.0, 0.0)) for name in depths}
             if any(depths[name][1] > (1.0 + _ROUNDING) * allowed[name][1] for name in depths):
                 may_keep = {name: depth for name, (depth, _) in self._allowed.items()}
-                self._contacts.separate(there, decoded, found, may_keep)
+                self._contacts.separate(there, decoded, found, regions, may_keep)
                 return False
             self._found = found
             self._allowed = {
@@ -315,12 +316,6 @@ class PoseDragger:
         if isinstance(self._goal, CodesGoal) or self._options.strength == 0.0:
             return 0.0
         return self._options.strength * (largest_stretch(self._space, decoded) - 1.0)
-
-    def _depths(self, found: SelfCollisions) -> dict[int, tuple[float, float]]:
-        """Return the depth of each region in contact, and the sum of its pairs' squared depths."""
-        regions = ContactRegions.of(self._space, found)
-        values = zip(regions.depth.tolist(), regions.squared_depth.tolist(), strict=True)
-        return dict(zip(regions.names.tolist(), values, strict=True))
 
     def _result(self, miss: float, settled: bool) -> DragStep:
         vertices = exported_vertices(self._here.vertices * self._check.body_size)

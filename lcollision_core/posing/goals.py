@@ -105,7 +105,7 @@ class TwistGoal:
         self._part = Grip(int(inside[0]), 0.0, inside, np.full(len(inside), 1.0 / len(inside)))
         self._space, self._strength = space, strength
         self._pins = [(self._part, self._part.position(decoded)), *pins]
-        self._rows = _rows(space, [self._part, *(pin for pin, _ in self._pins)])
+        self._rows = _rows(space, [pin for pin, _ in self._pins])
         self._arms = self._arms_of(decoded)
         self.axis = long_axis(self._arms)
 
@@ -130,11 +130,11 @@ class TwistGoal:
         across = np.cross(self.axis, arms)
         radius = np.sqrt((across**2).sum() / len(arms))
         left = float(target[0]) - self._angle(arms)
-        rows = self._rows.copy()
-        # The first row is the turn: the mean of the motions across the axis.
-        rows[:3] = 0.0
-        rows[0, self._part.vertices] = across / (radius * len(arms))
-        way = np.array([radius * np.clip(left, -self.reach, self.reach), 0.0, 0.0])
+        # The turn: the mean of the motions across the axis.
+        turn = np.zeros((1, *pose.vertices.shape))
+        turn[0, self._part.vertices] = across / (radius * len(arms))
+        way = np.array([radius * np.clip(left, -self.reach, self.reach)])
+        rows = np.concatenate([turn, self._rows])
         return _squares(self._space, pose, rows, [way, *_drifts(self._pins, pose)], self._strength)
 
 
@@ -188,14 +188,14 @@ def _squares(
     ways: Sequence[FloatArray],
     strength: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Newton of half the squared ways that are left, the first patch's and then the pins'.
+    """Gauss-Newton of half the squared ways that are left, the grip's and then the pins'.
 
     The excess stretch of the edges is one more of them.
     """
     excess, slope = _excess_stretch(space, pose.vertices)
     rows = space.pull_back(pose.codes, np.concatenate([by_vertices, slope[None]]))
     weights = np.full(len(rows), PIN_WEIGHT)
-    weights[:3] = 1.0
+    weights[: len(ways[0])] = 1.0
     weights[-1] = STRETCH_WEIGHT * strength
     weighted = rows * weights[:, None]
     return weighted.T @ rows, -(np.concatenate([*ways, [-excess]]) @ weighted)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.sparse import csgraph
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.meshes.topology import FloatArray, length_graph
+from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.pose_space import PoseSpace
 
 GRIP_RADIUS = 0.03
@@ -91,14 +91,13 @@ def make_grip(space: PoseSpace, vertex: int, radius: float = GRIP_RADIUS) -> Gri
     -----
     A vertex at distance s along the edges weighs (1 - (s / r)^2)^2, the biweight kernel.
     """
-    topology = space.topology
-    if not 0 <= vertex < topology.n_vertices:
+    n_vertices = space.topology.n_vertices
+    if not 0 <= vertex < n_vertices:
         raise LCollisionError.must_be(
-            "the vertex to take hold of", f"0 to {topology.n_vertices - 1}", vertex
+            "the vertex to take hold of", f"0 to {n_vertices - 1}", vertex
         )
     radius = float(np.clip(radius, LEAST_RADIUS, LARGEST_RADIUS))
-    graph = length_graph(topology.edges, space.rest_vertices)
-    along = csgraph.dijkstra(graph, directed=False, indices=vertex, limit=radius)
+    along = csgraph.dijkstra(space.surface_graph, directed=False, indices=vertex, limit=radius)
     # A vertex at the rim weighs nothing.
     weights = np.clip(1.0 - (along / radius) ** 2, 0.0, None) ** 2
     inside = np.flatnonzero(weights > 0.0)

@@ -8,9 +8,10 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_matrix
 
 from lcollision_core.embedding import Embedding
-from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.topology import FloatArray, Topology, length_graph
 
 _JACOBIAN_POSES = 8
 _STIFFENING = 1e-3
@@ -73,6 +74,10 @@ class PoseSpace(Protocol):
     @property
     def longest_edges(self) -> FloatArray:
         """(E,) float64 array: how long each of the topology's edges gets in plausible poses."""
+
+    @property
+    def surface_graph(self) -> csr_matrix:
+        """(V, V) lengths of the edges on the reference, for distances along the surface."""
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes body parts own: (D,)."""
@@ -143,6 +148,11 @@ class LatentPoseSpace:
             lengths = self.topology.edge_lengths(self.decode(row[None])[0])
             np.maximum(longest, lengths, out=longest)
         return longest
+
+    @cached_property
+    def surface_graph(self) -> csr_matrix:
+        """(V, V) lengths of the edges on the reference."""
+        return length_graph(self.topology.edges, self.rest_vertices)
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes belong to domains: (D,); see `Embedding.codes_of`."""
