@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator, Sequence
 from contextlib import suppress
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -60,8 +61,13 @@ def label_on_cluster(
             "labelling on a cluster needs Dask",
             "install it with pip install 'lcollision[cluster]'",
         ) from error
+    connect = partial(Client, scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
     try:
-        client = Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+        try:
+            client = connect()
+        except AssertionError:
+            # On a machine that stalls Dask gives its own thread up; a second one starts afresh.
+            client = connect()
     except (OSError, ValueError, TypeError) as error:
         raise LCollisionError(
             f"no Dask scheduler answers at {scheduler}",

@@ -1,0 +1,99 @@
+"""A character as its file has it: meshes joined for computing, a rig, and clips."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A skeleton with linear blend skinning.
+
+    Vertex v of a pose whose joints have the global transforms G is
+    sum_i weights[v, i] T_j points[v, i] with j = joint_of[v, i] and T_j = G_j rest[j]^-1.
+
+    Attributes
+    ----------
+    joint_names : J names as in the file, unique
+    parents : (J,) int64 array, each joint's parent, -1 for a root; parents come before children
+    rest : (J, 4, 4) float64 array, the joints' global transforms in the rest pose, in the
+        character's frame and unit
+    nodes : (J,) int64 array, the number of each joint's node in the file
+    joint_of : (V, I) int32 array, the joints that move each vertex
+    weights : (V, I) float64 array >= 0, each row sums to 1
+    points : (V, I, 3) float64 array: where each of these joints alone has the vertex in the rest
+        pose; all the same where the rest pose is the bind pose
+    """
+
+    joint_names: tuple[str, ...]
+    parents: npt.NDArray[np.int64]
+    rest: FloatArray
+    nodes: npt.NDArray[np.int64]
+    joint_of: npt.NDArray[np.int32]
+    weights: FloatArray
+    points: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ClipFrames:
+    """Frames of one animation.
+
+    Attributes
+    ----------
+    clip : its name
+    names : N names, as "moves 12", numbered from 0 by frame
+    times : (N,) float64 array, in seconds
+    vertices : (N, V, 3) float64 array, as the file says, in the character's frame and unit
+    transforms : (N, J, 4, 4) float64 array, global transforms of the rig's joints; None without rig
+    """
+
+    clip: str
+    names: tuple[str, ...]
+    times: FloatArray
+    vertices: FloatArray
+    transforms: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Character:
+    """A character, its vertices at equal places with equal weights in all frames joined.
+
+    Attributes
+    ----------
+    name : the file's, without extension
+    source : its file
+    topology : of the joined vertices; faces that joining makes degenerate are left out
+    rest_vertices : (V, 3) float64 array, the rest pose in the file's frame and unit
+    joined : (W,) int64 array: the joined vertex of each of the file's W vertices, in the order of
+        the file's meshes and primitives
+    up : (3,) float64 array, a signed unit axis: what the file says, else a guess
+    up_is_sure : whether the file says so, or the guess leaves no doubt
+    metres : length of the file's unit
+    groups : named meshes and materials, of the joined faces
+    rig : None for one without joints
+    clips : names of its animations
+    sample : (clip, fps) to its frames; None for the clip's own key frames at at most 30 a second
+    notes : sentences on what was changed on reading
+    """
+
+    name: str
+    source: Path
+    topology: Topology
+    rest_vertices: FloatArray
+    joined: npt.NDArray[np.int64]
+    up: FloatArray
+    up_is_sure: bool
+    metres: float
+    groups: tuple[FaceGroup, ...]
+    rig: Rig | None
+    clips: tuple[str, ...]
+    sample: Callable[[str, float | None], ClipFrames]
+    notes: tuple[str, ...] = ()
