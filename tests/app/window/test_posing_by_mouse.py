@@ -51,6 +51,18 @@ RECIPES = (
 )
 
 
+ACROSS = 0.1
+"""Normalised: how far past the middle of the body each hand of crossed arms ends at least."""
+
+CROSSED: tuple[tuple[bool, Point], ...] = (
+    (True, (0.13, -0.22, 1.18)),
+    (False, (-0.13, -0.22, 1.12)),
+    (True, (0.20, -0.20, 1.18)),
+    (False, (-0.20, -0.20, 1.14)),
+)
+"""Drags from the front that cross the arms: whether of the right hand, and where to."""
+
+
 class Hand:
     """Uses the mouse in a window as a person does: clicks menus, double-clicks, drags slowly."""
 
@@ -161,4 +173,32 @@ def test_a_pose_is_made_by_mouse_alone(
     assert document.solid
     assert hand.n_drags <= MOST_DRAGS
     assert miss() < NEAR
+    assert seconds < MOST_SECONDS
+
+
+def test_arms_are_crossed_by_mouse_alone(qtbot: QtBot, body_window: MainWindow) -> None:
+    document = body_window.document
+    document.set_solid(True)
+    hand = Hand(qtbot, body_window)
+    began = time.monotonic()
+    take_picture(body_window, "arms crossed, before")
+    hand.choose_in_bar("Pose", "Pin feet")
+    hand.choose_in_bar("Pose", "Pin hands")
+    hand.look_from("Front")
+    # The hands are the highest pins; the body's left is at positive x.
+    places = {pin.vertex: pin.position for pin in document.pins}
+    hands = sorted(places, key=lambda vertex: places[vertex][2])[-2:]
+    right, left = sorted(hands, key=lambda vertex: places[vertex][0])
+    for number, (is_right, to) in enumerate(CROSSED, 1):
+        hand.put(right if is_right else left, np.array(to))
+        take_picture(body_window, f"arms crossed, drag {number}")
+    rest(qtbot, body_window)
+    seconds = time.monotonic() - began
+    assert document.exact is not None
+    assert not document.exact.colliding
+    assert hand.n_drags <= MOST_DRAGS
+    past = ACROSS * document.model.body_size
+    vertices = shown(body_window)
+    assert vertices[right][0] > past
+    assert vertices[left][0] < -past
     assert seconds < MOST_SECONDS
