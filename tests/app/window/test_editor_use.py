@@ -553,7 +553,7 @@ def test_the_benchmark_refuses_a_model_that_is_not_there(lcollision: Lcollision)
     assert "nobody" in sentence
 
 
-@pytest.mark.usefixtures("signals")
+@pytest.mark.usefixtures("qapp", "signals")
 def test_the_benchmark_ends_where_a_model_cannot_be_opened(home: Path) -> None:
     broken = home / "broken.safetensors"
     broken.write_text("garbage")
