@@ -1,0 +1,181 @@
+"""PC2 and MDD: the vertices of a mesh frame by frame, beside the file of the mesh."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
+from lcollision_core.regular_files import open_regular
+
+POINT_CACHE_SUFFIXES = (".pc2", ".mdd")
+"""Extensions that `read_point_cache` and `write_point_cache` know, in lower case."""
+
+_PC2_MAGIC = b"POINTCACHE2\0"
+_PC2_HEADER = np.dtype(
+    [
+        ("magic", "S12"),
+        ("version", "<i4"),
+        ("n_points", "<i4"),
+        ("start", "<f4"),
+        ("step", "<f4"),
+        ("n_frames", "<i4"),
+    ]
+)
+_MDD_HEADER = np.dtype([("n_frames", ">i4"), ("n_points", ">i4")])
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCache:
+    """The content of a point cache.
+
+    Attributes
+    ----------
+    frames : (N, V, 3) float32 array, read-only, vertices in the order of the mesh, in its unit
+    times : (N,) float64 array: MDD's in seconds, PC2's in frames of a scene whose rate it does
+        not say
+    """
+
+    frames: npt.NDArray[np.float32]
+    times: npt.NDArray[np.float64]
+
+
+def read_point_cache(path: str | os.PathLike[str]) -> PointCache:
+    """Read a point cache; its extension, in any case, says the format.
+
+    What follows the announced frames is left aside: Blender's MDD files hold one frame more.
+
+    Parameters
+    ----------
+    path : a .pc2 or .mdd file
+
+    Raises
+    ------
+    MeshFileError : the file is missing, truncated, of another kind, announces more than it holds,
+        has more than `MAX_FILE_BYTES`, or a coordinate is not finite.
+    """
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > MAX_FILE_BYTES:
+                raise MeshFileError(
+                    f"it is larger than {MAX_FILE_BYTES >> 20} MiB", "keep fewer frames"
+                )
+            cache = _read_mdd(file, size) if _suffix(path) == ".mdd" else _read_pc2(file, size)
+    except (MeshFileError, OSError, MemoryError) as error:
+        reason = error if str(error) else "it needs more memory than there is"
+        raise MeshFileError.unreadable(path, reason, "export the cache again") from error
+    for index, frame in enumerate(cache.frames):
+        if not np.isfinite(frame).all():
+            vertex = int(np.flatnonzero(~np.isfinite(frame).all(axis=1))[0])
+            raise MeshFileError.unreadable(
+                path,
+                f"vertex {vertex} of frame {index} (from 0) is at {frame[vertex].tolist()}, which "
+                "is not finite",
+                "export the cache again",
+            )
+    cache.frames.flags.writeable = False
+    return cache
+
+
+def _read_pc2(file: BinaryIO, size: int) -> PointCache:
+    header = _header(file, _PC2_HEADER, size)
+    if bytes(header["magic"]) != _PC2_MAGIC.rstrip(b"\0"):
+        raise MeshFileError("it does not begin with POINTCACHE2, so it is not a PC2 file")
+    if header["version"] != 1:
+        raise MeshFileError(f"its version is {header['version']}, only 1 is known")
+    frames = _frames(file, header, size - _PC2_HEADER.itemsize, "<f4")
+    times = float(header["start"]) + float(header["step"]) * np.arange(len(frames))
+    return PointCache(frames, _finite(times))
+
+
+def _read_mdd(file: BinaryIO, size: int) -> PointCache:
+    header = _header(file, _MDD_HEADER, size)
+    n_frames = max(int(header["n_frames"]), 0)
+    # Their bytes are counted before any is read.
+    left = size - _MDD_HEADER.itemsize - 4 * n_frames
+    times = file.read(4 * n_frames) if left >= 0 else b""
+    frames = _frames(file, header, left, ">f4")
+    return PointCache(frames, _finite(np.frombuffer(times, ">f4")))
+
+
+def _header(file: BinaryIO, layout: np.dtype[Any], size: int) -> Any:
+    if size < layout.itemsize:
+        raise MeshFileError(f"it has {size} bytes, too few for a point cache")
+    return np.frombuffer(file.read(layout.itemsize), layout)[0]
+
+
+def _frames(file: BinaryIO, header: Any, n_bytes: int, dtype: str) -> npt.NDArray[np.float32]:
+    n_frames, n_points = int(header["n_frames"]), int(header["n_points"])
+    needed = 12 * n_frames * n_points
+    if n_frames < 1 or n_points < 1 or needed > n_bytes:
+        raise MeshFileError(
+            f"it is truncated or damaged: it announces {n_frames} frames of {n_points} vertices, "
+            f"and holds {max(n_bytes, 0)} bytes for them"
+        )
+    data = np.frombuffer(file.read(needed), dtype)
+    return data.astype(np.float32).reshape(n_frames, n_points, 3)
+
+
+def _finite(times: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    if not np.isfinite(times).all():
+        raise MeshFileError("the time of a frame is not finite")
+    return times.astype(np.float64)
+
+
+def write_point_cache(
+    path: str | os.PathLike[str], frames: npt.ArrayLike, fps: float = 30.0
+) -> None:
+    """Write a point cache whole or not at all; its extension, in any case, says the format.
+
+    Frame 0 is at time 0. Both formats hold float32.
+
+    Parameters
+    ----------
+    path : a .pc2 or .mdd file in an existing folder
+    frames : (N, V, 3) array, vertices in the order of the mesh, in its unit
+    fps : frames a second, which MDD stores
+
+    Raises
+    ------
+    ShapeError : another shape, a coordinate that float32 cannot hold, or fps is not above 0.
+    MeshFileError : the extension is unknown, or the file cannot be written.
+    """
+    suffix = _suffix(path)
+    points = np.asarray(frames)
+    if points.ndim != 3 or points.shape[2] != 3 or not points.size:
+        raise ShapeError.must_be("frames", "an (N, V, 3) array, not empty", points.shape)
+    if not 0.0 < fps < np.inf:
+        raise ShapeError.must_be("fps", "a number above 0", fps)
+    n_frames, n_points = points.shape[:2]
+    if not float(np.abs(points).max()) <= _LARGEST:  # NaN too
+        raise ShapeError.must_be("coordinates of frames", "finite in float32", "others")
+    if suffix == ".mdd":
+        times = (np.arange(n_frames) / fps).astype(">f4").tobytes()
+        head = np.array((n_frames, n_points), _MDD_HEADER).tobytes() + times
+    else:
+        head = np.array((_PC2_MAGIC, 1, n_points, 0.0, 1.0, n_frames), _PC2_HEADER).tobytes()
+    with atomic_write(path) as file:
+        file.write(head)
+        for frame in points:
+            file.write(frame.astype(">f4" if suffix == ".mdd" else "<f4").tobytes())
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    suffix = Path(path).suffix.lower()
+    if suffix not in POINT_CACHE_SUFFIXES:
+        raise MeshFileError(
+            "is no point cache",
+            where=path,
+            expected=" or ".join(POINT_CACHE_SUFFIXES),
+            got=suffix or "a name without extension",
+        )
+    return suffix
