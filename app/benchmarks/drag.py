@@ -38,7 +38,7 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.model import PoseModel
 from lcollision_core.posing import DragOptions, Grip, Pin, make_grip
-from lcollision_core.posing.goals import largest_stretch
+from lcollision_core.posing.stretch import largest_stretch
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -218,7 +218,8 @@ def _time_mode(
         reach = np.linalg.norm(model.reference - model.reference[drag.grip.vertex], axis=1)
         moved = np.linalg.norm(after - before, axis=1)[reach > _REST * size]
         rest.append(float(moved.mean()) / size)
-        stretch.append(largest_stretch(model.pose_space, after / size))
+        longest = model.pose_space.longest_edges
+        stretch.append(largest_stretch(after / size, model.topology.edges, longest))
         for pin in drag.pins:
             there = make_grip(model.pose_space, pin.vertex, pin.radius).position(after)
             drifts.append((drag.kind, float(np.linalg.norm(there - pin.position)) / size))

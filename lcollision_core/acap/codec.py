@@ -7,11 +7,12 @@ exact already (rigid, uniformly scaled, flat) are not changed.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_matrix
 
 from lcollision_core.acap.components import component_bridges
 from lcollision_core.acap.consistency import component_roots, consistent_logarithms
@@ -20,6 +21,7 @@ from lcollision_core.acap.features import (
     N_ROTATION,
     gradients_from_features,
     pull_back,
+    pull_back_means,
     push_forward,
 )
 from lcollision_core.acap.gradients import deformation_gradients, fit_rings
@@ -206,16 +208,75 @@ class AcapCodec:
         grad_features = np.empty(at.shape)
 
         def pull_block(start: int, stop: int) -> None:
-            sides = np.empty((self.topology.n_vertices, 3 * (stop - start)))
-            for slot, one in enumerate(given[start:stop]):
-                unload_vertices_transposed(self._poisson, one, slot, sides)
-            substitute(self._poisson, sides)
-            grad_gradients = np.empty((self.topology.n_vertices, 3, 3))
-            for slot, pose in enumerate(range(start, stop)):
-                load_gradients_transposed(self._poisson, sides, slot, grad_gradients)
+            for pose, grad_gradients in enumerate(self._by_gradients(given[start:stop]), start):
                 pull_back(at[pose], grad_gradients, grad_features[pose])
 
         for_blocks(pull_block, len(at), BLOCK_POSES, n_threads)
+        return grad_features
+
+    def means_by_gradients(self, weights: csr_matrix) -> FloatArray:
+        """Differentiate patches' means by the deformation gradients, for `means_vjp`.
+
+        These are the same in every pose, as vertices are linear in deformation gradients.
+
+        Parameters
+        ----------
+        weights : (m, V) sparse matrix; each patch's mean is its row times a pose's vertices
+
+        Returns
+        -------
+        by_gradients : (m, V, 3) float64 array: coordinate a of patch k's mean, whichever a is,
+            changes by by_gradients[k, i] with row a of vertex i's deformation gradient
+
+        Raises
+        ------
+        ShapeError : another number of columns.
+        """
+        n_patches, n_vertices = weights.shape[0], self.topology.n_vertices
+        if weights.shape[1] != n_vertices:
+            raise ShapeError.must_be("weights", f"of shape (m, {n_vertices})", weights.shape)
+        # All coordinates need the same solve, so that of x, y and z serves three patches.
+        padded = np.zeros((n_patches + -n_patches % 3, n_vertices))
+        padded[:n_patches] = weights.toarray()
+        triples = np.ascontiguousarray(padded.reshape(-1, 3, n_vertices).transpose(0, 2, 1))
+        by_gradients = np.empty((len(triples), 3, n_vertices, 3))
+        for start in range(0, len(triples), BLOCK_POSES):
+            solved = self._by_gradients(triples[start : start + BLOCK_POSES])
+            for triple, grad_gradients in enumerate(solved, start):
+                by_gradients[triple] = grad_gradients.transpose(1, 0, 2)
+        return by_gradients.reshape(-1, n_vertices, 3)[:n_patches]
+
+    def means_vjp(
+        self,
+        features: npt.NDArray[Any],
+        by_gradients: FloatArray,
+        grad_vertices: npt.NDArray[Any],
+    ) -> FloatArray:
+        """Differentiate patches' means, and losses by vertices, by one pose's features.
+
+        The means need no solve; the losses need one, as in `decode_vjp`.
+
+        Parameters
+        ----------
+        features : (V, 9) array, where
+        by_gradients : (m, V, 3) float64 array of `means_by_gradients`
+        grad_vertices : (n, V, 3) array, the losses' derivatives by the vertices
+
+        Returns
+        -------
+        grad_features : (3 m + n, V, 9) float64 array: x, y and z of each mean, then the losses
+
+        Raises
+        ------
+        ShapeError : another shape.
+        """
+        at = self._checked(np.asarray(features)[None], N_FEATURES, "features")[0]
+        given = self._checked(grad_vertices, 3, "grad_vertices")
+        n_means = 3 * len(by_gradients)
+        grad_features = np.empty((n_means + len(given), *at.shape))
+        pull_back_means(at, by_gradients, grad_features[:n_means].reshape(-1, 3, *at.shape))
+        for row, grad_gradients in enumerate(self._by_gradients(given), n_means):
+            pull_back(at, grad_gradients, grad_features[row])
         return grad_features
 
     def _sharpened(self, poses: FloatArray) -> FloatArray:
@@ -233,6 +294,21 @@ class AcapCodec:
         substitute(self._poisson, sides)
         for slot, out in enumerate(vertices):
             unload_vertices(self._poisson, sides, slot, out)
+
+    def _by_gradients(self, grad_vertices: FloatArray) -> Iterator[FloatArray]:
+        """Turn n derivatives by (V, 3) vertices into those by (V, 3, 3) deformation gradients.
+
+        The transpose of `_integrate`. All are yielded in the same memory.
+        """
+        n_vertices = self.topology.n_vertices
+        sides = np.empty((n_vertices, 3 * len(grad_vertices)))
+        for slot, one in enumerate(grad_vertices):
+            unload_vertices_transposed(self._poisson, one, slot, sides)
+        substitute(self._poisson, sides)
+        grad_gradients = np.empty((n_vertices, 3, 3))
+        for slot in range(len(grad_vertices)):
+            load_gradients_transposed(self._poisson, sides, slot, grad_gradients)
+            yield grad_gradients
 
     def _checked(self, array: npt.NDArray[Any], width: int, name: str) -> FloatArray:
         shape = np.shape(array)

@@ -150,3 +150,50 @@ def pull_back(features: FloatArray, grad_gradient: FloatArray, grad_features: Fl
         grad_features[i, 6] = h[1, 1]
         grad_features[i, 7] = h[1, 2] + h[2, 1]
         grad_features[i, 8] = h[2, 2]
+
+
+@compiled
+def pull_back_means(
+    features: FloatArray, by_gradients: FloatArray, grad_features: FloatArray
+) -> None:
+    """Write the derivatives of patches' means by the features, given those by T.
+
+    Coordinate a of a mean depends on row a of each T_i only, and in the same way for all three, so
+    that one row stands for the three matrices that `pull_back` would take.
+
+    Parameters
+    ----------
+    features : (V, 9) float64 array
+    by_gradients : (m, V, 3) float64 array, of m patches' means the derivatives by the rows of T
+    grad_features : (m, 3, V, 9) float64 array, overwritten
+    """
+    rotation = np.empty((3, 3))
+    turned = np.empty((3, 3))
+    units = np.eye(3)
+    for i in range(len(features)):
+        x, y, z = features[i, 0], features[i, 1], features[i, 2]
+        exponential(x, y, z, rotation)
+        _, b, c = exponential_coefficients(x * x + y * y + z * z)
+        _stretch_product(rotation, features[i, 3:], turned)
+        for patch in range(len(by_gradients)):
+            g = by_gradients[patch, i]
+            g0, g1, g2 = g[0], g[1], g[2]
+            u0 = turned[0, 0] * g0 + turned[0, 1] * g1 + turned[0, 2] * g2
+            u1 = turned[1, 0] * g0 + turned[1, 1] * g1 + turned[1, 2] * g2
+            u2 = turned[2, 0] * g0 + turned[2, 1] * g1 + turned[2, 2] * g2
+            for a in range(3):
+                out = grad_features[patch, a, i]
+                # As in `pull_back`, p = u x e_a, and the left Jacobian of -log R.
+                e0, e1, e2 = units[a, 0], units[a, 1], units[a, 2]
+                p0, p1, p2 = u1 * e2 - u2 * e1, u2 * e0 - u0 * e2, u0 * e1 - u1 * e0
+                k0, k1, k2 = y * p2 - z * p1, z * p0 - x * p2, x * p1 - y * p0
+                out[0] = p0 - b * k0 + c * (y * k2 - z * k1)
+                out[1] = p1 - b * k1 + c * (z * k0 - x * k2)
+                out[2] = p2 - b * k2 + c * (x * k1 - y * k0)
+                r0, r1, r2 = rotation[a, 0], rotation[a, 1], rotation[a, 2]
+                out[3] = r0 * g0
+                out[4] = r0 * g1 + r1 * g0
+                out[5] = r0 * g2 + r2 * g0
+                out[6] = r1 * g1
+                out[7] = r1 * g2 + r2 * g1
+                out[8] = r2 * g2

@@ -19,9 +19,9 @@ from lcollision_core.posing.goals import (
     Goal,
     PatchGoal,
     TwistGoal,
-    largest_stretch,
 )
 from lcollision_core.posing.grip import Grip, Pin, Twist, make_grip
+from lcollision_core.posing.stretch import largest_stretch
 
 MAX_STEPS = 3
 """Steps of one event: where the pointer leapt, the next events go on."""
@@ -315,7 +315,8 @@ class PoseDragger:
         """Return the excess length of the longest edge, priced; codes may stretch what they do."""
         if isinstance(self._goal, CodesGoal) or self._options.strength == 0.0:
             return 0.0
-        return self._options.strength * (largest_stretch(self._space, decoded) - 1.0)
+        edges, longest = self._space.topology.edges, self._space.longest_edges
+        return self._options.strength * (largest_stretch(decoded, edges, longest) - 1.0)
 
     def _result(self, miss: float, settled: bool) -> DragStep:
         vertices = exported_vertices(self._here.vertices * self._check.body_size)

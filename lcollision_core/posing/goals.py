@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.grip import Grip
 from lcollision_core.posing.parts import long_axis
-from lcollision_core.posing.pose_space import PoseSpace
+from lcollision_core.posing.pose_space import MeanSlopes, PoseSpace
+from lcollision_core.posing.stretch import excess_stretch
 
 PIN_WEIGHT = 100.0
 """Of the squared drift of a pin, against the squared miss of the grip."""
@@ -70,7 +72,8 @@ class PatchGoal:
 
     def __init__(self, space: PoseSpace, grip: Grip, pins: Held, strength: float) -> None:
         self._space, self._pins, self._grip, self._strength = space, pins, grip, strength
-        self._rows = _rows(space, [grip, *(pin for pin, _ in pins)])
+        self._means = _mean_slopes(space, [grip, *(pin for pin, _ in pins)])
+        self._weights = np.array([1.0] * 3 + [PIN_WEIGHT] * 3 * len(pins))
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
         """Measure the distance to the target."""
@@ -79,9 +82,8 @@ class PatchGoal:
     def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `Goal.cost`."""
         way = _shortened(target - self._grip.position(pose.vertices), self.reach)
-        return _squares(
-            self._space, pose, self._rows, [way, *_drifts(self._pins, pose)], self._strength
-        )
+        ways = np.concatenate([way, *_drifts(self._pins, pose)])
+        return _squares(self._space, pose, self._means, ways, self._weights, self._strength)
 
 
 class TwistGoal:
@@ -105,7 +107,8 @@ class TwistGoal:
         self._part = Grip(int(inside[0]), 0.0, inside, np.full(len(inside), 1.0 / len(inside)))
         self._space, self._strength = space, strength
         self._pins = [(self._part, self._part.position(decoded)), *pins]
-        self._rows = _rows(space, [pin for pin, _ in self._pins])
+        self._means = _mean_slopes(space, [pin for pin, _ in self._pins])
+        self._weights = np.array([PIN_WEIGHT] * 3 * len(self._pins) + [1.0])
         self._arms = self._arms_of(decoded)
         self.axis = long_axis(self._arms)
 
@@ -131,11 +134,11 @@ class TwistGoal:
         radius = np.sqrt((across**2).sum() / len(arms))
         left = float(target[0]) - self._angle(arms)
         # The turn: the mean of the motions across the axis.
-        turn = np.zeros((1, *pose.vertices.shape))
-        turn[0, self._part.vertices] = across / (radius * len(arms))
+        turn = np.zeros_like(pose.vertices)
+        turn[self._part.vertices] = across / (radius * len(arms))
         way = np.array([radius * np.clip(left, -self.reach, self.reach)])
-        rows = np.concatenate([turn, self._rows])
-        return _squares(self._space, pose, rows, [way, *_drifts(self._pins, pose)], self._strength)
+        ways = np.concatenate([*_drifts(self._pins, pose), way])
+        return _squares(self._space, pose, self._means, ways, self._weights, self._strength, turn)
 
 
 class CodesGoal:
@@ -163,13 +166,13 @@ class CodesGoal:
         return self._space.metric, -(self._space.metric @ way)
 
 
-def _rows(space: PoseSpace, patches: Sequence[Grip]) -> FloatArray:
-    """Return the (3 n, V, 3) derivatives of n patches' means by the vertices."""
-    rows = np.zeros((len(patches), 3, space.topology.n_vertices, 3))
-    for row, patch in zip(rows, patches, strict=True):
-        for axis in range(3):
-            row[axis, patch.vertices, axis] = patch.weights
-    return rows.reshape(-1, *rows.shape[2:])
+def _mean_slopes(space: PoseSpace, patches: Sequence[Grip]) -> MeanSlopes:
+    """Solve once for the means of all patches that a drag moves or holds."""
+    weights = np.concatenate([patch.weights for patch in patches])
+    vertices = np.concatenate([patch.vertices for patch in patches])
+    ends = np.cumsum([0, *(len(patch.vertices) for patch in patches)])
+    shape = (len(patches), space.topology.n_vertices)
+    return space.mean_slopes(csr_matrix((weights, vertices, ends), shape=shape))
 
 
 def _drifts(pins: Held, pose: Decoded) -> list[FloatArray]:
@@ -184,47 +187,23 @@ def _shortened(way: FloatArray, most: float) -> FloatArray:
 def _squares(
     space: PoseSpace,
     pose: Decoded,
-    by_vertices: FloatArray,
-    ways: Sequence[FloatArray],
+    means: MeanSlopes,
+    ways: FloatArray,
+    weights: FloatArray,
     strength: float,
+    *others: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Newton of half the squared ways that are left, the grip's and then the pins'.
+    """Gauss-Newton of half the weighted squares of the (r,) ways that are left.
 
-    The excess stretch of the edges is one more of them.
+    They are of the means, then of what has the (V, 3) derivatives `others`. The excess stretch of
+    the edges is one more of them.
     """
-    excess, slope = _excess_stretch(space, pose.vertices)
-    rows = space.pull_back(pose.codes, np.concatenate([by_vertices, slope[None]]))
-    weights = np.full(len(rows), PIN_WEIGHT)
-    weights[: len(ways[0])] = 1.0
-    weights[-1] = STRETCH_WEIGHT * strength
+    slope = np.empty_like(pose.vertices)
+    excess = excess_stretch(pose.vertices, space.topology.edges, space.longest_edges, slope)
+    if strength * excess > 0.0:
+        others = (*others, slope)
+        ways = np.append(ways, -excess)
+        weights = np.append(weights, STRETCH_WEIGHT * strength)
+    rows = means(pose.codes, np.array(others).reshape(-1, *pose.vertices.shape))
     weighted = rows * weights[:, None]
-    return weighted.T @ rows, -(np.concatenate([*ways, [-excess]]) @ weighted)
-
-
-def largest_stretch(space: PoseSpace, vertices: FloatArray) -> float:
-    """Return the largest ratio of an edge to its longest length in plausible poses."""
-    lengths = space.topology.edge_lengths(vertices)
-    return float((lengths / space.longest_edges).max())
-
-
-def _excess_stretch(space: PoseSpace, vertices: FloatArray) -> tuple[float, FloatArray]:
-    """Return the root of the sum of squares of what edges are stretched beyond 1, and its slope.
-
-    Returns
-    -------
-    excess : 0 or more
-    slope : (V, 3) float64 array, by the vertices
-    """
-    start, end = space.topology.edges.T
-    along = vertices[end] - vertices[start]
-    longest = space.longest_edges
-    lengths = np.linalg.norm(along, axis=1)
-    over = np.flatnonzero(lengths > longest)
-    beyond = lengths[over] / longest[over] - 1.0
-    excess = float(np.linalg.norm(beyond))
-    slope = np.zeros_like(vertices)
-    if excess > 0.0:
-        by_end = along[over] * (beyond / (excess * lengths[over] * longest[over]))[:, None]
-        np.add.at(slope, end[over], by_end)
-        np.subtract.at(slope, start[over], by_end)
-    return excess, slope
+    return weighted.T @ rows, -(ways @ weighted)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Protocol
 
@@ -12,6 +12,10 @@ from scipy.sparse import csr_matrix
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray, Topology, length_graph
+
+MeanSlopes = Callable[[FloatArray, FloatArray], FloatArray]
+"""Derivatives by the codes, (3 m + n, D), of (D,) codes and (n, V, 3) derivatives by the vertices:
+see `PoseSpace.mean_slopes`."""
 
 _JACOBIAN_POSES = 8
 _STIFFENING = 1e-3
@@ -87,6 +91,20 @@ class PoseSpace(Protocol):
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
+
+    def mean_slopes(self, weights: csr_matrix) -> MeanSlopes:
+        """Prepare the derivatives of patches' means by the codes, for the many poses of a drag.
+
+        Parameters
+        ----------
+        weights : (m, V); row k times a pose's (V, 3) vertices is the mean of patch k
+
+        Returns
+        -------
+        slopes : called with the (D,) codes of a pose and (n, V, 3) further derivatives by its
+            vertices (n may be 0), returns (3 m + n, D) derivatives by its codes: rows 3 k + a are
+            coordinate a of the mean of patch k; the last n are `pull_back` of the further ones
+        """
 
 
 class LatentPoseSpace:
@@ -165,3 +183,7 @@ class LatentPoseSpace:
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
         return self.embedding.pull_back(codes, by_vertices)
+
+    def mean_slopes(self, weights: csr_matrix) -> MeanSlopes:
+        """Solve for patches' means once; see `PoseSpace.mean_slopes`."""
+        return self.embedding.mean_slopes(weights)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.sparse import csr_matrix
 
 from lcollision_core.acap.codec import AcapCodec
 from lcollision_core.acap.scaling import FeatureScaling
@@ -65,8 +66,44 @@ def test_backward_is_the_transpose_of_forward(codec: AcapCodec, features: FloatA
         assert np.array_equal(codec.decode_vjp(fields[one], pulls[one])[0], pulled[pose])
 
 
+@pytest.mark.parametrize("n_patches", [1, 3, 25])
+def test_derivatives_of_means_are_the_central_differences(
+    codec: AcapCodec, features: FloatArray, n_patches: int
+) -> None:
+    rng = np.random.default_rng(5)
+    n_vertices = codec.topology.n_vertices
+    weights = np.where(rng.random((n_patches, n_vertices)) < 0.2, rng.random(n_vertices), 0.0)
+    by_gradients = codec.means_by_gradients(csr_matrix(weights))
+    pulls = rng.normal(size=(2, n_vertices, 3))
+    for at in features:
+        by_features = codec.means_vjp(at, by_gradients, pulls)
+        assert by_features.shape == (3 * n_patches + 2, n_vertices, 9)
+        for tangent in rng.normal(size=(4, n_vertices, 9)):
+            ends = codec.decode(np.stack([at + STEP * tangent, at - STEP * tangent]))
+            moved = (ends[0] - ends[1]) / (2 * STEP)
+            expected = np.append((weights @ moved).ravel(), (pulls * moved).sum(axis=(1, 2)))
+            assert (by_features * tangent).sum(axis=(1, 2)) == pytest.approx(expected, abs=1e-5)
+            assert np.abs(expected).max() > 0.1
+
+
+def test_derivatives_of_means_are_those_of_their_vertices(
+    codec: AcapCodec, features: FloatArray
+) -> None:
+    rng = np.random.default_rng(6)
+    weights = rng.random((2, codec.topology.n_vertices))
+    by_gradients = codec.means_by_gradients(csr_matrix(weights))
+    rows = (weights[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(6, -1, 3)
+    none = np.empty((0, *rows.shape[1:]))
+    for at in features:
+        expected = codec.decode_vjp(np.repeat(at[None], 6, axis=0), rows)
+        by_features = codec.means_vjp(at, by_gradients, none)
+        assert by_features == pytest.approx(expected, abs=1e-13 * np.abs(expected).max())
+
+
 def test_other_shapes_are_refused(codec: AcapCodec, features: FloatArray) -> None:
     n_vertices = codec.topology.n_vertices
+    with pytest.raises(ShapeError, match=r"weights must be of shape \(m, "):
+        codec.means_by_gradients(csr_matrix((1, n_vertices + 1)))
     with pytest.raises(ShapeError, match="features must be of shape"):
         codec.decode(np.zeros((1, n_vertices - 1, 9)))
     with pytest.raises(ShapeError, match="tangents must be of shape"):

@@ -1,0 +1,46 @@
+"""Slopes of patches' means that are solved for once, against those of vertices and differences."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.model import PoseModel, sample_poses
+
+
+def patches(model: PoseModel) -> FloatArray:
+    """Return the (4, V) weights of four means over a tenth of the vertices each."""
+    generator = np.random.default_rng(0)
+    weights = generator.random((4, model.n_vertices))
+    weights[generator.random(weights.shape) > 0.1] = 0.0
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def test_mean_slopes_are_those_of_vertices(tube_model: PoseModel) -> None:
+    space, weights = tube_model.pose_space, patches(tube_model)
+    slopes = space.mean_slopes(csr_matrix(weights))
+    rows = (weights[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(12, -1, 3)
+    others = np.random.default_rng(1).normal(size=(2, tube_model.n_vertices, 3))
+    for codes in sample_poses(tube_model, 3, seed=4):
+        for further in (others, others[:0]):
+            expected = space.pull_back(codes, np.concatenate([rows, further]))
+            found = slopes(codes, further)
+            assert found.shape == (12 + len(further), len(codes))
+            np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_mean_slopes_are_those_of_differences(tube_model: PoseModel) -> None:
+    # The decoder's features are float32, so the step must be far above their rounding.
+    step = 1e-2
+    space, weights = tube_model.pose_space, patches(tube_model)
+    codes = sample_poses(tube_model, 1, seed=4)[0]
+    slopes = space.mean_slopes(csr_matrix(weights))(codes, np.empty((0, tube_model.n_vertices, 3)))
+    differences = np.empty_like(slopes)
+    for code, unit in enumerate(np.eye(len(codes))):
+        decoded = space.decode(codes + step * np.array([[2.0], [1.0], [-1.0], [-2.0]]) * unit)
+        along = (-decoded[0] + 8.0 * decoded[1] - 8.0 * decoded[2] + decoded[3]) / (12.0 * step)
+        differences[:, code] = (weights @ along).ravel()
+    scale = np.abs(slopes).max()
+    assert scale > 0.001
+    np.testing.assert_allclose(slopes, differences, atol=2e-3 * scale)
