@@ -295,7 +295,7 @@ class Session(QObject):
     def _core_times(self) -> dict[str, Any]:
         model, latent = self._document.model, self._document.latent
         predict = None
-        if model.predictor is not None:
+        if model.has_predictor:
             predict = 1e3 * median_seconds([lambda: model.predict(latent)] * _REPEATS)
         decode = median_seconds([lambda: model.decode(latent, n_threads=1)] * _REPEATS)
         return {

@@ -16,7 +16,7 @@ from app.wording import counted, mirrored_text
 from lcollision_core.errors import ModelFileError
 
 if TYPE_CHECKING:
-    from lcollision_core.model import MirroredPose, PoseModel
+    from lcollision_core.model import MirroredPose, PosableBody
 
 
 def mirror(
@@ -32,10 +32,10 @@ def mirror(
     that is free of collisions by the exact check, and whose image is not, is resolved; exits with
     1 where that fails.
     """
-    from lcollision_core.model import PoseModel, read_poses
+    from lcollision_core.model import open_body, read_poses
 
     destination = require_output(output, ".json")
-    model = PoseModel.load(model_name)
+    model = open_body(model_name)
     named = read_poses(poses, model)
     if not named:
         raise ModelFileError("has no poses in it", "name a file that has some", where=poses)
@@ -69,7 +69,7 @@ def mirror(
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
-def _row(model: PoseModel, source: str, output: Path, mirrored: MirroredPose) -> dict[str, Any]:
+def _row(model: PosableBody, source: str, output: Path, mirrored: MirroredPose) -> dict[str, Any]:
     names = ("restored", "fit_error_mean", "fit_error_max")
     pairs = ("pairs_before", "pairs_mirrored", "pairs_after")
     return {

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.model import NamedPose, PosableBody
 
 _SECONDS_BETWEEN_WRITES = 5.0
 _MAX_STEM_BYTES = 200
@@ -36,7 +36,7 @@ class UnfinishedPoses:
     finished : what is done, by index: a pose, and JSON values that come with it
     """
 
-    def __init__(self, path: Path, model: PoseModel, key: str, total: int) -> None:
+    def __init__(self, path: Path, model: PosableBody, key: str, total: int) -> None:
         self.path = path
         self.finished: dict[int, tuple[NamedPose, Mapping[str, Any]]] = {}
         self._model, self._key, self._total = model, key, total
@@ -111,7 +111,7 @@ class UnfinishedPoses:
 @contextmanager
 def unfinished_poses(
     output: Path,
-    model: PoseModel,
+    model: PosableBody,
     arrays: Mapping[str, npt.NDArray[np.generic]],
     options: Mapping[str, Any],
     total: int,

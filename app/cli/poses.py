@@ -39,15 +39,15 @@ def encode(
     import numpy as np
 
     from lcollision_core.model import (
-        PoseModel,
         encode_mesh,
         name_of_file,
+        open_body,
         read_model_mesh,
         unique_names,
     )
 
     destination = require_output(output, ".json")
-    model = PoseModel.load(model_name)
+    model = open_body(model_name)
     files = [read_model_mesh(path, model) for path in expanded(meshes)]
     names = unique_names(name_of_file(mesh.source) for mesh in files)
     vertices = np.stack([mesh.vertices for mesh in files])
@@ -99,7 +99,7 @@ def decode(
     importer begins with: y-up; blender; maya and unreal, in centimetres. A GLB file is y up and
     in the model's unit whatever is asked for, as its standard fixes both.
     """
-    from lcollision_core.model import PoseModel, read_poses
+    from lcollision_core.model import open_body, read_poses
 
     destination = output_named(output)
     if destination.form == "poses" and (axes != "model" or scale is not None):
@@ -108,7 +108,7 @@ def decode(
             "name a mesh or a folder",
             where=output,
         )
-    model = PoseModel.load(model_name)
+    model = open_body(model_name)
     named = read_poses(poses, model)
     require_format_holds(destination, model, named, mesh_format)
     write_result(destination, model, named, mesh_format, axes=axes, scale=scale)
@@ -125,10 +125,10 @@ def sample(
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal poses.")] = 0,
 ) -> None:
     """Draw latent poses from the box of 1.2 times the training range."""
-    from lcollision_core.model import NamedPose, PoseModel, sample_poses
+    from lcollision_core.model import NamedPose, open_body, sample_poses
 
     destination = require_output(output, ".json")
-    model = PoseModel.load(model_name)
+    model = open_body(model_name)
     with progress_bar("Drawing poses") as progress:
         latent = sample_poses(model, count, seed, colliding, progress)
     width = len(str(count))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from lcollision_core.meshes import FileStamp
-    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.model import NamedPose, PosableBody
 
 
 MeshFormat = Literal["obj", "ply", "off", "stl", "glb"]
@@ -73,7 +73,7 @@ def require_output(path: Path, suffix: str) -> Output:
     return Output(path, "poses", file_stamp(path))
 
 
-def note_near_exclusion(model: PoseModel) -> None:
+def note_near_exclusion(model: PosableBody) -> None:
     """Report the pairs of faces that the figures leave out, if any."""
     if model.near_exclusion:
         note(
@@ -139,7 +139,7 @@ def require_one_mesh(output: Output, n_poses: int) -> None:
 
 def require_format_holds(
     output: Output,
-    model: PoseModel,
+    model: PosableBody,
     poses: Sequence[NamedPose],
     mesh_format: MeshFormat = "obj",
 ) -> None:
@@ -162,7 +162,7 @@ def require_format_holds(
 
 def write_result(
     output: Output,
-    model: PoseModel,
+    model: PosableBody,
     poses: Sequence[NamedPose],
     mesh_format: MeshFormat = "obj",
     vertices: Sequence[npt.NDArray[np.floating]] | None = None,

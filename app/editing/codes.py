@@ -12,7 +12,7 @@ from app.editing.history import PoseHistory
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
-    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.model import NamedPose, PosableBody
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class CodeEditing(PoseHistory):
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
-        self._model: PoseModel | None = None
+        self._model: PosableBody | None = None
         self.locked_domains: frozenset[int] = frozenset()
 
     @property
@@ -39,7 +39,7 @@ class CodeEditing(PoseHistory):
         return self._model is not None
 
     @property
-    def model(self) -> PoseModel:
+    def model(self) -> PosableBody:
         """The model that the pose belongs to."""
         if self._model is None:
             raise LCollisionError("no model is open yet", "open one first")
@@ -98,7 +98,7 @@ class CodeEditing(PoseHistory):
 
     def reset_domain(self, domain: int) -> None:
         """Set all numbers of a domain to 0: its own, and its entry of the whole body."""
-        codes = self.model.embedding.codes_of([domain])
+        codes = self.model.pose_space.codes_of([domain])
         self._set_codes(f"Reset {self.model.domain_names[domain]}", codes, 0.0)
 
     def _set_codes(self, label: str, codes: Any, value: float, run: int | None = None) -> None:
@@ -144,4 +144,4 @@ class CodeEditing(PoseHistory):
 
     def _with_locked(self, latent: FloatArray) -> FloatArray:
         """Return the latent with the current codes of locked domains."""
-        return np.where(self.model.embedding.codes_of(self.locked_domains), self.latent, latent)
+        return np.where(self.model.pose_space.codes_of(self.locked_domains), self.latent, latent)

@@ -24,7 +24,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleEr
 
 if TYPE_CHECKING:
     from lcollision_core.meshes import FileStamp
-    from lcollision_core.model import MirroredPose, NamedPose, OtherModelError, PoseModel
+    from lcollision_core.model import MirroredPose, NamedPose, OtherModelError, PosableBody
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
@@ -89,7 +89,7 @@ class PoseDocument(LiveEditing):
 
     def __init__(
         self,
-        model: PoseModel | None = None,
+        model: PosableBody | None = None,
         parent: QObject | None = None,
         library_folder: Path | None = None,
     ) -> None:
@@ -193,7 +193,7 @@ class PoseDocument(LiveEditing):
 
     # Models and files.
 
-    def set_model(self, model: PoseModel) -> None:
+    def set_model(self, model: PosableBody) -> None:
         """Load another model, with a new pose and the user's library of it.
 
         Parameters
@@ -552,7 +552,7 @@ class PoseDocument(LiveEditing):
             work = partial(jobs.load_predictor, self.model)
             self._loading = self._long.start("Loading predictions", work, self._on_predictor)
 
-    def _on_predictor(self, model: PoseModel) -> None:
+    def _on_predictor(self, model: PosableBody) -> None:
         if model is self._model:
             self._predicts = True
             if self._drag is None:

@@ -28,7 +28,7 @@ from lcollision_core.meshes import atomic_write
 from lcollision_core.regular_files import read_regular, require_regular
 
 if TYPE_CHECKING:
-    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.model import NamedPose, PosableBody
 
 _log = logging.getLogger(__name__)
 
@@ -278,7 +278,7 @@ class Autosave(QObject):
             if self._session is not None:
                 self._session.discard()
             self._session = lost.session
-            for domain in range(self._document.model.embedding.n_domains):
+            for domain in range(len(self._document.model.domain_names)):
                 self._document.set_locked(domain, domain in lost.locked)
 
     def _on_written(self, is_kept: bool) -> None:
@@ -297,7 +297,7 @@ class Autosave(QObject):
 def _write(
     folder: Path,
     session: dict[str, Any],
-    model: PoseModel,
+    model: PosableBody,
     file_poses: tuple[NamedPose, ...],
     working: NamedPose,
     _: Progress,

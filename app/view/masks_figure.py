@@ -14,14 +14,14 @@ from app.view.palettes import LIGHT
 from app.view.shading import mask_colours
 
 if TYPE_CHECKING:
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PosableBody
 
 _VIEW_WIDTH, _VIEW_HEIGHT = 900, 1300
 _LEGEND_COLUMN, _LEGEND_ROW = 425, 52
 _MARGIN = 50
 
 
-def draw_masks(model: PoseModel, path: str | os.PathLike[str]) -> None:
+def draw_masks(model: PosableBody, path: str | os.PathLike[str]) -> None:
     """Draw the reference from two sides, each domain in its colour, stronger where it owns more.
 
     Parameters

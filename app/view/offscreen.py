@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
     from app.view.palettes import Theme
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PosableBody
 
 _NOTHING = "#000000"
 """Behind a cut-out picture: adds nothing to the pixels that a rim covers in part."""
@@ -32,7 +32,7 @@ class PoseRenderer:
     """
 
     def __init__(
-        self, model: PoseModel, width: int, height: int, theme: Theme, transparent: bool = False
+        self, model: PosableBody, width: int, height: int, theme: Theme, transparent: bool = False
     ) -> None:
         import pyvista as pv
         from vtkmodules.vtkCommonCore import vtkLogger

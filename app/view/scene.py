@@ -17,7 +17,7 @@ from app.view.surface import Surface, actor_of
 
 if TYPE_CHECKING:
     from app.view.palettes import Theme
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PosableBody
     from lcollision_core.posing import Grip
 
 _GHOST_OPACITY = 0.4
@@ -39,7 +39,7 @@ class Scene:
     theme : whose colours are used
     """
 
-    def __init__(self, plotter: pv.BasePlotter, model: PoseModel, theme: Theme) -> None:
+    def __init__(self, plotter: pv.BasePlotter, model: PosableBody, theme: Theme) -> None:
         self._renderer = plotter.renderer
         self._renderer.RemoveAllViewProps()
         self._faces, self._mask = model.faces, model.attention_mask

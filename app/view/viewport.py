@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.view.canvas import Canvas
     from app.view.scene import Scene
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PosableBody
     from lcollision_core.resolve import ResolveResult
 
 _GROWTH = 1.15
@@ -93,7 +93,7 @@ class Viewport(QWidget):
         self.mouse: Mouse | None = None
         self.scene: Scene | None = None
         self._shader: Shader | None = None
-        self._model: PoseModel | None = None
+        self._model: PosableBody | None = None
         self.shown_frame: LiveFrame | None = None
         self._pose_stale = self._colours_stale = self._crossing_stale = False
         self._place_camera = False
@@ -281,7 +281,7 @@ class Viewport(QWidget):
         view = None
         if self.scene is not None:
             # The same body with other names or colours is looked at as before.
-            is_same = self._model is not None and self._model.embedding is model.embedding
+            is_same = self._model is not None and self._model.topology is model.topology
             view = self.scene.view if is_same else None
         self.scene = Scene(self.canvas, model, current_theme())
         self._model = model

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from app.window.main_window import MainWindow
-    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.model import NamedPose, PosableBody
 
 _log = logging.getLogger(__name__)
 
@@ -118,7 +118,7 @@ def last_model(remembered: str) -> str:
     return remembered if bundled.is_file() or Path(remembered).is_file() else DEFAULT_MODEL
 
 
-def opening_pose(model: PoseModel) -> NamedPose:
+def opening_pose(model: PosableBody) -> NamedPose:
     """Return a pose worth looking at.
 
     The first of the bundled file of poses with the name of the model; for a model without

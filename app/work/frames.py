@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 if TYPE_CHECKING:
     from lcollision_core.contact import SelfCollisions
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PosableBody
     from lcollision_core.posing import PoseDragger
 
 Float32Array = npt.NDArray[np.float32]
@@ -122,7 +122,7 @@ class FrameEvaluator:
     predicts : whether frames get predictions, as far as the model has a predictor
     """
 
-    def __init__(self, model: PoseModel) -> None:
+    def __init__(self, model: PosableBody) -> None:
         self.model = model
         self.predicts = True
         self._checks: deque[float] = deque(maxlen=_CHECKS)
@@ -172,7 +172,7 @@ class FrameEvaluator:
             verdict = ExactVerdict.of(found, request_id)
         elif self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS:
             verdict = self._checked(vertices, request_id)
-        predicts = self.predicts and self.model.predictor is not None
+        predicts = self.predicts and self.model.has_predictor
         return LiveFrame(
             request_id=request_id,
             latent=latent,
@@ -208,13 +208,13 @@ class FrameEvaluator:
         return vertex_normals(vertices, self.model.faces)
 
 
-def keep_torch_to_one_thread(model: PoseModel) -> None:
+def keep_torch_to_one_thread(model: PosableBody) -> None:
     """Let torch use one core in the calling thread: a single pose is too small to parallelise.
 
     On a busy machine torch's threads wait for each other: one prediction took 32 ms instead of
     0.4. Does nothing for a model whose predictions of a pose need no torch.
     """
-    if model.predictor is not None and model.predictor.needs_torch:
+    if model.prediction_needs_torch:
         import torch
 
         torch.set_num_threads(1)

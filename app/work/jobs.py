@@ -24,8 +24,8 @@ if TYPE_CHECKING:
         MirroredPose,
         NamedPose,
         OtherModelError,
+        PosableBody,
         PoseFile,
-        PoseModel,
     )
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
@@ -37,7 +37,7 @@ FloatArray = npt.NDArray[np.float64]
 class OpenedModel:
     """A model and the file that it was read from, or written to."""
 
-    model: PoseModel
+    model: PosableBody
     file: str
 
 
@@ -78,16 +78,16 @@ class PartEdits:
 
 def open_model(name_or_path: str | Path, _: Progress, cancel: CancelToken) -> OpenedModel:
     """Read a model and use it once, so that nothing is left to compile before the first frame."""
-    from lcollision_core.model import PoseModel, find_model
+    from lcollision_core.model import find_model, open_body
 
     path = find_model(name_or_path).absolute()
-    model = PoseModel.load(path)
+    model = open_body(path)
     cancel.raise_if_cancelled()
     warm_up(model)
     return OpenedModel(model, str(path))
 
 
-def warm_up(model: PoseModel) -> None:
+def warm_up(model: PosableBody) -> None:
     """Compute once, in another thread, what the first frames need apart from predictions."""
     evaluator = FrameEvaluator(model)
     evaluator.predicts = False
@@ -99,7 +99,7 @@ def warm_up(model: PoseModel) -> None:
         _drag_once(model)
 
 
-def _drag_once(model: PoseModel) -> None:
+def _drag_once(model: PosableBody) -> None:
     """Compile a drag, and compute its metric: the latter takes seconds for a large mesh."""
     from lcollision_core.posing import make_grip
 
@@ -108,7 +108,7 @@ def _drag_once(model: PoseModel) -> None:
     dragger.move(model.reference[0])
 
 
-def load_predictor(model: PoseModel, _: Progress, __: CancelToken) -> PoseModel:
+def load_predictor(model: PosableBody, _: Progress, __: CancelToken) -> PosableBody:
     """Load the predictor and use it once, then a drag: compiling and importing may take seconds."""
     keep_torch_to_one_thread(model)
     model.predict(np.zeros(model.latent_size))
@@ -117,7 +117,7 @@ def load_predictor(model: PoseModel, _: Progress, __: CancelToken) -> PoseModel:
 
 
 def read_poses(
-    model: PoseModel | None,
+    model: PosableBody | None,
     model_file: str | Path,
     path: Path,
     progress: Progress,
@@ -148,7 +148,7 @@ def read_poses(
 
 
 def encode(
-    model: PoseModel, path: Path, scale: float, _: Progress, cancel: CancelToken
+    model: PosableBody, path: Path, scale: float, _: Progress, cancel: CancelToken
 ) -> NamedPose | WrongScaleError:
     """Read a mesh of a model's topology as a latent pose, named after its file.
 
@@ -166,7 +166,7 @@ def encode(
 
 
 def mirror_poses(
-    model: PoseModel, poses: Sequence[NamedPose], progress: Progress, cancel: CancelToken
+    model: PosableBody, poses: Sequence[NamedPose], progress: Progress, cancel: CancelToken
 ) -> list[tuple[NamedPose, MirroredPose]]:
     """Return the mirror images of poses, and a remark on each."""
     from lcollision_core.model import MAX_POSE_NAME_LENGTH
@@ -181,7 +181,7 @@ def mirror_poses(
 
 
 def export(
-    model: PoseModel,
+    model: PosableBody,
     pose: NamedPose,
     outcome: ResolveResult | None,
     path: Path,
@@ -211,7 +211,7 @@ def export(
 
 
 def resolve(
-    model: PoseModel,
+    model: PosableBody,
     latent: FloatArray,
     placement: RigidTransform | None,
     options: ResolveOptions,
@@ -245,11 +245,18 @@ def is_bundled(model_file: str) -> bool:
 
 
 def edit_parts(
-    model: PoseModel, model_file: str, edits: PartEdits, _: Progress, __: CancelToken
+    model: PosableBody, model_file: str, edits: PartEdits, _: Progress, __: CancelToken
 ) -> OpenedModel:
-    """Write a model's parts into its file, as that is now, or into a copy of the user's own."""
+    """Write a model's parts into its file, as that is now, or into a copy of the user's own.
+
+    Those of a character, whose file is not ours, change in the window alone.
+    """
     from lcollision_core.meshes import locked
-    from lcollision_core.model import change_model, model_destination
+    from lcollision_core.model import PoseModel, change_model, model_destination
+
+    if not isinstance(model, PoseModel):
+        changed = model.edit_domains(edits.names, edits.colours, edits.order)
+        return OpenedModel(changed, model_file)
 
     def change(held: PoseModel) -> PoseModel:
         if held.fingerprint != model.fingerprint:

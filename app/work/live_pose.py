@@ -19,7 +19,7 @@ from app.work.threads import Response, end_thread, guarded, single_shot, started
 
 if TYPE_CHECKING:
     from lcollision_core.meshes import RigidTransform
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PosableBody
     from lcollision_core.posing import DragOptions, Grip, Pin, PoseDragger, Twist
 
 _QUICK_SECONDS = 0.012
@@ -45,7 +45,7 @@ class FrameRequest:
     """
 
     request_id: int
-    model: PoseModel
+    model: PosableBody
     latent: npt.NDArray[np.float64]
     predicts: bool
 
@@ -63,7 +63,7 @@ class DragSession:
     placement : where the pose is exported to
     """
 
-    model: PoseModel
+    model: PosableBody
     latent: npt.NDArray[np.float64]
     grip: Grip | Twist | None
     pins: tuple[Pin, ...]
@@ -88,7 +88,7 @@ class DragRequest:
     predicts: bool
 
     @property
-    def model(self) -> PoseModel:
+    def model(self) -> PosableBody:
         """The model of the drag."""
         return self.session.model
 
@@ -98,7 +98,7 @@ class VerdictRequest:
     """Ask for the exact check of a frame that is on the screen."""
 
     request_id: int
-    model: PoseModel
+    model: PosableBody
     frame: LiveFrame
 
 
@@ -199,7 +199,7 @@ class LivePose(QObject):
         self._thread = started_thread("live pose", self._worker, self)
         self._wanted.connect(self._worker.answer)
         self._worker.answered.connect(self._on_answered)
-        self._model: PoseModel | None = None
+        self._model: PosableBody | None = None
         self._session: DragSession | None = None
         self._least_miss, self._n_idle = np.inf, 0
         self._next: FrameRequest | DragRequest | None = None
@@ -214,7 +214,7 @@ class LivePose(QObject):
         self._due.connect(self._on_due, Qt.ConnectionType.QueuedConnection)
         self._rested = single_shot(self, rest_milliseconds, self._ask)
 
-    def follow(self, model: PoseModel, latent: npt.NDArray[np.float64], predicts: bool) -> None:
+    def follow(self, model: PosableBody, latent: npt.NDArray[np.float64], predicts: bool) -> None:
         """Request the frame, and later the exact check, of another pose; a drag ends.
 
         Parameters

@@ -21,6 +21,8 @@ from lcollision_core.model.model_store import (
     user_models_folder,
 )
 from lcollision_core.model.naming import MAX_POSE_NAME_LENGTH, unique_names
+from lcollision_core.model.open_body import open_body
+from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_file import (
     MAX_PINS,
     MAX_TAGS,

@@ -10,14 +10,14 @@ import numpy.typing as npt
 
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import Mesh, read_mesh
+from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_file import NamedPose, name_of_file
-from lcollision_core.model.pose_model import PoseModel
 
 if TYPE_CHECKING:
     from lcollision_core.resolve import ResolveResult
 
 
-def read_model_mesh(path: str | os.PathLike[str], model: PoseModel) -> Mesh:
+def read_model_mesh(path: str | os.PathLike[str], model: PosableBody) -> Mesh:
     """Read a mesh file and refuse it where its topology is not the model's.
 
     Raises
@@ -31,14 +31,14 @@ def read_model_mesh(path: str | os.PathLike[str], model: PoseModel) -> Mesh:
 
 
 def encode_mesh(
-    mesh: Mesh, model: PoseModel, scale: float = 1.0, cancel: CancelToken | None = None
+    mesh: Mesh, model: PosableBody, scale: float = 1.0, cancel: CancelToken | None = None
 ) -> NamedPose:
     """Find the latent pose nearest to a mesh, and name it after the mesh's file.
 
     Parameters
     ----------
     mesh : of the model's topology, by `read_model_mesh`
-    model, scale, cancel : see `PoseModel.encode`, which raises the same errors
+    model, scale, cancel : see `PosableBody.encode`, which raises the same errors
     """
     encoded = model.encode(mesh.vertices, cancel, scale)
     return NamedPose(
@@ -51,7 +51,7 @@ def encode_mesh(
 
 
 def with_detail(
-    model: PoseModel, mesh: npt.NDArray[np.float64], pose: NamedPose, result: ResolveResult
+    model: PosableBody, mesh: npt.NDArray[np.float64], pose: NamedPose, result: ResolveResult
 ) -> npt.NDArray[np.float64] | None:
     """Move a mesh by the displacement that Resolve gave its encoded pose, to keep its detail.
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.meshes import RigidTransform, as_stored, write_mesh
-from lcollision_core.model.pose_model import PoseModel
+from lcollision_core.model.posable_body import PosableBody
 
 _AXES = np.eye(3)
 _X, _Y, _Z = _AXES
@@ -70,7 +70,7 @@ class ExportFrame:
 
 
 def export_frame(
-    model: PoseModel, axes: str, path: str | os.PathLike[str], scale: float | None = None
+    model: PosableBody, axes: str, path: str | os.PathLike[str], scale: float | None = None
 ) -> ExportFrame:
     """Return the axes and the unit that a file gets.
 
@@ -104,7 +104,7 @@ def export_frame(
 
 def export_mesh(
     path: str | os.PathLike[str],
-    model: PoseModel,
+    model: PosableBody,
     vertices: npt.NDArray[Any],
     placement: RigidTransform | None = None,
     frame: ExportFrame | None = None,

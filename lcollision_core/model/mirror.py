@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.model.matching import sorted_faces
 
 if TYPE_CHECKING:
     from lcollision_core.posing import ExactCheck, Pin
-    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
+    from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -138,20 +138,22 @@ def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | No
 
 @dataclass(frozen=True, eq=False)
 class PoseMirror:
-    """Exchanges left and right of one model's poses; immutable, safe between threads.
+    """Exchanges left and right of one body's poses; immutable, safe between threads.
 
     Attributes
     ----------
-    embedding : decodes latent poses, and finds those of meshes
-    symmetry : of the mesh, in the data's unit
-    check : the exact check of the model's poses
-    resolver : of what collides in the mirror only; None leaves it colliding
+    attention_mask : (K, V) float32 array
+    symmetry : of the mesh, in the body's unit
+    check : the exact check of the body's poses
+    nearest : finds the codes of (V, 3) normalised vertices, in place
+    resolve : `PosableBody.resolve`, for what collides in the mirror only; None leaves it colliding
     """
 
-    embedding: Embedding
+    attention_mask: npt.NDArray[np.float32]
     symmetry: Symmetry
     check: ExactCheck
-    resolver: PoseResolver | None
+    nearest: Callable[[FloatArray, CancelToken | None], FloatArray]
+    resolve: Callable[..., ResolveResult] | None
 
     def mirror(
         self,
@@ -179,7 +181,7 @@ class PoseMirror:
 
         Raises
         ------
-        ShapeError, LCollisionError, CancelledError : as of `PoseModel.resolve`.
+        ShapeError, LCollisionError, CancelledError : as of `PosableBody.resolve`.
         """
         pose, size = np.array(latent, dtype=np.float64), self.check.body_size
         check = replace(self.check, placement=placement)
@@ -193,18 +195,17 @@ class PoseMirror:
         else:
             # With the placement fixed: a fitted rigid motion would have to be undone, and the
             # codes hold it nearly as well.
-            fit = self.embedding.encode(image, cancel, in_place=True)
-            found = fit.latent.astype(np.float64)
+            found = self.nearest(image, cancel)
         check = replace(check, placement=image_placement)
         mirrored = check.decode(found)[0]
         pairs_mirrored = pairs_after = len(check.find(check.exported(mirrored)).pairs)
         resolution = None
-        if not restored and pairs_before == 0 < pairs_mirrored and self.resolver is not None:
-            resolution = self.resolver.resolve(found, options, progress, cancel, image_placement)
+        if not restored and pairs_before == 0 < pairs_mirrored and self.resolve is not None:
+            resolution = self.resolve(found, options, progress, cancel, image_placement)
             if resolution.exactly_free:
                 found, pairs_after = resolution.latent, 0
                 mirrored = check.decode(found)[0]
-        picked = self.embedding.topology.picked
+        picked = self.check.space.topology.picked
         distances = np.linalg.norm((mirrored - image)[picked], axis=1)
         return MirroredPose(
             latent=found,
@@ -221,7 +222,7 @@ class PoseMirror:
 
     def partner(self, domain: int) -> int | None:
         """Return the domain on the other side; None for one in the middle, or unlike any other."""
-        mask = self.embedding.attention_mask
+        mask = self.attention_mask
 
         def image(of: int) -> int:
             return int((mask @ mask[of, self.symmetry.partner]).argmax())
@@ -252,10 +253,10 @@ class PoseMirror:
         """
         size = self.check.body_size
         image = self.symmetry.image(self.check.decode(latent)[0] * size) / size
-        fit = self.embedding.encode(image, cancel, in_place=True)
+        mirrored = self.nearest(image, cancel)
         other = self.partner(domain)
-        own = self.embedding.codes_of([] if other is None else [other])
-        return np.where(own, fit.latent, latent).astype(np.float64)
+        own = self.check.space.codes_of([] if other is None else [other])
+        return np.where(own, mirrored, latent)
 
 
 def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int) -> Symmetry | None:

@@ -20,7 +20,7 @@ from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry, pose_bytes
 from lcollision_core.model.model_store import ListedModel, user_models_folder
 from lcollision_core.model.naming import MAX_POSE_NAME_LENGTH, unique_names
-from lcollision_core.model.pose_model import PoseModel
+from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.regular_files import read_regular
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ class OtherModelError(ModelFileError):
 
 def write_poses(
     path: str | os.PathLike[str],
-    model: PoseModel,
+    model: PosableBody,
     poses: Sequence[NamedPose],
     working: NamedPose | None = None,
     extra: Mapping[str, Any] | None = None,
@@ -203,7 +203,7 @@ def write_poses(
         raise ModelFileError.like(error) from error
 
 
-def read_poses(path: str | os.PathLike[str], model: PoseModel) -> tuple[NamedPose, ...]:
+def read_poses(path: str | os.PathLike[str], model: PosableBody) -> tuple[NamedPose, ...]:
     """Read all latent poses of a file, the working pose among them: `PoseFile.all_poses`.
 
     Raises
@@ -213,7 +213,7 @@ def read_poses(path: str | os.PathLike[str], model: PoseModel) -> tuple[NamedPos
     return read_pose_file(path, model).all_poses
 
 
-def read_pose_file(path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
+def read_pose_file(path: str | os.PathLike[str], model: PosableBody) -> PoseFile:
     """Read latent poses of a model.
 
     Raises
@@ -254,7 +254,7 @@ def name_of_file(path: Path) -> str:
     return stem[:MAX_POSE_NAME_LENGTH]
 
 
-def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> PoseFile:
+def _parse(document: Any, path: str | os.PathLike[str], model: PosableBody) -> PoseFile:
     if not isinstance(document, dict) or document.get("format") != POSES_FORMAT:
         raise DamagedPosesError(
             "is not an LCollision pose file", "name a file that lcollision wrote", where=path
@@ -288,7 +288,7 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PoseModel) -> Pos
 
 
 def _other_model(
-    path: str | os.PathLike[str], owner: dict[str, Any], model: PoseModel
+    path: str | os.PathLike[str], owner: dict[str, Any], model: PosableBody
 ) -> OtherModelError:
     """Say which model a file belongs to, by name."""
     fingerprint, name = (
@@ -339,7 +339,7 @@ def _placed_to_json(pose: NamedPose | MirrorSource) -> dict[str, Any]:
     return entry
 
 
-def _from_json(entry: Any, model: PoseModel) -> NamedPose:
+def _from_json(entry: Any, model: PosableBody) -> NamedPose:
     pose = _object(entry, "entry")
     name = pose.get("name")
     reason = why_no_name(name if isinstance(name, str) else "")

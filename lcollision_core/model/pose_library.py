@@ -15,6 +15,7 @@ from pathlib import Path
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.meshes import FileStamp, file_stamp, locked, unused_name
 from lcollision_core.model.naming import unique_names
+from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_file import (
     DamagedPosesError,
     NamedPose,
@@ -23,7 +24,6 @@ from lcollision_core.model.pose_file import (
     to_json,
     write_poses,
 )
-from lcollision_core.model.pose_model import PoseModel
 
 _LOCK_SECONDS = 5.0
 _MAX_NAME = 60
@@ -69,7 +69,7 @@ class PoseLibrary:
     """
 
     def __init__(
-        self, model: PoseModel, folder: Path, tell: Callable[[LCollisionError], None]
+        self, model: PosableBody, folder: Path, tell: Callable[[LCollisionError], None]
     ) -> None:
         self._model = model
         self._tell = tell
@@ -175,7 +175,7 @@ def _alike(pose: NamedPose, other: NamedPose | None) -> bool:
     return other is not None and pose.name == other.name and to_json(pose) == to_json(other)
 
 
-def _path(model: PoseModel, folder: Path) -> Path:
+def _path(model: PosableBody, folder: Path) -> Path:
     ending = f"{model.fingerprint}.json"
     readable = re.sub(r"[^\w-]+", "_", model.name)[:_MAX_NAME]
     return next(iter(sorted(folder.glob(f"* {ending}"))), folder / f"{readable} {ending}")

@@ -7,14 +7,14 @@ import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Progress, no_progress
-from lcollision_core.model.pose_model import PoseModel
+from lcollision_core.model.posable_body import PosableBody
 
 _DRAWN_AT_ONCE = 64
 _MOST_MISSES = 10_000
 
 
 def sample_poses(
-    model: PoseModel,
+    model: PosableBody,
     n_poses: int,
     seed: int,
     colliding: bool | None = None,

@@ -25,7 +25,7 @@ from app.work.jobs import PartEdits
 from lcollision_core.errors import ModelFileError
 
 if TYPE_CHECKING:
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PosableBody
 
 _DOMAIN, _COLOUR = Qt.ItemDataRole.UserRole, Qt.ItemDataRole.UserRole + 1
 _SWATCH = 16
@@ -50,7 +50,7 @@ class BodyPartsDialog(QDialog):
     edited = Signal(object)
 
     def __init__(
-        self, model: PoseModel, copies: bool, taken: Collection[str], parent: QWidget
+        self, model: PosableBody, copies: bool, taken: Collection[str], parent: QWidget
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle("Body parts")

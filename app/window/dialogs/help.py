@@ -25,7 +25,7 @@ from app.window.dialogs.questions import message_box, widen
 from app.window.widgets import dialog_vbox, labelled, scrolling
 
 if TYPE_CHECKING:
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PosableBody
 
 _TITLE_BAR = 60
 """Margin for a dialog frame and the desktop, in device-independent pixels."""
@@ -43,7 +43,7 @@ trained on {model.card.source}, licence {model.card.licence}.
 """
 
 
-def show_about(model: PoseModel | None, parent: QWidget) -> None:
+def show_about(model: PosableBody | None, parent: QWidget) -> None:
     """Show name, version, licence and origin of the program and of the model."""
     box = message_box(parent, "About LCollision", "LCollision", _ABOUT.format(version=_version()))
     if model is not None:

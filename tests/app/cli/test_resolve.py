@@ -25,7 +25,14 @@ from lcollision_core.meshes import (
     write_mesh,
     write_pose_set,
 )
-from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
+from lcollision_core.model import (
+    NamedPose,
+    PosableBody,
+    PoseModel,
+    read_poses,
+    sample_poses,
+    write_poses,
+)
 from lcollision_core.resolve import PoseResolver, find_free_poses
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
@@ -233,7 +240,7 @@ def test_what_the_check_saw_is_what_is_written(
         return results
 
     monkeypatch.setattr(PoseResolver, "resolve_many", remember)
-    monkeypatch.delattr(PoseModel, "exported_vertices")
+    monkeypatch.delattr(PosableBody, "exported_vertices")
     out = tmp_path / "out"
     result = lcollision("resolve", model_file, poses, "-o", out, "--format", "ply", "--json")
     assert result.exit_code == 0

@@ -16,7 +16,14 @@ from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
 from app.work.threads import Failure
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
-from lcollision_core.model import NamedPose, PoseModel, read_poses, sample_poses, write_poses
+from lcollision_core.model import (
+    NamedPose,
+    PosableBody,
+    PoseModel,
+    read_poses,
+    sample_poses,
+    write_poses,
+)
 from tests.bending_tube import LENGTH_IN_FILES, RADIUS, SIDES
 
 QUARTER_TURN = RigidTransform(
@@ -405,7 +412,7 @@ def test_what_resolve_checked_is_what_is_exported(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.delattr(PoseModel, "exported_vertices")
+    monkeypatch.delattr(PosableBody, "exported_vertices")
     document.blend_towards(colliding, 1.0)
     resolve(qtbot, document)
     with qtbot.waitSignal(document.message):

@@ -1,0 +1,476 @@
+"""A body that can take poses, whatever its pose space: what every front end knows."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.embedding.fitting import LatentFit
+from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes import RigidTransform, Topology, front_direction
+from lcollision_core.model.card import ModelCard
+from lcollision_core.model.code_names import CodeEffect, code_names
+from lcollision_core.model.encoded_pose import EncodedPose
+from lcollision_core.model.latent_space import WHOLE_BODY, LatentGroup, LatentSpace
+from lcollision_core.model.matching import checked_mesh, require_same_faces
+from lcollision_core.model.mirror import (
+    MirroredPose,
+    MirrorSource,
+    PoseMirror,
+    Symmetry,
+    find_symmetry,
+)
+
+if TYPE_CHECKING:
+    from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
+    from lcollision_core.predictor import Prediction
+    from lcollision_core.resolve import ResolveOptions, ResolveResult
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class PosableBody(ABC):
+    """A body that can take poses: immutable, and safe to share between threads.
+
+    A pose is a vector of D codes in the body's pose space: the latent codes of a trained model
+    (`PoseModel`), or the angles of a character's joints. Meshes are NumPy arrays in the body's
+    unit, in the coordinates of its reference.
+
+    Parameters
+    ----------
+    name : what the body is called
+    card : its units, names and origin
+    topology : of all its poses
+    reference : (V, 3) float64 array, in its unit
+    attention_mask : (K, V) float32 array, how much of each vertex each domain has; columns sum to 1
+    training_latent : (N, D) float64 array, the codes of the poses that the body came with
+
+    Attributes
+    ----------
+    name, card, topology : as given
+    reference, attention_mask, training_latent : as given, read-only
+    """
+
+    def __init__(
+        self,
+        name: str,
+        card: ModelCard,
+        topology: Topology,
+        reference: FloatArray,
+        attention_mask: npt.NDArray[np.float32],
+        training_latent: FloatArray,
+    ) -> None:
+        self.name, self.card, self.topology = name, card, topology
+        self.reference: FloatArray = read_only(reference)
+        self.attention_mask: npt.NDArray[np.float32] = read_only(attention_mask)
+        self.training_latent: FloatArray = read_only(training_latent)
+
+    @property
+    @abstractmethod
+    def pose_space(self) -> PoseSpace:
+        """The poses as dragging and Resolve see them."""
+
+    @property
+    @abstractmethod
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that identify the pose space.
+
+        Bodies with one fingerprint can exchange poses: it depends on neither names nor anything
+        that is trained on the pose space.
+        """
+
+    @property
+    @abstractmethod
+    def code_effects(self) -> tuple[CodeEffect, ...]:
+        """The effect of raising each of the D codes."""
+
+    @property
+    @abstractmethod
+    def has_predictor(self) -> bool:
+        """Whether a predictor was trained; it loads nothing."""
+
+    @property
+    @abstractmethod
+    def can_resolve(self) -> bool:
+        """Whether colliding poses can be resolved; it loads nothing."""
+
+    @property
+    def prediction_needs_torch(self) -> bool:
+        """Whether predictions need torch; it loads the predictor."""
+        return False
+
+    @abstractmethod
+    def predict(self, latent: npt.ArrayLike) -> Prediction:
+        """Predict whether poses collide, and how deeply in which domain, without decoding them.
+
+        Parameters
+        ----------
+        latent : (D,) or (B, D) finite array; one pose is a batch of 1
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        ModelFileError : the body has no predictor, or a damaged one.
+        """
+
+    @abstractmethod
+    def resolve(
+        self,
+        latent: npt.ArrayLike,
+        options: ResolveOptions | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+        placement: RigidTransform | None = None,
+    ) -> ResolveResult:
+        """Find the nearest collision-free pose.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        options : the solver, what is kept small, locked domains and limits
+        progress : called with (steps done, all steps)
+        cancel : polled at every evaluation
+        placement : where the pose is exported to; the exact check is of the vertices there
+
+        Raises
+        ------
+        ShapeError : another shape, a number that is not finite or another number of weights.
+        LCollisionError : an unknown locked domain.
+        ModelFileError : the body cannot resolve: it needs a predictor, and has none or a damaged
+            one.
+        CancelledError : `cancel` was set.
+        """
+
+    @abstractmethod
+    def _fit(
+        self, vertices: FloatArray, cancel: CancelToken | None, *, in_place: bool
+    ) -> LatentFit:
+        """Find the codes whose mesh is nearest to (V, 3) normalised vertices.
+
+        Parameters
+        ----------
+        in_place : the mesh lies as the reference does and stays there
+        """
+
+    def _decode(self, codes: FloatArray, n_threads: int | None) -> FloatArray:  # noqa: ARG002
+        """Decode (B, D) codes to new (B, V, 3) normalised vertices."""
+        return self.pose_space.decode(codes)
+
+    def decode(self, latent: npt.ArrayLike, n_threads: int | None = None) -> FloatArray:
+        """Turn latent poses into meshes.
+
+        Parameters
+        ----------
+        latent : (D,) or (B, D) finite array
+        n_threads : threads to spread the poses over, one for each core by default
+
+        Returns
+        -------
+        vertices : (V, 3) or (B, V, 3) float64 array, in the body's unit, in its reference's
+            coordinates; a pose gets the same bits alone and in any batch
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        codes = self._checked(latent)
+        vertices = self._decode(codes.reshape(-1, self.latent_size), n_threads)
+        vertices *= self.card.height
+        return vertices[0] if codes.ndim == 1 else vertices
+
+    def exported_vertices(
+        self, latent: npt.ArrayLike, placement: RigidTransform | None = None
+    ) -> npt.NDArray[np.floating]:
+        """Decode a (D,) latent pose to the (V, 3) vertices that it is exported with.
+
+        Parameters
+        ----------
+        placement : where the pose is exported to; None leaves it in the model's coordinates
+        """
+        from lcollision_core.posing import exported_vertices
+
+        return exported_vertices(self.decode(latent, n_threads=1), placement)
+
+    def exact_check(self, placement: RigidTransform | None = None) -> ExactCheck:
+        """Return the exact check of poses placed for export."""
+        from lcollision_core.posing import ExactCheck
+
+        return ExactCheck(self.pose_space, self.detector, self.body_size, placement)
+
+    def dragger(self, placement: RigidTransform | None = None) -> PoseDragger:
+        """Return what drags poses placed for export by hand; for one thread at a time."""
+        from lcollision_core.posing import PoseDragger
+
+        return PoseDragger(self.exact_check(placement))
+
+    def mirror(
+        self,
+        latent: npt.ArrayLike,
+        placement: RigidTransform | None = None,
+        source: MirrorSource | None = None,
+        options: ResolveOptions | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> MirroredPose:
+        """Exchange left and right of a pose: see `PoseMirror.mirror`.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        placement, source, options, progress, cancel : see there
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        LCollisionError : the model has no two sides, or a locked domain is unknown.
+        ModelFileError : the model's predictor is damaged.
+        CancelledError : `cancel` was set.
+        """
+        pose = self._checked(latent)
+        if pose.ndim != 1:
+            raise ShapeError("one pose is mirrored at a time", got=f"shape {pose.shape}")
+        return self.pose_mirror.mirror(pose, placement, source, options, progress, cancel)
+
+    def encode(
+        self, vertices: npt.ArrayLike, cancel: CancelToken | None = None, scale: float = 1.0
+    ) -> EncodedPose:
+        """Find the pose whose mesh lies nearest to a given one, wherever that lies.
+
+        A guess, then Gauss-Newton steps on the vertex distance that settle codes and rigid motion
+        together.
+
+        Parameters
+        ----------
+        vertices : (V, 3) finite array, in any unit; the placement converts back to it
+        cancel : polled before the fit
+        scale : brings `vertices` into the body's unit
+
+        Raises
+        ------
+        ShapeError : another shape, a coordinate that is not finite, or a scale that is not above 0.
+        WrongScaleError : larger or smaller than a pose of the reference can be.
+        PoseSetError : with other vertices joined, or too far from the origin.
+        CancelledError : `cancel` was set.
+        """
+        mesh = checked_mesh(vertices, self.reference, self.topology, self.name, scale)
+        fit = self._fit(mesh / self.body_size, cancel, in_place=False)
+        aligning = RigidTransform(fit.rotation, fit.translation * self.body_size, scale)
+        return EncodedPose(
+            latent=fit.latent.astype(np.float64),
+            placement=aligning.inverse(),
+            fit_error_mean=fit.mean_error,
+            fit_error_max=fit.max_error,
+        )
+
+    def nearest(self, vertices: FloatArray, cancel: CancelToken | None = None) -> FloatArray:
+        """Return the (D,) codes whose mesh is nearest to (V, 3) normalised vertices, in place.
+
+        Raises
+        ------
+        CancelledError : `cancel` was set.
+        """
+        return self._fit(vertices, cancel, in_place=True).latent.astype(np.float64)
+
+    def require_topology(self, topology: Topology, source: str) -> None:
+        """Refuse a mesh whose faces are not the model's, in any order.
+
+        Parameters
+        ----------
+        topology : the mesh's
+        source : what the sentence calls the mesh
+
+        Raises
+        ------
+        PoseSetError : another number of vertices or faces, or other faces.
+        """
+        require_same_faces(topology, self.topology, source, self.name)
+
+    def edit_domains(
+        self,
+        names: Mapping[int, str] | None = None,
+        colours: Mapping[int, str] | None = None,
+        order: Sequence[int] | None = None,
+    ) -> Self:
+        """Return the same model with other names, colours or order of some domains.
+
+        Parameters
+        ----------
+        names : new names by domain, an index from 0; two domains may swap theirs
+        colours : new colours "#rrggbb" by domain
+        order : all domains in listing order; the order of the latent entries does not change
+
+        Raises
+        ------
+        ModelFileError : there is no such domain, a name cannot be or is another domain's, or a
+            colour or an order is invalid.
+        """
+        renamed, coloured = list(self.domain_names), list(self.domain_colours)
+        for values, changes in ((renamed, names or {}), (coloured, colours or {})):
+            for domain, value in changes.items():
+                if not 0 <= domain < len(values):
+                    raise ModelFileError(
+                        f"{self.name} has no domain {domain + 1}",
+                        f"its domains are 1 to {len(values)}",
+                    )
+                values[domain] = value.strip() if values is renamed else value.lower()
+        return self.with_card(
+            replace(
+                self.card,
+                domain_names=tuple(renamed),
+                domain_colours=tuple(coloured),
+                domain_order=self.card.domain_order if order is None else tuple(order),
+            )
+        )
+
+    def with_card(self, card: ModelCard, name: str | None = None) -> Self:
+        """Return the same model with another card; computed properties are kept.
+
+        Parameters
+        ----------
+        card : names, colours or order differ; units and poses are the same
+        name : the new name of the model, by default the same
+        """
+        other = copy(self)
+        other.card, other.name = card, name or self.name
+        for cached in ("latent_space", "code_names"):
+            other.__dict__.pop(cached, None)
+        return other
+
+    def _checked(self, latent: npt.ArrayLike) -> FloatArray:
+        codes = np.asarray(latent, dtype=np.float64)
+        if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
+            raise ShapeError.must_be(
+                f"a latent pose of {self.name}",
+                f"{self.latent_size} numbers",
+                f"shape {codes.shape}",
+            )
+        if not np.isfinite(codes).all():
+            raise ShapeError("a latent pose has a number that is not finite")
+        return codes
+
+    @cached_property
+    def symmetry(self) -> Symmetry | None:
+        """Left and right of the mesh; None if its reference is not its own mirror image."""
+        return find_symmetry(self.reference, self.topology, self.up_axis)
+
+    @cached_property
+    def pose_mirror(self) -> PoseMirror:
+        """Exchanges left and right of this model's poses.
+
+        Raises
+        ------
+        LCollisionError : the mesh has no two sides.
+        ModelFileError : the model has a damaged predictor.
+        """
+        if self.symmetry is None:
+            raise LCollisionError(
+                "cannot be mirrored: its first pose is not symmetric, so that left and "
+                "right are unknown",
+                "train a model whose first pose is",
+                where=f"poses of {self.name}",
+            )
+        resolve = self.resolve if self.can_resolve else None
+        return PoseMirror(
+            self.attention_mask, self.symmetry, self.exact_check(), self.nearest, resolve
+        )
+
+    @cached_property
+    def latent_space(self) -> LatentSpace:
+        """The groups, names, colours and ranges of the latent's codes."""
+        space = self.pose_space
+        groups, start = [], 0
+        labels = ((WHOLE_BODY, None), *zip(self.domain_names, self.domain_colours, strict=True))
+        for (name, colour), size in zip(labels, space.group_sizes, strict=True):
+            code_names = (
+                self.domain_names
+                if colour is None
+                else tuple(f"motion {code + 1}" for code in range(size))
+            )
+            groups.append(LatentGroup(name, colour, slice(start, start + size), code_names))
+            start += size
+        return LatentSpace(
+            groups=tuple(groups),
+            low=read_only(space.low),
+            high=read_only(space.high),
+        )
+
+    @cached_property
+    def code_names(self) -> tuple[str, ...]:
+        """D names of the codes by effect, unique within each group: "left thigh forward"."""
+        return code_names(self.code_effects, self.domain_names, self.pose_space.group_sizes)
+
+    @cached_property
+    def detector(self) -> CollisionDetector:
+        """Finds exact self-collisions of this model's meshes, in the data's unit."""
+        return CollisionDetector(self.topology, self.reference, near_exclusion=self.near_exclusion)
+
+    @property
+    def faces(self) -> npt.NDArray[np.int32]:
+        """(F, 3) int32 array, vertex indices from 0, read-only."""
+        return self.topology.faces
+
+    @property
+    def n_vertices(self) -> int:
+        """V."""
+        return self.topology.n_vertices
+
+    @property
+    def latent_size(self) -> int:
+        """D, the number of a latent pose's codes."""
+        return len(self.pose_space.low)
+
+    @property
+    def body_size(self) -> float:
+        """The body size in the data's unit; lengths are normalised by it."""
+        return self.card.height
+
+    @property
+    def up_axis(self) -> int:
+        """0, 1 or 2 for x, y or z."""
+        return self.card.up_axis
+
+    @cached_property
+    def front(self) -> FloatArray:
+        """(3,) unit vector along an axis: where the reference faces, guessed from its shape."""
+        return read_only(front_direction(self.reference, self.up_axis))
+
+    @property
+    def near_exclusion(self) -> float:
+        """Normalised length along the surface within which pairs of faces are folds of the skin."""
+        return self.card.near_exclusion
+
+    @property
+    def domain_names(self) -> tuple[str, ...]:
+        """K different names."""
+        return self.card.domain_names
+
+    @property
+    def domain_colours(self) -> tuple[str, ...]:
+        """K colours "#rrggbb"."""
+        return self.card.domain_colours
+
+    @property
+    def domain_order(self) -> tuple[int, ...]:
+        """All K domains, indices from 0, in listing order."""
+        return self.card.domain_order or tuple(range(len(self.domain_names)))
+
+    @property
+    def pose_names(self) -> tuple[str, ...]:
+        """N names of the training poses, whose codes are `training_latent`, (N, D)."""
+        return self.card.pose_names
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return a read-only view of an array."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
