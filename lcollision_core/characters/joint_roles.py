@@ -1,0 +1,167 @@
+"""What joints are, by their names and places: their axes, and how far they turn."""
+
+from __future__ import annotations
+
+import re
+from enum import Enum
+
+import numpy as np
+
+from lcollision_core.characters.character import Rig
+from lcollision_core.meshes.topology import FloatArray
+
+_BENT = np.radians(6.0)
+"""A hinge whose bones lie at this angle at rest turns about their common normal."""
+
+_PARALLEL = 0.9
+"""Cosine from which a bone points too much along a direction to be bent towards it."""
+
+_SHORT = 1e-6
+"""Of the size of the rig: a bone of this length has no direction."""
+
+
+class Role(Enum):
+    """What a joint is in a body; values are patterns of its name's letters, the first counts."""
+
+    TWIST = "twist|roll(?!er)"
+    THUMB = "thumb"
+    FINGER = "finger|index|middle|(?<!sp)(?<!st)ring|pinky|pinkie|little|metacarpal"
+    TOE = "toe|ball"
+    FOOT = "foot|ankle"
+    HAND = "hand|wrist"
+    FOREARM = "forearm|lowerarm|loarm|elbow"
+    SHOULDER = "shoulder|clavicle|collar"
+    UPPER_ARM = "arm(?!atu|or)"
+    THIGH = "thigh|upleg|upperleg"
+    SHIN = "shin|calf|knee|leg"
+    NECK = "neck"
+    HEAD = "head|skull"
+    SPINE = "spine|chest|torso|waist|abdomen|belly"
+    OTHER = ""
+
+
+_LIMITS: dict[Role, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
+    Role.TWIST: ((0, 0), (-60, 60), (0, 0)),
+    Role.THUMB: ((-30, 60), (-20, 20), (-30, 30)),
+    Role.FINGER: ((-20, 95), (0, 0), (-15, 15)),
+    Role.TOE: ((-45, 45), (0, 0), (0, 0)),
+    Role.FOOT: ((-50, 50), (-30, 30), (-30, 30)),
+    Role.HAND: ((-80, 80), (-40, 40), (-40, 40)),
+    Role.FOREARM: ((-5, 150), (-90, 90), (-5, 5)),
+    Role.SHOULDER: ((-30, 30), (-15, 15), (-30, 30)),
+    Role.UPPER_ARM: ((-100, 140), (-90, 90), (-120, 120)),
+    Role.THIGH: ((-45, 130), (-50, 50), (-70, 70)),
+    Role.SHIN: ((-5, 150), (-20, 20), (-5, 5)),
+    Role.NECK: ((-40, 40), (-50, 50), (-35, 35)),
+    Role.HEAD: ((-40, 40), (-60, 60), (-35, 35)),
+    Role.SPINE: ((-25, 40), (-35, 35), (-30, 30)),
+    Role.OTHER: ((-75, 75), (-75, 75), (-75, 75)),
+}
+"""Degrees of bend, twist and sideways turn from the rest pose. They are wider than a person's, as
+rest poses differ, and a hinge hardly bends backwards."""
+
+
+def joint_roles(rig: Rig) -> tuple[Role, ...]:
+    """Tell what each of the rig's joints is.
+
+    A forearm is one only below an arm, and a shin below a thigh, so that limits of hinges are not
+    given to what merely sounds like one.
+    """
+    roles: list[Role] = []
+    above = {Role.FOREARM: Role.UPPER_ARM, Role.SHIN: Role.THIGH}
+    for name, parent in zip(rig.joint_names, rig.parents, strict=True):
+        letters = re.sub("[^a-z]", "", re.split("[:|]", name)[-1].lower())
+        role = next(role for role in Role if re.search(role.value, letters))
+        if role in above and (parent < 0 or roles[parent] is not above[role]):
+            role = Role.OTHER
+        roles.append(role)
+    return tuple(roles)
+
+
+def bone_directions(rig: Rig, origins: FloatArray) -> FloatArray:
+    """Return the unit vectors along which the joints' bones lie in the rest pose: (J, 3).
+
+    Towards the children's middle, else the middle of the vertices that the joint moves, else on
+    from the parent.
+
+    Parameters
+    ----------
+    origins : (J, 3) of the joints
+    """
+    size = float(np.ptp(origins, axis=0).max()) + float(np.ptp(rig.points, axis=(0, 1)).max())
+    directions = np.zeros_like(origins)
+    heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
+    for joint, parent in enumerate(rig.parents):
+        ends = origins[rig.parents == joint] - origins[joint]
+        ends = ends[np.linalg.norm(ends, axis=1) > _SHORT * size]
+        led = np.flatnonzero(heaviest == joint)
+        if len(ends):
+            way = ends.mean(axis=0)
+        elif len(led):
+            way = rig.points[led].mean(axis=(0, 1)) - origins[joint]
+        else:
+            way = np.zeros(3)
+        length = float(np.linalg.norm(way))
+        if length > _SHORT * size:
+            directions[joint] = way / length
+        else:
+            directions[joint] = directions[parent] if parent >= 0 else np.eye(3)[1]
+    return directions
+
+
+def front_of(roles: tuple[Role, ...], directions: FloatArray, up: FloatArray) -> FloatArray | None:
+    """Return the horizontal unit vector along which the feet point; None without feet."""
+    feet = [joint for joint, role in enumerate(roles) if role is Role.FOOT]
+    way: FloatArray = directions[feet].sum(axis=0)
+    way -= (way @ up) * up
+    length = float(np.linalg.norm(way))
+    return way / length if length > 0.5 * len(feet) * (1 - _PARALLEL) and feet else None
+
+
+def joint_axes(
+    rig: Rig,
+    roles: tuple[Role, ...],
+    origins: FloatArray,
+    directions: FloatArray,
+    up: FloatArray,
+    front: FloatArray,
+) -> FloatArray:
+    """Return the axes that joints turn about in the rest pose: (J, 3, 3), an axis a column.
+
+    The first bends the bone forward (fingers towards the palm, hinges the way they go), the second
+    lies along the bone, the third turns it sideways.
+    """
+    middle = origins.mean(axis=0)
+    axes = np.empty((len(origins), 3, 3))
+    for joint, (role, bone) in enumerate(zip(roles, directions, strict=True)):
+        towards = front
+        if role is Role.SHIN:
+            towards = -front
+        elif role is Role.FINGER:
+            # The palms face down in a T pose, and the body where the arms hang.
+            towards = -up
+            if abs(bone @ up) > _PARALLEL:
+                towards = middle - origins[joint]
+        if abs(bone @ towards) > _PARALLEL * np.linalg.norm(towards):
+            towards = up if abs(bone @ up) <= _PARALLEL else front
+        bend = np.cross(bone, towards)
+        if role in (Role.FOREARM, Role.SHIN):
+            normal = np.cross(directions[rig.parents[joint]], bone)
+            if np.linalg.norm(normal) > np.sin(_BENT):
+                bend = normal
+        bend /= np.linalg.norm(bend)
+        axes[joint] = np.stack([bend, bone, np.cross(bend, bone)], axis=1)
+    return axes
+
+
+def joint_limits(rig: Rig, roles: tuple[Role, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return the bounds of the joints' rotation vectors in their axes, (J, 3) each, in radians.
+
+    Both are 0 where a joint does not turn.
+    """
+    bounds = np.radians(np.array([_LIMITS[role] for role in roles], dtype=np.float64))
+    for joint, (role, parent) in enumerate(zip(roles, rig.parents, strict=True)):
+        # Only the first joint of a finger turns sideways.
+        if role is Role.FINGER and parent >= 0 and roles[parent] is Role.FINGER:
+            bounds[joint, 2] = 0.0
+    return bounds[:, :, 0], bounds[:, :, 1]

@@ -1,0 +1,451 @@
+"""A rig as a space of poses: the codes are the turns of its joints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.characters import joint_roles, rig_kernels
+from lcollision_core.characters.character import Character, Rig
+from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.meshes.topology import FloatArray, IntArray, length_graph
+from lcollision_core.meshes.units import body_size, front_direction
+
+ROOT_CODES = 6
+"""Of the whole body: its shift along left, up and front, and its turn about them."""
+
+_SHIFT, _TURN = 1.0, np.pi
+"""Most that the whole body is moved, normalised, and turned about an axis."""
+
+_SLACK = np.radians(5.0)
+"""By which joints may turn further than in any frame of the character's clips."""
+
+_METRIC_POSES = 8
+_METRIC_VERTICES = 3000
+_STRETCH_POSES = 64
+_STRETCH_SLACK = 1.25
+"""Edges at joints get longer than in poses where each joint is bent alone or at random."""
+
+_STIFFENING = 1e-3
+"""Of the mean diagonal: what a code costs that moves no vertex, so that the metric is definite."""
+
+_SPREAD = 0.25
+"""Of its range: the deviation of a code in plausible poses, where no clip says more."""
+
+_SEED = 0
+
+
+class RigPoseSpace:
+    """The poses that a rig's joints give a character, as a `posing.PoseSpace`.
+
+    Codes are, first, the shift of the whole body (normalised) and its turn, along and about left,
+    up and front; then for each body part the rotation vectors of its joints, in radians, each in
+    axes along its bone. Zeros are the rest pose. Joints below which nothing is skinned have none.
+
+    Parameters
+    ----------
+    character : with a rig
+    parts : J names of body parts, by joint; by default each joint is one
+    frames : (N, J, 4, 4) global transforms of the joints in plausible poses, as `ClipFrames` has
+        them: they widen the limits, and say what moves together
+
+    Attributes
+    ----------
+    part_names : K names of the body parts
+    joint_of_code, axis_of_code : (D,) int64 arrays: the joint of the rig, and its axis: 0 bends,
+        1 twists, 2 turns sideways; of the root's first six codes the axis is 0 to 5
+    axes : (J, 3, 3) float64 array, the joints' axes in the rest pose, a column each
+    front : (3,) float64 unit vector, where the character faces at rest
+    body_size : the unit of the normalised lengths, in the character's unit
+
+    Raises
+    ------
+    LCollisionError : the character has no rig.
+    ShapeError : `parts` or `frames` are not of its joints.
+    """
+
+    def __init__(
+        self,
+        character: Character,
+        parts: Sequence[str] | None = None,
+        frames: FloatArray | None = None,
+    ) -> None:
+        rig = character.rig
+        if rig is None:
+            raise LCollisionError(
+                "has no joints to pose it by", "choose a rigged character", where=character.source
+            )
+        n_joints = len(rig.parents)
+        parts = rig.joint_names if parts is None else parts
+        if len(parts) != n_joints:
+            raise ShapeError.must_be("body parts of a rig", f"{n_joints} names", len(parts))
+        self.topology = character.topology
+        self.body_size = body_size(character.rest_vertices, character.topology)
+        self.rest_vertices: FloatArray = character.rest_vertices / self.body_size
+        self._rig = rig
+        self._origins: FloatArray = rig.rest[:, :3, 3] / self.body_size
+        self._set_bones(rig)
+        self._set_axes(rig, character.up)
+        self._set_influences(rig)
+        self.low, self.high = self._set_codes(rig, parts)
+        self._frame_codes = np.empty((0, len(self.low)))
+        if frames is not None:
+            self._frame_codes = self.codes_of_transforms(frames)
+            if len(self._frame_codes):
+                self.low = np.minimum(self.low, self._frame_codes.min(axis=0) - _SLACK)
+                self.high = np.maximum(self.high, self._frame_codes.max(axis=0) + _SLACK)
+
+    def _set_bones(self, rig: Rig) -> None:
+        """Find the root, the lowest joint that carries all vertices, and the joints that count.
+
+        `_bones` are their numbers in the rig; a rig whose roots share nothing above them gets a
+        root that is no joint, -1.
+        """
+        n_joints, used = len(rig.parents), np.zeros(len(rig.parents), dtype=np.int64)
+        used[rig.joint_of[rig.weights > 0.0]] = 1
+        below = used.copy()
+        for joint in range(n_joints - 1, -1, -1):
+            if rig.parents[joint] >= 0:
+                below[rig.parents[joint]] += below[joint]
+        carriers = np.flatnonzero(below == used.sum())
+        root = int(carriers[-1]) if len(carriers) else -1
+        above = {-1, *carriers.tolist()} - {root}
+        bones = [root] + [
+            joint for joint in range(n_joints) if below[joint] and joint not in {root, *above}
+        ]
+        number = {joint: place for place, joint in enumerate(bones)}
+        self._bones = np.array(bones)
+        parents = [-1] + [number.get(int(rig.parents[joint]), 0) for joint in bones[1:]]
+        self._parents = np.array(parents, dtype=np.int64)
+        self._bone_of = np.zeros(n_joints, dtype=np.int64)
+        """Of each joint the bone that carries it; -1 above the root."""
+        for joint in range(n_joints):
+            parent = int(rig.parents[joint])
+            carried = self._bone_of[parent] if parent >= 0 else (0 if root < 0 else -1)
+            self._bone_of[joint] = number.get(joint, carried)
+
+    def _set_axes(self, rig: Rig, up: FloatArray) -> None:
+        roles = joint_roles.joint_roles(rig)
+        directions = joint_roles.bone_directions(rig, rig.rest[:, :3, 3])
+        front = joint_roles.front_of(roles, directions, up)
+        if front is None:
+            upwards = int(np.abs(up).argmax())
+            front = front_direction(self.rest_vertices * up[upwards], upwards) * up[upwards]
+        self.front: FloatArray = front
+        self.axes = joint_roles.joint_axes(rig, roles, self._origins, directions, up, front)
+        self._least, self._most = joint_roles.joint_limits(rig, roles)
+        body = np.stack([np.cross(up, front), up, front], axis=1)
+        root = self._bones[0]
+        middle = 0.5 * (self.rest_vertices.min(axis=0) + self.rest_vertices.max(axis=0))
+        self._bone_origins = self._origins[self._bones]
+        self._bone_axes = np.ascontiguousarray(self.axes[self._bones])
+        self._bone_axes[0] = body
+        if root < 0:
+            self._bone_origins[0] = middle
+        else:
+            self.axes[root] = body
+
+    def _set_influences(self, rig: Rig) -> None:
+        counts = rig.weights > 0.0
+        self._first = np.concatenate([[0], np.cumsum(counts.sum(axis=1))]).astype(np.int32)
+        self._joints = self._bone_of[rig.joint_of[counts]].astype(np.int32)
+        self._weights = np.ascontiguousarray(rig.weights[counts])
+        self._points = np.ascontiguousarray(rig.points[counts]) / self.body_size
+
+    def _set_codes(self, rig: Rig, parts: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Give each body part the vertices and codes of its joints, and return the codes' bounds.
+
+        A joint whose part would lead no vertex belongs to its parent's.
+        """
+        heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
+        leading = {parts[joint] for joint in np.unique(heaviest)}
+        part_of: dict[int, str] = {}
+        for joint in self._bones.tolist():
+            name = parts[joint] if joint >= 0 else ""
+            above = part_of.get(int(rig.parents[joint]), "") if joint >= 0 else ""
+            part_of[joint] = name if name in leading else above
+        fallback = parts[heaviest[0]]
+        part_of = {joint: name or fallback for joint, name in part_of.items()}
+        self.part_names = tuple(dict.fromkeys(part_of.values()))
+        part_of_joint = np.array(
+            [
+                self.part_names.index(part_of[int(self._bones[bone])]) if bone >= 0 else 0
+                for bone in self._bone_of
+            ]
+        )
+        self.vertex_domain: npt.NDArray[np.intp] = part_of_joint[heaviest]
+        self._part_of_joint = part_of_joint
+        bones, axes, sizes = [0] * ROOT_CODES, list(range(ROOT_CODES)), [ROOT_CODES]
+        low, high = [-_SHIFT] * 3 + [-_TURN] * 3, [_SHIFT] * 3 + [_TURN] * 3
+        for name in self.part_names:
+            before = len(bones)
+            for bone, joint in enumerate(self._bones.tolist()):
+                if bone == 0 or part_of[joint] != name:
+                    continue
+                for axis in range(3):
+                    if self._least[joint, axis] < self._most[joint, axis]:
+                        bones.append(bone)
+                        axes.append(axis)
+                        low.append(self._least[joint, axis])
+                        high.append(self._most[joint, axis])
+            sizes.append(len(bones) - before)
+        self._bone_of_code, self.axis_of_code = np.array(bones), np.array(axes)
+        self.joint_of_code = self._bones[self._bone_of_code]
+        self.group_sizes: tuple[int, ...] = tuple(sizes)
+        # Where a code's number lies among the shift and the turns of all bones.
+        self._place = self.axis_of_code + np.where(
+            self._bone_of_code == 0, 0, 3 + 3 * self._bone_of_code
+        )
+        return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
+
+    @property
+    def n_domains(self) -> int:
+        """K, the number of body parts."""
+        return len(self.part_names)
+
+    @property
+    def n_joints(self) -> int:
+        """J, the number of the rig's joints."""
+        return len(self._rig.parents)
+
+    @cached_property
+    def attention_mask(self) -> npt.NDArray[np.float32]:
+        """(K, V) the share of each body part in each vertex: the skin weights of its joints."""
+        mask = np.zeros((self.n_domains, self.topology.n_vertices))
+        part = self._part_of_joint[self._rig.joint_of]
+        vertex = np.broadcast_to(np.arange(len(part))[:, None], part.shape)
+        np.add.at(mask, (part, vertex), self._rig.weights)
+        return mask.astype(np.float32)
+
+    @cached_property
+    def _plausible(self) -> FloatArray:
+        """(n, D) codes of the rest pose and of some frames, else of moderate random poses."""
+        if len(self._frame_codes):
+            chosen = np.linspace(0, len(self._frame_codes) - 1, _METRIC_POSES - 1).astype(int)
+            others = self._frame_codes[np.unique(chosen)]
+        else:
+            others = 0.5 * self._random(_METRIC_POSES - 1)
+        return np.concatenate([np.zeros((1, len(self.low))), others])
+
+    def _random(self, n: int) -> FloatArray:
+        """Return (n, D) codes between their bounds, of the body in its place."""
+        poses = np.random.default_rng(_SEED).uniform(self.low, self.high, (n, len(self.low)))
+        poses[:, :ROOT_CODES] = 0.0
+        return poses
+
+    @cached_property
+    def domain_metrics(self) -> FloatArray:
+        """J_k^T J_k / V of the Jacobian, averaged over plausible poses; see `PoseSpace`."""
+        every = max(1, self.topology.n_vertices // _METRIC_VERTICES)
+        chosen = self.topology.used_vertices[::every].astype(np.int64)
+        led = self.vertex_domain[chosen]
+        size = len(self.low)
+        gram = np.zeros((self.n_domains, size, size))
+        for codes in self._plausible:
+            moved = self.tangents(codes, chosen)
+            for domain in range(self.n_domains):
+                by_code = moved[:, led == domain].reshape(size, -1)
+                gram[domain] += by_code @ by_code.T
+        gram /= len(self._plausible) * len(chosen)
+        return gram
+
+    @cached_property
+    def metric(self) -> FloatArray:
+        """The sum of `domain_metrics`, with a little more on the diagonal."""
+        gram: FloatArray = self.domain_metrics.sum(axis=0)
+        gram[np.diag_indices_from(gram)] += _STIFFENING * np.trace(gram) / len(gram)
+        return gram
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """The inverse of a covariance: half of a share of the limits, half of the frames'."""
+        covariance = np.diag((_SPREAD * (self.high - self.low)) ** 2)
+        if len(self._frame_codes):
+            frames = self._frame_codes
+            covariance = 0.5 * covariance + 0.5 * frames.T @ frames / len(frames)
+        return np.linalg.inv(covariance).astype(np.float64)
+
+    @cached_property
+    def longest_edges(self) -> FloatArray:
+        """(E,) float64 array: the longest of each edge where joints are at their limits, and more.
+
+        Skinning stretches edges at joints; only tears are to be prevented.
+        """
+        extremes = np.concatenate([np.diag(self.low), np.diag(self.high)])
+        longest = self.topology.edge_lengths(self.rest_vertices)
+        for codes in np.concatenate([extremes, self._random(_STRETCH_POSES), self._plausible]):
+            lengths = self.topology.edge_lengths(self._decoded(codes))
+            np.maximum(longest, lengths, out=longest)
+        # Where seams are joined, an edge may have no length at all.
+        shortest = np.finfo(np.float64).eps * float(longest.max())
+        return np.maximum(_STRETCH_SLACK * longest, shortest).astype(np.float64)
+
+    @cached_property
+    def surface_graph(self) -> csr_matrix:
+        """(V, V) lengths of the edges on the reference."""
+        return length_graph(self.topology.edges, self.rest_vertices)
+
+    def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
+        """Return which codes body parts own: (D,)."""
+        group = np.repeat(np.arange(len(self.group_sizes)), self.group_sizes)
+        owned: npt.NDArray[np.bool_] = np.isin(group, [1 + domain for domain in domains])
+        return owned
+
+    def _motions(self, codes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        numbers = np.zeros(3 + 3 * len(self._bones))
+        numbers[self._place] = codes
+        return rig_kernels.joint_motions(
+            numbers[3:].reshape(-1, 3),
+            self._bone_axes[0] @ numbers[:3],
+            self._parents,
+            self._bone_axes,
+            self._bone_origins,
+        )
+
+    @property
+    def _influences(
+        self,
+    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        return self._first, self._joints, self._weights, self._points
+
+    def _decoded(self, codes: FloatArray) -> FloatArray:
+        rotations, translations, _, _ = self._motions(codes)
+        return rig_kernels.skin(*self._influences, rotations, translations)
+
+    def decode(self, codes: FloatArray) -> FloatArray:
+        """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
+        return np.stack([self._decoded(pose) for pose in np.asarray(codes, dtype=np.float64)])
+
+    def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
+        """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
+        by_turns, by_shift = rig_kernels.pull_back_moments(
+            np.ascontiguousarray(by_vertices, dtype=np.float64),
+            *self._influences,
+            self._parents,
+            *self._motions(codes),
+        )
+        by_numbers = np.concatenate(
+            [by_shift @ self._bone_axes[0], by_turns.reshape(len(by_vertices), -1)], axis=1
+        )
+        by_codes: FloatArray = by_numbers[:, self._place]
+        return by_codes
+
+    def tangents(self, codes: FloatArray, chosen: npt.NDArray[np.int64]) -> FloatArray:
+        """Return how (n,) vertices of a (D,) pose move with its codes: (D, n, 3)."""
+        turned = rig_kernels.tangents(
+            chosen, *self._influences, self._parents, *self._motions(codes)
+        )
+        shifted = np.broadcast_to(self._bone_axes[0].T[:, None], (3, len(chosen), 3))
+        moved = np.concatenate([shifted, turned.reshape(-1, len(chosen), 3)])
+        by_codes: FloatArray = moved[self._place]
+        return by_codes
+
+    def mean_slopes(self, weights: FloatArray) -> Callable[[FloatArray, FloatArray], FloatArray]:
+        """Return what differentiates the means of patches, and other functions, by the codes.
+
+        Parameters
+        ----------
+        weights : (m, V) of the patches' means
+
+        Returns
+        -------
+        slopes : of (D,) codes and (n, V, 3) derivatives of n functions by the vertices, the
+            (3 m + n, D) derivatives of the means, x, y and z of each, and of the functions
+        """
+        means = (weights[:, None, :, None] * np.eye(3)[:, None]).reshape(-1, weights.shape[1], 3)
+
+        def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
+            return np.concatenate(
+                [self.pull_back(codes, means), self.pull_back(codes, by_vertices)]
+            )
+
+        return slopes
+
+    def transforms(self, codes: FloatArray) -> FloatArray:
+        """Return the joints' global transforms of a (D,) pose: (J, 4, 4), as `Rig.rest`."""
+        rotations, translations, _, _ = self._motions(np.asarray(codes, dtype=np.float64))
+        moved = np.broadcast_to(np.eye(4), (self.n_joints, 4, 4)).copy()
+        carried = self._bone_of >= 0
+        moved[carried, :3, :3] = rotations[self._bone_of[carried]]
+        moved[carried, :3, 3] = translations[self._bone_of[carried]] * self.body_size
+        return moved @ self._rig.rest
+
+    def codes_of_transforms(self, transforms: npt.ArrayLike) -> FloatArray:
+        """Find the codes whose joints are turned as given ones are.
+
+        What codes cannot express is left out: scaled, sheared or shifted joints, and turns about
+        axes that a joint does not have; compare `decode` with `skinned`.
+
+        Parameters
+        ----------
+        transforms : (J, 4, 4) or (N, J, 4, 4) finite array of global transforms, as `Rig.rest`
+
+        Returns
+        -------
+        codes : (D,) or (N, D) float64 array, of which some may lie beyond the bounds
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        given = self._checked(transforms)
+        poses = given.reshape(-1, self.n_joints, 4, 4)
+        moved = poses @ np.linalg.inv(self._rig.rest)
+        numbers = np.zeros((len(poses), 3 + 3 * len(self._bones)))
+        kept = np.zeros(numbers.shape[1], dtype=np.bool_)
+        kept[self._place] = True
+        rotations = np.empty((len(poses), len(self._bones), 3, 3))
+        for bone, joint in enumerate(self._bones.tolist()):
+            parent, axes = self._parents[bone], self._bone_axes[bone]
+            before = axes if parent < 0 else rotations[:, parent] @ axes
+            # A root that is no joint stays.
+            wanted = _nearest_rotations(moved[:, joint, :3, :3]) if joint >= 0 else np.eye(3)
+            local = np.swapaxes(before, -1, -2) @ wanted @ axes
+            places = slice(3 + 3 * bone, 6 + 3 * bone)
+            turn = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec()
+            numbers[:, places] = np.where(kept[places], turn, 0.0)
+            turned = Rotation.from_rotvec(numbers[:, places]).as_matrix()
+            rotations[:, bone] = before @ turned @ axes.T
+        if self._bones[0] >= 0:
+            origin = self._bone_origins[0]
+            place = moved[:, self._bones[0]] @ np.append(origin * self.body_size, 1.0)
+            numbers[:, :3] = (place[:, :3] / self.body_size - origin) @ self._bone_axes[0]
+        codes: FloatArray = numbers[:, self._place]
+        return codes if given.ndim == 4 else codes[0]
+
+    def skinned(self, transforms: npt.ArrayLike) -> FloatArray:
+        """Return the normalised (V, 3) vertices that (J, 4, 4) global transforms give.
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        rig = self._rig
+        moved = self._checked(transforms) @ np.linalg.inv(rig.rest)
+        turned = np.einsum("vixy,viy->vix", moved[:, :3, :3][rig.joint_of], rig.points)
+        posed = turned + moved[:, :3, 3][rig.joint_of]
+        vertices: FloatArray = np.einsum("vi,vix->vx", rig.weights, posed) / self.body_size
+        return vertices
+
+    def _checked(self, transforms: npt.ArrayLike) -> FloatArray:
+        given = np.asarray(transforms, dtype=np.float64)
+        if given.ndim not in (3, 4) or given.shape[-3:] != (self.n_joints, 4, 4):
+            raise ShapeError.must_be(
+                "transforms of a rig", f"({self.n_joints}, 4, 4) a pose", f"shape {given.shape}"
+            )
+        if not np.isfinite(given).all():
+            raise ShapeError("transforms of a rig have a number that is not finite")
+        return given
+
+
+def _nearest_rotations(matrices: FloatArray) -> FloatArray:
+    """Return the rotations nearest to (N, 3, 3) matrices."""
+    left, _, right = np.linalg.svd(matrices)
+    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+    rotations: FloatArray = left @ right
+    return rotations

@@ -1,0 +1,346 @@
+"""The rig as a space of poses: skinning, derivatives, transforms, metrics, and drags on it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.characters import Character, Rig, RigPoseSpace
+from lcollision_core.characters.joint_roles import Role, joint_roles
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.posing import DragOptions, ExactCheck, PoseDragger, PoseSpace, make_grip
+from tests.rigged_shapes import rigged_body, rigged_tube, skinned, turned
+
+FloatArray = npt.NDArray[np.float64]
+
+STEP = 1e-6
+
+
+def rig_of(character: Character) -> Rig:
+    assert character.rig is not None
+    return character.rig
+
+
+def random_codes(space: RigPoseSpace, seed: int = 0, share: float = 0.8) -> FloatArray:
+    codes = np.random.default_rng(seed).uniform(space.low, space.high) * share
+    codes[:3] *= 0.2
+    return codes
+
+
+def a_few(character: Character, n: int, seed: int) -> FloatArray:
+    """Return (n, V, 3) derivatives that are zero at most vertices, as those of patches are."""
+    generator = np.random.default_rng(seed)
+    by_vertices = generator.normal(size=(n, len(character.rest_vertices), 3))
+    by_vertices[generator.random(by_vertices.shape[:2]) < 0.8] = 0.0
+    return by_vertices
+
+
+CHARACTERS = {
+    "tube": rigged_tube(),
+    "long chain": rigged_tube(n_joints=6, scale=170.0, differs=True),
+    "one joint": rigged_tube(n_joints=1),
+    "body": rigged_body(scale=100.0),
+}
+
+
+@pytest.fixture(params=CHARACTERS.values(), ids=CHARACTERS)
+def character(request: pytest.FixtureRequest) -> Character:
+    return request.param
+
+
+def test_zeros_are_the_rest_pose(character: Character) -> None:
+    space = RigPoseSpace(character)
+    decoded = space.decode(np.zeros((2, len(space.low))))
+    expected = character.rest_vertices / space.body_size
+    np.testing.assert_allclose(decoded, np.stack([expected, expected]), atol=1e-12)
+    transforms = space.transforms(np.zeros(len(space.low)))
+    np.testing.assert_allclose(transforms, rig_of(character).rest, atol=1e-12)
+    assert sum(space.group_sizes) == len(space.low) == len(space.high)
+    assert (space.low < space.high).all()
+    assert (space.low <= 0.0).all()
+    assert (space.high >= 0.0).all()
+
+
+def test_decoding_is_the_skinning_of_its_transforms(character: Character) -> None:
+    space = RigPoseSpace(character)
+    for seed in range(3):
+        codes = random_codes(space, seed)
+        expected = skinned(rig_of(character), space.transforms(codes)) / space.body_size
+        np.testing.assert_allclose(space.decode(codes[None])[0], expected, atol=1e-12)
+        np.testing.assert_allclose(space.skinned(space.transforms(codes)), expected, atol=1e-12)
+
+
+def test_joints_stay_together(character: Character) -> None:
+    """A joint's place is where its parent has it, whatever the codes."""
+    space, rig = RigPoseSpace(character), rig_of(character)
+    transforms = space.transforms(random_codes(space))
+    for joint, parent in enumerate(rig.parents):
+        if parent >= 0:
+            carried = transforms[parent] @ np.linalg.inv(rig.rest[parent]) @ rig.rest[joint]
+            np.testing.assert_allclose(transforms[joint, :3, 3], carried[:3, 3], atol=1e-10)
+
+
+def test_derivatives_are_those_of_differences(character: Character) -> None:
+    space = RigPoseSpace(character)
+    for seed, share in enumerate((0.8, 1.0, 1e-3, 0.0)):
+        codes = random_codes(space, seed, share)
+        by_vertices = a_few(character, 4, seed)
+        slopes = space.pull_back(codes, by_vertices)
+        ends = np.concatenate(
+            [codes + STEP * np.eye(len(codes)), codes - STEP * np.eye(len(codes))]
+        )
+        above, below = np.split(space.decode(ends), 2)
+        moved = (above - below) / (2.0 * STEP)
+        differences = np.einsum("nvx,dvx->nd", by_vertices, moved)
+        assert np.abs(slopes).max() > 0.1
+        np.testing.assert_allclose(slopes, differences, atol=1e-7 * np.abs(slopes).max())
+        chosen = np.arange(0, space.topology.n_vertices, 3)
+        np.testing.assert_allclose(space.tangents(codes, chosen), moved[:, chosen], atol=1e-8)
+
+
+def test_means_of_patches_are_differentiated_with_the_rest() -> None:
+    character = CHARACTERS["body"]
+    space = RigPoseSpace(character)
+    codes, by_vertices = random_codes(space), a_few(character, 2, 3)
+    weights = np.random.default_rng(1).random((2, space.topology.n_vertices))
+    slopes = space.mean_slopes(weights)(codes, by_vertices)
+    assert slopes.shape == (3 * 2 + 2, len(codes))
+    moved = space.tangents(codes, np.arange(space.topology.n_vertices))
+    means = np.einsum("mv,dvx->mxd", weights, moved).reshape(6, -1)
+    np.testing.assert_allclose(slopes[:6], means, atol=1e-10 * np.abs(means).max())
+    np.testing.assert_array_equal(slopes[6:], space.pull_back(codes, by_vertices))
+
+
+def test_codes_come_back_from_their_transforms(character: Character) -> None:
+    space = RigPoseSpace(character)
+    codes = np.stack([random_codes(space, seed, 0.9) for seed in range(4)])
+    transforms = np.stack([space.transforms(one) for one in codes])
+    # Rotation vectors are told apart up to half a turn only.
+    back = space.codes_of_transforms(transforms)
+    again = np.stack([space.transforms(one) for one in back])
+    np.testing.assert_allclose(again, transforms, atol=1e-9 * space.body_size)
+    short = 0.3 * codes
+    transforms = np.stack([space.transforms(one) for one in short])
+    np.testing.assert_allclose(space.codes_of_transforms(transforms), short, atol=1e-9)
+    np.testing.assert_allclose(space.codes_of_transforms(transforms[0]), short[0], atol=1e-9)
+
+
+def test_turns_of_any_origin_are_expressed_and_scales_left_out() -> None:
+    character = CHARACTERS["tube"]
+    space, rig = RigPoseSpace(character), rig_of(character)
+    turns = Rotation.random(3, rng=np.random.default_rng(2)).as_matrix()
+    transforms = turned(rig, turns)
+    codes = space.codes_of_transforms(transforms)
+    np.testing.assert_allclose(space.transforms(codes), transforms, atol=1e-12)
+    scaled = transforms.copy()
+    scaled[1, :3, :3] *= 1.3
+    np.testing.assert_allclose(space.codes_of_transforms(scaled), codes, atol=1e-12)
+    assert np.abs(space.decode(codes[None])[0] - space.skinned(scaled)).max() > 0.01
+
+
+def test_roots_that_share_nothing_move_as_one_body() -> None:
+    tube = CHARACTERS["tube"]
+    rig = replace(rig_of(tube), parents=np.array([-1, 0, -1]))
+    space = RigPoseSpace(replace(tube, rig=rig))
+    assert len(space.low) == 6 + 9
+    codes = np.zeros(15)
+    codes[:6] = 0.1, 0.2, -0.1, 0.3, 0.2, 0.1
+    moved = space.decode(codes[None])[0]
+    np.testing.assert_allclose(
+        space.topology.edge_lengths(moved), space.topology.edge_lengths(space.rest_vertices)
+    )
+    assert np.abs(moved - space.rest_vertices).max() > 0.2
+    codes = random_codes(space, 3)
+    by_vertices = a_few(tube, 2, 1)
+    steps = STEP * np.eye(15)
+    differences = (space.decode(codes + steps) - space.decode(codes - steps)) / (2.0 * STEP)
+    np.testing.assert_allclose(
+        space.pull_back(codes, by_vertices),
+        np.einsum("nvx,dvx->nd", by_vertices, differences),
+        atol=1e-6,
+    )
+
+
+def test_joints_that_carry_nothing_have_no_codes() -> None:
+    space, rig = RigPoseSpace(CHARACTERS["body"]), rig_of(CHARACTERS["body"])
+    with_codes = {rig.joint_names[joint] for joint in space.joint_of_code}
+    assert with_codes == {name for name in rig.joint_names if not name.endswith("End")}
+    assert space.group_sizes[:2] == (6, 0)
+    assert set(space.joint_of_code[:6]) == {0}
+
+
+def test_body_parts_own_the_codes_of_their_joints() -> None:
+    character = rigged_body()
+    rig = rig_of(character)
+    parts = [name.removesuffix("End").replace("Hand", "ForeArm") for name in rig.joint_names]
+    space = RigPoseSpace(character, parts)
+    assert "LeftHand" not in space.part_names
+    # The neck leads no vertex.
+    assert "Neck" not in space.part_names
+    forearm = space.part_names.index("LeftForeArm")
+    own = space.codes_of([forearm])
+    assert {rig.joint_names[joint] for joint in space.joint_of_code[own]} == {
+        "LeftForeArm",
+        "LeftHand",
+    }
+    assert own.sum() == space.group_sizes[1 + forearm] == 6
+    assert not space.codes_of([]).any()
+    np.testing.assert_allclose(space.attention_mask.sum(axis=0), 1.0, atol=1e-6)
+    led = space.attention_mask.argmax(axis=0) == space.vertex_domain
+    assert led.mean() > 0.99
+
+
+def test_hinges_bend_one_way_and_forward_is_where_the_toes_point() -> None:
+    character = rigged_body()
+    space, rig = RigPoseSpace(character), rig_of(character)
+    np.testing.assert_allclose(space.front, [0.0, -1.0, 0.0], atol=1e-12)
+
+    def bent(joint: str, axis: int, degrees: float) -> FloatArray:
+        number = rig.joint_names.index(joint)
+        code = np.flatnonzero((space.joint_of_code == number) & (space.axis_of_code == axis))
+        codes = np.zeros(len(space.low))
+        codes[code] = np.radians(degrees)
+        assert (codes <= space.high + 1e-12).all()
+        assert (codes >= space.low - 1e-12).all()
+        return space.transforms(codes)
+
+    place = rig.joint_names.index
+    for side in ("Left", "Right"):
+        assert bent(f"{side}ForeArm", 0, 90)[place(f"{side}Hand"), 1, 3] < -0.2
+        assert bent(f"{side}Leg", 0, 90)[place(f"{side}Foot"), 1, 3] > 0.3
+        assert bent(f"{side}UpLeg", 0, 90)[place(f"{side}Leg"), 1, 3] < -0.3
+        for joint in ("ForeArm", "Leg"):
+            hinge = space.joint_of_code == place(side + joint)
+            bend, _, aside = np.degrees(np.stack([space.low[hinge], space.high[hinge]], axis=1))
+            np.testing.assert_allclose(bend, [-5.0, 150.0])
+            np.testing.assert_allclose(aside, [-5.0, 5.0])
+    upright = bent("Spine", 1, 30)
+    np.testing.assert_allclose(upright[place("Head"), :3, 3], rig.rest[place("Head"), :3, 3])
+
+
+@pytest.mark.parametrize(
+    ("chain", "roles"),
+    [
+        (
+            "mixamorig:LeftUpLeg mixamorig:LeftLeg mixamorig:LeftFoot mixamorig:LeftToeBase",
+            (Role.THIGH, Role.SHIN, Role.FOOT, Role.TOE),
+        ),
+        (
+            "upper_arm.L forearm.L hand.L f_index.01.L",
+            (Role.UPPER_ARM, Role.FOREARM, Role.HAND, Role.FINGER),
+        ),
+        (
+            "J_Bip_R_UpperArm J_Bip_R_LowerArm J_Bip_R_Hand J_Bip_R_Thumb1",
+            (Role.UPPER_ARM, Role.FOREARM, Role.HAND, Role.THUMB),
+        ),
+        (
+            "Bip01 L Thigh|Bip01 L Calf|Bip01 L Foot|Bip01 L Toe0",
+            (Role.THIGH, Role.SHIN, Role.FOOT, Role.TOE),
+        ),
+        (
+            "clavicle_l upperarm_l lowerarm_l lowerarm_twist_01_l",
+            (Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.TWIST),
+        ),
+        ("Armature leg spring controller", (Role.OTHER, Role.OTHER, Role.OTHER, Role.OTHER)),
+    ],
+)
+def test_names_say_what_joints_are(chain: str, roles: tuple[Role, ...]) -> None:
+    names = tuple(chain.split("|" if "|" in chain else " "))
+    rig = rig_of(rigged_tube(n_joints=4))
+    assert joint_roles(replace(rig, joint_names=names)) == roles
+
+
+def test_clips_widen_limits_and_say_what_is_plausible() -> None:
+    character = rigged_body(n_frames=20)
+    frames = character.sample("moves", None)
+    assert frames.transforms is not None
+    plain, measured = RigPoseSpace(character), RigPoseSpace(character, frames=frames.transforms)
+    codes = measured.codes_of_transforms(frames.transforms)
+    assert ((codes < plain.low) | (codes > plain.high)).any()
+    assert ((codes >= measured.low) & (codes <= measured.high)).all()
+    assert (measured.low <= plain.low).all()
+    assert (measured.high >= plain.high).all()
+    np.testing.assert_allclose(
+        measured.decode(codes), frames.vertices / measured.body_size, atol=1e-9
+    )
+    # What the clip does is more plausible than as much in a direction of its own.
+    turn = np.zeros(len(codes[0]))
+    turn[6:] = np.random.default_rng(0).permutation(codes[10, 6:])
+    cost = [float(move @ measured.precision @ move) for move in (codes[10], turn)]
+    assert cost[0] < 0.7 * cost[1]
+    assert (np.linalg.eigvalsh(measured.precision) > 0.0).all()
+    assert (measured.topology.edge_lengths(measured.rest_vertices) < measured.longest_edges).all()
+
+
+@pytest.mark.parametrize("name", ["tube", "body"])
+def test_the_metric_measures_vertices(name: str) -> None:
+    space = RigPoseSpace(CHARACTERS[name])
+    generator = np.random.default_rng(2)
+    ratios = []
+    for seed in range(40):
+        codes = random_codes(space, seed, 0.4)
+        step = 1e-3 * generator.normal(size=len(codes))
+        moved = space.decode((codes + step)[None]) - space.decode(codes[None])
+        squared = (moved**2).sum(axis=2).mean()
+        ratios.append(np.sqrt(step @ space.metric @ step / squared))
+    assert 0.8 < np.median(ratios) < 1.25
+    assert (np.linalg.eigvalsh(space.metric) > 0.0).all()
+    np.testing.assert_allclose(
+        space.domain_metrics.sum(axis=0) - space.metric,
+        np.diag(
+            np.full(
+                len(space.low), -1e-3 * np.trace(space.domain_metrics.sum(axis=0)) / len(space.low)
+            )
+        ),
+        atol=1e-12,
+    )
+
+
+def test_a_hand_is_dragged_to_the_hip_and_stays_out_of_it() -> None:
+    character = rigged_body()
+    space: PoseSpace = RigPoseSpace(character)
+    rig = rig_of(character)
+    detector = CollisionDetector(character.topology, character.rest_vertices)
+    size = float(np.ptp(character.rest_vertices, axis=0).max())
+    hand = int(
+        np.flatnonzero(
+            rig.weights[:, 0] * (rig.joint_of[:, 0] == rig.joint_names.index("LeftHand")) > 0.9
+        )[4]
+    )
+    grip = make_grip(space, hand)
+    # Only its own component is near along the surface.
+    assert len(grip.vertices) > 3
+    begin = grip.position(character.rest_vertices)
+    target = np.array([0.1, -0.02, 1.1])
+    ends = {}
+    for solid in (False, True):
+        dragger = PoseDragger(ExactCheck(space, detector, size))
+        dragger.begin(np.zeros(len(space.low)), grip, (), DragOptions(solid=solid))
+        for event in range(1, 61):
+            step = dragger.move(begin + min(1.0, event / 45) * (target - begin))
+            if solid:
+                assert not detector.detect(step.vertices).colliding
+        ends[solid] = step
+    assert ends[False].miss < 0.02
+    assert detector.detect(ends[False].vertices).colliding
+    assert ends[True].miss < 0.2
+    assert len(ends[True].contacts)
+
+
+def test_a_character_without_a_rig_is_refused_in_a_sentence() -> None:
+    with pytest.raises(LCollisionError, match=r"tube\.glb has no joints to pose it by"):
+        RigPoseSpace(replace(CHARACTERS["tube"], rig=None))
+    with pytest.raises(ShapeError, match="must be 3 names, got 1"):
+        RigPoseSpace(CHARACTERS["tube"], ["arm"])
+    space = RigPoseSpace(CHARACTERS["tube"])
+    with pytest.raises(ShapeError, match=r"must be \(3, 4, 4\) a pose"):
+        space.codes_of_transforms(np.eye(4))
+    broken = np.broadcast_to(np.eye(4), (3, 4, 4)).copy()
+    broken[1, 0, 0] = np.nan
+    with pytest.raises(ShapeError, match="not finite"):
+        space.codes_of_transforms(broken)

@@ -1,0 +1,235 @@
+"""Characters made here: a tube on a chain of joints, and a body of tubes on a tree of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.characters import Character, ClipFrames, Rig
+from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes import FaceGroup, Topology
+from tests.bending_tube import RINGS, SIDES, bent_tube, tube_topology
+
+FloatArray = npt.NDArray[np.float64]
+
+_LIMB_RINGS = 13
+
+_JOINTS: dict[str, tuple[str, tuple[float, float, float]]] = {
+    "Hips": ("", (0.0, 0.0, 1.0)),
+    "Spine": ("Hips", (0.0, 0.0, 1.15)),
+    "Neck": ("Spine", (0.0, 0.0, 1.52)),
+    "Head": ("Neck", (0.0, 0.0, 1.6)),
+    "HeadEnd": ("Head", (0.0, 0.0, 1.85)),
+    **{
+        f"{side}{name}": (parent if parent == "Hips" or parent == "Spine" else side + parent, place)
+        for side, sign in (("Left", 1.0), ("Right", -1.0))
+        for name, parent, place in (
+            ("Arm", "Spine", (0.2 * sign, 0.0, 1.45)),
+            ("ForeArm", "Arm", (0.5 * sign, 0.0, 1.45)),
+            ("Hand", "ForeArm", (0.75 * sign, 0.0, 1.45)),
+            ("HandEnd", "Hand", (0.9 * sign, 0.0, 1.45)),
+            ("UpLeg", "Hips", (0.12 * sign, 0.0, 0.9)),
+            ("Leg", "UpLeg", (0.12 * sign, 0.0, 0.5)),
+            ("Foot", "Leg", (0.12 * sign, 0.0, 0.1)),
+            ("ToeEnd", "Foot", (0.12 * sign, -0.2, 0.05)),
+        )
+    },
+}
+"""Name, parent and place; z is up, and the body faces -y."""
+
+_LIMBS: tuple[tuple[tuple[str, ...], float, float], ...] = (
+    (("Hips", "Spine", "Neck"), 0.13, 0.06),
+    (("Head", "HeadEnd"), 0.09, 0.03),
+    *(
+        (tuple(side + name for name in chain), radius, 0.04)
+        for side in ("Left", "Right")
+        for chain, radius in (
+            (("Arm", "ForeArm", "Hand", "HandEnd"), 0.045),
+            (("UpLeg", "Leg", "Foot"), 0.07),
+            (("Foot", "ToeEnd"), 0.05),
+        )
+    ),
+)
+"""The joints along each tube, its radius, and how far it stays from its ends."""
+
+
+def rigged_tube(
+    n_joints: int = 3, scale: float = 1.0, frames: bool = False, differs: bool = False
+) -> Character:
+    """Rig the straight tube, of length `scale` along y, with a chain of joints along it.
+
+    Parameters
+    ----------
+    frames : give it a clip of random turns
+    differs : give the joints points of their own, as where the rest pose is not the bind pose
+    """
+    vertices = bent_tube(0.0, 0.0) * scale
+    places = np.linspace(0.1, 0.7, n_joints) if n_joints > 1 else np.array([0.5])
+    rest = np.broadcast_to(np.eye(4), (n_joints, 4, 4)).copy()
+    rest[:, 1, 3] = places * scale
+    # A joint's own axes do not matter for what it can do.
+    rest[:, :3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    along = vertices[:, 1] / scale
+    width = 0.1
+    shares = np.clip((along[:, None] - places[None]) / width + 0.5, 0.0, 1.0)
+    shares[:, 0] = 1.0
+    weights = shares - np.concatenate([shares[:, 1:], np.zeros((len(shares), 1))], axis=1)
+    points = np.repeat(vertices[:, None], n_joints, axis=1)
+    if differs:
+        points = points + 0.02 * scale * np.random.default_rng(4).normal(size=points.shape)
+        vertices = (weights[:, :, None] * points).sum(axis=1)
+    rig = Rig(
+        joint_names=tuple(f"link {joint}" for joint in range(n_joints)),
+        parents=np.arange(n_joints) - 1,
+        rest=rest,
+        nodes=np.arange(n_joints),
+        joint_of=np.broadcast_to(np.arange(n_joints, dtype=np.int32), weights.shape).copy(),
+        weights=weights,
+        points=points,
+    )
+    return character_of("tube", tube_topology(), vertices, rig, [0.0, 1.0, 0.0], 8 if frames else 0)
+
+
+def rigged_body(scale: float = 1.0, n_frames: int = 0) -> Character:
+    """Make a body of tubes that do not touch, 1.85 `scale` high, on a tree of 21 joints."""
+    names = tuple(_JOINTS)
+    places = np.array([place for _, place in _JOINTS.values()])
+    parents = np.array([names.index(parent) if parent else -1 for parent, _ in _JOINTS.values()])
+    vertices, faces, joints, weights, groups, n_vertices = [], [], [], [], [], 0
+    for chain, radius, gap in _LIMBS:
+        numbers = np.array([names.index(name) for name in chain])
+        points, blends = _limb(places[numbers], radius, gap)
+        held = np.zeros((len(points), len(names)))
+        held[:, numbers[:-1]] = blends
+        n_faces = sum(map(len, faces))
+        faces.append(_limb_faces() + n_vertices)
+        groups.append(FaceGroup(chain[0], np.arange(n_faces, n_faces + len(faces[-1]))))
+        vertices.append(points)
+        order = np.argsort(-held, axis=1, kind="stable")[:, :3]
+        joints.append(order)
+        weights.append(np.take_along_axis(held, order, axis=1))
+        n_vertices += len(points)
+    rest = np.broadcast_to(np.eye(4), (len(names), 4, 4)).copy()
+    rest[:, :3, 3] = places * scale
+    rest_vertices = np.concatenate(vertices) * scale
+    rig = Rig(
+        joint_names=names,
+        parents=parents,
+        rest=rest,
+        nodes=np.arange(len(names)),
+        joint_of=np.concatenate(joints).astype(np.int32),
+        weights=np.concatenate(weights),
+        points=np.repeat(rest_vertices[:, None], 3, axis=1),
+    )
+    topology = Topology(np.concatenate(faces), n_vertices)
+    return character_of(
+        "body", topology, rest_vertices, rig, [0.0, 0.0, 1.0], n_frames, tuple(groups)
+    )
+
+
+def turned(rig: Rig, turns: FloatArray) -> FloatArray:
+    """Return the (J, 4, 4) global transforms of joints turned by (J, 3, 3) rotations.
+
+    Each turns about its place, in the axes of the character, and carries those below it.
+    """
+    moved = np.empty_like(rig.rest)
+    for joint, parent in enumerate(rig.parents):
+        place = rig.rest[joint, :3, 3]
+        own = np.eye(4)
+        own[:3, :3] = turns[joint]
+        own[:3, 3] = place - turns[joint] @ place
+        moved[joint] = own if parent < 0 else moved[parent] @ own
+    return moved @ rig.rest
+
+
+def skinned(rig: Rig, transforms: FloatArray) -> FloatArray:
+    """Skin by the formula of `Rig`, vertex by vertex."""
+    vertices = np.zeros((len(rig.weights), 3))
+    for vertex in range(len(vertices)):
+        for joint, weight, point in zip(
+            rig.joint_of[vertex], rig.weights[vertex], rig.points[vertex], strict=True
+        ):
+            moved = transforms[joint] @ np.linalg.inv(rig.rest[joint])
+            vertices[vertex] += weight * (moved @ np.append(point, 1.0))[:3]
+    return vertices
+
+
+def character_of(
+    name: str,
+    topology: Topology,
+    vertices: FloatArray,
+    rig: Rig,
+    up: list[float],
+    n_frames: int,
+    groups: tuple[FaceGroup, ...] = (),
+) -> Character:
+    """Wrap a rig, with a clip of `n_frames` frames in which its joints turn smoothly."""
+
+    def sample(clip: str, fps: float | None) -> ClipFrames:  # noqa: ARG001
+        if clip != "moves" or not n_frames:
+            raise LCollisionError.must_be("a clip", "moves", clip)
+        from scipy.spatial.transform import Rotation
+
+        ways = np.random.default_rng(11).normal(size=(len(rig.parents), 3))
+        times = np.arange(n_frames) / 30.0
+        transforms = np.stack(
+            [
+                turned(rig, Rotation.from_rotvec(0.3 * np.sin(4.0 * time) * ways).as_matrix())
+                for time in times
+            ]
+        )
+        posed = np.stack([skinned(rig, one) for one in transforms])
+        names = tuple(f"moves {frame}" for frame in range(n_frames))
+        return ClipFrames("moves", names, times, posed, transforms)
+
+    return Character(
+        name=name,
+        source=Path(f"{name}.glb"),
+        topology=topology,
+        rest_vertices=vertices,
+        joined=np.arange(len(vertices)),
+        up=np.array(up),
+        up_is_sure=True,
+        metres=1.0,
+        groups=groups,
+        rig=rig,
+        clips=("moves",) if n_frames else (),
+        sample=sample,
+    )
+
+
+def _limb(places: FloatArray, radius: float, gap: float) -> tuple[FloatArray, FloatArray]:
+    """Return a tube along (n, 3) places, and its vertices' (V, n - 1) weights by segment."""
+    lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    ends = np.concatenate([[0.0], np.cumsum(lengths)])
+    along = np.linspace(gap, ends[-1] - gap, _LIMB_RINGS)
+    centres = np.stack([np.interp(along, ends, column) for column in places.T], axis=1)
+    way = (places[-1] - places[0]) / np.linalg.norm(places[-1] - places[0])
+    across = np.cross(way, np.eye(3)[np.abs(way).argmin()])
+    across /= np.linalg.norm(across)
+    angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
+    circle = np.outer(np.cos(angles), across) + np.outer(np.sin(angles), np.cross(way, across))
+    rings = centres[:, None] + radius * circle
+    shares = np.clip((along[:, None] - ends[None, :-1]) / (2.0 * radius) + 0.5, 0.0, 1.0)
+    shares[:, 0] = 1.0
+    shares[:, :-1] -= shares[:, 1:].copy()
+    return (
+        np.concatenate([rings.reshape(-1, 3), centres[[0, -1]]]),
+        np.concatenate([np.repeat(shares, SIDES, axis=0), shares[[0, -1]]]),
+    )
+
+
+def _limb_faces() -> npt.NDArray[np.int32]:
+    """Return the faces of `tests.bending_tube`'s tube, of fewer rings."""
+    faces = tube_topology().faces
+    first_dropped = _LIMB_RINGS * SIDES
+    removed = (RINGS - _LIMB_RINGS) * SIDES
+    last = (RINGS - 1) * SIDES
+    wall = (faces < first_dropped).all(axis=1)
+    bottom = (faces == RINGS * SIDES).any(axis=1)
+    top = ((faces >= last) | (faces == RINGS * SIDES + 1)).all(axis=1) & ~bottom
+    kept = faces[wall | bottom | top].copy()
+    kept[kept >= last] -= removed
+    return kept
