@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
 
 from lcollision_core.acap.codec import AcapCodec
 from lcollision_core.acap.features import N_FEATURES
@@ -168,33 +167,6 @@ class Embedding:
         features = self.decoder.features(latent[None])
         at = np.repeat(features, len(by_vertices), axis=0)
         return self.decoder.pull_back(latent, self.codec.decode_vjp(at, by_vertices, n_threads=1))
-
-    def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
-        """Prepare the derivatives of patches' means by the codes, so that a pose needs no solve.
-
-        Parameters
-        ----------
-        weights : (m, V) sparse matrix; each patch's mean is its row times a pose's vertices
-
-        Returns
-        -------
-        slopes : of (D,) codes and (n, V, 3) further derivatives by their vertices, in normalised
-            length, those by the codes, (3 m + n, D): x, y and z of each mean, then the further ones
-            as `pull_back` has them
-
-        Raises
-        ------
-        ShapeError : another number of columns.
-        """
-        codec, decoder = self.codec, self.decoder
-        by_gradients = codec.means_by_gradients(weights)
-
-        def slopes(latent: FloatArray, by_vertices: FloatArray) -> FloatArray:
-            features = decoder.features(latent[None])[0]
-            grad_features = codec.means_vjp(features, by_gradients, by_vertices)
-            return decoder.pull_back(latent, grad_features)
-
-        return slopes
 
     def guess(self, features: npt.NDArray[Any]) -> Float32Array:
         """Run the encoders: (B, V, 9) unscaled features to a (B, D) float32 latent."""

@@ -280,7 +280,7 @@ class PoseDragger:
     def _hold(self, moved: FloatArray) -> FloatArray:
         """Return the (D, D) price of a (D,) change since the start: high for parts that rest."""
         metrics = self._space.domain_metrics
-        squared = np.einsum("i,kij,j->k", moved, metrics, moved) / self._shares
+        squared = metrics @ moved @ moved / self._shares
         weights = HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / MOVED)
         price: FloatArray = np.tensordot(weights, metrics, 1)
         return price

@@ -121,6 +121,7 @@ class LatentPoseSpace:
         self.low, self.high = embedding.box.low, embedding.box.high
         self.group_sizes, self.n_domains = embedding.group_sizes, embedding.n_domains
         self.vertex_domain = embedding.attention_mask.argmax(axis=0)
+        self._last_features = (np.full(embedding.latent_size, np.nan), np.empty(0))
 
     @cached_property
     def domain_metrics(self) -> FloatArray:
@@ -178,6 +179,8 @@ class LatentPoseSpace:
 
     def decode(self, codes: FloatArray) -> FloatArray:
         """Decode (B, D) latent poses to (B, V, 3) vertices."""
+        if len(codes) == 1:
+            return self.embedding.codec.decode(self._features(codes[0])[None], n_threads=1)
         return self.embedding.decode(codes, n_threads=1)
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
@@ -186,4 +189,20 @@ class LatentPoseSpace:
 
     def mean_slopes(self, weights: csr_matrix) -> MeanSlopes:
         """Solve for patches' means once; see `PoseSpace.mean_slopes`."""
-        return self.embedding.mean_slopes(weights)
+        codec, decoder = self.embedding.codec, self.embedding.decoder
+        by_gradients = codec.means_by_gradients(weights)
+
+        def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
+            features = self._features(codes)
+            return decoder.pull_back(codes, codec.means_vjp(features, by_gradients, by_vertices))
+
+        return slopes
+
+    def _features(self, codes: FloatArray) -> FloatArray:
+        """Return the (V, 9) features of (D,) codes; a drag asks twice for those of every pose."""
+        # Taken and put as a pair, as other threads may do so at the same time.
+        at, features = self._last_features
+        if not np.array_equal(at, codes):
+            features = self.embedding.decoder.features(codes[None])[0]
+            self._last_features = (codes.copy(), features)
+        return features

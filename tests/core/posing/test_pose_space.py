@@ -44,3 +44,19 @@ def test_mean_slopes_are_those_of_differences(tube_model: PoseModel) -> None:
     scale = np.abs(slopes).max()
     assert scale > 0.001
     np.testing.assert_allclose(slopes, differences, atol=2e-3 * scale)
+
+
+def test_a_pose_does_not_depend_on_the_one_before(tube_model: PoseModel) -> None:
+    """The features of the last codes are kept, and codes may be changed in their place."""
+    space, poses = tube_model.pose_space, sample_poses(tube_model, 2, seed=4)
+    slopes = space.mean_slopes(csr_matrix(patches(tube_model)))
+    none = np.empty((0, tube_model.n_vertices, 3))
+    together = space.decode(poses)
+    by_codes = [slopes(codes, none) for codes in poses]
+    assert not np.array_equal(*by_codes)
+    here = np.empty((1, poses.shape[1]))
+    for pose in (0, 1, 1, 0):
+        here[0] = poses[pose]
+        assert np.array_equal(slopes(here[0], none), by_codes[pose])
+        here[0] = poses[1 - pose]
+        assert np.array_equal(space.decode(here)[0], together[1 - pose])
