@@ -7,6 +7,7 @@ texture coordinates or normals differ.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -28,6 +29,7 @@ from lcollision_core.meshes.formats.text import (
 )
 
 _SHORTEST_LINE = len(b"f 1 2 3\n")
+_NORMAL_OF_CORNER = re.compile(rb"[^\s/]+(?:/[^\s/]*)?(?:/([^\s/]*))?")
 
 
 def read(file: BinaryIO) -> Polygons:
@@ -45,28 +47,100 @@ def read(file: BinaryIO) -> Polygons:
     ------
     MeshFileError : a vertex or face is not readable, named by its number from 0.
     """
-    data = read_rest(file)
-    if b"\0" in data:
-        raise MeshFileError("it is not a text file, so not an OBJ file")
-    if len(data) > _SHORTEST_LINE * MAX_FACES:
-        require_plausible_count(data.count(b"\nf"), "faces")
-        require_plausible_count(data.count(b"\nv "), "vertices")
-    data = plain_lines(data)
-    if b"\\" in data:
-        data = data.replace(b"\\\n", b" ") + b"\n"
-    if data.startswith(b" ") or b"\n " in data:
-        data = re.sub(rb"(?m)^ +", b"", data)
-    text = np.frombuffer(bytearray(data), dtype=np.uint8)
-    lengths = np.diff(np.flatnonzero(text == ord("\n")), prepend=-1)
-    starts = np.cumsum(lengths) - lengths
-    is_lone = text[np.minimum(starts + 1, len(text) - 1)] <= ord(" ")
-    is_vertex, is_face = ((text[starts] == ord(letter)) & is_lone for letter in "vf")
-    text[starts] = ord(" ")
-    vertex_text, face_text = (
-        text[np.repeat(chosen, lengths)].tobytes() for chosen in (is_vertex, is_face)
+    lines = _Lines.of(read_rest(file))
+    return Polygons(lines.points("v"), *lines.faces())
+
+
+@dataclass(frozen=True, eq=False)
+class ObjCorners:
+    """The vertices and normals of an OBJ file, and the corners that use them.
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64 array
+    normals : (N, 3) float64 array
+    sizes : (P,) int64 array, corners of each polygon
+    corners : (sum of sizes,) int64 array, vertex indices from 0
+    corner_normals : (sum of sizes,) int64 array, normal indices from 0; -1 where a corner has none
+    """
+
+    vertices: npt.NDArray[np.float64]
+    normals: npt.NDArray[np.float64]
+    sizes: npt.NDArray[np.int64]
+    corners: npt.NDArray[np.int64]
+    corner_normals: npt.NDArray[np.int64]
+
+
+def read_corners(data: bytes) -> ObjCorners:
+    """Read `v`, `vn` and `f` lines from a file's bytes.
+
+    Raises
+    ------
+    MeshFileError : as for `read`.
+    """
+    lines = _Lines.of(data)
+    sizes, corners = lines.faces()
+    normals = lines.points("vn")
+    return ObjCorners(
+        lines.points("v"), normals, sizes, corners, lines.corner_normals(len(normals))
     )
-    vertices = points(vertex_text, "vertex")
-    return Polygons(vertices, *_faces(face_text, np.cumsum(is_vertex)[is_face]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """The text of a file, without comments, and which lines are what.
+
+    Attributes
+    ----------
+    text : (n,) uint8 array, the keywords replaced by blanks
+    lengths : (L,) int64 array, of the lines
+    is_kind : for each of the keywords "v", "vn" and "f" an (L,) bool array
+    """
+
+    text: npt.NDArray[np.uint8]
+    lengths: npt.NDArray[np.int64]
+    is_kind: dict[str, npt.NDArray[np.bool_]]
+
+    @classmethod
+    def of(cls, data: bytes) -> _Lines:
+        if b"\0" in data:
+            raise MeshFileError("it is not a text file, so not an OBJ file")
+        if len(data) > _SHORTEST_LINE * MAX_FACES:
+            require_plausible_count(data.count(b"\nf"), "faces")
+            require_plausible_count(data.count(b"\nv "), "vertices")
+        data = plain_lines(data)
+        if b"\\" in data:
+            data = data.replace(b"\\\n", b" ") + b"\n"
+        if data.startswith(b" ") or b"\n " in data:
+            data = re.sub(rb"(?m)^ +", b"", data)
+        text = np.frombuffer(bytearray(data), dtype=np.uint8)
+        lengths = np.diff(np.flatnonzero(text == ord("\n")), prepend=-1)
+        starts = np.cumsum(lengths) - lengths
+        first, second, third = (text[np.minimum(starts + i, len(text) - 1)] for i in range(3))
+        is_kind = {name: (first == ord(name)) & (second <= ord(" ")) for name in "vf"}
+        is_kind["vn"] = (first == ord("v")) & (second == ord("n")) & (third <= ord(" "))
+        text[starts] = ord(" ")
+        text[starts[is_kind["vn"]] + 1] = ord(" ")
+        return cls(text, lengths, is_kind)
+
+    def _of_kind(self, kind: str) -> bytes:
+        return self.text[np.repeat(self.is_kind[kind], self.lengths)].tobytes()
+
+    def points(self, kind: str) -> npt.NDArray[np.float64]:
+        return points(self._of_kind(kind), {"v": "vertex", "vn": "normal"}[kind])
+
+    def faces(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        n_before = np.cumsum(self.is_kind["v"], dtype=np.int64)
+        return _faces(self._of_kind("f"), n_before[self.is_kind["f"]])
+
+    def corner_normals(self, n_normals: int) -> npt.NDArray[np.int64]:
+        """Return each corner's normal, an index from 0; -1 for none and for one out of range."""
+        named = _NORMAL_OF_CORNER.sub(lambda corner: corner[1] or b"0", self._of_kind("f"))
+        values, sizes = number_rows(named, "face", whole=True)
+        index = vertex_numbers(values, sizes)
+        n_before = np.repeat(np.cumsum(self.is_kind["vn"])[self.is_kind["f"]], sizes)
+        index = np.where(index < 0, n_before + index, index - 1)
+        return np.where(index < n_normals, np.maximum(index, -1), -1)
 
 
 def _faces(
