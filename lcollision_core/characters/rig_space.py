@@ -345,24 +345,18 @@ class RigPoseSpace:
         by_codes: FloatArray = moved[self._place]
         return by_codes
 
-    def mean_slopes(self, weights: FloatArray) -> Callable[[FloatArray, FloatArray], FloatArray]:
-        """Return what differentiates the means of patches, and other functions, by the codes.
+    def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
+        """Prepare the derivatives of patches' means by the codes; see `posing.PoseSpace`.
 
         Parameters
         ----------
         weights : (m, V) of the patches' means
-
-        Returns
-        -------
-        slopes : of (D,) codes and (n, V, 3) derivatives of n functions by the vertices, the
-            (3 m + n, D) derivatives of the means, x, y and z of each, and of the functions
         """
-        means = (weights[:, None, :, None] * np.eye(3)[:, None]).reshape(-1, weights.shape[1], 3)
+        means = weights.toarray()[:, None, :, None] * np.eye(3)[:, None]
+        means = means.reshape(-1, weights.shape[1], 3)
 
         def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
-            return np.concatenate(
-                [self.pull_back(codes, means), self.pull_back(codes, by_vertices)]
-            )
+            return self.pull_back(codes, np.concatenate([means, by_vertices]))
 
         return slopes
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import Character, Rig, RigPoseSpace
@@ -108,12 +109,14 @@ def test_means_of_patches_are_differentiated_with_the_rest() -> None:
     space = RigPoseSpace(character)
     codes, by_vertices = random_codes(space), a_few(character, 2, 3)
     weights = np.random.default_rng(1).random((2, space.topology.n_vertices))
-    slopes = space.mean_slopes(weights)(codes, by_vertices)
+    slopes = space.mean_slopes(csr_matrix(weights))(codes, by_vertices)
     assert slopes.shape == (3 * 2 + 2, len(codes))
     moved = space.tangents(codes, np.arange(space.topology.n_vertices))
     means = np.einsum("mv,dvx->mxd", weights, moved).reshape(6, -1)
     np.testing.assert_allclose(slopes[:6], means, atol=1e-10 * np.abs(means).max())
     np.testing.assert_array_equal(slopes[6:], space.pull_back(codes, by_vertices))
+    none = np.empty((0, space.topology.n_vertices, 3))
+    np.testing.assert_array_equal(space.mean_slopes(csr_matrix(weights))(codes, none), slopes[:6])
 
 
 def test_codes_come_back_from_their_transforms(character: Character) -> None:
