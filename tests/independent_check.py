@@ -1,12 +1,16 @@
 """Whether a mesh runs into itself, by code that shares nothing with the project's.
 
 Two triangles in general position meet exactly where an edge of one pierces the other. Every edge
-is tried on every triangle near it; there is no tree, no depth, and no file reader of ours.
+is tried on every triangle near it; there is no tree, no depth, and no file reader of ours. Contact
+rules are applied pair by pair, by the text of their definition in the glossary.
 """
 
 from __future__ import annotations
 
+import heapq
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +48,70 @@ def crossing_pairs(vertices: Array, faces: npt.NDArray[np.int64]) -> set[tuple[i
             edge = corners[near[:, own]][:, [start, (start + 1) % 3]]
             found |= _pierces(edge[:, 0], edge[:, 1], triangle)
     return {(int(a), int(b)) for a, b in near[found]}
+
+
+def excluding_rules(
+    pairs: Mapping[tuple[int, int], float],
+    touching_at_rest: Iterable[tuple[int, int]],
+    rest: Array,
+    faces: npt.NDArray[np.int64],
+    rules: Mapping[str, Any],
+    groups: Mapping[str, set[int]],
+) -> dict[tuple[int, int], str]:
+    """Return the first rule that excludes each pair of a pose; those that count are left out.
+
+    Parameters
+    ----------
+    pairs : colliding faces with their depths, in the unit of `rest`
+    touching_at_rest : pairs of faces of the rest pose
+    rules : as in JSON
+    groups : faces by name
+    """
+    size = float(np.ptp(rest[np.unique(faces)], axis=0).max())
+    neighbours: dict[int, set[int]] = {}
+    for a, b, c in faces.tolist():
+        for i, j in ((a, b), (b, c), (c, a)):
+            neighbours.setdefault(i, set()).add(j)
+            neighbours.setdefault(j, set()).add(i)
+    faces_of: dict[int, set[int]] = {}
+    for face, corners in enumerate(faces.tolist()):
+        for corner in corners:
+            faces_of.setdefault(corner, set()).add(face)
+
+    def around(face: int, radius: float) -> set[int]:
+        """Faces with a corner at most so far from one of this face, along edges, by Dijkstra."""
+        reached: set[int] = set()
+        waiting = [(0.0, corner) for corner in faces[face].tolist()]
+        while waiting:
+            length, vertex = heapq.heappop(waiting)
+            if vertex in reached:
+                continue
+            reached.add(vertex)
+            for other in neighbours[vertex] - reached:
+                further = length + float(np.linalg.norm(rest[vertex] - rest[other]))
+                if further <= radius:
+                    heapq.heappush(waiting, (further, other))
+        return set().union(*(faces_of[vertex] for vertex in reached))
+
+    near, of_rest = rules["near_exclusion"] * size, rules["rest_exclusion"]
+    at_rest: set[tuple[int, int]] = set()
+    for pair in touching_at_rest if of_rest is not None else ():
+        a, b = ({face} if of_rest == 0.0 else around(face, of_rest * size) for face in pair)
+        at_rest |= {(one, two) for one in a for two in b} | {(two, one) for one in a for two in b}
+    excluded = {}
+    for (a, b), depth in pairs.items():
+        if near > 0.0 and b in around(a, near):
+            excluded[a, b] = "near"
+        elif (a, b) in at_rest:
+            excluded[a, b] = "rest"
+        elif any(
+            (a in groups[one] and b in groups[two]) or (b in groups[one] and a in groups[two])
+            for one, two in rules["ignored"]
+        ):
+            excluded[a, b] = "ignored"
+        elif depth <= rules["tolerated_depth"] * size:
+            excluded[a, b] = "tolerated"
+    return excluded
 
 
 def _pierces(start: Array, stop: Array, triangle: Array) -> npt.NDArray[np.bool_]:

@@ -33,7 +33,6 @@ from scipy.sparse import csgraph
 
 from app.benchmarks.timing import Row
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
-from lcollision_core.contact.near_exclusion import are_pairs_near, near_vertices
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.model import PoseModel
@@ -101,7 +100,6 @@ def time_drags(
 def is_free_by_brute_force(model: PoseModel, vertices: npt.NDArray[np.floating]) -> bool:
     """Compare all pairs of faces of a (V, 3) pose that share no vertex, without a tree."""
     faces, size = model.faces, model.body_size
-    near = near_vertices(model.topology, model.reference, model.near_exclusion * size)
     corners = vertices[faces].astype(np.float64)
     low, high = corners.min(axis=1), corners.max(axis=1)
     for first in range(0, len(faces), _ROWS_AT_ONCE):
@@ -113,8 +111,8 @@ def is_free_by_brute_force(model: PoseModel, vertices: npt.NDArray[np.floating])
         shared = (faces[a][:, :, None] == faces[b][:, None, :]).any(axis=(1, 2))
         pairs = np.stack([a, b], axis=1)[~shared & (a < b)]
         deep = penetration_depth(corners[pairs[:, 0]], corners[pairs[:, 1]]) / size
-        pairs = pairs[deep > DEPTH_TOLERANCE]
-        if len(pairs) and not are_pairs_near(model.topology, pairs, near).all():
+        pairs, deep = pairs[deep > DEPTH_TOLERANCE], deep[deep > DEPTH_TOLERANCE]
+        if not model.detector.rules_of(pairs, deep).all():
             return False
     return True
 

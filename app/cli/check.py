@@ -48,7 +48,7 @@ def check(
 
 def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
     """Check one file; the keys are those of ``lcollision check --json``."""
-    from lcollision_core.contact import CollisionDetector
+    from lcollision_core.contact import CollisionDetector, ContactRules
     from lcollision_core.errors import MeshFileError, ShapeError
     from lcollision_core.meshes import audit_mesh, read_mesh
 
@@ -57,7 +57,7 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
     for remark in (*mesh.notes, *audit_mesh(mesh.topology, mesh.vertices)):
         note(f"{path}: {remark}")
     try:
-        detector = CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=near_exclusion)
+        detector = CollisionDetector(mesh.topology, mesh.vertices, ContactRules(near_exclusion))
         with progress_bar("Finding self-collisions") as progress:
             found = detector.summarise(mesh.vertices, n_deepest=_DEEPEST, progress=progress)
     except ShapeError as error:
@@ -71,7 +71,7 @@ def check_mesh(path: Path, near_exclusion: float = 0.0) -> dict[str, Any]:
         "faces": mesh.topology.n_faces,
         "watertight": mesh.topology.is_watertight,
         "pairs": found.n_pairs,
-        "near_pairs": found.n_near_pairs,
+        "near_pairs": found.excluded.near,
         "coincident_pairs": found.n_coincident_pairs,
         "deepest": [
             {"faces": faces, "depth": depth}

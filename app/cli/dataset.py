@@ -25,7 +25,7 @@ def check(
     Exits with 1 when the set cannot be trained on as it is: a pose is unusable, or a face of
     the first has no area.
     """
-    from lcollision_core.contact import CollisionDetector
+    from lcollision_core.contact import CollisionDetector, ContactRules
     from lcollision_core.errors import MeshFileError, ShapeError
     from lcollision_core.meshes import degenerate_faces, inspect_pose_set
 
@@ -38,7 +38,7 @@ def check(
         note(f"{path}: {remark}")
     exclusion = poses.near_exclusion if near_exclusion is None else near_exclusion
     try:
-        detector = CollisionDetector(poses.topology, poses.vertices[0], near_exclusion=exclusion)
+        detector = CollisionDetector(poses.topology, poses.vertices[0], ContactRules(exclusion))
         with progress_bar("Finding self-collisions") as progress:
             found = detector.detect_batch(poses.vertices, progress=progress)
     except ShapeError as error:

@@ -34,15 +34,30 @@ class FaceTree(NamedTuple):
     size: IntArray
 
 
-class NearVertices(NamedTuple):
-    """For each vertex the vertices within the near exclusion of it, itself among them.
+class Exclusions(NamedTuple):
+    """Which pairs of faces do not count, by `ContactRules` on one mesh.
 
-    ``vertex[start[v]:start[v + 1]]`` are those of v, ascending; `vertex` is empty where nothing
-    is excluded.
+    Those of face f with faces after it, by distance at rest and by touching at rest, are
+    ``face[start[f]:start[f + 1]]``, ascending. Pairs of groups are kept by region, as two groups
+    relate too many faces for a list.
+
+    Attributes
+    ----------
+    start : (F + 1,) int64
+    face : (n,) int32, face indices
+    rule : (n,) uint8, `kernels.NEAR` or `kernels.REST`
+    region : (F,) int32, the region of each face: faces of one region are of the same groups; (0,)
+        where no groups are ignored
+    ignored : (R, R) bool, symmetric, which pairs of regions are ignored
+    squared_tolerance : of the tolerated depth, in normalised length squared
     """
 
     start: npt.NDArray[np.int64]
-    vertex: IntArray
+    face: IntArray
+    rule: npt.NDArray[np.uint8]
+    region: IntArray
+    ignored: npt.NDArray[np.bool_]
+    squared_tolerance: float
 
 
 class PoseWork(NamedTuple):
@@ -73,9 +88,10 @@ class Found(NamedTuple):
     ----------
     slots : (P, 2) int32, the slots of the two faces
     squared_depth : (P,) float64, in normalised length squared
-    is_near : (P,) bool
+    rule : (P,) uint8, why the pair does not count: `kernels.NEAR` and so on, `kernels.COUNTED`
+        where it does
     """
 
     slots: IntArray
     squared_depth: npt.NDArray[np.float64]
-    is_near: npt.NDArray[np.bool_]
+    rule: npt.NDArray[np.uint8]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NoReturn
@@ -11,17 +11,23 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact.arrays import FaceTree, Found, NearVertices, PoseWork
+from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork
 from lcollision_core.contact.kernels import (
+    COINCIDENT,
+    COUNTED,
     LEAF_SIZE,
     MAX_DISTANCE,
+    NEAR,
     add_vertex_energy,
     search_pose,
 )
-from lcollision_core.contact.near_exclusion import near_vertices
+from lcollision_core.contact.rules import exclusions_of, require_room, rules_of
 from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress
+from lcollision_core.meshes.contact_rules import N_RULES, ContactRules, RuleCounts
+from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.precision import can_hold
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.units import body_size
 
@@ -47,6 +53,8 @@ _POSES_PER_TASK = 8
 _TASKS_PER_THREAD = 4
 """Least number of pieces of a small batch, to keep all threads busy."""
 
+_STRICT = ContactRules()
+
 
 @dataclass(frozen=True, slots=True)
 class SelfCollisions:
@@ -56,21 +64,40 @@ class SelfCollisions:
     ----------
     pairs : (P, 2) int32, face indices, the smaller first, rows in ascending order
     penetration_depth : (P,) float64, PD of each pair, > 1e-9
-    near_pairs, near_penetration_depth : (Q, 2) and (Q,), the same of the pairs within the near
-        exclusion: folds of the skin, which count neither for the verdict nor for the energy
+    excluded_pairs, excluded_depth : (Q, 2) and (Q,), the same of the pairs that a contact rule
+        excludes: they count neither for the verdict nor for the energy
+    excluded_rule : (Q,) uint8, by which rule: 1 for the first of `RuleCounts` and so on
     vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
     """
 
     pairs: IntArray
     penetration_depth: FloatArray
-    near_pairs: IntArray
-    near_penetration_depth: FloatArray
+    excluded_pairs: IntArray
+    excluded_depth: FloatArray
+    excluded_rule: npt.NDArray[np.uint8]
     vertex_energy: FloatArray
 
     @property
     def colliding(self) -> bool:
         """Whether the pose intersects itself."""
         return len(self.pairs) > 0
+
+    @property
+    def excluded(self) -> RuleCounts:
+        """How many pairs each rule excludes."""
+        return RuleCounts.of(self.excluded_rule)
+
+    @property
+    def near_pairs(self) -> IntArray:
+        """(Q, 2) int32, the pairs within the near exclusion: folds of the skin."""
+        pairs: IntArray = self.excluded_pairs[self.excluded_rule == NEAR]
+        return pairs
+
+    @property
+    def near_penetration_depth(self) -> FloatArray:
+        """(Q,) float64, their penetration depths."""
+        depth: FloatArray = self.excluded_depth[self.excluded_rule == NEAR]
+        return depth
 
     @property
     def energy(self) -> float:
@@ -85,13 +112,18 @@ class BatchCollisions:
     Attributes
     ----------
     n_pairs : (B,) int64, colliding pairs
-    n_near_pairs : (B,) int64, pairs within the near exclusion
+    n_excluded : (B, 4) int64, pairs that each rule excludes, in the order of `RuleCounts`
     vertex_energy : (B, V) float64, PDe of Algorithm 1 in normalised length squared
     """
 
     n_pairs: npt.NDArray[np.int64]
-    n_near_pairs: npt.NDArray[np.int64]
+    n_excluded: npt.NDArray[np.int64]
     vertex_energy: FloatArray
+
+    @property
+    def n_near_pairs(self) -> npt.NDArray[np.int64]:
+        """(B,) int64, pairs within the near exclusion."""
+        return self.n_excluded[:, 0]
 
     @property
     def colliding(self) -> npt.NDArray[np.bool_]:
@@ -105,7 +137,8 @@ class CollisionSummary:
 
     Attributes
     ----------
-    n_pairs, n_near_pairs : colliding pairs, and those within the near exclusion
+    n_pairs : colliding pairs
+    excluded : pairs that each rule excludes
     deepest_pairs : (P, 2) int32, face indices of the deepest colliding pairs, the deepest first,
         the smaller index first
     deepest_depth : (P,) float64, their penetration depths
@@ -115,7 +148,7 @@ class CollisionSummary:
     """
 
     n_pairs: int
-    n_near_pairs: int
+    excluded: RuleCounts
     deepest_pairs: IntArray
     deepest_depth: FloatArray
     n_coincident_pairs: int
@@ -144,17 +177,21 @@ class CollisionDetector:
     topology : of all poses
     reference : (V, 3) array, a typical pose: the tree is built on it, and the longest
         side of its bounding box, the body size, is the unit of every result
-    near_exclusion : pairs with an edge path of at most this length between them on the
-        reference, in normalised length, are counted separately; 0 excludes nothing
+    rules : which pairs do not count
+    groups : of faces, which the ignored pairs of the rules name
 
     Raises
     ------
     ShapeError : `reference` is not a finite (V, 3) array with an extent between 1 / `MAX_BODY_SIZE`
-        and `MAX_BODY_SIZE`, or `near_exclusion` is negative, or relates too many vertices.
+        and `MAX_BODY_SIZE`, or the rules exclude too many pairs or name an unknown group.
     """
 
     def __init__(
-        self, topology: Topology, reference: npt.ArrayLike, *, near_exclusion: float = 0.0
+        self,
+        topology: Topology,
+        reference: npt.ArrayLike,
+        rules: ContactRules = _STRICT,
+        groups: Sequence[FaceGroup] = (),
     ) -> None:
         vertices = np.asarray(reference, dtype=np.float64)
         if vertices.shape != (topology.n_vertices, 3):
@@ -164,10 +201,8 @@ class CollisionDetector:
         if not np.isfinite(vertices).all():
             vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
             raise ShapeError("is not finite", where=f"vertex {vertex} of the reference")
-        if not near_exclusion >= 0.0:
-            raise ShapeError.must_be("the near exclusion", "0 or more", near_exclusion)
         self.topology = topology
-        self.near_exclusion = float(near_exclusion)
+        self.rules = rules
         self.body_size = body_size(vertices, topology)
         if self.body_size == 0.0:
             raise ShapeError("all vertices are in one point", "give it a mesh with an extent")
@@ -175,10 +210,22 @@ class CollisionDetector:
             needed = f"{1.0 / MAX_BODY_SIZE:.0e} to {MAX_BODY_SIZE:.0e}"
             raise ShapeError.must_be("the body size", needed, f"{self.body_size:.1e}", "scale it")
         self._tree: FaceTree = build_tree(vertices, topology.faces)
-        self._near: NearVertices = near_vertices(
-            topology, vertices, self.near_exclusion * self.body_size
-        )
+        self._exclusions = self._exclusions_of(vertices, _STRICT, ())
+        if not rules.exclude_nothing:
+            self._exclusions = self._exclusions_of(vertices, rules, groups)
         self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()
+
+    def rules_of(
+        self, pairs: npt.NDArray[np.integer], penetration_depth: FloatArray
+    ) -> npt.NDArray[np.uint8]:
+        """Return by which rule each of (n, 2) colliding pairs does not count, 0 where it does.
+
+        Parameters
+        ----------
+        pairs : (n, 2) face indices
+        penetration_depth : (n,) of them, normalised
+        """
+        return rules_of(self._exclusions, pairs, penetration_depth)
 
     def detect(self, vertices: npt.ArrayLike, *, unit: float = 1.0) -> SelfCollisions:
         """Find all colliding pairs of one pose.
@@ -194,22 +241,24 @@ class CollisionDetector:
         """
         pose = self._checked(vertices, (self.topology.n_vertices, 3))
         vertex_energy = np.zeros(self.topology.n_vertices)
-        parts: list[tuple[IntArray, FloatArray, npt.NDArray[np.bool_]]] = []
+        parts: list[tuple[IntArray, FloatArray, npt.NDArray[np.uint8]]] = []
         with self._searcher() as searcher:
             for n_found in searcher.search(pose, unit=unit):
                 found = searcher.found
                 add_vertex_energy(self._tree, found, n_found, vertex_energy)
                 pairs = np.sort(self._tree.slot_face[found.slots[:n_found]], axis=1)
                 depth = np.sqrt(found.squared_depth[:n_found])
-                parts.append((pairs, depth, found.is_near[:n_found].copy()))
-        pairs, depth, is_near = (np.concatenate(part) for part in zip(*parts, strict=True))
+                parts.append((pairs, depth, found.rule[:n_found].copy()))
+        pairs, depth, rule = (np.concatenate(part) for part in zip(*parts, strict=True))
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
-        pairs, depth, is_near = pairs[order], depth[order], is_near[order]
+        pairs, depth, rule = pairs[order], depth[order], rule[order]
+        counts = rule == COUNTED
         return SelfCollisions(
-            pairs=pairs[~is_near],
-            penetration_depth=depth[~is_near],
-            near_pairs=pairs[is_near],
-            near_penetration_depth=depth[is_near],
+            pairs=pairs[counts],
+            penetration_depth=depth[counts],
+            excluded_pairs=pairs[~counts],
+            excluded_depth=depth[~counts],
+            excluded_rule=rule[~counts],
             vertex_energy=vertex_energy,
         )
 
@@ -237,18 +286,17 @@ class CollisionDetector:
         """
         pose = self._checked(vertices, (self.topology.n_vertices, 3))
         vertex_energy = np.zeros(self.topology.n_vertices)
-        n_coincident = np.zeros(1, dtype=np.int64)
-        n_pairs = n_near_pairs = 0
+        n_by_rule = np.zeros(COINCIDENT + 1, dtype=np.int64)
         pairs, depth = np.empty((0, 2), dtype=np.int32), np.empty(0)
         with self._searcher() as searcher:
-            for n_found in searcher.search(pose, n_coincident=n_coincident):
+            for n_found in searcher.search(pose, with_coincident=True):
                 if cancel is not None:
                     cancel.raise_if_cancelled()
                 found = searcher.found
                 add_vertex_energy(self._tree, found, n_found, vertex_energy)
-                counts = ~found.is_near[:n_found]
-                n_pairs += int(np.count_nonzero(counts))
-                n_near_pairs += n_found - int(np.count_nonzero(counts))
+                rule = found.rule[:n_found]
+                n_by_rule += np.bincount(rule, minlength=len(n_by_rule))
+                counts = rule == COUNTED
                 if len(depth) == n_deepest > 0:
                     counts &= np.sqrt(found.squared_depth[:n_found]) >= depth[-1]
                 deep = np.flatnonzero(counts)
@@ -258,8 +306,9 @@ class CollisionDetector:
                 order = np.lexsort((pairs[:, 1], pairs[:, 0], -depth))[:n_deepest]
                 pairs, depth = pairs[order], depth[order]
                 progress(int(_SHARES * searcher.share_done), _SHARES)
+        n_pairs, *n_excluded, n_coincident = n_by_rule.tolist()
         return CollisionSummary(
-            n_pairs, n_near_pairs, pairs, depth, int(n_coincident[0]), vertex_energy
+            n_pairs, RuleCounts(*n_excluded), pairs, depth, n_coincident, vertex_energy
         )
 
     def detect_batch(
@@ -285,18 +334,18 @@ class CollisionDetector:
         """
         poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
         n_pairs = np.zeros(len(poses), dtype=np.int64)
-        n_near_pairs = np.zeros(len(poses), dtype=np.int64)
+        n_excluded = np.zeros((len(poses), N_RULES), dtype=np.int64)
         vertex_energy = np.zeros(poses.shape[:2])
 
         def search(searcher: _Searcher, pose: int) -> None:
             for n_found in searcher.search(poses[pose], number=pose):
                 add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
-                n_near = int(np.count_nonzero(searcher.found.is_near[:n_found]))
-                n_near_pairs[pose] += n_near
-                n_pairs[pose] += n_found - n_near
+                found = np.bincount(searcher.found.rule[:n_found], minlength=1 + N_RULES)
+                n_pairs[pose] += found[COUNTED]
+                n_excluded[pose] += found[1:]
 
         self._for_each(len(poses), search, workers, progress, cancel)
-        return BatchCollisions(n_pairs, n_near_pairs, vertex_energy)
+        return BatchCollisions(n_pairs, n_excluded, vertex_energy)
 
     def are_colliding(
         self,
@@ -318,10 +367,34 @@ class CollisionDetector:
         def search(searcher: _Searcher, pose: int) -> None:
             for n_found in searcher.search(poses[pose], first_only=True, number=pose, unit=unit):
                 # The search ends at a pair that counts, so the last one found tells.
-                colliding[pose] = n_found > 0 and not searcher.found.is_near[n_found - 1]
+                colliding[pose] = n_found > 0 and searcher.found.rule[n_found - 1] == COUNTED
 
         self._for_each(len(poses), search, workers, progress, cancel)
         return colliding
+
+    def _exclusions_of(
+        self, reference: FloatArray, rules: ContactRules, groups: Sequence[FaceGroup]
+    ) -> Exclusions:
+        touching = np.empty((0, 2), dtype=np.int32)
+        if rules.rest_exclusion is not None:
+            touching = self._touching_pairs(reference)
+        return exclusions_of(rules, self.topology, reference, self.body_size, touching, groups)
+
+    def _touching_pairs(self, reference: FloatArray) -> IntArray:
+        """Return (n, 2) int32, the pairs that collide in the reference or lie on each other there.
+
+        Poses are checked as they are drawn, so it is looked at with that rounding as well.
+        """
+        searcher = self._new_searcher()
+        parts: list[IntArray] = []
+        n_touching = 0
+        drawn = [np.float32] if can_hold(reference, self.topology, np.float32) else []
+        for dtype in (np.float64, *drawn):
+            for n_found in searcher.search(reference.astype(dtype), with_coincident=True):
+                n_touching += n_found
+                require_room(n_touching, "rest exclusion")
+                parts.append(np.sort(self._tree.slot_face[searcher.found.slots[:n_found]], axis=1))
+        return np.unique(np.concatenate(parts), axis=0)
 
     def _checked(self, vertices: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[np.floating]:
         """Refuse another shape; -1 stands for any number of poses."""
@@ -350,30 +423,30 @@ class CollisionDetector:
         # Starting a thread takes a third of the time that a pose of 2000 vertices does.
         for_blocks(work, n_poses, size, n_threads, progress, cancel)
 
+    def _new_searcher(self) -> _Searcher:
+        return _Searcher(self._tree, self._exclusions, self.topology, self.body_size)
+
     @contextmanager
     def _searcher(self) -> Iterator[_Searcher]:
         """Lend the work arrays of one thread, kept from search to search."""
         try:
             searcher = self._idle.get_nowait()
         except queue.Empty:
-            searcher = _Searcher(self._tree, self._near, self.topology, self.body_size)
+            searcher = self._new_searcher()
         try:
             yield searcher
         finally:
             self._idle.put(searcher)
 
 
-_NOT_COUNTED = np.empty(0, dtype=np.int64)
-
-
 class _Searcher:
     """One thread's work arrays and the search with them."""
 
     def __init__(
-        self, tree: FaceTree, near: NearVertices, topology: Topology, body_size: float
+        self, tree: FaceTree, exclusions: Exclusions, topology: Topology, body_size: float
     ) -> None:
         self._tree = tree
-        self._near = near
+        self._exclusions = exclusions
         self._body_size = body_size
         self._scale = 1.0 / body_size
         self._work: PoseWork = allocate_work(tree)
@@ -384,7 +457,7 @@ class _Searcher:
         self.found = Found(
             slots=np.empty((_PAIRS_AT_ONCE, 2), dtype=np.int32),
             squared_depth=np.empty(_PAIRS_AT_ONCE),
-            is_near=np.empty(_PAIRS_AT_ONCE, dtype=np.bool_),
+            rule=np.empty(_PAIRS_AT_ONCE, dtype=np.uint8),
         )
 
     def search(
@@ -394,12 +467,12 @@ class _Searcher:
         first_only: bool = False,
         number: int | None = None,
         unit: float = 1.0,
-        n_coincident: npt.NDArray[np.int64] = _NOT_COUNTED,
+        with_coincident: bool = False,
     ) -> Iterator[int]:
         """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
 
         `number` is the pose's index in its batch, for the error message; `unit` is as of
-        `CollisionDetector.detect`; `n_coincident` is as of `search_pose`.
+        `CollisionDetector.detect`; `with_coincident` is as of `search_pose`.
         """
         np.copyto(self._pose, pose)
         self._pose[self._unused] = self._pose[self._used]
@@ -411,11 +484,11 @@ class _Searcher:
                 self._scale,
                 DEPTH_TOLERANCE,
                 self._tree,
-                self._near,
+                self._exclusions,
                 self._work,
                 first_only,
                 self.found,
-                n_coincident,
+                with_coincident,
                 self._waiting,
                 LEAF_SIZE,
             )

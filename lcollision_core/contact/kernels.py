@@ -17,7 +17,7 @@ import numpy.typing as npt
 from numba import njit, uint64
 
 from lcollision_core.compiled import compiled
-from lcollision_core.contact.arrays import FaceTree, Found, NearVertices, PoseWork
+from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -37,6 +37,10 @@ products of coordinates stay far from overflow."""
 
 SMALL_SINE_SQUARED = 1e-6
 """Below this squared sine of their angle, two edges' cross product is corrected for rounding."""
+
+COUNTED, NEAR, REST, IGNORED, TOLERATED, COINCIDENT = range(6)
+"""Of a pair of faces: that it counts; the rule by which it does not, in the order of
+`RuleCounts`; that its faces lie on each other, which is no collision."""
 
 _LEAF = np.uint64(LEAF_SIZE)
 _LEAF_CORNERS = np.uint64(3 * LEAF_SIZE)
@@ -259,47 +263,45 @@ def _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
 
 
 @compiled
-def _are_vertices_near(v, w, near):
-    low = near.start[v]
-    high = near.start[v + 1]
+def _rule_of(face_a, face_b, squared_depth, exclusions):
+    """Return the first rule by which two faces do not count, or `COUNTED`."""
+    first = min(face_a, face_b)
+    second = max(face_a, face_b)
+    low = exclusions.start[first]
+    end = exclusions.start[first + 1]
+    high = end
     while low < high:
         probe = (low + high) // 2
-        if near.vertex[probe] < w:
+        if exclusions.face[probe] < second:
             low = probe + 1
         else:
             high = probe
-    return low < near.start[v + 1] and near.vertex[low] == w
+    if low < end and exclusions.face[low] == second:
+        return exclusions.rule[low]
+    region = exclusions.region
+    if len(region) > 0 and exclusions.ignored[region[first], region[second]]:
+        return np.uint8(IGNORED)
+    if squared_depth <= exclusions.squared_tolerance:
+        return np.uint8(TOLERATED)
+    return np.uint8(COUNTED)
 
 
 @compiled
-def _are_faces_near(face_a, face_b, near):
-    """Whether some corner of one face, a tuple of vertices, is near some corner of the other."""
-    if len(near.vertex) == 0:
-        return False
-    for v in face_a:
-        for w in face_b:
-            if _are_vertices_near(v, w, near):
-                return True
-    return False
-
-
-@compiled
-def find_near(
-    faces: npt.NDArray[np.integer],
+def find_rules(
     pairs: npt.NDArray[np.integer],
-    near: NearVertices,
-    is_near: npt.NDArray[np.bool_],
+    squared_depth: FloatArray,
+    exclusions: Exclusions,
+    rule: npt.NDArray[np.uint8],
 ) -> None:
-    """Fill in (n,) whether some corner of one face is near some corner of the other.
+    """Fill in (n,) the rule by which each of (n, 2) pairs of faces does not count, or `COUNTED`.
 
     Parameters
     ----------
-    faces : (F, 3)
-    pairs : (n, 2) of them
+    pairs : (n, 2) face indices
+    squared_depth : (n,) in normalised length squared
     """
     for n in range(len(pairs)):
-        a, b = faces[pairs[n, 0]], faces[pairs[n, 1]]
-        is_near[n] = _are_faces_near((a[0], a[1], a[2]), (b[0], b[1], b[2]), near)
+        rule[n] = _rule_of(pairs[n, 0], pairs[n, 1], squared_depth[n], exclusions)
 
 
 @compiled
@@ -349,7 +351,7 @@ def _coincide(triangles, a, b, tolerance):
 def _search_leaves(
     tree,
     work,
-    near,
+    exclusions,
     leaf_a,
     leaf_b,
     box_b,
@@ -357,7 +359,7 @@ def _search_leaves(
     first_only,
     found,
     n_found,
-    n_coincident,
+    with_coincident,
     leaf_size,
 ):
     """Append the pairs that penetrate between two leaves, or within one.
@@ -407,17 +409,21 @@ def _search_leaves(
             slot_b = leaf_b * LEAF_SIZE + j
             squared_depth = _pair_depth_squared(work.triangles, slot_a, slot_b, tolerance)
             if squared_depth == 0.0:
-                if len(n_coincident) > 0 and _coincide(work.triangles, slot_a, slot_b, tolerance):
-                    n_coincident[0] += 1
-                continue
-            other = (corners[c], corners[c + _LEAF], corners[c + uint64(2) * _LEAF])
-            is_near = _are_faces_near((f0, f1, f2), other, near)
+                if not with_coincident:
+                    continue
+                if not _coincide(work.triangles, slot_a, slot_b, tolerance):
+                    continue
+                rule = np.uint8(COINCIDENT)
+            else:
+                face_a = tree.slot_face[slot_a]
+                face_b = tree.slot_face[slot_b]
+                rule = _rule_of(face_a, face_b, squared_depth, exclusions)
             found.slots[n_found, 0] = slot_a
             found.slots[n_found, 1] = slot_b
             found.squared_depth[n_found] = squared_depth
-            found.is_near[n_found] = is_near
+            found.rule[n_found] = rule
             n_found += 1
-            if first_only and not is_near:
+            if first_only and rule == COUNTED:
                 return n_found, True
     return n_found, False
 
@@ -428,11 +434,11 @@ def search_pose(
     scale: float,
     tolerance: float,
     tree: FaceTree,
-    near: NearVertices,
+    exclusions: Exclusions,
     work: PoseWork,
     first_only: bool,
     found: Found,
-    n_coincident: npt.NDArray[np.int64],
+    with_coincident: bool,
     n_waiting: int,
     leaf_size: int,
 ) -> tuple[int, int]:
@@ -445,11 +451,10 @@ def search_pose(
     pose : (V, 3) float64 array
     scale : factor from the pose's unit to normalised length
     tolerance : depth in normalised length up to which two faces touch rather than penetrate
-    tree, near, work : of one topology; `work` is overwritten
-    first_only : end the search at the first pair that is not near
+    tree, exclusions, work : of one topology; `work` is overwritten
+    first_only : end the search at the first pair that counts
     found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
-    n_coincident : (1,) array that the pairs that touch face to face are added to, or (0,) where
-        they are not counted
+    with_coincident : whether pairs that lie on each other are found too, with depth 0
     n_waiting : 0 to begin, else what the call before returned
     leaf_size : `LEAF_SIZE`
 
@@ -480,7 +485,7 @@ def search_pose(
             n_found, stop = _search_leaves(
                 tree,
                 work,
-                near,
+                exclusions,
                 tree.leaf[a],
                 tree.leaf[b],
                 boxes[b],
@@ -488,7 +493,7 @@ def search_pose(
                 first_only,
                 found,
                 n_found,
-                n_coincident,
+                with_coincident,
                 leaf_size,
             )
             if stop:
@@ -520,10 +525,11 @@ def add_vertex_energy(
 ) -> None:
     """Add a sixth of each pair's squared depth to its six vertices: Algorithm 1 of the paper.
 
-    Near pairs add nothing. `vertex_energy` (V,) float64, in normalised length squared, is added to.
+    Pairs that do not count add nothing. `vertex_energy` (V,) float64, in normalised length squared,
+    is added to.
     """
     for pair in range(n_found):
-        if found.is_near[pair]:
+        if found.rule[pair] != COUNTED:
             continue
         energy = found.squared_depth[pair] / 6.0
         for side in range(2):

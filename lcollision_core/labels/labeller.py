@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector
+from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding
 
 
@@ -88,7 +88,7 @@ class Labeller:
         return CollisionDetector(
             self.embedding.topology,
             self.embedding.rest_vertices * self.body_size,
-            near_exclusion=self.near_exclusion,
+            ContactRules(self.near_exclusion),
         )
 
     def prepare(self) -> None:

@@ -10,6 +10,7 @@ from lcollision_core.meshes.atomic import (
     unused_name,
 )
 from lcollision_core.meshes.audit import audit_mesh, inspect_pose_set
+from lcollision_core.meshes.contact_rules import ContactRules, RuleCounts
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.file_names import file_stem, file_stems, has_known_suffix
 from lcollision_core.meshes.files import (

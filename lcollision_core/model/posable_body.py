@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector
+from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
@@ -411,7 +411,7 @@ class PosableBody(ABC):
     @cached_property
     def detector(self) -> CollisionDetector:
         """Finds exact self-collisions of this model's meshes, in the data's unit."""
-        return CollisionDetector(self.topology, self.reference, near_exclusion=self.near_exclusion)
+        return CollisionDetector(self.topology, self.reference, ContactRules(self.near_exclusion))
 
     @property
     def faces(self) -> npt.NDArray[np.int32]:

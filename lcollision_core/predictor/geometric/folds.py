@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector, SelfCollisions
-from lcollision_core.contact.near_exclusion import are_pairs_near, near_vertices
+from lcollision_core.contact import CollisionDetector, ContactRules, SelfCollisions
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.inference.points import (
@@ -48,18 +49,19 @@ class FoldDetector:
 
     def __init__(self, embedding: Embedding, near_exclusion: float) -> None:
         topology, rest = embedding.topology, embedding.rest_vertices
-        radius = near_exclusion + FOLD_RADIUS
-        self._detector = CollisionDetector(topology, rest, near_exclusion=radius)
-        self._excluded = near_vertices(topology, rest, near_exclusion * self._detector.body_size)
+        rules = ContactRules(near_exclusion)
+        with_folds = replace(rules, near_exclusion=near_exclusion + FOLD_RADIUS)
+        self._detector = CollisionDetector(topology, rest, with_folds)
+        self._by_rules = CollisionDetector(topology, rest, rules)
 
     def detect(
         self, vertices: npt.NDArray[np.floating]
     ) -> tuple[SelfCollisions, npt.NDArray[np.int32], FloatArray]:
         """Find the contacts, and the folds' pairs of faces (n, 2) with their depths (n,)."""
         found = self._detector.detect(vertices)
-        pairs = found.near_pairs
-        folds = ~are_pairs_near(self._detector.topology, pairs, self._excluded)
-        return found, pairs[folds], found.near_penetration_depth[folds]
+        pairs, depth = found.near_pairs, found.near_penetration_depth
+        folds = self._by_rules.rules_of(pairs, depth) == 0
+        return found, pairs[folds], depth[folds]
 
 
 def find_fold_sites(

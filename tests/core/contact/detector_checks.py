@@ -24,7 +24,7 @@ def check_against_brute_force(
     np.testing.assert_allclose(
         found.penetration_depth, expected.depth / detector.body_size, rtol=0, atol=1e-12
     )
-    assert len(found.near_pairs) == len(found.near_penetration_depth) == 0
+    assert len(found.excluded_pairs) == len(found.excluded_depth) == len(found.excluded_rule) == 0
     batch = detector.detect_batch(vertices[None], workers=1)
     assert batch.n_pairs.tolist() == [len(expected.pairs)]
     assert batch.n_near_pairs.tolist() == [0]

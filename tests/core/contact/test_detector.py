@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lcollision_core.contact import CollisionDetector
+from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import Topology
 from tests.core.brute_force import exact_depth
@@ -166,10 +166,12 @@ def test_results_hold_up_to_the_largest_unit(factor: float) -> None:
     mesh = figure_eight(0.2, 0.15)
     at_home = detector_for(mesh).detect(mesh.vertices)
     scaled = Mesh(mesh.vertices * factor, mesh.faces)
-    found = CollisionDetector(scaled.topology, scaled.vertices, near_exclusion=0.1).detect(
+    found = CollisionDetector(scaled.topology, scaled.vertices, rules=ContactRules(0.1)).detect(
         scaled.vertices
     )
-    near = CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=0.1).detect(mesh.vertices)
+    near = CollisionDetector(mesh.topology, mesh.vertices, rules=ContactRules(0.1)).detect(
+        mesh.vertices
+    )
     assert at_home.colliding
     assert found.pairs.tolist() == near.pairs.tolist()
     assert found.near_pairs.tolist() == near.near_pairs.tolist()

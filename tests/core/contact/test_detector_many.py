@@ -28,7 +28,7 @@ def test_a_summary_counts_all_pairs_and_keeps_the_deepest(
     found = detector.detect(vertices)
     summary = detector.summarise(vertices, n_deepest=50, progress=lambda *one: told.append(one))
     assert len(found.pairs) > 2 * 2**14
-    assert (summary.n_pairs, summary.n_near_pairs) == (len(found.pairs), 0)
+    assert (summary.n_pairs, summary.excluded.total) == (len(found.pairs), 0)
     assert np.array_equal(summary.vertex_energy, found.vertex_energy)
     assert summary.energy == found.energy
     order = np.argsort(-found.penetration_depth, kind="stable")[:50]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.contact import DEPTH_TOLERANCE, CollisionDetector
-from lcollision_core.contact import near_exclusion as near_exclusion_module
+from lcollision_core.contact import DEPTH_TOLERANCE, CollisionDetector, ContactRules
+from lcollision_core.contact import rules as rules_module
 from lcollision_core.errors import ShapeError
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import Mesh, grid, join, random_rotation, soup, strip
@@ -77,7 +77,7 @@ def test_pairs_up_to_the_distance_are_near(near_exclusion: float, near: list[lis
     far = sorted(pair for pair in AT_DISTANCE_4 + AT_DISTANCE_5 if pair not in near)
 
     detector = CollisionDetector(
-        STRAIGHT.topology, STRAIGHT.vertices, near_exclusion=near_exclusion
+        STRAIGHT.topology, STRAIGHT.vertices, rules=ContactRules(near_exclusion)
     )
     found = detector.detect(LOOP.vertices)
     assert found.pairs.tolist() == far
@@ -102,7 +102,7 @@ def test_pairs_up_to_the_distance_are_near(near_exclusion: float, near: list[lis
 
 def test_lengths_are_those_of_the_reference_not_of_the_pose() -> None:
     # On the loop itself the way round is longer than all of its height.
-    detector = CollisionDetector(LOOP.topology, LOOP.vertices, near_exclusion=0.625)
+    detector = CollisionDetector(LOOP.topology, LOOP.vertices, rules=ContactRules(0.625))
     round_trip = pair_distances(LOOP, np.array(AT_DISTANCE_4 + AT_DISTANCE_5))
     assert round_trip.min() > 0.625 * detector.body_size
     assert len(detector.detect(LOOP.vertices).pairs) == 3
@@ -110,7 +110,7 @@ def test_lengths_are_those_of_the_reference_not_of_the_pose() -> None:
 
 def test_the_path_is_along_the_mesh_not_through_the_air() -> None:
     # Faces that pass through each other are at distance 0 through the air.
-    detector = CollisionDetector(LOOP.topology, LOOP.vertices, near_exclusion=1e-3)
+    detector = CollisionDetector(LOOP.topology, LOOP.vertices, rules=ContactRules(1e-3))
     found = detector.detect(LOOP.vertices)
     assert (len(found.pairs), len(found.near_pairs)) == (3, 0)
 
@@ -118,7 +118,7 @@ def test_the_path_is_along_the_mesh_not_through_the_air() -> None:
 def test_another_component_is_never_near() -> None:
     floor, blade = [[0, 0, 0], [4, 0, 0], [0, 4, 0]], [[1, 1, -1], [1, 1, 1], [2, 1, 1]]
     mesh = soup([floor, blade])
-    detector = CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=1e6)
+    detector = CollisionDetector(mesh.topology, mesh.vertices, rules=ContactRules(1e6))
     assert detector.detect(mesh.vertices).pairs.tolist() == [[0, 1]]
     assert detector.are_colliding(mesh.vertices[None]).tolist() == [True]
 
@@ -133,7 +133,7 @@ def test_duplicate_vertices_are_at_distance_zero_and_linked() -> None:
     assert pair_distances(reference, pairs).tolist() == [4.0, 5.0, 4.0]
     for near_exclusion, n_near in ((np.nextafter(0.5, 0), 0), (0.5, 2), (0.625, 3)):
         detector = CollisionDetector(
-            reference.topology, reference.vertices, near_exclusion=near_exclusion
+            reference.topology, reference.vertices, rules=ContactRules(near_exclusion)
         )
         assert len(detector.detect(pose.vertices).near_pairs) == n_near
 
@@ -151,7 +151,9 @@ def test_the_first_hit_is_sought_past_near_pairs_in_whatever_order() -> None:
         reference = join(sheet, through)
         topology = Mesh(reference.vertices, reference.faces[order]).topology
         rotation = random_rotation(shuffled)
-        detector = CollisionDetector(topology, reference.vertices @ rotation.T, near_exclusion=3)
+        detector = CollisionDetector(
+            topology, reference.vertices @ rotation.T, rules=ContactRules(3)
+        )
         poses = np.stack([join(crumpled, blade).vertices for blade in (through, apart)])
         batch = detector.detect_batch(poses)
         # More than the room that a search starts with.
@@ -168,7 +170,9 @@ def test_near_pairs_of_a_crumpled_sheet_against_brute_force(near_exclusion: floa
     # An uneven reference, so that no path happens to be as long as the limit.
     uneven = Mesh(sheet.vertices + rng.normal(scale=0.02, size=sheet.vertices.shape), sheet.faces)
     pose = uneven.vertices + rng.normal(scale=0.3, size=sheet.vertices.shape)
-    detector = CollisionDetector(sheet.topology, uneven.vertices, near_exclusion=near_exclusion)
+    detector = CollisionDetector(
+        sheet.topology, uneven.vertices, rules=ContactRules(near_exclusion)
+    )
     expected = all_pairs(pose, sheet.faces, DEPTH_TOLERANCE * detector.body_size)
     limit = near_exclusion * detector.body_size
     is_near = pair_distances(uneven, expected.pairs) <= limit
@@ -185,15 +189,14 @@ def test_near_pairs_of_a_crumpled_sheet_against_brute_force(near_exclusion: floa
 @pytest.mark.parametrize("near_exclusion", [-0.1, np.nan])
 def test_a_limit_that_is_no_length_is_refused(near_exclusion: float) -> None:
     with pytest.raises(ShapeError, match="near exclusion"):
-        CollisionDetector(STRAIGHT.topology, STRAIGHT.vertices, near_exclusion=near_exclusion)
+        CollisionDetector(STRAIGHT.topology, STRAIGHT.vertices, rules=ContactRules(near_exclusion))
 
 
 def test_a_table_beyond_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = grid(30)
-    whole = near_exclusion_module.near_vertices(mesh.topology, mesh.vertices, 10.0)
-    assert len(whole.vertex) == len(mesh.vertices) ** 2
-    monkeypatch.setattr(near_exclusion_module, "MAX_NEAR", len(whole.vertex))
-    near_exclusion_module.near_vertices(mesh.topology, mesh.vertices, 10.0)
-    monkeypatch.setattr(near_exclusion_module, "MAX_NEAR", len(whole.vertex) - 1)
+    all_pairs = len(mesh.faces) * (len(mesh.faces) - 1) // 2
+    monkeypatch.setattr(rules_module, "MAX_EXCLUDED", all_pairs)
+    CollisionDetector(mesh.topology, mesh.vertices, rules=ContactRules(10.0))
+    monkeypatch.setattr(rules_module, "MAX_EXCLUDED", all_pairs - 1)
     with pytest.raises(ShapeError, match=r"near exclusion .* make it smaller"):
-        CollisionDetector(mesh.topology, mesh.vertices, near_exclusion=10.0)
+        CollisionDetector(mesh.topology, mesh.vertices, rules=ContactRules(10.0))

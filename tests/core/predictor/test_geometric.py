@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from lcollision_core.contact import CollisionDetector
+from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.model import PoseModel
@@ -192,7 +192,7 @@ def test_folds_are_looked_for_where_the_skin_folds(
     centres = tube_folds[:, 0]
     assert len(np.unique(centres)) == len(centres)
     detector = CollisionDetector(
-        embedding.topology, embedding.rest_vertices, near_exclusion=FOLD_RADIUS
+        embedding.topology, embedding.rest_vertices, rules=ContactRules(FOLD_RADIUS)
     )
     folded = [
         detector.detect(pose.astype(np.float32)).near_pairs
@@ -257,7 +257,7 @@ def test_every_collision_that_counts_is_taught(
     """With sites and without, and beyond a near exclusion, within which nothing counts."""
     embedding, latent = tube_model.embedding, colliding_latent(tube_model)
     detector = CollisionDetector(
-        embedding.topology, embedding.rest_vertices, near_exclusion=near_exclusion
+        embedding.topology, embedding.rest_vertices, rules=ContactRules(near_exclusion)
     )
     found = detector.detect_batch(embedding.decode(latent).astype(np.float32))
     rows = replace(labeller_of(tube_model), near_exclusion=near_exclusion).label(latent)

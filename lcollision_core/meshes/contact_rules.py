@@ -1,0 +1,155 @@
+"""Contact rules: which pairs of colliding faces do not count, as sets, models and results say it.
+
+`contact` applies them. They stand here because a pose set carries them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import ShapeError
+from lcollision_core.json_values import from_json
+
+CHARACTER_REST_EXCLUSION = 0.02
+"""Normalised length: the rest exclusion of characters whose rest pose does not ask for more."""
+
+_MAX_NAME_LENGTH = 500
+
+
+@dataclass(frozen=True)
+class RuleCounts:
+    """How many colliding pairs each rule excludes; a pair counts under the first that applies.
+
+    Attributes
+    ----------
+    near : pairs within the near exclusion along the surface
+    rest : pairs at places that touch at rest
+    ignored : pairs of groups that are ignored
+    tolerated : pairs no deeper than the tolerated depth
+    """
+
+    near: int = 0
+    rest: int = 0
+    ignored: int = 0
+    tolerated: int = 0
+
+    @classmethod
+    def of(cls, rule: npt.NDArray[np.integer]) -> RuleCounts:
+        """Count (n,) rules: 0 for a pair that counts, then 1 for near and so on."""
+        return cls(*np.bincount(rule, minlength=N_RULES + 1)[1 : N_RULES + 1].tolist())
+
+    @property
+    def total(self) -> int:
+        """The number of colliding pairs that do not count."""
+        return self.near + self.rest + self.ignored + self.tolerated
+
+    def to_json(self) -> dict[str, int]:
+        """Return the numbers by the names of the rules."""
+        return asdict(self)
+
+
+N_RULES = len(fields(RuleCounts))
+
+
+@dataclass(frozen=True)
+class ContactRules:
+    """Which pairs of colliding faces do not count, for any pose of one mesh.
+
+    All lengths are normalised, and along edges of the rest pose between the nearest corners of two
+    faces.
+
+    Attributes
+    ----------
+    near_exclusion : pairs within this of each other do not count; 0 excludes nothing
+    rest_exclusion : pairs that touch at rest do not count, nor do pairs of which one face is
+        within this of one face of such a pair, and the other within this of the other; 0 excludes
+        those pairs only, None none. Faces touch at rest where they collide or lie on each other.
+    ignored : pairs of names of groups of faces; a pair of faces of one and of the other does not
+        count
+    tolerated_depth : pairs with a penetration depth up to this do not count; deeper ones count with
+        all of it
+
+    Raises
+    ------
+    ShapeError : a length is negative or not finite, or an ignored pair is not two names.
+    """
+
+    near_exclusion: float = 0.0
+    rest_exclusion: float | None = None
+    ignored: tuple[tuple[str, str], ...] = ()
+    tolerated_depth: float = 0.0
+
+    def __post_init__(self) -> None:
+        for what, length in (
+            ("the near exclusion", self.near_exclusion),
+            ("the rest exclusion", self.rest_exclusion),
+            ("the tolerated depth", self.tolerated_depth),
+        ):
+            if length is not None and not 0.0 <= length < math.inf:
+                raise ShapeError.must_be(what, "0 or more, and finite", length)
+        for pair in self.ignored:
+            if len(pair) != 2 or not all(map(_is_name, pair)):
+                raise ShapeError.must_be(
+                    "an ignored pair", "two names of groups", repr(pair)[:_MAX_NAME_LENGTH]
+                )
+
+    @property
+    def exclude_nothing(self) -> bool:
+        """Whether all colliding pairs count."""
+        return self == _STRICT
+
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON values for `from_json`."""
+        return asdict(self) | {"ignored": [list(pair) for pair in self.ignored]}
+
+    @classmethod
+    def from_json(cls, values: Any) -> ContactRules:
+        """Rebuild the rules from what `to_json` returned; what is missing is off.
+
+        Raises
+        ------
+        ShapeError : a value is of another type, or invalid.
+        """
+        try:
+            return from_json(cls, values, "rules")
+        except ShapeError:
+            raise
+        except ValueError as error:
+            raise ShapeError(str(error)) from error
+
+    def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
+        """Say how many pairs are not counted, and by which rules; empty if there are none."""
+        counts = counts if isinstance(counts, RuleCounts) else RuleCounts(**counts)
+        groups = " or ".join(f"{a} and {b}" for a, b in self.ignored[:_NAMED_PAIRS])
+        if len(self.ignored) > _NAMED_PAIRS:
+            groups = f"{len(self.ignored)} ignored pairs of groups"
+        said = [
+            f"{number} {'pair' if number == 1 else 'pairs'} {what}"
+            for number, what in (
+                (counts.near, f"within {self.near_exclusion:g} along the surface"),
+                (counts.rest, f"that {'touches' if counts.rest == 1 else 'touch'} at rest"),
+                (counts.ignored, f"of {groups}"),
+                (counts.tolerated, f"not deeper than {self.tolerated_depth:g}"),
+            )
+            if number
+        ]
+        if not said:
+            return ""
+        listed = " and ".join(filter(None, [", ".join(said[:-1]), said[-1]]))
+        return f"{listed} {'is' if counts.total == 1 else 'are'} not counted"
+
+
+_STRICT = ContactRules()
+
+_NAMED_PAIRS = 3
+"""Most pairs of groups that a sentence names one by one."""
+
+
+def _is_name(name: object) -> bool:
+    return isinstance(name, str) and name.strip() != "" and len(name) <= _MAX_NAME_LENGTH
