@@ -107,7 +107,8 @@ def resolve(
     when it is stopped is kept in a file beside the output, and the same command goes on from there.
 
     The step that resolved a pose is one of: solver, the paper's problem; margin, the same with more
-    distance from collision; polish, of shallow contacts; start, a restart elsewhere; walk-back,
+    distance from collision; polish, of shallow contacts; start, a restart elsewhere; towards, from
+    a free pose as near as contacts let it (of characters, which have no predictor); walk-back,
     falling back to a pose known to be free; neighbour, the correction of the frame before
     (--sequence).
     """

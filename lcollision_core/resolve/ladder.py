@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -18,6 +18,7 @@ from lcollision_core.resolve.polish import polish
 from lcollision_core.resolve.problem import ResolveProblem, SolverOutcome
 from lcollision_core.resolve.pull_back import fall_back, pull_back
 from lcollision_core.resolve.sqp import SqpBatch
+from lcollision_core.resolve.towards import step_towards
 
 MARGINS = (0.0, 2.0, 4.0, 8.0, 16.0)
 """In the logit, above the user's own. Those that no pose reaches still lead the right way."""
@@ -77,6 +78,8 @@ class Ladder:
         elif not problem.movable.any():
             note = ALL_LOCKED
         else:
+            if problem.model is None:
+                self._outcome = replace(self._outcome, status="no predictor")
             for done, (tried, found) in enumerate(self._steps(), 1):
                 self.progress(done, self._n_steps)
                 if found is not None:
@@ -104,7 +107,9 @@ class Ladder:
     @property
     def _n_steps(self) -> int:
         """Return the most steps that `_steps` yields, plus pulling back."""
-        if self.options.solver == Solver.SQP:
+        if self.problem.model is None:
+            n_tries = 1
+        elif self.options.solver == Solver.SQP:
             n_tries = len(ITERATIONS) + 1
         else:
             n_tries = len(MARGINS) + min(len(self.free_latents), _KNOWN_STARTS) + _RANDOM_STARTS
@@ -116,7 +121,10 @@ class Ladder:
         if self.correction is not None:
             near = np.clip(problem.target + self.correction, problem.low, problem.high)
             yield Step.NEIGHBOUR, self._first_free([near])
-        tries = chain(self._by_margins(), self._by_polish(), self._by_restarts())
+        if problem.model is None:
+            tries = chain(self._by_polish(), self._from_free_poses())
+        else:
+            tries = chain(self._by_margins(), self._by_polish(), self._by_restarts())
         while not problem.deadline.expired and (tried := next(tries, None)) is not None:
             yield tried
         yield Step.FALL_BACK, fall_back(self.check, problem, self.free_latents)
@@ -159,6 +167,10 @@ class Ladder:
             return
         for start in starts:
             yield Step.RESTART, self._first_free([self._solve(margin, start).latent])
+
+    def _from_free_poses(self) -> Iterator[_Tried]:
+        locked = self.options.locked_domains
+        yield Step.TOWARDS, step_towards(self.check, self.problem, self.free_latents, locked)
 
     def _by_polish(self) -> Iterator[_Tried]:
         """Polish the poses that the steps before left in the shallowest contact."""
@@ -207,7 +219,9 @@ class Ladder:
         moved = np.linalg.norm(decoded[1] - decoded[0], axis=1)
         vertices = check.exported(decoded[1])
         after = before if step == Step.UNCHANGED else check.find(vertices) if before else None
-        excess, _ = problem.excess(latent[None])
+        predicted_free = None
+        if problem.model is not None:
+            predicted_free = bool(problem.excess(latent[None])[0][0] <= 0.0)
         answer = latent.copy()
         answer.flags.writeable = vertices.flags.writeable = False
         return ResolveResult(
@@ -215,7 +229,7 @@ class Ladder:
             vertices=vertices,
             solver_status=self._outcome.status,
             converged=self._outcome.converged,
-            predicted_free=bool(excess[0] <= 0.0),
+            predicted_free=predicted_free,
             exactly_free=not after.colliding if after else None,
             step=step,
             energy_before=before.energy if before else None,

@@ -40,6 +40,7 @@ class Step(StrEnum):
     MARGIN = "margin"
     POLISH = "polish"
     RESTART = "start"
+    TOWARDS = "towards"
     FALL_BACK = "walk-back"
     NONE = "none"
 
@@ -120,9 +121,10 @@ class ResolveResult:
     vertices : (V, 3) array, read-only, in the data's unit: what the exact check saw, and what is to
         be written; float32 in the model's coordinates, or float64 where the pose is placed
     solver_status : the status of the solver of the paper's problem at its least margin, "not run"
-        where none ran
+        where none ran, "no predictor" where the steps did without
     converged : that it ended by its own tolerances
-    predicted_free : the collision probability of `latent` is at most the threshold
+    predicted_free : the collision probability of `latent` is at most the threshold; None of a body
+        without a predictor
     exactly_free : by the exact check of the vertices rounded to float32; None without `verify`
     step : of the ladder, the one that resolved the collisions
     energy_before, energy_after : exact penetration energy; None without `verify`
@@ -141,7 +143,7 @@ class ResolveResult:
     vertices: npt.NDArray[np.floating]
     solver_status: str
     converged: bool
-    predicted_free: bool
+    predicted_free: bool | None
     exactly_free: bool | None
     step: Step
     energy_before: float | None

@@ -65,7 +65,7 @@ class ResolveProblem:
     code_weights : (D,) float64 array > 0, of the solvers' own distance
     low, high : (D,) float64 arrays; equal where a code is locked
     limit : the threshold's logit
-    model : of the constraint
+    model : of the constraint; None without a predictor, and then there is none but the exact check
     deadline : polled before each evaluation
     evaluations : poses evaluated so far
 
@@ -82,7 +82,7 @@ class ResolveProblem:
     low: FloatArray
     high: FloatArray
     limit: float
-    model: CollisionModel
+    model: CollisionModel | None
     deadline: Deadline = field(default_factory=Deadline)
     evaluations: int = 0
 
@@ -115,7 +115,10 @@ class ResolveProblem:
         Raises
         ------
         CancelledError : the token was set.
+        RuntimeError : there is no predictor.
         """
+        if self.model is None:
+            raise RuntimeError("there is no predictor to evaluate")
         self.deadline.poll()
         self.evaluations += len(latent)
         logit, gradient = self.model.logit_and_gradient(latent)

@@ -28,7 +28,8 @@ class PoseResolver:
     Parameters
     ----------
     check : the exact check of the model's poses
-    predictor : the differentiable predictor: a `CollisionPredictor`
+    predictor : the differentiable predictor: a `CollisionPredictor`; None leaves out the steps that
+        need one, and steps from known free poses towards the target instead
     free_latents : (F, D) array of poses known to be collision-free: see `find_free_poses`. Without
         any, a pose that the other steps do not resolve stays colliding.
     """
@@ -36,7 +37,7 @@ class PoseResolver:
     def __init__(
         self,
         check: ExactCheck,
-        predictor: CollisionModel,
+        predictor: CollisionModel | None,
         free_latents: npt.ArrayLike,
     ) -> None:
         self._check, self._space, self._predictor = check, check.space, predictor
@@ -72,10 +73,16 @@ class PoseResolver:
         Raises
         ------
         ShapeError : another shape, a number that is not finite or another number of weights.
-        LCollisionError : an unknown locked domain.
+        LCollisionError : an unknown locked domain, or neither a predictor nor the exact check.
         CancelledError : `cancel` was set.
         """
         chosen = options or ResolveOptions()
+        if self._predictor is None and not chosen.verify:
+            raise LCollisionError(
+                "has no predictor whose answer could stay unchecked",
+                "resolve with the exact check",
+                where="the body",
+            )
         target = self._checked(latent)
         outside = int(np.count_nonzero((target < self._low) | (target > self._high)))
         remark = (

@@ -32,6 +32,11 @@ _SIGNS = {True: ("check", "free"), False: ("error", "colliding"), None: ("info",
 """Icon and colour for yes, no and not known."""
 
 _CHECKED = {True: "No collisions (checked)", False: "Still colliding", None: "Not checked"}
+_ESTIMATED = {
+    True: "Estimate: probably clear",
+    False: "Estimate: probably colliding",
+    None: "No estimate: nothing was trained",
+}
 
 
 class Fact(QWidget):
@@ -210,8 +215,8 @@ class ResolveCard(Card):
         else:
             search = "No search was needed"
         self.converged.say(search, bool(exactly_free or result.converged) if ran else None)
-        estimate = "Estimate: probably clear" if predicted_free else "Estimate: probably colliding"
-        overruled = exactly_free not in (None, predicted_free)
+        estimate = _ESTIMATED[predicted_free]
+        overruled = None not in (exactly_free, predicted_free) and exactly_free != predicted_free
         self.predicted_free.say(estimate + ", overruled" * overruled, predicted_free)
         if result.energy_before is None or result.energy_after is None:
             self._energy.setText("not measured")

@@ -565,3 +565,46 @@ def test_known_free_poses_are_free(tube_model: PoseModel, free_latents: FloatArr
     free = ~tube_model.detector.are_colliding(tube_model.decode(training).astype(np.float32))
     known = {row.tobytes() for row in free_latents}
     assert {row.tobytes() for row in training[free]} <= known
+
+
+def test_without_a_predictor_the_way_in_leads_near(
+    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
+) -> None:
+    resolver = PoseResolver(tube_model.exact_check(), None, free_latents)
+    fallen = resolver_of(tube_model, useless(colliding[0]), free_latents)
+    steps, nearer = set(), []
+    for latent in colliding[:8]:
+        done: list[tuple[int, int]] = []
+        result = resolver.resolve(latent, progress=lambda *at, done=done: done.append(at))
+        assert_free_by_brute_force(tube_model, result)
+        assert_measured(tube_model, latent, result)
+        assert (result.predicted_free, result.evaluations) == (None, 0)
+        assert result.solver_status == "no predictor"
+        assert done[-1][0] == done[-1][1]
+        steps.add(result.step)
+        other = fallen.resolve(latent, ResolveOptions(time_budget=1e-9))
+        nearer.append(result.vertex_distance_mean <= other.vertex_distance_mean)
+    assert Step.TOWARDS in steps
+    assert np.mean(nearer) > 0.7
+    free = resolver.resolve(free_latents[0])
+    assert (free.step, free.predicted_free) == (Step.UNCHANGED, None)
+
+
+def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
+    tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray
+) -> None:
+    resolver = PoseResolver(tube_model.exact_check(), None, free_latents)
+    locked = tube_model.pose_space.codes_of([1])
+    result = resolver.resolve(deep, ResolveOptions(locked_domains=frozenset({1})))
+    assert np.array_equal(result.latent[locked], deep[locked])
+    if result.exactly_free:
+        assert_free_by_brute_force(tube_model, result)
+    nothing = PoseResolver(tube_model.exact_check(), None, np.empty((0, 8))).resolve(deep)
+    assert (nothing.step, nothing.exactly_free) == (Step.NONE, False)
+    assert "no known collision-free pose" in (nothing.note or "")
+    with pytest.raises(LCollisionError, match="has no predictor whose answer"):
+        resolver.resolve(deep, ResolveOptions(verify=False))
+    token = CancelToken()
+    token.cancel()
+    with pytest.raises(CancelledError):
+        resolver.resolve(deep, cancel=token)
