@@ -1,4 +1,10 @@
 """Characters: files with meshes, a rig and clips, and posing by the rig."""
 
 from lcollision_core.characters.character import Character, ClipFrames, Rig
+from lcollision_core.characters.reading import (
+    CHARACTER_SUFFIXES,
+    is_rigged,
+    joint_parts,
+    read_character,
+)
 from lcollision_core.characters.rig_space import RigPoseSpace

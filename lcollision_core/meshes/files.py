@@ -1,8 +1,7 @@
-"""Mesh files: OBJ, PLY, OFF, STL, GLB and glTF, read and written in unchanged vertex order."""
+"""Mesh files: OBJ, PLY, OFF, STL, GLB, glTF and VRM, read and written in unchanged vertex order."""
 
 from __future__ import annotations
 
-import errno
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,15 +11,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError
+from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats import gltf, obj, off, ply, stl
-from lcollision_core.meshes.formats.polygons import MAX_FACES, Polygons, triangulate
+from lcollision_core.meshes.formats.polygons import (
+    MAX_FACES,
+    Polygons,
+    triangulate,
+    with_order_of,
+)
+from lcollision_core.meshes.formats.scene import Scene
+from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.precision import as_stored, can_hold, rounding_step
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, one_sentence, scene_of
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.regular_files import open_regular
 
-READABLE_SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
+READABLE_SUFFIXES = (".obj", ".ply", ".off", ".stl", *SCENE_SUFFIXES)
 """Extensions that `read_mesh` reads, in lower case."""
 
 _ENCODERS: dict[str, Callable[[npt.NDArray[Any], npt.NDArray[np.int32]], bytes]] = {
@@ -33,6 +40,7 @@ _ENCODERS: dict[str, Callable[[npt.NDArray[Any], npt.NDArray[np.int32]], bytes]]
 WRITABLE_SUFFIXES = tuple(_ENCODERS)
 """Extensions that `write_mesh` writes, in lower case."""
 
+_REORDERED = "vertices that had been split were put back into the set's vertex order"
 
 KEEP_PRECISION = "export it nearer to the origin, or with double precision"
 """What to do about a mesh that `coarseness_of` has something to say of."""
@@ -68,12 +76,13 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
     """Read one triangle mesh; its extension, in any case, says the format.
 
     No vertex is merged, moved, reordered or dropped. STL is the exception, as it stores no shared
-    vertices: corners at equal coordinates become one vertex, numbered by first appearance.
-    Polygons are cut into fans of triangles and `Mesh.notes` says so.
+    vertices: corners at equal coordinates become one vertex, numbered by first appearance. So is a
+    scene of several meshes, or of one that joints or morph targets move, which is read in its rest
+    pose and joined at its seams. Polygons are cut into fans of triangles and `Mesh.notes` says so.
 
     Parameters
     ----------
-    path : an .obj, .ply, .off, .stl, .glb or .gltf file
+    path : an .obj, .ply, .off, .stl, .glb, .gltf or .vrm file
     topology : the connectivity that an STL file, or a glTF file of other vertices, is expected to
         have: when its triangles fit, they are put back into this vertex order. A mesh with the
         same faces shares the object.
@@ -89,14 +98,12 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
         does not exist or names one twice. The sentence names the file and the element.
     """
     source = Path(path)
-    try:
+    with one_sentence(path):
         polygons = _read_polygons(source, topology)
         vertices = np.ascontiguousarray(polygons.vertices)
         faces, notes = triangulate(polygons)
         _require_usable(vertices, faces)
         found = Topology(faces, len(vertices))
-    except (MeshFileError, PoseSetError) as error:
-        raise MeshFileError.unreadable(path, error, "export the mesh again") from error
     vertices.flags.writeable = False
     if topology is not None and found == topology:
         found = topology
@@ -120,34 +127,50 @@ def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:
 
 def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
     suffix = path.suffix.lower()
-    try:
-        with open_regular(path) as file:
-            if suffix not in READABLE_SUFFIXES:
-                raise MeshFileError(
-                    f"{suffix or 'a name without extension'} is not a known mesh format",
-                    f"use one of {', '.join(READABLE_SUFFIXES)}",
-                )
-            size = os.fstat(file.fileno()).st_size
-            if size == 0:
-                raise MeshFileError("it is empty")
-            if suffix == ".obj":
-                return obj.read(file)
-            if suffix == ".ply":
-                return ply.read(file)
-            if suffix == ".off":
-                return off.read(file)
-            if suffix == ".stl":
-                return stl.read(file, size, topology)
-            return gltf.read(file, path, topology)
-    except FileNotFoundError as error:
-        raise MeshFileError("there is no such file", "check the name") from error
-    except PermissionError as error:
-        raise MeshFileError("permission is denied", "change the file's permissions") from error
-    except OSError as error:
-        reason = "the name is too long" if error.errno == errno.ENAMETOOLONG else error.strerror
-        raise MeshFileError(str(reason or error), "check the file") from error
-    except MemoryError as error:
-        raise MeshFileError("it needs more memory than there is", "decimate the mesh") from error
+    with open_regular(path) as file:
+        if suffix not in READABLE_SUFFIXES:
+            raise MeshFileError(
+                f"{suffix or 'a name without extension'} is not a known mesh format",
+                f"use one of {', '.join(READABLE_SUFFIXES)}",
+            )
+        size = os.fstat(file.fileno()).st_size
+        if size == 0:
+            raise MeshFileError("it is empty")
+        if suffix == ".obj":
+            return obj.read(file)
+        if suffix == ".ply":
+            return ply.read(file)
+        if suffix == ".off":
+            return off.read(file)
+        if suffix == ".stl":
+            return stl.read(file, size, topology)
+        return _rest_pose(scene_of(file, path), topology)
+
+
+def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
+    """Return the rest pose of a scene, in the vertex order of a topology where that fits."""
+    part = scene.parts[0]
+    is_plain = len(scene.parts) == 1 and not part.is_skinned and not part.morphs.size
+    notes: tuple[str, ...] = ()
+    # A node may move float32 vertices far away, where the product keeps their digits.
+    is_single = False
+    if is_plain:
+        vertices, faces, notes = part.points, part.faces, scene.notes
+        transform = scene.rest.transforms[0, part.node]
+        is_single = part.is_single and np.array_equal(transform, np.eye(4))
+        if not is_single:
+            # A coordinate that is not finite is refused with all others.
+            with np.errstate(all="ignore"):
+                vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
+    else:
+        mesh = join_parts(scene)
+        vertices, faces = mesh.posed(scene.rest)[0], mesh.topology.faces.astype(np.int64)
+        notes = mesh.notes
+    if topology is not None and len(vertices) != topology.n_vertices:
+        reordered = with_order_of(vertices[faces.reshape(-1)], topology, _REORDERED, is_single)
+        if reordered is not None:
+            return reordered
+    return Polygons.triangles(vertices, faces, notes, is_single)
 
 
 def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> None:

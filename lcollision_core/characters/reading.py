@@ -1,0 +1,157 @@
+"""Read a character from its file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.characters.character import Character, ClipFrames, Rig
+from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.formats.scene import Scene, parents_first, unique_names
+from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
+from lcollision_core.meshes.part_names import part_labels
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin, one_sentence, read_scene
+from lcollision_core.meshes.topology import FloatArray
+
+CHARACTER_SUFFIXES = SCENE_SUFFIXES
+"""Extensions that `read_character` reads, in lower case."""
+
+
+def read_character(path: str | os.PathLike[str], up: int | str | None = None) -> Character:
+    """Read the meshes, the rig and the clips of a file.
+
+    Parameters
+    ----------
+    path : a .glb, .gltf or .vrm file
+    up : the up axis where the file is wrong about it: 0, 1, 2, "x", "y" or "z"
+
+    Raises
+    ------
+    MeshFileError : the file is missing, damaged, compressed or too large, or shows no triangles.
+        The sentence names the file.
+    ShapeError : `up` is no axis.
+    """
+    axis = None if up is None else _axis(up)
+    scene = read_scene(path)
+    with one_sentence(path):
+        mesh = join_parts(scene)
+        rest = mesh.posed(scene.rest)[0]
+        rig, notes = _rig(scene, mesh)
+
+    def sample(clip: str, fps: float | None) -> ClipFrames:
+        with one_sentence(path):
+            found = sample_clip(scene, mesh, clip, fps)
+        names = tuple(f"{clip} {frame}" for frame in range(len(found.times)))
+        transforms = None if rig is None else found.poses.transforms[:, rig.nodes]
+        return ClipFrames(clip, names, found.times, found.vertices, transforms)
+
+    source = Path(path)
+    return Character(
+        source.stem,
+        source,
+        mesh.topology,
+        rest,
+        mesh.joined,
+        scene.up if axis is None else np.eye(3)[axis],
+        True,
+        scene.metres,
+        mesh.groups,
+        rig,
+        tuple(clip.name for clip in scene.clips),
+        sample,
+        mesh.notes + notes,
+    )
+
+
+def is_rigged(path: str | os.PathLike[str]) -> bool:
+    """Whether a file shows something that joints move; its meshes are not read.
+
+    Raises
+    ------
+    MeshFileError : the file is missing or damaged; the sentence names it.
+    """
+    return has_skin(path)
+
+
+def joint_parts(rig: Rig) -> npt.NDArray[np.str_]:
+    """Return the human name of each vertex's body part, by the largest weight.
+
+    Returns
+    -------
+    (V,) array, as "Left forearm"; fingers and toes belong to hands and feet, and what no known name
+    tells is called after its joint
+    """
+    return part_labels(rig.joint_names, rig.parents, rig.joint_of, rig.weights)
+
+
+def _axis(up: int | str) -> int:
+    if up in ("x", "y", "z"):
+        return "xyz".index(str(up))
+    if up in (0, 1, 2):
+        return int(up)
+    raise ShapeError.must_be("up", "0, 1, 2, 'x', 'y' or 'z'", repr(up))
+
+
+def _rig(scene: Scene, mesh: JoinedMesh) -> tuple[Rig | None, tuple[str, ...]]:
+    """Return the skeleton of what is skinned, and notes."""
+    in_skins = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
+    if not in_skins:
+        return None, ()
+    anchors = _anchors(scene, in_skins)
+    rest = scene.rest.transforms[0]
+    used = {anchors[bone] for bone in mesh.bones[np.unique(mesh.bone_of)].tolist()}
+    order = [
+        node
+        for node in parents_first(scene.parents)
+        if node in used or (node in in_skins and _is_regular(rest[node]))
+    ]
+    flat = [node for node in order if not _is_regular(rest[node])]
+    if flat:
+        name = scene.node_names[flat[0]] or f"node {flat[0]}"
+        return None, (f"joint {name} is scaled to nothing, so no pose is made by the joints",)
+    joint = {node: number for number, node in enumerate(order)}
+    joint_of_bone = np.array([joint.get(anchors[bone], -1) for bone in mesh.bones.tolist()])
+    placed = rest[mesh.bones] @ mesh.bind
+    points = mesh.morphed(tuple(weights[0] for weights in scene.rest.weights))
+    turns = placed[mesh.bone_of]
+    return Rig(
+        unique_names([scene.node_names[node] or f"node {node}" for node in order]),
+        np.array([_parent_joint(scene, node, joint) for node in order], dtype=np.int64),
+        rest[order],
+        np.array(order, dtype=np.int64),
+        joint_of_bone[mesh.bone_of].astype(np.int32),
+        mesh.weights,
+        np.einsum("vijk,vk->vij", turns[..., :3, :3], points) + turns[..., :3, 3],
+    ), ()
+
+
+def _is_regular(transform: FloatArray) -> bool:
+    """Whether a transform can be inverted: its columns span a volume."""
+    columns = transform[:3, :3]
+    lengths = np.linalg.norm(columns, axis=0)
+    return bool(abs(np.linalg.det(columns)) > 1e-9 * np.prod(lengths))
+
+
+def _parent_joint(scene: Scene, node: int, joint: dict[int, int]) -> int:
+    parent = int(scene.parents[node])
+    while parent >= 0 and parent not in joint:
+        parent = int(scene.parents[parent])
+    return joint.get(parent, -1)
+
+
+def _anchors(scene: Scene, in_skins: set[int]) -> dict[int, int]:
+    """Return for each node that moves vertices the one that is to be the joint.
+
+    What hangs on a joint of a skin without moving in any clip is part of that joint.
+    """
+    moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
+    anchors = {}
+    for bone in {bone for part in scene.parts for bone in part.bones.tolist()}:
+        node = bone
+        while node >= 0 and node not in in_skins and node not in moved:
+            node = int(scene.parents[node])
+        anchors[bone] = node if node in in_skins else bone
+    return anchors

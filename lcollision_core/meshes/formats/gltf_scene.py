@@ -1,0 +1,310 @@
+"""The nodes, meshes, skins and morph targets that a glTF file shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.formats.gltf_animation import read_clips, stored_transform
+from lcollision_core.meshes.formats.gltf_document import GltfDocument, element, numbers, whole
+from lcollision_core.meshes.formats.polygons import MAX_FACES, require_plausible_count
+from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses, parents_first
+from lcollision_core.meshes.formats.transforms import compose, global_transforms
+from lcollision_core.meshes.topology import FloatArray
+
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+
+
+@dataclass(frozen=True)
+class ShownPrimitive:
+    """A primitive that a node shows: numbers in the file, and the number of vertices."""
+
+    node: int
+    mesh: int
+    primitive: int
+    n_vertices: int
+
+
+def read_shown(document: GltfDocument) -> Scene:
+    """Read the default scene of a glTF file.
+
+    Raises
+    ------
+    MeshFileError : the file is damaged, or shows no triangles.
+    """
+    nodes = document.description.nodes
+    parents = _parents(document)
+    order = parents_first(parents)
+    local = _local_transforms(nodes)
+    rest = global_transforms(local[None], parents, order)
+    shown, notes = shown_primitives(document, parents)
+    if not shown:
+        n_meshes = len(document.description.meshes)
+        raise MeshFileError(f"it holds {n_meshes} meshes, none of which shows triangles")
+    parts = tuple(_part(document, primitive, rest[0]) for primitive in shown)
+    defaults = tuple(
+        _default_weights(document, one, part) for one, part in zip(shown, parts, strict=True)
+    )
+    clips = read_clips(document, local, parents, order, parts, defaults)
+    return Scene(
+        tuple(str(node.name or "") for node in nodes),
+        parents,
+        ScenePoses(rest, tuple(weights[None] for weights in defaults)),
+        parts,
+        clips,
+        # By the standard.
+        up=np.array([0.0, 1.0, 0.0]),
+        metres=1.0,
+        notes=notes,
+    )
+
+
+def shown_primitives(
+    document: GltfDocument, parents: npt.NDArray[np.int64]
+) -> tuple[list[ShownPrimitive], tuple[str, ...]]:
+    """Return the primitives with triangles that the default scene shows, and notes on others.
+
+    They are in the order of the meshes, for each mesh of the nodes that show it, and for each node
+    of its primitives: the order of a character's vertices.
+    """
+    description = document.description
+    meshes = description.meshes
+    visible = _visible(document, parents)
+    showing = [
+        (whole(node.mesh, f"the mesh of node {i}", 0, len(meshes) - 1), i)
+        for i, node in enumerate(description.nodes)
+        if node.mesh is not None and i in visible
+    ]
+    shown: list[ShownPrimitive] = []
+    n_vertices = n_others = 0
+    for mesh, node in sorted(showing):
+        for number, primitive in enumerate(meshes[mesh].primitives or ()):
+            mode = _TRIANGLES if primitive.mode is None else primitive.mode
+            what = f"positions of mesh {mesh}"
+            position = getattr(primitive.attributes, "POSITION", None)
+            if mode not in (_TRIANGLES, _STRIP, _FAN) or position is None:
+                n_others += 1
+                continue
+            count = element(description.accessors, position, f"the accessor of {what}").count
+            count = whole(count, f"the count of {what}", 0, MAX_FACES)
+            n_vertices += count
+            require_plausible_count(n_vertices, "vertices")
+            shown.append(ShownPrimitive(node, mesh, number, count))
+    if not n_others:
+        return shown, ()
+    return shown, (f"{n_others} parts without triangles (points, lines) were left out",)
+
+
+def _parents(document: GltfDocument) -> npt.NDArray[np.int64]:
+    nodes = document.description.nodes
+    parents = np.full(len(nodes), -1, dtype=np.int64)
+    for number, node in enumerate(nodes):
+        for child in node.children or ():
+            index = whole(child, f"a child of node {number}", 0, len(nodes) - 1)
+            if parents[index] >= 0:
+                raise MeshFileError(
+                    f"is damaged: node {index} (from 0) has two parents", where="it"
+                )
+            parents[index] = number
+    return parents
+
+
+def _visible(document: GltfDocument, parents: npt.NDArray[np.int64]) -> set[int]:
+    """Return the nodes of the default scene; all where the file has no scene."""
+    description = document.description
+    if not description.scenes:
+        return set(range(len(parents)))
+    scene = element(description.scenes, description.scene or 0, "the scene")
+    n_nodes = len(parents)
+    roots = {whole(node, "a node of the scene", 0, n_nodes - 1) for node in scene.nodes or ()}
+    found: set[int] = set()
+    for node in parents_first(parents):
+        if node in roots or parents[node] in found:
+            found.add(node)
+    return found
+
+
+def _local_transforms(nodes: list[Any]) -> FloatArray:
+    local = np.tile(np.eye(4), (len(nodes), 1, 1))
+    for number, node in enumerate(nodes):
+        where = f"node {number}"
+        if node.matrix is not None:
+            # Column by column.
+            local[number] = numbers(node.matrix, f"the matrix of {where}", 16).reshape(4, 4).T
+            local[number, 3] = 0.0, 0.0, 0.0, 1.0
+        elif (node.translation, node.rotation, node.scale) != (None, None, None):
+            moved, turned, scaled = stored_transform(node, where)
+            local[number] = compose(moved[None], turned[None], scaled[None])[0]
+    return local
+
+
+def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Part:
+    description = document.description
+    mesh = description.meshes[shown.mesh]
+    primitive = mesh.primitives[shown.primitive]
+    node = description.nodes[shown.node]
+    where = f"mesh {shown.mesh}"
+    stored = document.array(primitive.attributes.POSITION, f"the positions of {where}", ("VEC3",))
+    points = stored.astype(np.float64)
+    n = len(points)
+    bones, bind = np.array([shown.node]), np.eye(4)[None]
+    bone_of, weights = np.zeros((n, 1), dtype=np.int32), np.ones((n, 1))
+    is_skinned = node.skin is not None and hasattr(primitive.attributes, "JOINTS_0")
+    is_skinned = is_skinned and primitive.attributes.JOINTS_0 is not None
+    if is_skinned:
+        bones, bind = _skin(document, node.skin)
+        bone_of, weights = _influences(document, primitive, where, n, len(bones))
+    faces = _faces(document, primitive, where, n)
+    # Mirrored triangles are wound the other way.
+    with np.errstate(all="ignore"):
+        signs = np.sign(np.linalg.det((rest[bones] @ bind)[:, :3, :3]))
+    if (signs[bone_of] * weights).sum() < 0.0:
+        faces = faces[:, [0, 2, 1]]
+    material = ""
+    if primitive.material is not None:
+        named = element(description.materials, primitive.material, "a material")
+        material = str(named.name or f"material {primitive.material}")
+    return Part(
+        str(mesh.name or node.name or where),
+        material,
+        shown.node,
+        points,
+        faces,
+        bones,
+        bind,
+        bone_of,
+        weights,
+        is_skinned,
+        _morphs(document, primitive, where, n),
+        is_single=stored.dtype == np.float32,
+    )
+
+
+def _faces(
+    document: GltfDocument, primitive: Any, where: str, n_vertices: int
+) -> npt.NDArray[np.int64]:
+    """Return the (F, 3) triangles of a primitive: a list, a strip or a fan."""
+    if primitive.indices is None:
+        corners = np.arange(n_vertices)
+    else:
+        stored = document.array(primitive.indices, f"the indices of {where}", ("SCALAR",))[:, 0]
+        if stored.dtype.kind != "u":
+            raise MeshFileError.must_be(f"the indices of {where}", "whole numbers", stored.dtype)
+        corners = stored.astype(np.int64)
+    n = len(corners) - 2
+    if primitive.mode in (_STRIP, _FAN):
+        step = np.arange(max(n, 0))
+        if primitive.mode == _FAN:
+            picked = np.stack([step + 1, step + 2, np.zeros_like(step)], axis=1)
+        else:
+            # Every second triangle of a strip is wound the other way.
+            odd = step % 2
+            picked = np.stack([step, step + 1 + odd, step + 2 - odd], axis=1)
+        faces = corners[picked]
+        # Strips are joined by triangles without area.
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    else:
+        if len(corners) % 3:
+            raise MeshFileError(f"have {len(corners)} corners, no multiple of 3", where=where)
+        faces = corners.reshape(-1, 3)
+    wrong = np.flatnonzero((faces >= n_vertices).any(axis=1))
+    if len(wrong):
+        raise MeshFileError(
+            f"names vertices {faces[wrong[0]].tolist()}",
+            where=f"face {wrong[0]}",
+            expected=f"0 to {n_vertices - 1}",
+        )
+    return faces
+
+
+def _skin(document: GltfDocument, index: object) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    description = document.description
+    skin = element(description.skins, index, "the skin")
+    n_nodes = len(description.nodes)
+    what = f"a joint of skin {index}"
+    joints = [whole(joint, what, 0, n_nodes - 1) for joint in skin.joints or ()]
+    if not joints:
+        raise MeshFileError("has no joints", where=f"skin {index}")
+    bones = np.array(joints, dtype=np.int64)
+    if skin.inverseBindMatrices is None:
+        return bones, np.tile(np.eye(4), (len(bones), 1, 1))
+    what = f"the inverse bind matrices of skin {index}"
+    stored = document.array(skin.inverseBindMatrices, what, ("MAT4",))
+    if len(stored) < len(bones):
+        raise MeshFileError(f"have {len(stored)} values, {len(bones)} are needed", where=what)
+    # Column by column.
+    bind = stored[: len(bones)].reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
+    bind[:, 3] = 0.0, 0.0, 0.0, 1.0
+    _require_finite(bind, what)
+    return bones, bind
+
+
+def _influences(
+    document: GltfDocument, primitive: Any, where: str, n: int, n_bones: int
+) -> tuple[npt.NDArray[np.int32], FloatArray]:
+    """Return the bones and the weights of n vertices, from all sets of four that are there."""
+    joints: list[npt.NDArray[np.int64]] = []
+    weights: list[FloatArray] = []
+    while getattr(primitive.attributes, f"JOINTS_{len(joints)}", None) is not None:
+        name = str(len(joints))
+        what = f"the joints {name} of {where}"
+        stored = document.array(getattr(primitive.attributes, f"JOINTS_{name}"), what, ("VEC4",), n)
+        if stored.dtype.kind != "u":
+            raise MeshFileError.must_be(what, "whole numbers", stored.dtype)
+        joints.append(stored.astype(np.int64))
+        what = f"the weights {name} of {where}"
+        weights.append(
+            document.array(
+                getattr(primitive.attributes, f"WEIGHTS_{name}", None), what, ("VEC4",), n
+            ).astype(np.float64)
+        )
+    bone_of, shares = np.concatenate(joints, axis=1), np.concatenate(weights, axis=1)
+    _require_finite(shares, f"the weights of {where}")
+    shares = np.maximum(shares, 0.0)
+    # A joint without weight may be any number.
+    bone_of[shares == 0.0] = 0
+    wrong = np.flatnonzero((bone_of >= n_bones).any(axis=1))
+    if len(wrong):
+        raise MeshFileError(
+            f"is moved by joints {bone_of[wrong[0]].tolist()}",
+            where=f"vertex {wrong[0]} of {where}",
+            expected=f"0 to {n_bones - 1}",
+        )
+    total = shares.sum(axis=1)
+    # What nothing moves follows the first joint.
+    shares[total == 0.0, 0] = 1.0
+    total[total == 0.0] = 1.0
+    return bone_of.astype(np.int32), shares / total[:, None]
+
+
+def _morphs(document: GltfDocument, primitive: Any, where: str, n: int) -> npt.NDArray[np.float32]:
+    deltas = []
+    for number, target in enumerate(primitive.targets or ()):
+        what = f"morph target {number} of {where}"
+        if not isinstance(target, dict):
+            raise MeshFileError.must_be(what, "an object", type(target).__name__)
+        if target.get("POSITION") is None:
+            deltas.append(np.zeros((n, 3), dtype=np.float32))
+        else:
+            stored = document.array(target["POSITION"], what, ("VEC3",), n)
+            deltas.append(stored.astype(np.float32))
+    stacked = np.stack(deltas) if deltas else np.empty((0, n, 3), dtype=np.float32)
+    _require_finite(stacked, f"the morph targets of {where}")
+    return stacked
+
+
+def _default_weights(document: GltfDocument, shown: ShownPrimitive, part: Part) -> FloatArray:
+    """Return the (M,) weights of the morph targets that the file stores for a node's mesh."""
+    mesh = document.description.meshes[shown.mesh]
+    stored = document.node_weights.get(shown.node) or mesh.weights
+    n = len(part.morphs)
+    return numbers(stored, f"the weights of mesh {shown.mesh}", n) if stored and n else np.zeros(n)
+
+
+def _require_finite(values: npt.NDArray[Any], what: str) -> None:
+    if not np.isfinite(values).all():
+        raise MeshFileError("are not all finite", where=what)

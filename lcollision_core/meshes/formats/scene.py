@@ -1,0 +1,182 @@
+"""What a file of a scene holds, whatever its format: nodes, parts that they move, and clips."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.topology import FloatArray
+
+MAX_FRAME_NUMBERS = 1 << 28
+"""The most coordinates, and the most numbers of node transforms, that the frames of a clip have."""
+
+MOST_KEYS_PER_SECOND = 30.0
+"""Keys that follow faster are no frames of their own."""
+
+_MOST_FRAMES = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePoses:
+    """N poses of a scene.
+
+    Attributes
+    ----------
+    transforms : (N, n, 4, 4) float64 array, the nodes' global transforms
+    weights : for each part, the (N, M) float64 weights of its morph targets
+    """
+
+    transforms: FloatArray
+    weights: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Triangles of one mesh and one material, moved by nodes.
+
+    In a pose whose nodes have the global transforms G, vertex v, its morph deltas added, is
+    sum_i weights[v, i] G_b bind[j] points[v] with j = bone_of[v, i] and b = bones[j].
+
+    Attributes
+    ----------
+    mesh, material : names
+    node : the node that shows it
+    points : (W, 3) float64 array
+    faces : (F, 3) int64 array, indices from 0 into the part's vertices, checked
+    bones : (B,) int64 array, nodes; the node itself where nothing is skinned
+    bind : (B, 4, 4) float64 array, from the part's coordinates to each bone's
+    bone_of : (W, I) int32 array, indices into `bones`
+    weights : (W, I) float64 array >= 0, each row sums to 1
+    is_skinned : whether the bones are joints of a skin
+    morphs : (M, W, 3) float32 array, what each morph target adds
+    is_single : whether the file holds the points as float32
+    """
+
+    mesh: str
+    material: str
+    node: int
+    points: FloatArray
+    faces: npt.NDArray[np.int64]
+    bones: npt.NDArray[np.int64]
+    bind: FloatArray
+    bone_of: npt.NDArray[np.int32]
+    weights: FloatArray
+    is_skinned: bool
+    morphs: npt.NDArray[np.float32]
+    is_single: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """One animation.
+
+    Attributes
+    ----------
+    name : unique in the scene
+    key_times : (T,) float64 array, ascending, in seconds, T > 0
+    moved : the nodes that it moves, without those that follow them
+    sample : from (N,) times to the N poses then
+    """
+
+    name: str
+    key_times: FloatArray
+    moved: frozenset[int]
+    sample: Callable[[FloatArray], ScenePoses]
+
+    def times(self, fps: float | None) -> FloatArray:
+        """Return the times of its frames.
+
+        Parameters
+        ----------
+        fps : frames a second from the first key to the last; None for the keys themselves, without
+            those that follow another faster than `MOST_KEYS_PER_SECOND`
+
+        Raises
+        ------
+        MeshFileError : fps is no number above 0, or there would be too many frames.
+        """
+        start, end = float(self.key_times[0]), float(self.key_times[-1])
+        if fps is None:
+            # Keys are stored in single precision: a thousandth of a step is no difference.
+            least_step = (1.0 - 1e-3) / MOST_KEYS_PER_SECOND
+            kept = [start]
+            for time in self.key_times[1:].tolist():
+                if time - kept[-1] >= least_step:
+                    kept.append(time)
+            return np.array(kept)
+        if not 0.0 < fps < np.inf:
+            raise MeshFileError.must_be("fps", "a number above 0", f"{fps:g}")
+        n_steps = (end - start) * fps + 1e-6
+        if not n_steps < _MOST_FRAMES:
+            raise MeshFileError(
+                f"its clip {self.name!r} of {end - start:g} s has more than {_MOST_FRAMES} frames "
+                f"at {fps:g} a second",
+                "choose fewer frames a second",
+            )
+        return start + np.arange(int(n_steps) + 1) / fps
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The content of a file.
+
+    Attributes
+    ----------
+    node_names : as in the file, "" where it has none
+    parents : (n,) int64 array, each node's parent, -1 for a root; no circles
+    rest : the one pose in which the file stores the nodes
+    parts : in the order of the file's meshes, then of the nodes that show each, then of its
+        primitives
+    clips : its animations
+    up : (3,) float64 array, a signed unit axis
+    metres : length of the file's unit
+    notes : sentences on what was left out
+    """
+
+    node_names: tuple[str, ...]
+    parents: npt.NDArray[np.int64]
+    rest: ScenePoses
+    parts: tuple[Part, ...]
+    clips: tuple[Clip, ...]
+    up: FloatArray
+    metres: float
+    notes: tuple[str, ...] = ()
+
+
+def parents_first(parents: npt.NDArray[np.int64]) -> list[int]:
+    """Return all nodes, each after its parent.
+
+    Raises
+    ------
+    MeshFileError : a node is its own ancestor.
+    """
+    children: list[list[int]] = [[] for _ in parents]
+    order: list[int] = []
+    for node, parent in enumerate(parents.tolist()):
+        (order if parent < 0 else children[parent]).append(node)
+    for node in order:
+        order += children[node]
+    if len(order) < len(parents):
+        lost = min(set(range(len(parents))) - set(order))
+        raise MeshFileError(f"is damaged: node {lost} (from 0) is its own ancestor", where="it")
+    return order
+
+
+def unique_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Return names of which no two are equal: a later one gets a number behind it."""
+    taken: set[str] = set()
+    counts: Counter[str] = Counter()
+    result = []
+    for name in names:
+        unique = name
+        while unique in taken:
+            counts[name] += 1
+            unique = f"{name} {counts[name] + 1}"
+        taken.add(unique)
+        result.append(unique)
+    return tuple(result)

@@ -1,0 +1,87 @@
+"""Affine transforms of nodes: translation, rotation and scale, and chains of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.meshes.topology import FloatArray
+
+_NEARLY_PARALLEL = 1.0 - 1e-9
+"""Cosine above which the arc between two quaternions is taken for its chord."""
+
+
+def compose(translation: FloatArray, rotation: FloatArray, scale: FloatArray) -> FloatArray:
+    """Return the matrices that scale, then rotate, then translate.
+
+    Parameters
+    ----------
+    translation, scale : (..., 3) arrays
+    rotation : (..., 4) array, quaternions x, y, z, w of any length; one of length 0 rotates nothing
+
+    Returns
+    -------
+    (..., 4, 4) float64 array
+    """
+    length = np.linalg.norm(rotation, axis=-1, keepdims=True)
+    identity = np.array([0.0, 0.0, 0.0, 1.0])
+    unit = np.where(length > 0.0, rotation / np.where(length > 0.0, length, 1.0), identity)
+    x, y, z, w = np.moveaxis(unit, -1, 0)
+    result = np.zeros((*translation.shape[:-1], 4, 4))
+    result[..., 0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    result[..., 0, 1] = 2.0 * (x * y - z * w)
+    result[..., 0, 2] = 2.0 * (x * z + y * w)
+    result[..., 1, 0] = 2.0 * (x * y + z * w)
+    result[..., 1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    result[..., 1, 2] = 2.0 * (y * z - x * w)
+    result[..., 2, 0] = 2.0 * (x * z - y * w)
+    result[..., 2, 1] = 2.0 * (y * z + x * w)
+    result[..., 2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    result[..., :3, :3] *= scale[..., None, :]
+    result[..., :3, 3] = translation
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def decompose(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the translation, rotation (x, y, z, w) and scale of a (4, 4) matrix without shear.
+
+    A reflection is in the scale of x.
+    """
+    from scipy.spatial.transform import Rotation
+
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    if np.linalg.det(matrix[:3, :3]) < 0.0:
+        scale[0] = -scale[0]
+    if not scale.all():
+        return matrix[:3, 3].copy(), np.array([0.0, 0.0, 0.0, 1.0]), scale
+    return matrix[:3, 3].copy(), Rotation.from_matrix(matrix[:3, :3] / scale).as_quat(), scale
+
+
+def slerp(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
+    """Interpolate (N, 4) unit quaternions along the shorter arc by (N,) shares of it."""
+    cosine = np.einsum("ni,ni->n", start, end)
+    end = np.where(cosine[:, None] < 0.0, -end, end)
+    cosine = np.minimum(np.abs(cosine), 1.0)
+    angle = np.arccos(cosine)
+    is_chord = cosine > _NEARLY_PARALLEL
+    sine = np.where(is_chord, 1.0, np.sin(angle))
+    at_start = np.where(is_chord, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
+    at_end = np.where(is_chord, share, np.sin(share * angle) / sine)
+    result: FloatArray = at_start[:, None] * start + at_end[:, None] * end
+    return result
+
+
+def global_transforms(
+    local: FloatArray, parents: npt.NDArray[np.int64], order: Sequence[int]
+) -> FloatArray:
+    """Chain (N, n, 4, 4) local transforms of n nodes; `order` has parents before children."""
+    result = local.copy()
+    # Too large a number is refused where the vertices are.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for node in order:
+            if parents[node] >= 0:
+                result[:, node] = result[:, parents[node]] @ local[:, node]
+    return result

@@ -1,0 +1,293 @@
+"""The parts of a scene as one mesh, whose vertices at seams are joined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.formats.scene import MAX_FRAME_NUMBERS, Part, Scene, ScenePoses
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Morphs:
+    """Morph targets of some vertices: `part` weighs (M, n, 3) `deltas` of the n `vertices`."""
+
+    part: int
+    vertices: IntArray
+    deltas: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedMesh:
+    """One mesh of all parts of a scene; vertices that no pose can separate are one.
+
+    Those are vertices with the same coordinates, bones, weights and morph deltas.
+
+    Attributes
+    ----------
+    topology : of the V joined vertices, numbered by first appearance; faces that joining makes
+        degenerate are left out
+    joined : (W,) int64 array: the joined vertex of each of the parts' W vertices
+    bones : (B,) int64 array, nodes that move vertices; a node may be there several times
+    bind : (B, 4, 4) float64 array, from the vertices' coordinates to each bone's
+    bone_of : (V, I) int32 array, indices into `bones`, ascending, then those of no weight
+    weights : (V, I) float64 array >= 0, each row sums to 1
+    points : (V, 3) float64 array, in the coordinates of each vertex's part
+    is_skinned : (V,) bool array
+    morphs : what adds to `points`
+    groups : named meshes and materials
+    notes : sentences on what was changed
+    """
+
+    topology: Topology
+    joined: IntArray
+    bones: IntArray
+    bind: FloatArray
+    bone_of: npt.NDArray[np.int32]
+    weights: FloatArray
+    points: FloatArray
+    is_skinned: npt.NDArray[np.bool_]
+    morphs: tuple[_Morphs, ...]
+    groups: tuple[FaceGroup, ...]
+    notes: tuple[str, ...]
+
+    def morphed(self, weights: tuple[FloatArray, ...]) -> FloatArray:
+        """Return the (V, 3) points with the morph targets of the parts, of (M,) weights, added."""
+        points = self.points.copy()
+        for morphs in self.morphs:
+            used = np.flatnonzero(weights[morphs.part])
+            shares = weights[morphs.part][used]
+            points[morphs.vertices] += np.tensordot(shares, morphs.deltas[used], axes=1)
+        return points
+
+    def posed(
+        self,
+        poses: ScenePoses,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> FloatArray:
+        """Return the vertices of N poses of the scene.
+
+        Parameters
+        ----------
+        poses : of the scene
+        progress : called with (poses done, N)
+        cancel : polled between poses
+
+        Returns
+        -------
+        (N, V, 3) float64 array
+
+        Raises
+        ------
+        MeshFileError : a coordinate is not finite.
+        """
+        n, n_vertices = len(poses.transforms), self.topology.n_vertices
+        result = np.empty((n, n_vertices, 3))
+        rows = np.repeat(np.arange(n_vertices), self.bone_of.shape[1])
+        entries = (self.weights.reshape(-1), (rows, self.bone_of.reshape(-1)))
+        blend = sparse.csr_matrix(entries, (n_vertices, len(self.bones)))
+        for pose in range(n):
+            if cancel is not None:
+                cancel.raise_if_cancelled()
+            with np.errstate(over="ignore", invalid="ignore"):
+                turns = poses.transforms[pose, self.bones] @ self.bind
+                blended = (blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
+                points = self.morphed(tuple(weights[pose] for weights in poses.weights))
+                result[pose] = np.einsum("vij,vj->vi", blended[:, :, :3], points)
+                result[pose] += blended[:, :, 3]
+            progress(pose + 1, n)
+        if not np.isfinite(result).all():
+            raise MeshFileError("a pose of its nodes has coordinates that are not finite")
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class SampledClip:
+    """N frames of a clip: (N,) `times`, `poses` of the scene and (N, V, 3) `vertices`."""
+
+    times: FloatArray
+    poses: ScenePoses
+    vertices: FloatArray
+
+
+def sample_clip(
+    scene: Scene,
+    mesh: JoinedMesh,
+    name: str,
+    fps: float | None = None,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> SampledClip:
+    """Return the frames of a clip, as `Clip.times` chooses them.
+
+    Parameters
+    ----------
+    scene : of the clip
+    mesh : of its parts
+    name : the clip's
+    fps : frames a second; None for the clip's keys
+    progress, cancel : as of `JoinedMesh.posed`
+
+    Raises
+    ------
+    MeshFileError : there is no such clip, it has too many frames, or one is not finite.
+    """
+    found = [clip for clip in scene.clips if clip.name == name]
+    if not found:
+        known = ", ".join(repr(clip.name) for clip in scene.clips[:8]) or "none"
+        raise MeshFileError(f"it has no clip {name!r}, its clips are: {known}", "name one of them")
+    times = found[0].times(fps)
+    numbers_each = max(3 * mesh.topology.n_vertices, 16 * len(scene.parents))
+    if len(times) * numbers_each > MAX_FRAME_NUMBERS:
+        raise MeshFileError(
+            f"its clip {name!r} has {len(times)} frames of {mesh.topology.n_vertices} vertices, "
+            f"which take more than {MAX_FRAME_NUMBERS} numbers",
+            "choose fewer frames a second",
+        )
+    poses = found[0].sample(times)
+    return SampledClip(times, poses, mesh.posed(poses, progress, cancel))
+
+
+def join_parts(scene: Scene) -> JoinedMesh:
+    """Join the parts of a scene.
+
+    Raises
+    ------
+    MeshFileError : no face is left.
+    """
+    parts = scene.parts
+    first_vertex = np.cumsum([0] + [len(part.points) for part in parts])
+    bones, bind, bone_of, weights = _common_bones(parts)
+    points = np.concatenate([part.points for part in parts])
+    morph_of = _morph_numbers(parts)
+    # -0.0 becomes 0.0: equal numbers, equal bits.
+    keys = np.concatenate(
+        [(points + 0.0).view(np.int64), bone_of, weights.view(np.int64), morph_of], axis=1
+    )
+    kept, joined = _first_of_equal(keys)
+    faces = np.concatenate([joined[part.faces + first_vertex[i]] for i, part in enumerate(parts)])
+    is_flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    if is_flat.all():
+        raise MeshFileError("it holds vertices but no faces", "export it as a triangle mesh")
+    n_joined, n_flat = len(joined) - len(kept), int(is_flat.sum())
+    notes = list(scene.notes)
+    if n_joined:
+        notes.append(f"{n_joined} vertices that seams had split were joined")
+    if n_flat:
+        notes.append(f"{n_flat} faces that name a vertex twice were left out")
+    morphs = []
+    for i, part in enumerate(parts):
+        local = kept[(kept >= first_vertex[i]) & (kept < first_vertex[i + 1])]
+        moved = local[morph_of[local, 0] > 0]
+        if len(moved):
+            deltas = part.morphs[:, moved - first_vertex[i]]
+            morphs.append(_Morphs(i, joined[moved], deltas))
+    is_skinned = np.repeat([part.is_skinned for part in parts], np.diff(first_vertex))
+    return JoinedMesh(
+        Topology(faces[~is_flat], len(kept)),
+        joined,
+        bones,
+        bind,
+        bone_of[kept].astype(np.int32),
+        weights[kept],
+        points[kept],
+        is_skinned[kept],
+        tuple(morphs),
+        _groups(parts, is_flat),
+        tuple(notes),
+    )
+
+
+def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
+    """Give the bones of all parts common numbers, and sort each vertex's by them.
+
+    Returns
+    -------
+    bones, bind : as of `JoinedMesh`; no two rows are the same
+    bone_of : (W, I) int64 array, 0 where the weight is 0
+    weights : (W, I) float64 array
+    """
+    known: dict[tuple[int, bytes], int] = {}
+    bones: list[int] = []
+    binds: list[FloatArray] = []
+    width = max(part.bone_of.shape[1] for part in parts)
+    n = sum(len(part.points) for part in parts)
+    bone_of, weights = np.zeros((n, width), dtype=np.int64), np.zeros((n, width))
+    start = 0
+    for part in parts:
+        numbers = np.empty(len(part.bones), dtype=np.int64)
+        for i, (bone, bind) in enumerate(zip(part.bones.tolist(), part.bind + 0.0, strict=True)):
+            key = bone, bind.tobytes()
+            if key not in known:
+                known[key] = len(bones)
+                bones.append(bone)
+                binds.append(bind)
+            numbers[i] = known[key]
+        rows = slice(start, start + len(part.points))
+        start += len(part.points)
+        columns = part.bone_of.shape[1]
+        weights[rows, :columns] = part.weights
+        bone_of[rows, :columns] = np.where(part.weights > 0.0, numbers[part.bone_of], 0)
+    # Those without weight last, as number 0.
+    order = np.argsort(np.where(weights > 0.0, bone_of, len(bones)), axis=1, kind="stable")
+    bone_of = np.take_along_axis(bone_of, order, axis=1)
+    weights = np.take_along_axis(weights, order, axis=1)
+    return np.array(bones, dtype=np.int64), np.stack(binds), bone_of, weights
+
+
+def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
+    """Return (W, 2) numbers, equal where vertices have the same morph deltas: 0, 0 for none."""
+    result = [np.zeros((len(part.points), 2), dtype=np.int64) for part in parts]
+    # The parts that one node shows share their weights.
+    for node in {part.node for part in parts}:
+        shown = [i for i, part in enumerate(parts) if part.node == node and part.morphs.size]
+        n_targets = max((len(parts[i].morphs) for i in shown), default=0)
+        rows, deltas = [], []
+        for i in shown:
+            moved = np.flatnonzero(parts[i].morphs.any(axis=(0, 2)))
+            given = np.zeros((len(moved), n_targets, 3), dtype=np.float32)
+            given[:, : len(parts[i].morphs)] = parts[i].morphs[:, moved].transpose(1, 0, 2)
+            rows.append(moved)
+            deltas.append(given.reshape(len(moved), -1) + np.float32(0.0))
+        if not shown:
+            continue
+        _, kind = _first_of_equal(np.concatenate(deltas).view(np.int32))
+        kinds = np.split(kind, np.cumsum([len(moved) for moved in rows])[:-1])
+        for i, moved, which in zip(shown, rows, kinds, strict=True):
+            result[i][moved, 0], result[i][moved, 1] = node + 1, which
+    return np.concatenate(result)
+
+
+def _first_of_equal(rows: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
+    """Return the first of each kind of equal rows, ascending, and each row's kind among them."""
+    flat = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1])))
+    _, first, which = np.unique(flat[:, 0], return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[which.reshape(-1)]
+
+
+def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tuple[FaceGroup, ...]:
+    """Return the faces of each mesh, and of each material; of one name only once."""
+    number = np.cumsum(~is_left_out) - 1
+    start = 0
+    found: dict[str, list[IntArray]] = {}
+    for part in parts:
+        rows = np.arange(start, start + len(part.faces))
+        start += len(part.faces)
+        rows = number[rows[~is_left_out[rows]]]
+        for name in dict.fromkeys((part.mesh, part.material)):
+            if name:
+                found.setdefault(name, []).append(rows)
+    return tuple(FaceGroup(name, np.unique(np.concatenate(faces))) for name, faces in found.items())

@@ -1,0 +1,147 @@
+"""Human names of body parts from the names of joints, whatever program made the rig."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.meshes.topology import FloatArray
+
+_SIDES = {
+    **dict.fromkeys(("left", "lft", "l"), "Left"),
+    **dict.fromkeys(("right", "rgt", "rt", "r"), "Right"),
+}
+_PREFIXES = frozenset(
+    ("mixamorig", "bip", "bip01", "bip001", "biped", "valvebiped", "bind", "cc", "base", "def")
+    + ("org", "mch", "jnt", "joint", "jt", "skel", "rig", "c", "b", "j", "sec", "adj", "end")
+)
+"""Words that say nothing of the part."""
+
+_HAND = "thumb|index|middle|ring|pink(y|ie)|little|finger|metacarpal|carpal|palm|hand|wrist"
+_HEAD_WORDS = "eye|eyes|ear|lip|lips|jaw|hair|brow|nose|face|cheek|tongue|teeth|chin|faceeye"
+_PAIRED = (
+    (r"toe|ball|foot|feet|ankle|heel|tarsal|hallux", "foot"),
+    (_HAND, "hand"),
+    (r"forearm|lowerarm|lowarm|armlower|elbow|ulna|forearmbend", "forearm"),
+    (r"upperarm|uparm|armupper|bicep|humerus|shldr", "upper arm"),
+    (r"shoulder|clavicle|collar|scapula", "shoulder"),
+    (r"upleg|upperleg|legupper|thigh|femur", "thigh"),
+    (r"lowerleg|lowleg|leglower|calf|shin|knee|tibia", "shin"),
+)
+"""Parts of which a body has two, by a pattern that a name without blanks contains."""
+
+_PAIRED_WORDS = {"arm": ("upper arm", "forearm"), "leg": ("shin", "thigh")}
+"""A word that is a part of a limb where the rig names the other part, else the limb."""
+
+_SINGLE = (
+    (r"head|skull", "Head"),
+    (r"neck", "Neck"),
+    (r"chest|thorax|rib|breast|pectoral|bust", "Chest"),
+    (r"spine|torso|abdomen|waist|belly|stomach|lumbar", "Torso"),
+    (r"pelvis|hips?$|butt(ock)?", "Hips"),
+)
+
+
+def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
+    """Return the body part of each joint, as "Left forearm"; None where the name does not tell.
+
+    Fingers belong to the hand, toes to the foot, the face to the head.
+
+    Parameters
+    ----------
+    names : of all joints of a rig, as of Mixamo, Blender, VRM, Unreal, Biped or Daz
+    """
+    plain = [_part(*_words(name)) for name in names]
+    present = set(plain)
+    return tuple(
+        part if part is not None else _limb(*_words(name), present)
+        for name, part in zip(names, plain, strict=True)
+    )
+
+
+def part_labels(
+    names: Sequence[str],
+    parents: npt.NDArray[np.int64],
+    joint_of: npt.NDArray[np.int32],
+    weights: FloatArray,
+) -> npt.NDArray[np.str_]:
+    """Name the body part of each vertex after the part whose joints have the most weight.
+
+    A joint whose name does not tell is part of what its parents are, and if they do not tell
+    either, has its own name.
+
+    Parameters
+    ----------
+    names, parents : of J joints, parents before children
+    joint_of, weights : (V, I) arrays, as of a rig
+
+    Returns
+    -------
+    (V,) array of printable strings
+    """
+    own = part_names(names)
+    labels: list[str] = []
+    known: list[bool] = []
+    for joint, (name, parent) in enumerate(zip(names, parents.tolist(), strict=True)):
+        inherits = own[joint] is None and parent >= 0 and known[parent]
+        labels.append(own[joint] or (labels[parent] if inherits else _spelled_out(name)))
+        known.append(own[joint] is not None or inherits)
+    parts, part_of_joint = np.unique(np.array(labels), return_inverse=True)
+    share = np.zeros((len(joint_of), len(parts)))
+    rows = np.arange(len(joint_of))
+    for column in range(joint_of.shape[1]):
+        np.add.at(share, (rows, part_of_joint[joint_of[:, column]]), weights[:, column])
+    result: npt.NDArray[np.str_] = parts[share.argmax(axis=1)]
+    return result
+
+
+def _words(name: str) -> tuple[str, tuple[str, ...]]:
+    """Return the side, "Left", "Right" or "", and the words of a joint's name in lower case."""
+    local = re.split(r"[:|]", name)[-1]
+    split = re.sub(r"([a-z])([A-Z])|([A-Z])([A-Z][a-z])", r"\1\3 \2\4", local)
+    words = [word.lower() for word in re.findall(r"[^\W\d_]+", split)]
+    side = ""
+    rest = []
+    for word in words:
+        if word in _SIDES and not side:
+            side = _SIDES[word]
+            continue
+        long = re.fullmatch(r"(left|right)(\w+)|(\w+?)(left|right)", word)
+        if long and not side:
+            side = _SIDES[long[1] or long[4]]
+            word = long[2] or long[3]
+        rest.append(word)
+    return side, tuple(word for word in rest if word not in _PREFIXES)
+
+
+def _part(side: str, words: tuple[str, ...]) -> str | None:
+    joined = "".join(words)
+    if side and not set(words) & set(_HEAD_WORDS.split("|")):
+        for pattern, part in _PAIRED:
+            if re.search(pattern, joined):
+                return f"{side} {part}"
+        if joined in ("hip", "hipjoint"):
+            return f"{side} thigh"
+    for pattern, part in _SINGLE:
+        if re.search(pattern, joined):
+            return part
+    return "Head" if set(words) & set(_HEAD_WORDS.split("|")) else None
+
+
+def _limb(side: str, words: tuple[str, ...], present: set[str | None]) -> str | None:
+    """Return what "arm" or "leg" is where the rig has only one joint of that name a side."""
+    for word, (part, other) in _PAIRED_WORDS.items():
+        if side and word in words:
+            return f"{side} {part}" if f"{side} {other}" in present else f"{side} {word}"
+    return None
+
+
+def _spelled_out(name: str) -> str:
+    """Return a name as people write it: "tail_02.L" is "Left tail"."""
+    side, words = _words(name)
+    text = " ".join([side, *words]).strip() or " ".join(name.split())
+    printable = "".join(letter for letter in text if letter.isprintable()).strip() or "Part"
+    return printable[:1].upper() + printable[1:].lower() if side else printable.capitalize()

@@ -1,0 +1,86 @@
+"""Files of scenes: characters and what else has nodes, skins and animations."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from lcollision_core.errors import MeshFileError, PoseSetError
+from lcollision_core.meshes.formats import gltf
+from lcollision_core.meshes.formats.scene import Scene
+from lcollision_core.regular_files import open_regular
+
+SCENE_SUFFIXES = (".glb", ".gltf", ".vrm")
+"""Extensions that `read_scene` reads, in lower case."""
+
+
+def read_scene(path: str | os.PathLike[str]) -> Scene:
+    """Read what a file shows; its extension, in any case, says the format.
+
+    Raises
+    ------
+    MeshFileError : the file is missing, damaged, compressed, too large, or shows no triangles. The
+        sentence names the file.
+    """
+    with one_sentence(path), _opened(path) as file:
+        return scene_of(file, Path(path))
+
+
+def has_skin(path: str | os.PathLike[str]) -> bool:
+    """Whether a file shows something that joints move.
+
+    Raises
+    ------
+    MeshFileError : as of `read_scene`, as far as the file's description tells.
+    """
+    with one_sentence(path), _opened(path) as file:
+        return gltf.has_skin(file, Path(path))
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    suffix = Path(path).suffix.lower()
+    with open_regular(path) as file:
+        if suffix not in SCENE_SUFFIXES:
+            raise MeshFileError(
+                f"{suffix or 'a name without extension'} is not a known format of characters",
+                f"use one of {', '.join(SCENE_SUFFIXES)}",
+            )
+        if os.fstat(file.fileno()).st_size == 0:
+            raise MeshFileError("it is empty")
+        yield file
+
+
+def scene_of(file: BinaryIO, path: Path) -> Scene:
+    """Read an open file at its start, as `read_scene`; the sentence does not name it."""
+    return gltf.read_scene(file, path)
+
+
+@contextmanager
+def one_sentence(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what goes wrong while a file is read into one sentence that names it.
+
+    Raises
+    ------
+    MeshFileError : anything of the file or the system went wrong.
+    """
+    try:
+        try:
+            yield
+        except FileNotFoundError as error:
+            raise MeshFileError("there is no such file", "check the name") from error
+        except PermissionError as error:
+            raise MeshFileError("permission is denied", "change the file's permissions") from error
+        except OSError as error:
+            reason = "the name is too long" if error.errno == errno.ENAMETOOLONG else error.strerror
+            raise MeshFileError(str(reason or error), "check the file") from error
+        except MemoryError as error:
+            raise MeshFileError(
+                "it needs more memory than there is", "decimate the mesh"
+            ) from error
+    except (MeshFileError, PoseSetError) as error:
+        raise MeshFileError.unreadable(path, error, "export the mesh again") from error
