@@ -118,7 +118,8 @@ class ElidedLabel(QLabel):
 
 def longest_name(widget: QWidget, names: Iterable[str]) -> int:
     """Return the width that the longest of some names takes in a widget's font."""
-    return max(widget.fontMetrics().horizontalAdvance(name) for name in names) + 1
+    advances = (widget.fontMetrics().horizontalAdvance(name) for name in names)
+    return max(advances, default=0) + 1
 
 
 def hbox(

@@ -59,7 +59,11 @@ class RigPoseSpace:
     part_names : K names of the body parts
     joint_of_code, axis_of_code : (D,) int64 arrays: the joint of the rig, and its axis: 0 bends,
         1 twists, 2 turns sideways; of the root's first six codes the axis is 0 to 5
+    rig : of the character
+    roles : J of them, what each joint is by its name
+    origins : (J, 3) float64 array, where the joints are in the rest pose, normalised
     axes : (J, 3, 3) float64 array, the joints' axes in the rest pose, a column each
+    up : (3,) float64 unit vector
     front : (3,) float64 unit vector, where the character faces at rest
     body_size : the unit of the normalised lengths, in the character's unit
 
@@ -87,9 +91,10 @@ class RigPoseSpace:
         self.topology = character.topology
         self.body_size = body_size(character.rest_vertices, character.topology)
         self.rest_vertices: FloatArray = character.rest_vertices / self.body_size
-        self._rig = rig
-        self._origins: FloatArray = rig.rest[:, :3, 3] / self.body_size
+        self.rig = rig
+        self.origins: FloatArray = rig.rest[:, :3, 3] / self.body_size
         self._set_bones(rig)
+        self.up: FloatArray = character.up
         self._set_axes(rig, character.up)
         self._set_influences(rig)
         self.low, self.high = self._set_codes(rig, parts)
@@ -130,19 +135,19 @@ class RigPoseSpace:
             self._bone_of[joint] = number.get(joint, carried)
 
     def _set_axes(self, rig: Rig, up: FloatArray) -> None:
-        roles = joint_roles.joint_roles(rig)
+        self.roles = roles = joint_roles.joint_roles(rig)
         directions = joint_roles.bone_directions(rig, rig.rest[:, :3, 3])
         front = joint_roles.front_of(roles, directions, up)
         if front is None:
             upwards = int(np.abs(up).argmax())
             front = front_direction(self.rest_vertices * up[upwards], upwards) * up[upwards]
         self.front: FloatArray = front
-        self.axes = joint_roles.joint_axes(rig, roles, self._origins, directions, up, front)
+        self.axes = joint_roles.joint_axes(rig, roles, self.origins, directions, up, front)
         self._least, self._most = joint_roles.joint_limits(rig, roles)
         body = np.stack([np.cross(up, front), up, front], axis=1)
         root = self._bones[0]
         middle = 0.5 * (self.rest_vertices.min(axis=0) + self.rest_vertices.max(axis=0))
-        self._bone_origins = self._origins[self._bones]
+        self._bone_origins = self.origins[self._bones]
         self._bone_axes = np.ascontiguousarray(self.axes[self._bones])
         self._bone_axes[0] = body
         if root < 0:
@@ -211,15 +216,15 @@ class RigPoseSpace:
     @property
     def n_joints(self) -> int:
         """J, the number of the rig's joints."""
-        return len(self._rig.parents)
+        return len(self.rig.parents)
 
     @cached_property
     def attention_mask(self) -> npt.NDArray[np.float32]:
         """(K, V) the share of each body part in each vertex: the skin weights of its joints."""
         mask = np.zeros((self.n_domains, self.topology.n_vertices))
-        part = self._part_of_joint[self._rig.joint_of]
+        part = self._part_of_joint[self.rig.joint_of]
         vertex = np.broadcast_to(np.arange(len(part))[:, None], part.shape)
-        np.add.at(mask, (part, vertex), self._rig.weights)
+        np.add.at(mask, (part, vertex), self.rig.weights)
         return mask.astype(np.float32)
 
     @cached_property
@@ -367,7 +372,7 @@ class RigPoseSpace:
         carried = self._bone_of >= 0
         moved[carried, :3, :3] = rotations[self._bone_of[carried]]
         moved[carried, :3, 3] = translations[self._bone_of[carried]] * self.body_size
-        return moved @ self._rig.rest
+        return moved @ self.rig.rest
 
     def codes_of_transforms(self, transforms: npt.ArrayLike) -> FloatArray:
         """Find the codes whose joints are turned as given ones are.
@@ -389,7 +394,7 @@ class RigPoseSpace:
         """
         given = self._checked(transforms)
         poses = given.reshape(-1, self.n_joints, 4, 4)
-        moved = poses @ np.linalg.inv(self._rig.rest)
+        moved = poses @ np.linalg.inv(self.rig.rest)
         numbers = np.zeros((len(poses), 3 + 3 * len(self._bones)))
         kept = np.zeros(numbers.shape[1], dtype=np.bool_)
         kept[self._place] = True
@@ -419,7 +424,7 @@ class RigPoseSpace:
         ------
         ShapeError : another shape, or a number that is not finite.
         """
-        rig = self._rig
+        rig = self.rig
         moved = self._checked(transforms) @ np.linalg.inv(rig.rest)
         turned = np.einsum("vixy,viy->vix", moved[:, :3, :3][rig.joint_of], rig.points)
         posed = turned + moved[:, :3, 3][rig.joint_of]

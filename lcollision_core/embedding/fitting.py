@@ -45,14 +45,14 @@ class LatentFit:
 
     Attributes
     ----------
-    latent : (D,) float32 array
+    latent : (D,) array
     rotation, translation : (3, 3) and (3,) float64 arrays, in normalised lengths: the decoded mesh
         lies nearest to the aligned one, `vertices @ rotation.T + translation`
     mean_error, max_error : distance of the decoded vertices from the aligned ones, in normalised
         lengths
     """
 
-    latent: npt.NDArray[np.float32]
+    latent: npt.NDArray[np.floating]
     rotation: FloatArray
     translation: FloatArray
     mean_error: float

@@ -37,5 +37,6 @@ from lcollision_core.model.pose_file import (
 )
 from lcollision_core.model.pose_library import LibraryChange, PoseLibrary, user_poses_folder
 from lcollision_core.model.pose_model import PoseModel
+from lcollision_core.model.rig_model import RigModel
 from lcollision_core.model.sampling import sample_poses
 from lcollision_core.model.saving import change_model, save_trained

@@ -145,7 +145,7 @@ def _effect(
     side = np.sign(aside) if abs(aside) > np.sqrt(weight @ (arms @ axes[2]) ** 2) else 0.0
     shift = weight @ moved
     if float(shift @ shift) >= _AIMLESS * total:
-        return CodeEffect(domain, _way(axes @ shift, side))
+        return CodeEffect(domain, way_in_words(axes @ shift, side))
     spread = (weight[:, None] * arms).T @ arms
     inertia = np.trace(spread) * np.eye(3) - spread
     torque = weight @ np.cross(arms, moved - shift)
@@ -162,10 +162,10 @@ def _effect(
     away = long_axis @ (weight @ positions - positions.mean(axis=0))
     half_length = np.sqrt(3.0 * long_axis @ spread @ long_axis)
     outward = long_axis * np.sign((away if abs(away) > half_length else axes[0] @ long_axis) or 1)
-    return CodeEffect(domain, f"bend {_way(axes @ np.cross(turn, outward), side)}")
+    return CodeEffect(domain, f"bend {way_in_words(axes @ np.cross(turn, outward), side)}")
 
 
-def _way(along: FloatArray, side: float) -> str:
+def way_in_words(along: FloatArray, side: float) -> str:
     """Return the word for the largest component of a direction.
 
     Parameters

@@ -195,7 +195,7 @@ class PoseMirror:
         else:
             # With the placement fixed: a fitted rigid motion would have to be undone, and the
             # codes hold it nearly as well.
-            found = self.nearest(image, cancel)
+            found = self._codes_of_image(pose, image, cancel)
         check = replace(check, placement=image_placement)
         mirrored = check.decode(found)[0]
         pairs_mirrored = pairs_after = len(check.find(check.exported(mirrored)).pairs)
@@ -219,6 +219,15 @@ class PoseMirror:
             resolution=resolution,
             source=MirrorSource(pose, placement, fingerprint_of_pose(found, image_placement)),
         )
+
+    def _codes_of_image(
+        self,
+        latent: FloatArray,  # noqa: ARG002 - bodies whose codes have sides need no fit
+        image: FloatArray,
+        cancel: CancelToken | None,
+    ) -> FloatArray:
+        """Return the (D,) codes of the mirror image of a pose, whose (V, 3) vertices it is."""
+        return self.nearest(image, cancel)
 
     def partner(self, domain: int) -> int | None:
         """Return the domain on the other side; None for one in the middle, or unlike any other."""
@@ -253,7 +262,7 @@ class PoseMirror:
         """
         size = self.check.body_size
         image = self.symmetry.image(self.check.decode(latent)[0] * size) / size
-        mirrored = self.nearest(image, cancel)
+        mirrored = self._codes_of_image(latent, image, cancel)
         other = self.partner(domain)
         own = self.check.space.codes_of([] if other is None else [other])
         return np.where(own, mirrored, latent)

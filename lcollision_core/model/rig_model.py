@@ -1,0 +1,263 @@
+"""A character that its rig poses: a body without anything trained."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from lcollision_core.characters import Character, RigPoseSpace
+from lcollision_core.embedding.fitting import LatentFit
+from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes import RigidTransform
+from lcollision_core.model.card import ModelCard
+from lcollision_core.model.code_names import CodeEffect
+from lcollision_core.model.colours import domain_colours
+from lcollision_core.model.mirror import PoseMirror, Symmetry
+from lcollision_core.model.naming import MAX_NAME_LENGTH, MAX_POSE_NAME_LENGTH, unique_names
+from lcollision_core.model.posable_body import PosableBody, read_only
+from lcollision_core.model.rig_fit import fit_rig
+from lcollision_core.model.rig_mirror import RigMirror, find_joint_partners
+from lcollision_core.model.rig_names import motion_names
+from lcollision_core.model_file import digest_of
+
+if TYPE_CHECKING:
+    from lcollision_core.predictor import Prediction
+    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
+
+FloatArray = npt.NDArray[np.float64]
+
+NEAR_EXCLUSION = 0.1
+"""Normalised: folds at the joints of a skin that bends."""
+
+REST = "rest"
+"""The name of the rest pose."""
+
+_FRAMES_A_SECOND, _MOST_FRAMES = 10.0, 300
+"""Frames of the clips that are taken as poses: enough to know what the character does."""
+
+_SAME = 1e-5
+"""Normalised: what is alike to so much is the same rig."""
+
+_MOST_FREE = 32
+"""Of the poses that the character came with, evenly spaced, those that Resolve starts from."""
+
+
+class RigModel(PosableBody):
+    """A character posed by its joints: see `RigPoseSpace` for what the codes are.
+
+    Its unit is that of the character's file. Build one with `of`.
+
+    Parameters
+    ----------
+    character : with a rig
+    space : its poses
+    card : its units, names and origin
+    poses : (N, D) float64 array, the rest pose and frames of the clips
+
+    Attributes
+    ----------
+    character : as given
+    """
+
+    def __init__(
+        self, character: Character, space: RigPoseSpace, card: ModelCard, poses: FloatArray
+    ) -> None:
+        super().__init__(
+            character.name,
+            card,
+            character.topology,
+            character.topology.gathered(character.rest_vertices),
+            space.attention_mask,
+            poses,
+        )
+        self.character, self._space = character, space
+
+    @classmethod
+    def of(cls, character: Character, parts: Sequence[str] | None = None) -> RigModel:
+        """Make a body of a rigged character.
+
+        Parameters
+        ----------
+        character : with a rig
+        parts : names of body parts by joint, by default the joints' own
+
+        Raises
+        ------
+        LCollisionError : the character has no rig.
+        """
+        names, frames = [REST], []
+        for clip in character.clips if character.rig is not None else ():
+            found = character.sample(clip, _FRAMES_A_SECOND)
+            if found.transforms is not None:
+                names += found.names
+                frames.append(found.transforms)
+            if len(names) > _MOST_FRAMES:
+                break
+        transforms = np.concatenate(frames)[:_MOST_FRAMES] if frames else None
+        space = RigPoseSpace(character, parts, transforms)
+        poses = np.zeros((1, len(space.low)))
+        if transforms is not None:
+            poses = np.concatenate([poses, space.codes_of_transforms(transforms)])
+        printable = ("".join(filter(str.isprintable, name)) for name in space.part_names)
+        shown = [name.strip()[:MAX_NAME_LENGTH] or "part" for name in printable]
+        card = ModelCard(
+            height=space.body_size,
+            up_axis=int(np.abs(character.up).argmax()),
+            near_exclusion=NEAR_EXCLUSION,
+            domain_names=tuple(unique_names(shown, MAX_NAME_LENGTH)),
+            domain_colours=domain_colours(space.attention_mask),
+            pose_names=tuple(name[:MAX_POSE_NAME_LENGTH] for name in names[: len(poses)]),
+            source=character.source.name,
+            licence="unknown",
+        )
+        return cls(character, space, card, poses)
+
+    @property
+    def pose_space(self) -> RigPoseSpace:
+        """The rig's poses as dragging and Resolve see them."""
+        return self._space
+
+    @property
+    def space(self) -> RigPoseSpace:
+        """The same: `pose_space`, with what only rigs have."""
+        return self._space
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that identify the rig, its skin and its codes."""
+        space, rig = self.space, self.space.rig
+        measures = {
+            "points": rig.points / space.body_size,
+            "weights": rig.weights,
+            "origins": space.origins,
+            "axes": space.axes,
+        }
+        # Not to depend on how a machine rounds.
+        arrays: dict[str, npt.NDArray[Any]] = {
+            name: np.round(values / _SAME).astype(np.int64) for name, values in measures.items()
+        }
+        arrays |= {"faces": self.topology.faces, "joint_of": rig.joint_of, "parents": rig.parents}
+        arrays["codes"] = np.stack([space.joint_of_code, space.axis_of_code])
+        names = {"joints": rig.joint_names, "parts": space.part_names}
+        return digest_of(json.dumps(names), arrays)[:16]
+
+    @property
+    def has_predictor(self) -> bool:
+        """Nothing is trained on a rig."""
+        return False
+
+    @property
+    def can_resolve(self) -> bool:
+        """A rig steps from free poses towards the target."""
+        return True
+
+    def predict(self, latent: npt.ArrayLike) -> Prediction:  # noqa: ARG002
+        """Refuse: there is no predictor."""
+        raise ModelFileError(
+            f"the character {self.name!r} has no predictor", "train a model of its poses"
+        )
+
+    @cached_property
+    def free_latent(self) -> FloatArray:
+        """(F, D) collision-free poses that the character came with, read-only."""
+        count = len(self.training_latent)
+        chosen = np.unique(np.linspace(0, count - 1, _MOST_FREE).round().astype(int))
+        poses = self.training_latent[chosen]
+        return read_only(poses[self.exact_check().are_free(poses)])
+
+    @cached_property
+    def resolver(self) -> PoseResolver:
+        """Resolves the self-collisions of this character's poses."""
+        from lcollision_core.resolve import PoseResolver
+
+        return PoseResolver(self.exact_check(), None, self.free_latent)
+
+    def resolve(
+        self,
+        latent: npt.ArrayLike,
+        options: ResolveOptions | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+        placement: RigidTransform | None = None,
+    ) -> ResolveResult:
+        """Step from free poses towards a colliding one: see `PosableBody.resolve`."""
+        return self.resolver.resolve(latent, options, progress, cancel, placement)
+
+    def _fit(
+        self, vertices: FloatArray, cancel: CancelToken | None, *, in_place: bool
+    ) -> LatentFit:
+        return fit_rig(self.space, vertices, cancel, in_place=in_place)
+
+    @cached_property
+    def front(self) -> FloatArray:
+        """(3,) unit vector along an axis: where the character faces."""
+        axis = int(np.abs(self.space.front).argmax())
+        return read_only(np.sign(self.space.front[axis]) * np.eye(3)[axis])
+
+    @cached_property
+    def symmetry(self) -> Symmetry | None:
+        """Left and right of the rig; None if its joints are not each other's mirror images.
+
+        The mesh need not be symmetric: a vertex's partner is the one nearest to its image.
+        """
+        found = find_joint_partners(self.space)
+        if found is None:
+            return None
+        _, axis, offset = found
+        everyone = np.arange(self.n_vertices, dtype=np.int32)
+        image = Symmetry(everyone, axis, offset * self.body_size).image(self.reference)
+        partner = cKDTree(self.reference).query(image)[1].astype(np.int32)
+        return Symmetry(read_only(partner), axis, offset * self.body_size)
+
+    @cached_property
+    def pose_mirror(self) -> PoseMirror:
+        """Exchanges left and right of this character's poses, joint by joint.
+
+        Raises
+        ------
+        LCollisionError : the rig has no two sides.
+        """
+        found, symmetry = find_joint_partners(self.space), self.symmetry
+        if found is None or symmetry is None:
+            raise LCollisionError(
+                "cannot be mirrored: its joints do not lie symmetrically in the rest pose",
+                "export it in a symmetric rest pose",
+                where=f"poses of {self.name}",
+            )
+        return RigMirror(
+            self.attention_mask,
+            symmetry,
+            self.exact_check(),
+            self.nearest,
+            self.resolve,
+            self.space,
+            found[0],
+        )
+
+    @cached_property
+    def code_effects(self) -> tuple[CodeEffect, ...]:
+        """The body part that each code turns, and how, by the joints' axes."""
+        groups = np.repeat(np.arange(len(self.space.group_sizes)), self.space.group_sizes)
+        root = int(np.bincount(self.space.vertex_domain).argmax())
+        return tuple(
+            CodeEffect(int(group) - 1 if group else root, name)
+            for group, name in zip(groups, self.code_names, strict=True)
+        )
+
+    @cached_property
+    def code_names(self) -> tuple[str, ...]:
+        """D names of the codes, unique within each group: "bend", "index 1 sideways"."""
+        names = motion_names(self.space)
+        ends = np.cumsum(self.space.group_sizes)
+        return tuple(
+            name
+            for start, end in zip((0, *ends[:-1]), ends, strict=True)
+            for name in unique_names(names[start:end])
+        )

@@ -1,0 +1,229 @@
+"""A character posed by its rig, as a body: names, drags, Resolve, mirroring, encoding, files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from lcollision_core.contact import DEPTH_TOLERANCE
+from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.meshes import RigidTransform
+from lcollision_core.model import PosableBody, RigModel, sample_poses
+from lcollision_core.model.pose_file import NamedPose, read_poses, write_poses
+from lcollision_core.posing import DragOptions, Pin, Twist, make_grip
+from lcollision_core.resolve import ResolveOptions, Step
+from tests.core.brute_force import all_pairs
+from tests.core.shapes import random_rotation
+from tests.rigged_shapes import rigged_body, rigged_tube
+
+FloatArray = npt.NDArray[np.float64]
+
+SCALE = 100.0
+
+
+@pytest.fixture(scope="module")
+def model() -> RigModel:
+    return RigModel.of(rigged_body(SCALE, n_frames=20))
+
+
+def code_of(model: RigModel, joint: str, axis: int) -> int:
+    number = model.space.rig.joint_names.index(joint)
+    is_it = (model.space.joint_of_code == number) & (model.space.axis_of_code == axis)
+    (code,) = np.flatnonzero(is_it)
+    return int(code)
+
+
+def test_it_is_a_body(model: RigModel) -> None:
+    body: PosableBody = model
+    assert (body.name, body.card.source, body.up_axis) == ("body", "body.glb", 2)
+    assert body.body_size == pytest.approx(1.8 * SCALE, rel=0.05)
+    np.testing.assert_array_equal(body.front, [0.0, -1.0, 0.0])
+    assert (body.has_predictor, body.can_resolve) == (False, True)
+    assert body.pose_names[:2] == ("rest", "moves 0")
+    assert body.training_latent.shape == (len(body.pose_names), body.latent_size)
+    np.testing.assert_allclose(body.decode(body.training_latent[0]), body.reference, atol=1e-9)
+    assert body.latent_space.size == body.latent_size
+    assert body.latent_space.groups[0].name == "Whole body"
+    with pytest.raises(ModelFileError, match="no predictor"):
+        body.predict(np.zeros(body.latent_size))
+
+
+def test_its_codes_have_names(model: RigModel) -> None:
+    assert len(model.code_names) == len(model.code_effects) == model.latent_size
+    assert model.code_names[:6] == (
+        "move left", "move up", "move forward", "tilt forward", "turn left", "lean right",
+    )  # fmt: skip
+    names = {
+        (model.space.rig.joint_names[joint], int(axis)): name
+        for joint, axis, name in zip(
+            model.space.joint_of_code[6:],
+            model.space.axis_of_code[6:],
+            model.code_names[6:],
+            strict=True,
+        )
+    }
+    assert names["LeftForeArm", 0] == names["RightLeg", 0] == "bend"
+    assert names["LeftForeArm", 1] == "twist"
+    assert names["LeftArm", 0] == names["RightUpLeg", 0] == "forward"
+    assert {names["LeftArm", 2], names["RightArm", 2]} == {"up", "down"}
+    assert {names["LeftUpLeg", 2], names["RightUpLeg", 2]} == {"in", "out"}
+    # The neck, which leads no vertex, is part of the spine.
+    assert (names["Spine", 0], names["Neck", 0]) == ("spine forward", "neck forward")
+    effects = dict(zip(names, model.code_effects[6:], strict=True))
+    assert model.domain_names[effects["LeftForeArm", 0].domain] == "LeftForeArm"
+
+
+def test_names_are_those_of_the_motion(model: RigModel) -> None:
+    hands = {
+        side: make_grip(model.pose_space, int(np.argmax(sign * model.reference[:, 0])))
+        for side, sign in (("Left", 1.0), ("Right", -1.0))
+    }
+    ways = {"up": (2, 1.0), "down": (2, -1.0), "forward": (1, -1.0)}
+    for side, grip in hands.items():
+        for axis in (0, 2):
+            code = code_of(model, f"{side}Arm", axis)
+            codes = np.zeros(model.latent_size)
+            codes[code] = 0.2
+            moved = grip.position(model.decode(codes)) - grip.position(model.reference)
+            along, sign = ways[model.code_names[code]]
+            assert np.abs(moved).argmax() == along
+            assert moved[along] * sign > 0.0
+
+
+def test_limits_are_kept_and_reset_is_the_rest_pose(model: RigModel) -> None:
+    space = model.latent_space
+    assert (space.low < 0.0).all()
+    assert (space.high > 0.0).all()
+    bend = code_of(model, "LeftForeArm", 0)
+    assert np.degrees(space.high[bend]) >= 150.0
+    poses = space.sample(20, np.random.default_rng(0))
+    assert np.isfinite(model.decode(poses)).all()
+
+
+def test_other_characters_are_told_apart() -> None:
+    character = rigged_body(SCALE)
+    model = RigModel.of(character)
+    assert RigModel.of(rigged_body(SCALE)).fingerprint == model.fingerprint
+    assert RigModel.of(rigged_body(2.0 * SCALE)).fingerprint == model.fingerprint
+    assert character.rig is not None
+    weights = character.rig.weights.copy()
+    weights[0] = weights[0, ::-1]
+    other = replace(character, rig=replace(character.rig, weights=weights))
+    assert RigModel.of(other).fingerprint != model.fingerprint
+    assert RigModel.of(rigged_tube()).fingerprint != model.fingerprint
+    with pytest.raises(LCollisionError, match="no joints"):
+        RigModel.of(replace(character, rig=None))
+
+
+def test_a_body_part_without_codes_of_its_own_can_be_locked_and_twisted(model: RigModel) -> None:
+    hips = model.domain_names.index("Hips")
+    assert model.pose_space.group_sizes[1 + hips] == 0
+    assert not model.pose_space.codes_of([hips]).any()
+    dragger = model.dragger()
+    dragger.begin(np.zeros(model.latent_size), Twist(hips), (), DragOptions(solid=False))
+    for angle in np.linspace(0.0, 0.4, 12)[1:]:
+        step = dragger.move([angle])
+    assert step.miss < 0.1
+
+
+def test_a_hand_is_dragged_while_the_feet_stay(model: RigModel) -> None:
+    hand, foot = (
+        int(np.argmax(model.reference @ np.array(way)))
+        for way in ((1.0, 0.0, 0.0), (0.01, -1.0, -1.0))
+    )
+    grip, pinned = make_grip(model.pose_space, hand), make_grip(model.pose_space, foot)
+    pin = Pin.of(pinned, model.reference)
+    dragger = model.dragger()
+    dragger.begin(np.zeros(model.latent_size), grip, [pin], DragOptions(solid=True))
+    begin = grip.position(model.reference)
+    target = begin + SCALE * np.array([-0.35, -0.4, 0.2])
+    for event in range(1, 41):
+        step = dragger.move(begin + min(1.0, event / 30) * (target - begin))
+        assert step.exactly_free
+    assert step.miss < 0.01
+    moved = pinned.position(step.vertices) - pinned.position(model.reference)
+    assert np.linalg.norm(moved) < 0.01 * model.body_size
+
+
+def test_colliding_poses_are_resolved_and_confirmed_by_brute_force(model: RigModel) -> None:
+    poses = 0.8 * sample_poses(model, 12, seed=4, colliding=True)
+    poses[:, :6] = 0.0
+    steps = []
+    for latent in poses:
+        result = model.resolve(latent)
+        steps.append(result.step)
+        if result.step == Step.UNCHANGED:
+            continue
+        assert result.exactly_free
+        assert result.predicted_free is None
+        assert result.vertex_distance_mean < 0.3
+        vertices = result.vertices.astype(np.float64)
+        np.testing.assert_array_equal(result.vertices, model.exported_vertices(result.latent))
+        found = all_pairs(vertices, model.faces, DEPTH_TOLERANCE * model.body_size)
+        for a, b in found.pairs:
+            # What is left are folds of the skin, which the near exclusion leaves out.
+            reach = make_grip(model.pose_space, int(model.faces[a, 0]), model.near_exclusion + 0.1)
+            assert model.faces[b, 0] in reach.vertices
+    assert steps.count(Step.UNCHANGED) <= 6
+    assert {Step.POLISH, Step.TOWARDS} & set(steps)
+
+
+def test_locked_parts_stay_while_others_are_resolved(model: RigModel) -> None:
+    leg = model.domain_names.index("LeftUpLeg")
+    latent = np.zeros(model.latent_size)
+    code = code_of(model, "LeftUpLeg", 2)
+    latent[code] = 0.3 if model.code_names[code] == "in" else -0.3
+    assert not model.exact_check().is_free(latent)
+    result = model.resolve(latent, ResolveOptions(locked_domains=frozenset({leg})))
+    assert result.exactly_free
+    own = model.pose_space.codes_of([leg])
+    np.testing.assert_array_equal(result.latent[own], latent[own])
+
+
+def test_mirroring_exchanges_the_sides(model: RigModel) -> None:
+    latent = np.zeros(model.latent_size)
+    latent[code_of(model, "LeftArm", 0)] = 0.8
+    latent[code_of(model, "LeftForeArm", 0)] = 1.0
+    latent[code_of(model, "RightUpLeg", 0)] = 0.7
+    latent[code_of(model, "Spine", 1)] = 0.3
+    latent[1] = 0.05
+    mirrored = model.mirror(latent)
+    assert mirrored.fit_error_mean < 1e-3
+    assert mirrored.latent[code_of(model, "RightForeArm", 0)] == pytest.approx(1.0, abs=0.02)
+    assert mirrored.latent[code_of(model, "LeftForeArm", 0)] == pytest.approx(0.0, abs=0.02)
+    back = model.mirror(mirrored.latent, mirrored.placement, mirrored.source)
+    assert back.restored
+    np.testing.assert_array_equal(back.latent, latent)
+
+
+def test_a_mesh_of_the_character_is_encoded_wherever_it_lies(model: RigModel) -> None:
+    generator = np.random.default_rng(3)
+    latent = 0.35 * generator.uniform(model.pose_space.low, model.pose_space.high)
+    latent[:6] = 0.0
+    placed = RigidTransform(random_rotation(generator), np.array([10.0, -20.0, 5.0]))
+    mesh = placed.apply(model.decode(latent))
+    encoded = model.encode(mesh)
+    assert encoded.fit_error_max < 1e-3
+    assert encoded.placement is not None
+    again = encoded.placement.apply(model.decode(encoded.latent))
+    np.testing.assert_allclose(again, mesh, atol=2e-3 * model.body_size)
+    codes = model.nearest(model.decode(latent) / model.body_size)
+    np.testing.assert_allclose(
+        model.decode(codes), model.decode(latent), atol=1e-3 * model.body_size
+    )
+
+
+def test_poses_are_saved_and_read_again(model: RigModel, tmp_path: Path) -> None:
+    path = tmp_path / "poses.json"
+    poses = [
+        NamedPose("one", model.training_latent[3]),
+        NamedPose("rest", np.zeros(model.latent_size)),
+    ]
+    write_poses(path, model, poses)
+    read = read_poses(path, model)
+    assert [pose.name for pose in read] == ["one", "rest"]
+    np.testing.assert_allclose(read[0].latent, model.training_latent[3])
