@@ -31,6 +31,16 @@ def _garbage_waits(request: pytest.FixtureRequest) -> Iterator[None]:
     gc.collect(1)
 
 
+@pytest.fixture(scope="session")
+def characters() -> Path:
+    """Return the folder of characters that may not be redistributed, or skip the test."""
+    default = Path(__file__).parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("LCOLLISION_DATA", default)) / "characters"
+    if not folder.is_dir():
+        pytest.skip(f"there is no folder {folder} of characters (set LCOLLISION_DATA)")
+    return folder
+
+
 def _published_set(name: str) -> PoseSet:
     """Read a published pose set that may not be redistributed, or skip the test."""
     default = Path(__file__).parents[2] / "shared" / "data"

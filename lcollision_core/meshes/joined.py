@@ -184,7 +184,11 @@ def join_parts(scene: Scene) -> JoinedMesh:
     if n_joined:
         notes.append(f"{n_joined} vertices that seams had split were joined")
     if n_flat:
-        notes.append(f"{n_flat} faces that name a vertex twice were left out")
+        notes.append(
+            "1 face that names a vertex twice was left out"
+            if n_flat == 1
+            else f"{n_flat} faces that name a vertex twice were left out"
+        )
     morphs = []
     for i, part in enumerate(parts):
         local = kept[(kept >= first_vertex[i]) & (kept < first_vertex[i + 1])]

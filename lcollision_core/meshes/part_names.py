@@ -20,8 +20,16 @@ _PREFIXES = frozenset(
 )
 """Words that say nothing of the part."""
 
-_HAND = "thumb|index|middle|ring|pink(y|ie)|little|finger|metacarpal|carpal|palm|hand|wrist"
-_HEAD_WORDS = "eye|eyes|ear|lip|lips|jaw|hair|brow|nose|face|cheek|tongue|teeth|chin|faceeye"
+_HAND = (
+    r"thumb|index|middle|(?<!sp)(?<!st)(?<!ear)ring|pink(y|ie)|little|finger|metacarpal|carpal|"
+    r"palm|hand|wrist"
+)
+_FACE = frozenset(
+    ("eye", "eyes", "eyeball", "eyelid", "eyebrow", "brow", "ear", "earring", "lip", "lips", "jaw")
+    + ("chin", "hair", "nose", "face", "cheek", "tongue", "teeth")
+)
+"""Words that are too short to be sought inside others."""
+
 _PAIRED = (
     (r"toe|ball|foot|feet|ankle|heel|tarsal|hallux", "foot"),
     (_HAND, "hand"),
@@ -119,7 +127,7 @@ def _words(name: str) -> tuple[str, tuple[str, ...]]:
 
 def _part(side: str, words: tuple[str, ...]) -> str | None:
     joined = "".join(words)
-    if side and not set(words) & set(_HEAD_WORDS.split("|")):
+    if side and not _FACE.intersection(words):
         for pattern, part in _PAIRED:
             if re.search(pattern, joined):
                 return f"{side} {part}"
@@ -128,7 +136,7 @@ def _part(side: str, words: tuple[str, ...]) -> str | None:
     for pattern, part in _SINGLE:
         if re.search(pattern, joined):
             return part
-    return "Head" if set(words) & set(_HEAD_WORDS.split("|")) else None
+    return "Head" if _FACE.intersection(words) else None
 
 
 def _limb(side: str, words: tuple[str, ...], present: set[str | None]) -> str | None:

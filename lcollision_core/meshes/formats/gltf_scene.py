@@ -96,7 +96,9 @@ def shown_primitives(
             shown.append(ShownPrimitive(node, mesh, number, count))
     if not n_others:
         return shown, ()
-    return shown, (f"{n_others} parts without triangles (points, lines) were left out",)
+    others = "1 part" if n_others == 1 else f"{n_others} parts"
+    was = "was" if n_others == 1 else "were"
+    return shown, (f"{others} without triangles (points, lines) {was} left out",)
 
 
 def _parents(document: GltfDocument) -> npt.NDArray[np.int64]:

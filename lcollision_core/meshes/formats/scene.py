@@ -118,7 +118,12 @@ class Clip:
                 f"at {fps:g} a second",
                 "choose fewer frames a second",
             )
-        return start + np.arange(int(n_steps) + 1) / fps
+        times = start + np.arange(int(n_steps) + 1) / fps
+        # Just before a key, a value that steps would be the one of the key before.
+        keys = self.key_times[
+            np.minimum(np.searchsorted(self.key_times, times), len(self.key_times) - 1)
+        ]
+        return np.where(np.abs(keys - times) < 1e-3 / fps, keys, times)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,83 @@
+"""Names of body parts for the joints of rigs of several programs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lcollision_core.meshes.part_names import part_labels, part_names
+
+
+@pytest.mark.parametrize(
+    ("names", "parts"),
+    [
+        (  # Mixamo
+            "mixamorig:Hips mixamorig:Spine2 mixamorig:LeftShoulder mixamorig:LeftArm "
+            "mixamorig:LeftForeArm mixamorig:RightHandThumb4 mixamorig:LeftUpLeg "
+            "mixamorig:LeftLeg mixamorig:LeftToeBase mixamorig:HeadTop_End",
+            "Hips,Torso,Left shoulder,Left upper arm,Left forearm,Right hand,Left thigh,Left shin,"
+            "Left foot,Head",
+        ),
+        (  # Blender's Rigify
+            "spine.001 shoulder.L upper_arm.L forearm.L DEF-forearm.L.001 f_index.01.L palm.01.R "
+            "thigh.R shin.R foot.R toe.R heel.02.R",
+            "Torso,Left shoulder,Left upper arm,Left forearm,Left forearm,Left hand,Right hand,"
+            "Right thigh,Right shin,Right foot,Right foot,Right foot",
+        ),
+        (  # VRM, as VRoid names them and as the format does
+            "J_Bip_C_Hips J_Bip_C_UpperChest J_Bip_L_UpperArm J_Bip_L_LowerArm J_Bip_L_Index1 "
+            "J_Bip_R_UpperLeg J_Bip_R_LowerLeg J_Bip_R_ToeBase J_Adj_L_FaceEye leftLowerLeg",
+            "Hips,Chest,Left upper arm,Left forearm,Left hand,Right thigh,Right shin,Right foot,"
+            "Head,Left shin",
+        ),
+        (  # Unreal
+            "pelvis spine_01 clavicle_l upperarm_l upperarm_twist_01_l lowerarm_l hand_l thigh_r "
+            "calf_r ball_r neck_01",
+            "Hips,Torso,Left shoulder,Left upper arm,Left upper arm,Left forearm,Left hand,"
+            "Right thigh,Right shin,Right foot,Neck",
+        ),
+        (  # Daz and Maya
+            "lShldrBend lForearmBend rThighBend rShin lCollar abdomenLower L_Hip R_Knee L_Elbow",
+            "Left upper arm,Left forearm,Right thigh,Right shin,Left shoulder,Torso,Left thigh,"
+            "Right shin,Left forearm",
+        ),
+    ],
+)
+def test_joints_of_known_programs(names: str, parts: str) -> None:
+    assert part_names(names.split()) == tuple(parts.split(","))
+
+
+def test_biped_names_have_blanks() -> None:
+    names = ("Bip01 L Forearm", "Bip01 R Thigh", "Bip01 R Calf", "Bip01 L Finger0", "Bip01")
+    assert part_names(names) == (
+        "Left forearm", "Right thigh", "Right shin", "Left hand", None
+    )  # fmt: skip
+
+
+def test_an_arm_is_the_upper_one_only_where_there_is_a_forearm() -> None:
+    assert part_names(["arm.L", "leg.L"]) == ("Left arm", "Left leg")
+    assert part_names(["LeftArm", "LeftForeArm", "LeftLeg", "LeftUpLeg"]) == (
+        "Left upper arm", "Left forearm", "Left shin", "Left thigh"
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["spring_L", "string.R", "root", "Bone.003", "tail_02.L", "ik"])
+def test_other_names_tell_nothing(name: str) -> None:
+    assert part_names([name]) == (None,)
+
+
+def test_labels_follow_the_largest_weight_of_a_part() -> None:
+    names = ("Hips", "Spring", "tail_02.L", "LeftHand", "LeftHandIndex1", "LeftForeArm")
+    parents = np.array([-1, 0, -1, -1, 3, -1])
+    joint_of = np.array([[0, 1, 2], [2, 0, 1], [3, 4, 5]], dtype=np.int32)
+    weights = np.array([[0.3, 0.3, 0.4], [0.6, 0.2, 0.2], [0.3, 0.3, 0.4]])
+    # The spring is part of the hips; the shares of a hand and its finger are summed.
+    labels = part_labels(names, parents, joint_of, weights)
+    assert labels.tolist() == ["Hips", "Left tail", "Left hand"]
+
+
+def test_labels_are_printable_whatever_the_names() -> None:
+    names = ("\n", "", "\x00\u202e", "日本")
+    joints = np.arange(4, dtype=np.int32)[:, None]
+    labels = part_labels(names, np.full(4, -1), joints, np.ones((4, 1)))
+    assert labels.tolist() == ["Part", "Part", "Part", "日本"]
