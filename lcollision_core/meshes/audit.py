@@ -90,12 +90,15 @@ def inspect_pose_set(
     path: str | os.PathLike[str],
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
+    *,
+    clip: str | None = None,
+    fps: float | None = None,
 ) -> PoseSetInspection:
     """Read what can be read of a pose set and list every defect instead of refusing at the first.
 
     Parameters
     ----------
-    path : a folder of meshes or an .npz file, as for `read_pose_set`
+    path, clip, fps : as for `read_pose_set`
     progress : called with (poses done, poses in all)
     cancel : polled between poses
 
@@ -108,7 +111,7 @@ def inspect_pose_set(
     CancelledError : `cancel` was set.
     """
     defects: list[LCollisionError] = []
-    found = collect_poses(Path(path), defects.append, progress, cancel)
+    found = collect_poses(Path(path), defects.append, progress, cancel, clip, fps)
     problems = [str(defect) for defect in defects]
     if found.pose_set is not None:
         where = f"pose 0 ({found.pose_set.names[0]})"

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, read_animated
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.files import (
     KEEP_PRECISION,
@@ -154,19 +155,26 @@ def read_pose_set(
     path: str | os.PathLike[str],
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
+    *,
+    clip: str | None = None,
+    fps: float | None = None,
 ) -> PoseSet:
     """Read a pose set and refuse it at the first defect.
 
     Parameters
     ----------
-    path : a folder of mesh files of one format, read in natural order, or an .npz file with
-        `vertices` (N, V, 3) and `faces` (F, 3), also called `V` and `F`
+    path : a folder of mesh files of one format, read in natural order; an .npz file with
+        `vertices` (N, V, 3) and `faces` (F, 3), also called `V` and `F`; a .glb, .gltf or .vrm file
+        with animations, of which pose 0 is the rest pose; or a .pc2 or .mdd file with its mesh
+        beside it, which is pose 0
     progress : called with (poses done, poses in all)
     cancel : polled between poses
+    clip : the animation of a file that has several; None for all
+    fps : frames a second of an animation; None for its keys, at most 30 a second
 
     Returns
     -------
-    the pose set; a folder's vertices are float64, an .npz file's keep their precision
+    the pose set; its vertices are float64, but an .npz file's keep their precision
 
     Raises
     ------
@@ -179,7 +187,7 @@ def read_pose_set(
     def refuse(defect: LCollisionError) -> None:
         raise defect
 
-    pose_set = collect_poses(Path(path), refuse, progress, cancel).pose_set
+    pose_set = collect_poses(Path(path), refuse, progress, cancel, clip, fps).pose_set
     if pose_set is None:
         raise MeshFileError("holds no poses", "name another folder or file", where=path)
     flat = degenerate_faces(pose_set.topology, pose_set.vertices[0])
@@ -220,6 +228,8 @@ def collect_poses(
     report: Callable[[LCollisionError], None],
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
+    clip: str | None = None,
+    fps: float | None = None,
 ) -> PoseSetInspection:
     """Read all poses that fit together and report each defect.
 
@@ -227,7 +237,7 @@ def collect_poses(
     ----------
     path : as for `read_pose_set`
     report : called with each defect; when it raises, reading ends there
-    progress, cancel : as for `read_pose_set`
+    progress, cancel, clip, fps : as for `read_pose_set`
     """
     try:
         is_folder, exists = path.is_dir(), path.exists()
@@ -237,14 +247,19 @@ def collect_poses(
     if is_folder:
         return _without_outliers(_collect_folder(path, report, progress, cancel), report)
     suffix = path.suffix.lower()
+    if exists and suffix in ANIMATED_SUFFIXES:
+        return _collect_frames(path, report, progress, cancel, clip, fps)
     if exists and suffix == ".npz":
         return _without_outliers(_collect_npz(path, report, progress), report)
     if not exists:
-        what, next_step = "does not exist", "name a folder of meshes or an .npz file"
+        what, next_step = "does not exist", "name a folder of meshes, a character or an .npz file"
     elif suffix in READABLE_SUFFIXES:
         what, next_step = "is one mesh, not a pose set", "name its folder"
     else:
-        what, next_step = "is not a pose set", "name a folder of meshes or an .npz file"
+        what, next_step = (
+            "is not a pose set",
+            "name a folder of meshes, a character or an .npz file",
+        )
     report(MeshFileError(what, next_step, where=path))
     return PoseSetInspection(None)
 
@@ -367,7 +382,7 @@ def _collect_folder(
     if others:
         sentences.append(f"{len(others)} other entries were ignored: {', '.join(others[:5])}")
     # y is up in glTF, by its standard.
-    up_axis = 1 if formats.keys() <= {".glb", ".gltf"} else None
+    up_axis = 1 if formats.keys() <= {".glb", ".gltf", ".vrm"} else None
     pose_set = PoseSet(
         vertices[: len(names)], topology, tuple(names), path, tuple(sentences), up_axis=up_axis
     )
@@ -405,6 +420,38 @@ def _too_large(path: Path, n_poses: int, n_vertices: int) -> MeshFileError | Non
         "keep fewer poses or decimate them",
         where=path,
     )
+
+
+def _collect_frames(
+    path: Path,
+    report: Callable[[LCollisionError], None],
+    progress: Progress,
+    cancel: CancelToken | None,
+    clip: str | None,
+    fps: float | None,
+) -> PoseSetInspection:
+    try:
+        held = read_animated(path, clip, fps, progress, cancel)
+    except MeshFileError as error:
+        report(error)
+        return PoseSetInspection(None)
+    pose_set = PoseSet(
+        held.vertices,
+        held.topology,
+        held.names,
+        path,
+        held.notes,
+        up_axis=held.up_axis,
+        vertex_labels=held.vertex_labels,
+    )
+    kept = []
+    for pose, vertices in enumerate(held.vertices):
+        where = f"pose {pose} ({held.names[pose]}) of {path}"
+        if (too_far := _too_far_to_compute(where, vertices)) is not None:
+            report(too_far)
+        else:
+            kept.append(pose)
+    return PoseSetInspection(_only(pose_set, kept), len(held.vertices), same_topology=True)
 
 
 def _collect_npz(
