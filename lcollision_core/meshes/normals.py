@@ -9,6 +9,9 @@ import numpy.typing as npt
 
 from lcollision_core.compiled import compiled
 
+_LEAST_SINE = 1e-9
+"""Of the angle at a corner: below it, the direction of its triangle is rounding."""
+
 Array = npt.NDArray[np.floating[Any]]
 Real = TypeVar("Real", bound=np.floating[Any])
 
@@ -32,6 +35,72 @@ def vertex_normals(
     lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
     np.divide(normals, lengths, out=normals, where=lengths > 0.0)
     return normals
+
+
+def moved_normals(
+    normals: npt.NDArray[np.float64],
+    owners: npt.NDArray[np.integer],
+    corners: npt.NDArray[np.integer],
+    rest: npt.NDArray[np.float64],
+    posed: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """Move the normals that a mesh has at rest with its triangles.
+
+    Each triangle turns a normal by the inverse transpose of the linear map between its two shapes;
+    the mean by area is the new one. So what was smooth, flat or weighted by hand stays that, and
+    copies of a vertex at a seam keep equal normals if all are given the same triangles.
+
+    Parameters
+    ----------
+    normals : (N, 3) array
+    owners : (C,) normals that the triangles move, indices from 0
+    corners : (C, 3) vertices of each triangle, indices from 0; it is the first one's angle that
+        must not be 0
+    rest, posed : (V, 3) arrays
+
+    Returns
+    -------
+    moved : (N, 3) array of unit vectors; a normal all of whose triangles are equal in both shapes,
+        or without area, is as it was
+    """
+    old, new = _corner_frames(rest, corners), _corner_frames(posed, corners)
+    changes = np.zeros(len(normals), dtype=np.bool_)
+    changes[owners[(old != new).any(axis=(1, 2))]] = True
+    counts = changes[owners] & ~_is_thin(old) & ~_is_thin(new)
+    owners, old, new = owners[counts], old[counts], new[counts]
+    # The map takes the rows of `old` to those of `new`: new^T old^-T, whose inverse transpose is
+    # new^-1 old.
+    turned = np.linalg.solve(new, old @ normals[owners][:, :, None])[:, :, 0]
+    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+    turned = np.divide(turned, lengths, out=np.zeros_like(turned), where=lengths > 0.0)
+    turned *= np.square(new[:, 2]).sum(axis=1, keepdims=True)
+    sums = np.stack([np.bincount(owners, axis, len(normals)) for axis in turned.T], axis=1)
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    moved = normals.copy()
+    np.divide(sums, lengths, out=moved, where=lengths > 0.0)
+    return moved
+
+
+def _corner_frames(
+    vertices: npt.NDArray[np.float64], corners: npt.NDArray[np.integer]
+) -> npt.NDArray[np.float64]:
+    """Return three rows for each of C triangles, (C, 3, 3): two edges, and what stands on both.
+
+    That is as long as the root of the doubled area, so that a mesh that is scaled has all three
+    rows scaled alike.
+    """
+    at, to, back = (vertices[column] for column in corners.T)
+    edges = np.stack([to - at, back - at], axis=1)
+    across = np.cross(edges[:, 0], edges[:, 1])
+    length = np.sqrt(np.linalg.norm(across, axis=1, keepdims=True))
+    across = np.divide(across, length, out=np.zeros_like(across), where=length > 0.0)
+    return np.concatenate([edges, across[:, None]], axis=1)
+
+
+def _is_thin(frames: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    first, second, across = np.linalg.norm(frames, axis=2).T
+    is_thin: npt.NDArray[np.bool_] = across**2 <= _LEAST_SINE * first * second
+    return is_thin
 
 
 @compiled

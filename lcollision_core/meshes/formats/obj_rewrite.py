@@ -14,13 +14,12 @@ from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats.obj import ObjCorners, read_corners
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 from lcollision_core.meshes.formats.text import decimals
+from lcollision_core.meshes.normals import moved_normals
 from lcollision_core.regular_files import read_regular
 
 FloatArray = npt.NDArray[np.float64]
 
 _BLANKS = rb"(?:[ \t\v\f]|\\(?:\r\n|\n|\r))"
-_LEAST_SINE = 1e-9
-"""Of the angle at a corner: below it, the direction of the triangle is rounding."""
 _WORD = rb"[^\s\\]+"
 _THREE = re.compile(
     rb"(?:(?<=[\r\n])|\A(?:\xef\xbb\xbf)?)(?P<head>%(b)s*(?P<kind>vn?)%(b)s+)"
@@ -50,9 +49,8 @@ def rewritten(data: bytes, vertices: npt.NDArray[Any]) -> bytes:
     """Replace the coordinates of an OBJ file's `v` and `vn` lines.
 
     What stands behind the coordinates, such as vertex colours, stays, and so does the text of a
-    number that does not change. A normal keeps its number: it is the mean, by area, of the old
-    one as each of the faces that use it turns and stretches, so that what was smooth, flat or
-    weighted stays that. Programs that give faces of one direction a common normal, as Blender
+    number that does not change. A normal keeps its number and moves with the corners that use it:
+    see `moved_normals`. Programs that give faces of one direction a common normal, as Blender
     does, leave such faces one where the pose turns them apart.
 
     Parameters
@@ -105,59 +103,9 @@ def rewritten(data: bytes, vertices: npt.NDArray[Any]) -> bytes:
 
 
 def _moved_normals(held: ObjCorners, vertices: FloatArray) -> FloatArray:
-    """Return the (N, 3) normals of an OBJ file whose vertices have moved to (V, 3) places.
-
-    Each corner turns its normal as its face does, by the inverse transpose of the linear map that
-    takes the triangle of the corner and its neighbours, and their normal, to the new ones.
-    """
-    has_normal = np.flatnonzero(held.corner_normals >= 0)
-    owners = held.corner_normals[has_normal]
-    if not len(owners):
-        return held.normals
-    old, new = (_corner_frames(held, points, has_normal) for points in (held.vertices, vertices))
-    area = np.linalg.norm(new[:, 2], axis=1) ** 2
-    is_thin = _is_thin(old) | _is_thin(new)
-    changes = np.zeros(len(held.normals), dtype=np.bool_)
-    changes[owners[(old != new).any(axis=(1, 2))]] = True
-    counts = changes[owners] & ~is_thin
-    owners, old, new, area = owners[counts], old[counts], new[counts], area[counts]
-    # The map takes the rows of `old` to those of `new`: new^T old^-T, whose inverse transpose is
-    # new^-1 old.
-    turned = np.linalg.solve(new, old @ held.normals[owners][:, :, None])[:, :, 0]
-    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
-    turned = np.divide(turned, lengths, out=np.zeros_like(turned), where=lengths > 0.0)
-    n_normals = len(held.normals)
-    sums = np.stack([np.bincount(owners, area * axis, n_normals) for axis in turned.T], axis=1)
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    normals = held.normals.copy()
-    np.divide(sums, lengths, out=normals, where=lengths > 0.0)
-    return normals
-
-
-def _corner_frames(
-    held: ObjCorners, vertices: FloatArray, chosen: npt.NDArray[np.int64]
-) -> FloatArray:
-    """Return three rows for each of n corners, (n, 3, 3): two edges, and what stands on both.
-
-    That is as long as the root of the triangle's doubled area, so that a mesh that is scaled has
-    all three rows scaled alike.
-    """
-    sizes = held.sizes
-    position = np.arange(len(held.corners))
-    start = np.repeat(np.cumsum(sizes) - sizes, sizes)
-    size = np.repeat(sizes, sizes)
-    after, before = (start + (position - start + step) % size for step in (1, -1))
-    at, to, back = (vertices[held.corners[index[chosen]]] for index in (position, after, before))
-    edges = np.stack([to - at, back - at], axis=1)
-    across = np.cross(edges[:, 0], edges[:, 1])
-    length = np.sqrt(np.linalg.norm(across, axis=1, keepdims=True))
-    across = np.divide(across, length, out=np.zeros_like(across), where=length > 0.0)
-    return np.concatenate([edges, across[:, None]], axis=1)
-
-
-def _is_thin(frames: FloatArray) -> npt.NDArray[np.bool_]:
-    lengths = np.linalg.norm(frames, axis=2)
-    is_thin: npt.NDArray[np.bool_] = (
-        lengths[:, 2] ** 2 <= _LEAST_SINE * lengths[:, 0] * lengths[:, 1]
-    )
-    return is_thin
+    sizes, position = held.sizes, np.arange(len(held.corners))
+    start, size = np.repeat(np.cumsum(sizes) - sizes, sizes), np.repeat(sizes, sizes)
+    beside = [held.corners[start + (position - start + step) % size] for step in (1, -1)]
+    corners = np.stack([held.corners, *beside], axis=1)[held.corner_normals >= 0]
+    owners = held.corner_normals[held.corner_normals >= 0]
+    return moved_normals(held.normals, owners, corners, held.vertices, vertices)
