@@ -1,6 +1,7 @@
 """Characters: files with meshes, a rig and clips, and posing by the rig."""
 
 from lcollision_core.characters.character import Character, ClipFrames, Rig
+from lcollision_core.characters.posed_gltf import CharacterForm, PosedFile, posed_gltf
 from lcollision_core.characters.reading import (
     CHARACTER_SUFFIXES,
     is_rigged,
@@ -8,3 +9,4 @@ from lcollision_core.characters.reading import (
     read_character,
 )
 from lcollision_core.characters.rig_space import RigPoseSpace
+from lcollision_core.characters.write import PATCHED_SUFFIXES, write_character

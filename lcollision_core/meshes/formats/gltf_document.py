@@ -56,7 +56,7 @@ class GltfDocument:
 
     def __init__(self, data: bytes, path: Path) -> None:
         # Before a mark the text would not begin with its brace.
-        text, self._blob = _chunks(data.removeprefix(b"\xef\xbb\xbf"))
+        text, self._blob = chunks(data.removeprefix(b"\xef\xbb\xbf"))
         self._path = path
         self._buffers: dict[int, bytes] = {}
         self._left = MAX_NUMBERS
@@ -160,7 +160,7 @@ class GltfDocument:
             buffer = self.description.buffers[number]
             if buffer.uri is not None:
                 held = sum(map(len, self._buffers.values()))
-                self._buffers[number] = _resource(buffer.uri, self._path, MAX_FILE_BYTES - held)
+                self._buffers[number] = resource(buffer.uri, self._path, MAX_FILE_BYTES - held)
             elif number == 0 and self._blob is not None:
                 self._buffers[number] = self._blob
             else:
@@ -204,7 +204,7 @@ def _texts(values: object) -> list[str]:
     return [value for value in values if isinstance(value, str)] if isinstance(values, list) else []
 
 
-def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
+def chunks(data: bytes) -> tuple[bytes, bytes | None]:
     """Return the text and the binary part of a file."""
     if not data.startswith(_GLB_MAGIC):
         return data, None
@@ -236,7 +236,7 @@ def _parsed(text: bytes) -> tuple[GLTF2, dict[str, Any]]:
         raise MeshFileError("it holds no readable glTF description") from error
 
 
-def _resource(uri: object, path: Path, most_bytes: int) -> bytes:
+def resource(uri: object, path: Path, most_bytes: int) -> bytes:
     """Read a data URI, or a regular file in the folder of the scene or below it."""
     if not isinstance(uri, str):
         raise MeshFileError.must_be("the URI of its buffer", "a text", quoted(uri))

@@ -1,0 +1,420 @@
+"""A character's glTF file with another pose in it: what makes no shape stays as it was."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.characters.character import Character, Rig
+from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.meshes.formats.gltf_patch import GltfPatch
+from lcollision_core.meshes.formats.gltf_scene import ShownPrimitive, read_shown, shown_primitives
+from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
+from lcollision_core.meshes.formats.scene import Part, ScenePoses, parents_first
+from lcollision_core.meshes.formats.transforms import compose, decompose
+from lcollision_core.meshes.joined import join_parts
+from lcollision_core.meshes.normals import moved_normals
+from lcollision_core.meshes.scene_files import one_sentence
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.units import body_size
+from lcollision_core.regular_files import read_regular
+
+_SAME = 1e-6
+"""Normalised: what moves less has not moved."""
+
+_LARGEST_ERROR = 1e-5
+"""Normalised: how far vertices that joints place may be from those that were asked for."""
+
+_SAME_TRANSFORM = 1e-9
+"""Of the largest number of a joint's transform: what changes less is rounding."""
+
+_SAME_NUMBER = 1e-6
+"""Of a joint's translation or scale: what changes less keeps its text."""
+
+_IDENTITY = np.eye(4)
+
+
+class CharacterForm(StrEnum):
+    """How a character's file holds a pose.
+
+    JOINTS turns the joints of its skins. MESH is a static mesh without skin. MORPH adds a morph
+    target of weight 1 and leaves the shape of the source as the base.
+    """
+
+    JOINTS = "joints"
+    MESH = "mesh"
+    MORPH = "morph"
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFile:
+    """A file that holds a pose.
+
+    Attributes
+    ----------
+    data : its bytes
+    vertices : (V, 3) float64 array, the character's vertices as readers of the file get them
+    notes : sentences on what was left out
+    """
+
+    data: bytes
+    vertices: FloatArray
+    notes: tuple[str, ...]
+
+
+def posed_gltf(
+    character: Character,
+    vertices: npt.NDArray[Any],
+    form: CharacterForm,
+    transforms: FloatArray | None = None,
+) -> PosedFile:
+    """Put a pose into the character's own .glb, .gltf or .vrm file.
+
+    Textures, UVs, materials, extras and extensions stay byte for byte, and so do the number and
+    the order of vertices. A clip that moves what shapes the character is left out, because it,
+    not the pose, would be seen on opening; cameras and lights keep theirs.
+
+    Parameters
+    ----------
+    character : read from such a file
+    vertices : (V, 3) finite array, in its frame and unit
+    form : how the file holds the pose
+    transforms : (J, 4, 4) global transforms of the joints, for the form of joints
+
+    Returns
+    -------
+    the file, as GLB
+
+    Raises
+    ------
+    ShapeError : another shape, or `transforms` are missing.
+    MeshFileError : the source cannot be read or has changed, or cannot hold the pose in this form.
+    """
+    if vertices.shape != character.rest_vertices.shape:
+        expected = f"of shape {character.rest_vertices.shape}"
+        raise ShapeError.must_be(f"vertices of {character.name}", expected, vertices.shape)
+    with one_sentence(character.source):
+        source = _Source(character)
+        pose = np.asarray(vertices, dtype=np.float64)
+        if form is CharacterForm.JOINTS:
+            if character.rig is None or transforms is None:
+                raise ShapeError.must_be("a pose in joints", "of a rig, with transforms", "none")
+            stored = source.turn_joints(character.rig, transforms)
+        elif form is CharacterForm.MESH:
+            stored = source.bake(pose)
+        else:
+            stored = source.add_morph(pose)
+        error = float(np.abs(stored - pose).max()) / source.size
+        if not error <= _LARGEST_ERROR:
+            raise MeshFileError(
+                f"cannot hold this pose in its {form}: vertices would be off by {error:.2g} of "
+                "the body size",
+                f"choose {CharacterForm.MESH}",
+                where="it",
+            )
+        clips = source.drop_clips()
+        data = source.patch.encoded()
+    notes = [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
+    return PosedFile(data, stored, tuple(notes))
+
+
+class _Source:
+    """The file of a character, read to be written again.
+
+    Attributes
+    ----------
+    patch : what is written
+    size : body size
+    """
+
+    def __init__(self, character: Character) -> None:
+        path = Path(character.source)
+        data = read_regular(path, MAX_FILE_BYTES)
+        document = GltfDocument(data, path)
+        scene = read_shown(document)
+        self.patch = GltfPatch(data, path)
+        self.size = body_size(character.rest_vertices, character.topology)
+        self._nodes: list[dict[str, Any]] = self.patch.description["nodes"]
+        self._document = document
+        self._scene = scene
+        self._mesh = join_parts(scene)
+        if not np.array_equal(self._mesh.joined, character.joined):
+            raise MeshFileError("it is not the file that the character was read from")
+        self._joined = character.joined
+        self._faces = character.topology.faces
+        self._rest = self._mesh.posed(scene.rest)[0]
+        shown, _ = shown_primitives(document, scene.parents)
+        ends = np.cumsum([len(part.points) for part in scene.parts]).tolist()
+        rows = [
+            slice(end - len(part.points), end) for part, end in zip(scene.parts, ends, strict=True)
+        ]
+        self._parts = list(zip(scene.parts, shown, rows, strict=True))
+
+    def turn_joints(self, rig: Rig, transforms: FloatArray) -> FloatArray:
+        """Give the joints' nodes these global transforms, and return where the vertices come."""
+        if transforms.shape != rig.rest.shape or not np.isfinite(transforms).all():
+            raise ShapeError.must_be("transforms", f"of shape {rig.rest.shape}", transforms.shape)
+        parents, rest = self._scene.parents, self._scene.rest.transforms[0]
+        wanted = dict(zip(rig.nodes.tolist(), transforms, strict=True))
+        placed = rest.copy()
+        for number in parents_first(parents):
+            # The parent as the file will have it, so that rounding does not add up.
+            above = placed[parents[number]] if parents[number] >= 0 else _IDENTITY
+            local = _stored_transform(self._nodes[number])
+            if number in wanted:
+                new = _relative(above, wanted[number])
+                if np.abs(new - local).max() > _SAME_TRANSFORM * np.abs(new).max():
+                    local = _set_transform(self._nodes[number], new)
+            placed[number] = above @ local
+        poses = ScenePoses(placed[None], self._scene.rest.weights)
+        posed: FloatArray = self._mesh.posed(poses)[0]
+        return posed
+
+    def bake(self, vertices: FloatArray) -> FloatArray:
+        """Make static meshes of what moves, in the scene's coordinates, and return the vertices."""
+        stored = vertices.astype(np.float32).astype(np.float64)
+        normals = self._normals(vertices)
+        skinned = {part.node for part, _, _ in self._parts if part.is_skinned}
+        moves = np.abs(vertices - self._rest).max(axis=1) > _SAME * self.size
+        moving = {part.node for part, _, rows in self._parts if moves[self._joined[rows]].any()}
+        for part, shown, rows in self._parts:
+            joined = self._joined[rows]
+            if part.node not in skinned | moving:
+                stored[joined] = self._rest[joined]
+                continue
+            primitive = self._own_mesh(shown)["primitives"][shown.primitive]
+            attributes = primitive["attributes"]
+            attributes["POSITION"] = self._vectors(stored[joined], has_bounds=True)
+            if "NORMAL" in attributes:
+                attributes["NORMAL"] = self._vectors(normals[rows])
+            # Readers compute tangents from the normals and UVs.
+            for name in [name for name in attributes if name.startswith(("JOINTS_", "WEIGHTS_"))]:
+                del attributes[name]
+            attributes.pop("TANGENT", None)
+            primitive.pop("targets", None)
+        for node in sorted(skinned | moving):
+            self.patch.description["meshes"][self._nodes[node]["mesh"]].pop("weights", None)
+            self._move_to_root(node)
+        if not any("skin" in node for node in self._nodes):
+            self.patch.description.pop("skins", None)
+        return stored
+
+    def add_morph(self, vertices: FloatArray) -> FloatArray:
+        """Add a morph target of weight 1 to each mesh, and return the vertices."""
+        stored = np.empty_like(vertices)
+        normals = self._normals(vertices)
+        rest = self._scene.rest.transforms[0]
+        for (part, shown, rows), weights in zip(self._parts, self._scene.rest.weights, strict=True):
+            turns = _blended(part, rest)
+            base = part.points + np.tensordot(weights[0], part.morphs, axes=1)
+            wanted = vertices[self._joined[rows]] - turns[:, :, 3]
+            try:
+                own = np.linalg.solve(turns[:, :, :3], wanted[:, :, None])[:, :, 0]
+            except np.linalg.LinAlgError as error:
+                raise MeshFileError(
+                    "its joints flatten vertices at rest, which no morph target undoes",
+                    f"choose {CharacterForm.MESH}",
+                ) from error
+            deltas = (own - base).astype(np.float32)
+            stored[self._joined[rows]] = _moved(turns, base + deltas)
+            mesh = self._own_mesh(shown)
+            primitive = mesh["primitives"][shown.primitive]
+            target = {"POSITION": self._vectors(deltas, has_bounds=True)}
+            if "NORMAL" in primitive["attributes"]:
+                # A reader turns normals by the inverse transpose.
+                turned = np.einsum("vij,vi->vj", turns[:, :, :3], normals[rows])
+                target["NORMAL"] = self._vectors(_unit(turned) - self._stored_normals(shown))
+            primitive.setdefault("targets", []).append(target)
+        for node in {part.node for part, _, _ in self._parts}:
+            self._weigh_morph(self._nodes[node])
+        return stored
+
+    def _weigh_morph(self, node: dict[str, Any]) -> None:
+        """Give the newest morph target of a node's mesh its weight, and its name if others have."""
+        mesh = self.patch.description["meshes"][node["mesh"]]
+        n_targets = max(len(primitive.get("targets", ())) for primitive in mesh["primitives"])
+        for primitive in mesh["primitives"]:
+            # Lines and points: all primitives have the same targets.
+            count = self.patch.description["accessors"][primitive["attributes"]["POSITION"]][
+                "count"
+            ]
+            while len(primitive.setdefault("targets", [])) < n_targets:
+                zeros = np.zeros((count, 3), dtype=np.float32)
+                primitive["targets"].append({"POSITION": self._vectors(zeros, has_bounds=True)})
+        for owner in (mesh, node):
+            if owner is mesh or "weights" in owner:
+                given = list(owner.get("weights", ()))[: n_targets - 1]
+                owner["weights"] = given + [0.0] * (n_targets - 1 - len(given)) + [1.0]
+        extras = mesh.get("extras")
+        names = extras.get("targetNames") if isinstance(extras, dict) else None
+        if isinstance(names, list) and len(names) == n_targets - 1:
+            names.append("pose")
+
+    def drop_clips(self) -> list[str]:
+        """Remove the animations that move what shapes the character, and return their names."""
+        parents = self._scene.parents
+        shaping = {part.node for part, _, _ in self._parts}
+        for part, _, _ in self._parts:
+            shaping |= set(part.bones[np.unique(part.bone_of[part.weights > 0.0])].tolist())
+        for node in reversed(parents_first(parents)):
+            if node in shaping and parents[node] >= 0:
+                shaping.add(int(parents[node]))
+
+        def shows_pose(animation: dict[str, Any]) -> bool:
+            targets = [channel["target"] for channel in animation["channels"]]
+            # What has no node is a pointer to anything, by an extension.
+            return all("node" in target and target["node"] not in shaping for target in targets)
+
+        animations = self.patch.description.pop("animations", [])
+        kept = [animation for animation in animations if shows_pose(animation)]
+        if kept:
+            self.patch.description["animations"] = kept
+        return [
+            str(animation.get("name", f"animation {number}"))
+            for number, animation in enumerate(animations)
+            if not shows_pose(animation)
+        ]
+
+    def _vectors(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
+        return self.patch.add_vectors(values.astype(np.float32), has_bounds=has_bounds)
+
+    def _own_mesh(self, shown: ShownPrimitive) -> dict[str, Any]:
+        """Return the mesh of a node, after copying it where other nodes show it too."""
+        meshes: list[dict[str, Any]] = self.patch.description["meshes"]
+        node = self._nodes[shown.node]
+        if sum(other.get("mesh") == node["mesh"] for other in self._nodes) > 1:
+            meshes.append(deepcopy(meshes[node["mesh"]]))
+            node["mesh"] = len(meshes) - 1
+        mesh: dict[str, Any] = meshes[node["mesh"]]
+        return mesh
+
+    def _move_to_root(self, number: int) -> None:
+        """Take a node's mesh out of its skin, to where the scene's coordinates are its own."""
+        node = self._nodes[number]
+        node.pop("skin", None)
+        node.pop("weights", None)
+        if np.array_equal(self._scene.rest.transforms[0, number], _IDENTITY):
+            return
+        description = self.patch.description
+        if not node.keys() <= {
+            "name",
+            "mesh",
+            "translation",
+            "rotation",
+            "scale",
+            "matrix",
+            "extras",
+        }:
+            # Others hang on this one.
+            self._nodes.append({"name": node.get("name", "mesh"), "mesh": node.pop("mesh")})
+            number = len(self._nodes) - 1
+        else:
+            for name in ("translation", "rotation", "scale", "matrix"):
+                node.pop(name, None)
+            for other in self._nodes:
+                if number in other.get("children", ()):
+                    other["children"].remove(number)
+                    if not other["children"]:
+                        del other["children"]
+        if description.get("scenes"):
+            roots = description["scenes"][description.get("scene", 0)].setdefault("nodes", [])
+            if number not in roots:
+                roots.append(number)
+
+    def _stored_normals(self, shown: ShownPrimitive) -> FloatArray:
+        mesh = self._document.description.meshes[shown.mesh]
+        number = mesh.primitives[shown.primitive].attributes.NORMAL
+        what = f"the normals of mesh {shown.mesh}"
+        stored = self._document.array(number, what, ("VEC3",), shown.n_vertices)
+        return stored.astype(np.float64)
+
+    def _normals(self, vertices: FloatArray) -> FloatArray:
+        """Return the unit normals of the file's W vertices in a pose; 0 where it has none."""
+        rest = np.zeros((len(self._joined), 3))
+        transforms = self._scene.rest.transforms[0]
+        for part, shown, rows in self._parts:
+            mesh = self._document.description.meshes[shown.mesh]
+            if mesh.primitives[shown.primitive].attributes.NORMAL is not None:
+                turns = np.linalg.pinv(_blended(part, transforms)[:, :, :3])
+                rest[rows] = _unit(np.einsum("vij,vi->vj", turns, self._stored_normals(shown)))
+        # All triangles of the joined vertex, so that the copies at a seam move alike.
+        faces = self._faces.astype(np.int64)
+        corners = np.concatenate([np.roll(faces, -side, axis=1) for side in range(3)])
+        corners = corners[np.argsort(corners[:, 0], kind="stable")]
+        first = np.searchsorted(corners[:, 0], np.arange(len(vertices) + 1))
+        counts = np.diff(first)[self._joined]
+        owners = np.repeat(np.arange(len(counts)), counts)
+        within = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
+        used = corners[np.repeat(first[self._joined], counts) + within]
+        return moved_normals(rest, owners, used, self._rest, vertices)
+
+
+def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
+    """Return a global transform relative to its parent's."""
+    try:
+        return np.linalg.solve(above, transform).astype(np.float64)
+    except np.linalg.LinAlgError as error:
+        raise MeshFileError(
+            "a joint hangs on a node that is scaled to nothing", f"choose {CharacterForm.MESH}"
+        ) from error
+
+
+def _stored_transform(node: dict[str, Any]) -> FloatArray:
+    """Return the (4, 4) local transform of a node of the file."""
+    if "matrix" in node:
+        # Column by column.
+        return np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
+    return compose(
+        np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64),
+        np.array(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64),
+        np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64),
+    )
+
+
+def _set_transform(node: dict[str, Any], local: FloatArray) -> FloatArray:
+    """Give a node a local transform, and return it as the file holds it.
+
+    A translation or a scale that stays, as where a joint only turns, keeps its text.
+    """
+    if node.pop("matrix", None) is not None:
+        node["translation"], node["scale"] = ([0.0] * 3, [0.0] * 3)
+    given = {
+        "translation": np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64),
+        "scale": np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64),
+    }
+    translation, rotation, scale = decompose(local)
+    for name, new in (("translation", translation), ("scale", scale)):
+        if np.abs(new - given[name]).max() > _SAME_NUMBER * np.abs(new).max():
+            given[name] = new.astype(np.float32).astype(np.float64)
+            node[name] = given[name].tolist()
+    turned = rotation.astype(np.float32).astype(np.float64)
+    node["rotation"] = turned.tolist()
+    return _stored_transform(node)
+
+
+def _blended(part: Part, transforms: FloatArray) -> FloatArray:
+    """Return the (n, 3, 4) affine map of each vertex of a part, for (nodes, 4, 4) transforms."""
+    turns = (transforms[part.bones] @ part.bind)[:, :3]
+    blended = np.zeros((len(part.points), 3, 4))
+    for bone, weight in zip(part.bone_of.T, part.weights.T, strict=True):
+        blended += weight[:, None, None] * turns[bone]
+    return blended
+
+
+def _moved(turns: FloatArray, points: FloatArray) -> FloatArray:
+    moved: FloatArray = np.einsum("vij,vj->vi", turns[:, :, :3], points) + turns[:, :, 3]
+    return moved
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit = np.zeros_like(vectors)
+    np.divide(vectors, lengths, out=unit, where=lengths > 0.0)
+    return unit

@@ -1,0 +1,138 @@
+"""A glTF file again as GLB, some of its description changed and arrays added behind its data."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.json_values import parse_json
+from lcollision_core.meshes.formats.gltf_document import chunks, resource, whole
+from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
+
+_MOST_BYTES = (1 << 32) - 1
+_FLOAT, _ARRAY_BUFFER = 5126, 34962
+_MEDIA_TYPES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp"}
+
+
+class GltfPatch:
+    """The description of a glTF file as plain values, and its data as one binary chunk.
+
+    Buffers, and images in files beside a .gltf, come into the chunk byte for byte; an image that is
+    not there stays named as it was.
+
+    Parameters
+    ----------
+    data : the file's bytes, which `GltfDocument` has read
+    path : where it is; buffers and images may lie beside it
+
+    Attributes
+    ----------
+    description : the file's JSON, to be changed
+
+    Raises
+    ------
+    MeshFileError : the file is damaged.
+    """
+
+    def __init__(self, data: bytes, path: Path) -> None:
+        text, blob = chunks(data.removeprefix(b"\xef\xbb\xbf"))
+        self.description: dict[str, Any] = parse_json(text)
+        self._binary = bytearray()
+        starts = []
+        for number, buffer in enumerate(self.description.get("buffers", [])):
+            content = blob
+            if "uri" in buffer:
+                content = resource(buffer["uri"], path, MAX_FILE_BYTES - len(self._binary))
+            elif number or blob is None:
+                raise MeshFileError(f"it has no data for buffer {number}")
+            starts.append(self._append(content or b""))
+        for number, view in enumerate(self.description.get("bufferViews", [])):
+            what = f"the buffer of buffer view {number}"
+            start = starts[whole(view.get("buffer"), what, 0, len(starts) - 1)]
+            view["buffer"] = 0
+            if start:
+                view["byteOffset"] = view.get("byteOffset", 0) + start
+        if starts:
+            first = self.description["buffers"][0]
+            first.pop("uri", None)
+            self.description["buffers"] = [first]
+        for image in self.description.get("images", []):
+            self._embed(image, path)
+
+    def _embed(self, image: dict[str, Any], path: Path) -> None:
+        uri = image.get("uri")
+        if uri is None or uri.startswith("data:"):
+            return
+        try:
+            content = resource(uri, path, MAX_FILE_BYTES - len(self._binary))
+        except MeshFileError:
+            # Missing beside the source, or elsewhere: it is no more missing afterwards.
+            return
+        media_type = next(
+            (t for magic, t in _MEDIA_TYPES.items() if content.startswith(magic)), None
+        )
+        if media_type is not None:
+            del image["uri"]
+            image["bufferView"] = self._view(content)
+            image["mimeType"] = media_type
+
+    def _append(self, content: bytes) -> int:
+        start = len(self._binary)
+        self._binary += content + bytes(-len(content) % 4)
+        return start
+
+    def _view(self, content: bytes, **fields: int) -> int:
+        views = self.description.setdefault("bufferViews", [])
+        start = self._append(content)
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(content), **fields})
+        return len(views) - 1
+
+    def add_vectors(self, vectors: npt.NDArray[np.float32], *, has_bounds: bool) -> int:
+        """Add an accessor of (n, 3) float32 vectors and return its number.
+
+        Parameters
+        ----------
+        has_bounds : whether it says its least and greatest numbers, as positions have to
+        """
+        accessor: dict[str, Any] = {
+            "bufferView": self._view(vectors.astype("<f4").tobytes(), target=_ARRAY_BUFFER),
+            "componentType": _FLOAT,
+            "count": len(vectors),
+            "type": "VEC3",
+        }
+        if has_bounds:
+            accessor["min"] = vectors.min(axis=0).tolist()
+            accessor["max"] = vectors.max(axis=0).tolist()
+        accessors = self.description.setdefault("accessors", [])
+        accessors.append(accessor)
+        return len(accessors) - 1
+
+    def encoded(self) -> bytes:
+        """Return the bytes of the GLB file.
+
+        Raises
+        ------
+        MeshFileError : it is larger than GLB files can be.
+        """
+        buffers = self.description.setdefault("buffers", [{}])
+        buffers[0]["byteLength"] = len(self._binary)
+        text = json.dumps(self.description, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        size = 12 + 8 + len(text) + 8 + len(self._binary)
+        if size > _MOST_BYTES:
+            raise MeshFileError(f"it would have {size} bytes, GLB files have less than 4 GiB")
+        return b"".join(
+            (
+                struct.pack("<4sII", b"glTF", 2, size),
+                struct.pack("<I4s", len(text), b"JSON"),
+                text,
+                struct.pack("<I4s", len(self._binary), b"BIN\0"),
+                bytes(self._binary),
+            )
+        )
