@@ -92,7 +92,7 @@ def embedding(
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
     if near_exclusion is not None:
-        poses = replace(poses, near_exclusion=near_exclusion)
+        poses = replace(poses, rules=replace(poses.rules, near_exclusion=near_exclusion))
     config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)
     checkpoint = checkpoint_path(destination)
     require_writable(checkpoint)
@@ -165,6 +165,7 @@ def predictor(
             model.embedding,
             replace(config, by_domain=not no_domains),
             store=store.identity,
+            groups=model.groups,
             device=device,
             checkpoint=checkpoint,
             progress=progress,

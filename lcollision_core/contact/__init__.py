@@ -15,4 +15,4 @@ from lcollision_core.contact.detector import (
     SelfCollisions,
 )
 from lcollision_core.contact.energy import domain_energy
-from lcollision_core.meshes.contact_rules import ContactRules, RuleCounts
+from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts

@@ -25,7 +25,7 @@ from lcollision_core.contact.rules import exclusions_of, require_room, rules_of
 from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress
-from lcollision_core.meshes.contact_rules import N_RULES, ContactRules, RuleCounts
+from lcollision_core.meshes.contact_rules import N_RULES, STRICT, ContactRules, RuleCounts
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.precision import can_hold
 from lcollision_core.meshes.topology import Topology
@@ -52,8 +52,6 @@ _POSES_PER_TASK = 8
 
 _TASKS_PER_THREAD = 4
 """Least number of pieces of a small batch, to keep all threads busy."""
-
-_STRICT = ContactRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +188,7 @@ class CollisionDetector:
         self,
         topology: Topology,
         reference: npt.ArrayLike,
-        rules: ContactRules = _STRICT,
+        rules: ContactRules = STRICT,
         groups: Sequence[FaceGroup] = (),
     ) -> None:
         vertices = np.asarray(reference, dtype=np.float64)
@@ -210,7 +208,7 @@ class CollisionDetector:
             needed = f"{1.0 / MAX_BODY_SIZE:.0e} to {MAX_BODY_SIZE:.0e}"
             raise ShapeError.must_be("the body size", needed, f"{self.body_size:.1e}", "scale it")
         self._tree: FaceTree = build_tree(vertices, topology.faces)
-        self._exclusions = self._exclusions_of(vertices, _STRICT, ())
+        self._exclusions = self._exclusions_of(vertices, STRICT, ())
         if not rules.exclude_nothing:
             self._exclusions = self._exclusions_of(vertices, rules, groups)
         self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()

@@ -13,7 +13,7 @@ from lcollision_core.contact.arrays import Exclusions
 from lcollision_core.contact.kernels import NEAR, REST, find_rules
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.contact_rules import ContactRules
-from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.face_groups import FaceGroup, require_groups
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 Pairs = npt.NDArray[np.integer]
@@ -47,8 +47,10 @@ def exclusions_of(
 
     Raises
     ------
-    ShapeError : a group of an ignored pair is unknown, or too many pairs are excluded.
+    ShapeError : a group of an ignored pair is unknown, a group has faces that the mesh has not, or
+        too many pairs are excluded.
     """
+    require_groups(rules, groups, topology.n_faces)
     none: sparse.csr_matrix = sparse.csr_matrix(2 * (topology.n_faces,), dtype=np.uint8)
     near = rest = none
     if rules.near_exclusion > 0.0:
@@ -170,12 +172,7 @@ def _regions(
     """Return (F,) regions of faces of the same groups, and (R, R) which of them are ignored."""
     if not ignored:
         return np.empty(0, dtype=np.int32), np.zeros((0, 0), dtype=np.bool_)
-    known = dict.fromkeys(group.name for group in groups)
     names = list(dict.fromkeys(name for pair in ignored for name in pair))
-    for name in names:
-        if name not in known:
-            listed = ", ".join(map(repr, list(known)[:8])) or "none: the mesh has no groups"
-            raise ShapeError("is unknown", where=f"the group {name!r}", expected=listed)
     is_of = np.zeros((len(names), n_faces), dtype=np.bool_)
     for group in groups:
         if group.name in names:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.embedding import LatentBox
 from lcollision_core.labels.labeller import Labeller
+from lcollision_core.meshes import STRICT, ContactRules
+from lcollision_core.meshes.face_groups import ignored_faces_digest
 
 
 def is_held_out(index: npt.ArrayLike) -> npt.NDArray[np.bool_]:
@@ -37,6 +39,8 @@ class StoreIdentity:
     height : the body size, in the data's unit, whose float32 values the vertices are rounded to
     near_exclusion : normalised
     box_low, box_high : D numbers each
+    rules : which pairs of faces do not count; older stores have the near exclusion only
+    ignored_faces : digest of the groups that the rules ignore pairs of, empty if none
 
     Raises
     ------
@@ -50,8 +54,12 @@ class StoreIdentity:
     near_exclusion: float
     box_low: tuple[float, ...]
     box_high: tuple[float, ...]
+    rules: ContactRules = STRICT
+    ignored_faces: str = ""
 
     def __post_init__(self) -> None:
+        rules = replace(self.rules, near_exclusion=self.near_exclusion)
+        object.__setattr__(self, "rules", rules)
         if not 0 < len(self.box_low) == len(self.box_high) or self.n_domains < 1:
             raise ValueError("there is no latent box, or no domain")
 
@@ -63,9 +71,11 @@ class StoreIdentity:
             seed=seed,
             n_domains=labeller.embedding.n_domains,
             height=labeller.body_size,
-            near_exclusion=labeller.near_exclusion,
+            near_exclusion=labeller.rules.near_exclusion,
             box_low=tuple(labeller.embedding.box.low.tolist()),
             box_high=tuple(labeller.embedding.box.high.tolist()),
+            rules=labeller.rules,
+            ignored_faces=ignored_faces_digest(labeller.rules, labeller.groups),
         )
 
     @property

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding
+from lcollision_core.meshes import FaceGroup
 
 
 def blocks_of(rows: range) -> Iterator[range]:
@@ -73,13 +74,15 @@ class Labeller:
     ----------
     embedding : decodes
     body_size : in the data's unit
-    near_exclusion : pairs of faces this near along the surface, normalised, are counted separately
+    rules : which pairs of faces do not count
+    groups : named groups of faces, of which the rules may ignore pairs
     fingerprint : identifies the model
     """
 
     embedding: Embedding
     body_size: float
-    near_exclusion: float
+    rules: ContactRules
+    groups: tuple[FaceGroup, ...]
     fingerprint: str
 
     @cached_property
@@ -88,7 +91,8 @@ class Labeller:
         return CollisionDetector(
             self.embedding.topology,
             self.embedding.rest_vertices * self.body_size,
-            ContactRules(self.near_exclusion),
+            self.rules,
+            self.groups,
         )
 
     def prepare(self) -> None:

@@ -143,7 +143,7 @@ class LabelStore:
         return store
 
     def require(self, identity: StoreIdentity) -> None:
-        """Refuse a store of another model, seed, unit, near exclusion or box.
+        """Refuse a store of another model, seed, unit, box or other contact rules.
 
         Raises
         ------
@@ -153,6 +153,8 @@ class LabelStore:
             ("model", "the model of fingerprint {}"),
             ("seed", "samples of seed {}"),
             ("near_exclusion", "with a near exclusion of {}"),
+            ("rules", "with the contact rules {}"),
+            ("ignored_faces", "with ignored groups of the faces {}"),
             ("height", "with a body size of {}"),
         ):
             ours, theirs = getattr(self.identity, name), getattr(identity, name)

@@ -10,8 +10,8 @@ from lcollision_core.meshes.atomic import (
     unused_name,
 )
 from lcollision_core.meshes.audit import audit_mesh, inspect_pose_set
-from lcollision_core.meshes.contact_rules import ContactRules, RuleCounts
-from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts
+from lcollision_core.meshes.face_groups import FaceGroup, component_groups, part_groups
 from lcollision_core.meshes.file_names import file_stem, file_stems, has_known_suffix
 from lcollision_core.meshes.files import (
     READABLE_SUFFIXES,

@@ -19,7 +19,11 @@ from lcollision_core.json_values import from_json
 CHARACTER_REST_EXCLUSION = 0.02
 """Normalised length: the rest exclusion of characters whose rest pose does not ask for more."""
 
-_MAX_NAME_LENGTH = 500
+MAX_IGNORED = 1000
+"""The most pairs of groups that are ignored."""
+
+MAX_NAME_LENGTH = 500
+"""Of a group of faces."""
 
 
 @dataclass(frozen=True)
@@ -93,16 +97,18 @@ class ContactRules:
         ):
             if length is not None and not 0.0 <= length < math.inf:
                 raise ShapeError.must_be(what, "0 or more, and finite", length)
+        if len(self.ignored) > MAX_IGNORED:
+            raise ShapeError.must_be("ignored pairs", f"at most {MAX_IGNORED}", len(self.ignored))
         for pair in self.ignored:
             if len(pair) != 2 or not all(map(_is_name, pair)):
                 raise ShapeError.must_be(
-                    "an ignored pair", "two names of groups", repr(pair)[:_MAX_NAME_LENGTH]
+                    "an ignored pair", "two names of groups", repr(pair)[:MAX_NAME_LENGTH]
                 )
 
     @property
     def exclude_nothing(self) -> bool:
         """Whether all colliding pairs count."""
-        return self == _STRICT
+        return self == STRICT
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values for `from_json`."""
@@ -145,11 +151,12 @@ class ContactRules:
         return f"{listed} {'is' if counts.total == 1 else 'are'} not counted"
 
 
-_STRICT = ContactRules()
+STRICT = ContactRules()
+"""All colliding pairs count."""
 
 _NAMED_PAIRS = 3
 """Most pairs of groups that a sentence names one by one."""
 
 
 def _is_name(name: object) -> bool:
-    return isinstance(name, str) and name.strip() != "" and len(name) <= _MAX_NAME_LENGTH
+    return isinstance(name, str) and name.strip() != "" and len(name) <= MAX_NAME_LENGTH

@@ -1,11 +1,20 @@
-"""Named groups of faces: the meshes, materials and objects of a file."""
+"""Named groups of faces: the meshes, materials, objects and body parts of a file."""
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+
+from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH, ContactRules
+from lcollision_core.meshes.topology import Topology
+
+MAX_GROUPS = 1000
+"""The most groups that are kept of one mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,3 +29,93 @@ class FaceGroup:
 
     name: str
     faces: npt.NDArray[np.int64]
+
+
+def component_groups(topology: Topology) -> tuple[FaceGroup, ...]:
+    """Return the connected components of a mesh, "component 1" being the one of most faces."""
+    _, of_vertex = topology.vertex_components
+    _, of_face, sizes = np.unique(
+        of_vertex[topology.faces[:, 0]], return_inverse=True, return_counts=True
+    )
+    order = np.argsort(-sizes, kind="stable")
+    return tuple(
+        FaceGroup(f"component {n + 1}", np.flatnonzero(of_face == component))
+        for n, component in enumerate(order)
+    )
+
+
+def part_groups(topology: Topology, vertex_labels: npt.NDArray[np.str_]) -> tuple[FaceGroup, ...]:
+    """Return the faces of each body part: of their second and third corner, or else the first.
+
+    Parameters
+    ----------
+    vertex_labels : (V,) names of the parts
+    """
+    first, second, third = vertex_labels[topology.faces].T
+    of_face = np.where(second == third, second, first)
+    return tuple(
+        FaceGroup(str(name), np.flatnonzero(of_face == name)) for name in np.unique(of_face)
+    )
+
+
+def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: int) -> None:
+    """Refuse groups of other faces than there are, and ignored pairs of groups that are not there.
+
+    Raises
+    ------
+    ShapeError : saying which.
+    """
+    if len(groups) > MAX_GROUPS:
+        raise ShapeError.must_be("the groups of faces", f"at most {MAX_GROUPS}", len(groups))
+    for group in groups:
+        where = f"the group {group.name[:80]!r}"
+        if not 0 < len(group.name) <= MAX_NAME_LENGTH or not group.name.isprintable():
+            allowed = f"named in 1 to {MAX_NAME_LENGTH} printable characters"
+            raise ShapeError.must_be("a group of faces", allowed, repr(group.name[:80]))
+        faces = group.faces
+        if faces.ndim != 1 or faces.dtype.kind != "i" or (np.diff(faces) <= 0).any():
+            raise ShapeError("must list its faces once each, ascending", where=where)
+        if len(faces) and not 0 <= faces[0] <= faces[-1] < n_faces:
+            outside = faces[0] if faces[0] < 0 else faces[-1]
+            raise ShapeError.must_be(where, f"of faces from 0 to {n_faces - 1}", int(outside))
+    known = dict.fromkeys(group.name for group in groups)
+    for name in (name for pair in rules.ignored for name in pair):
+        if name not in known:
+            listed = ", ".join(map(repr, list(known)[:8])) or "none: the mesh has no groups"
+            raise ShapeError("is unknown", where=f"the group {name!r}", expected=listed)
+
+
+def ignored_faces_digest(rules: ContactRules, groups: Iterable[FaceGroup]) -> str:
+    """Return a digest of the groups that the rules ignore pairs of; empty if they ignore none."""
+    names = {name for pair in rules.ignored for name in pair}
+    if not names:
+        return ""
+    digest = hashlib.sha256()
+    for group in sorted((group for group in groups if group.name in names), key=lambda g: g.name):
+        digest.update(f"{group.name}\n{len(group.faces)}\n".encode())
+        digest.update(group.faces.astype("<i8").tobytes())
+    return digest.hexdigest()
+
+
+def faces_to_runs(faces: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+    """Write ascending faces as runs: first, last plus one, first, last plus one ..."""
+    if not len(faces):
+        return np.empty(0, dtype=np.int64)
+    breaks = np.flatnonzero(np.diff(faces) != 1)
+    firsts, lasts = faces[np.r_[0, breaks + 1]], faces[np.r_[breaks, len(faces) - 1]]
+    return np.stack([firsts, lasts + 1], axis=1).ravel().astype(np.int64)
+
+
+def runs_to_faces(runs: npt.NDArray[np.integer], n_faces: int) -> npt.NDArray[np.int64]:
+    """Return the faces of runs as `faces_to_runs` writes them, of a mesh of so many.
+
+    Raises
+    ------
+    ShapeError : they are not runs that ascend within the mesh.
+    """
+    sound = runs.ndim == 1 and len(runs) % 2 == 0 and (np.diff(runs) > 0).all()
+    if not sound or (len(runs) and not 0 <= runs[0] < runs[-1] <= n_faces):
+        raise ShapeError("are not runs that ascend", where="the faces of a group")
+    inside = np.zeros(n_faces + 1, dtype=np.int8)
+    inside[runs[0::2]], inside[runs[1::2]] = 1, -1
+    return np.flatnonzero(np.cumsum(inside, dtype=np.int8))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +17,8 @@ from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError,
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, read_animated
 from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.contact_rules import STRICT, ContactRules
+from lcollision_core.meshes.face_groups import FaceGroup, require_groups
 from lcollision_core.meshes.files import (
     KEEP_PRECISION,
     READABLE_SUFFIXES,
@@ -27,6 +28,14 @@ from lcollision_core.meshes.files import (
 )
 from lcollision_core.meshes.npz import MAX_ITEMS, read_npz, write_npz
 from lcollision_core.meshes.outliers import outlier_poses
+from lcollision_core.meshes.stored_rules import (
+    RULE_ARRAYS,
+    groups_from_arrays,
+    groups_to_arrays,
+    rules_from_arrays,
+    rules_to_arrays,
+    texts_of,
+)
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.upright import UpGuess, guess_up
 
@@ -34,7 +43,10 @@ FORMAT_VERSION = 1
 """The version that `write_pose_set` stores; later ones are refused."""
 
 _MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
-_EXTRA_ARRAYS = ("format_version", "names", "notes", "near_exclusion", "up_axis", "vertex_labels")
+_EXTRA_ARRAYS = (
+    *("format_version", "names", "notes", "near_exclusion", "up_axis", "vertex_labels"),
+    *RULE_ARRAYS,
+)
 _MAX_TEXT_LENGTH = 500
 
 _LARGEST_COORDINATE = 1e150
@@ -53,7 +65,8 @@ class PoseSet:
     names : N names, the mesh files' or "pose 12"
     source : the folder or file that it was read from, if it was
     notes : sentences on changes made on reading
-    near_exclusion : normalised length up to which pairs are near, not colliding
+    rules : which pairs of faces do not count
+    groups : named groups of faces, of which the rules may ignore pairs
     up_axis : 0, 1 or 2 for x, y or z; None if it is to be guessed
     vertex_labels : (V,) array of printable strings, the body part of each vertex, if known
 
@@ -67,7 +80,8 @@ class PoseSet:
     names: tuple[str, ...]
     source: Path | None = None
     notes: tuple[str, ...] = ()
-    near_exclusion: float = 0.0
+    rules: ContactRules = STRICT
+    groups: tuple[FaceGroup, ...] = ()
     up_axis: int | None = None
     vertex_labels: npt.NDArray[np.str_] | None = None
 
@@ -83,8 +97,9 @@ class PoseSet:
             raise ShapeError.must_be("names", f"one for each of {shape[0]} poses", len(self.names))
         if self.up_axis not in (None, 0, 1, 2):
             raise ShapeError.must_be("up_axis", "0, 1 or 2", self.up_axis)
-        if not 0.0 <= self.near_exclusion < 1.0:
+        if not self.near_exclusion < 1.0:
             raise ShapeError.must_be("near_exclusion", "in [0, 1)", self.near_exclusion)
+        require_groups(self.rules, self.groups, self.topology.n_faces)
         if self.vertex_labels is not None:
             if self.vertex_labels.shape != shape[1:2]:
                 raise ShapeError.must_be(
@@ -112,6 +127,11 @@ class PoseSet:
         if float(np.abs(self.vertices).max()) > np.finfo(np.float64).max / max(factor, 1.0):
             raise ShapeError("is too large for the coordinates", where=f"the scale {factor:g}")
         return replace(self, vertices=self.vertices.astype(np.float64) * factor)
+
+    @property
+    def near_exclusion(self) -> float:
+        """Normalised length along the surface up to which pairs are near, and do not count."""
+        return self.rules.near_exclusion
 
     @property
     def up(self) -> UpGuess:
@@ -463,7 +483,9 @@ def _collect_npz(
         topology = Topology(faces, vertices.shape[1])
         names = tuple(f"pose {pose}" for pose in range(len(vertices)))
         extras = {"names": names} | _extras_of(arrays, vertices.shape)
-        pose_set = PoseSet(vertices, topology, source=path, **extras)
+        rules = rules_from_arrays(arrays, extras.pop("near_exclusion", 0.0))
+        groups = groups_from_arrays(arrays, topology.n_faces)
+        pose_set = PoseSet(vertices, topology, source=path, rules=rules, groups=groups, **extras)
     except LCollisionError as error:
         report(MeshFileError.because(path, "cannot be read as a pose set", error))
         return PoseSetInspection(None)
@@ -516,22 +538,12 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
             expected = f"{needed} strings" if kinds == "U" else "one number"
             raise MeshFileError.must_be(name, expected, f"{value.dtype} {value.shape}")
         convert = float if "f" in kinds else int
-        extras[name] = _texts(value, name) if kinds == "U" else convert(value)
+        extras[name] = texts_of(value, name, _MAX_TEXT_LENGTH) if kinds == "U" else convert(value)
     if (version := extras.pop("format_version", FORMAT_VERSION)) > FORMAT_VERSION:
         raise MeshFileError.too_new("it", version, FORMAT_VERSION)
     if "vertex_labels" in extras:
         extras["vertex_labels"] = np.array(extras["vertex_labels"])
     return extras
-
-
-def _texts(value: npt.NDArray[np.str_], name: str) -> tuple[str, ...]:
-    native = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("="))
-    if (native.view(np.uint32) > sys.maxunicode).any():
-        raise MeshFileError("holds a character that does not exist", where=name)
-    # A lone surrogate, from an undecodable file name, cannot be printed.
-    return tuple(
-        text[:_MAX_TEXT_LENGTH].encode(errors="replace").decode() for text in native.tolist()
-    )
 
 
 def _require_labels(vertex_labels: npt.NDArray[np.str_]) -> None:
@@ -565,7 +577,8 @@ def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
         "vertices": pose_set.vertices,
         "faces": pose_set.faces,
         "names": np.array(pose_set.names, dtype=np.str_),
-        "near_exclusion": np.array(pose_set.near_exclusion),
+        **rules_to_arrays(pose_set.rules),
+        **groups_to_arrays(pose_set.groups),
     }
     if pose_set.notes:
         arrays["notes"] = np.array(pose_set.notes, dtype=np.str_)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
+
+import numpy as np
 
 from lcollision_core.errors import ModelFileError
 from lcollision_core.json_values import from_json, quoted
+from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
+from lcollision_core.meshes.face_groups import faces_to_runs, require_groups, runs_to_faces
 from lcollision_core.model.naming import MAX_NAME_LENGTH
 
 _LEAST_BODY_SIZE = 1e-12
@@ -20,6 +24,21 @@ _ADVICE = "train or copy the model again"
 
 
 @dataclass(frozen=True)
+class _StoredGroup:
+    name: str
+    runs: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _StoredRules:
+    """What a card's JSON says of contacts; older cards have the near exclusion only."""
+
+    near_exclusion: float
+    rules: ContactRules = STRICT
+    groups: tuple[_StoredGroup, ...] = ()
+
+
+@dataclass(frozen=True)
 class ModelCard:
     """Units, names and origin of a model.
 
@@ -27,7 +46,6 @@ class ModelCard:
     ----------
     height : the body size, in the data's unit
     up_axis : 0, 1 or 2 for x, y or z
-    near_exclusion : pairs of faces this near along the surface, normalised, are counted separately
     domain_names : K different names
     domain_colours : K strings "#rrggbb"
     pose_names : N names of the training poses
@@ -35,6 +53,8 @@ class ModelCard:
     licence : of the model
     provenance : how it was made, JSON values by name
     domain_order : all K domains, indices from 0, in listing order; empty for that of the latent
+    rules : which pairs of faces do not count
+    groups : named groups of faces, of which the rules may ignore pairs
 
     Raises
     ------
@@ -43,7 +63,6 @@ class ModelCard:
 
     height: float
     up_axis: int
-    near_exclusion: float
     domain_names: tuple[str, ...]
     domain_colours: tuple[str, ...]
     pose_names: tuple[str, ...]
@@ -51,6 +70,8 @@ class ModelCard:
     licence: str
     provenance: Mapping[str, Any] = field(default_factory=dict)
     domain_order: tuple[int, ...] = ()
+    rules: ContactRules = STRICT
+    groups: tuple[FaceGroup, ...] = ()
 
     def __post_init__(self) -> None:
         names, order, largest = self.domain_names, self.domain_order, 1.0 / _LEAST_BODY_SIZE
@@ -60,7 +81,7 @@ class ModelCard:
             )
         if self.up_axis not in (0, 1, 2):
             raise ModelFileError("its up_axis must be 0, 1 or 2")
-        if not 0.0 <= self.near_exclusion < 1.0:
+        if not self.near_exclusion < 1.0:
             raise ModelFileError("its near_exclusion must be from 0 to below 1")
         if max(map(len, (*self.pose_names, self.source, self.licence))) > _MAX_TEXT_LENGTH:
             raise ModelFileError(
@@ -81,23 +102,49 @@ class ModelCard:
             what = f"{quoted(list(order))} is not an order of the {len(names)} domains"
             raise ModelFileError(what, "name each once")
 
+    @property
+    def near_exclusion(self) -> float:
+        """Pairs of faces this near along the surface, normalised, do not count."""
+        return self.rules.near_exclusion
+
     def to_metadata(self) -> dict[str, Any]:
         """Return JSON values for `from_metadata`."""
-        values = asdict(self)
+        values = asdict(replace(self, groups=()))
+        del values["rules"], values["groups"]
         if not self.domain_order:
             del values["domain_order"]
+        values["near_exclusion"] = self.near_exclusion
+        if self.rules != ContactRules(self.near_exclusion):
+            values["rules"] = self.rules.to_json()
+        if self.groups:
+            values["groups"] = [
+                {"name": group.name, "runs": faces_to_runs(group.faces).tolist()}
+                for group in self.groups
+            ]
         return values
 
     @classmethod
-    def from_metadata(cls, metadata: Mapping[str, Any]) -> ModelCard:
+    def from_metadata(cls, metadata: Mapping[str, Any], n_faces: int) -> ModelCard:
         """Rebuild a card from what `to_metadata` returned.
+
+        Parameters
+        ----------
+        n_faces : of the model
 
         Raises
         ------
         ModelFileError : something is missing or invalid.
         """
         try:
-            return from_json(cls, metadata, "card")
+            stored = from_json(_StoredRules, metadata, "card")
+            groups = tuple(
+                FaceGroup(group.name, runs_to_faces(np.array(group.runs, dtype=np.int64), n_faces))
+                for group in stored.groups
+            )
+            rules = replace(stored.rules, near_exclusion=stored.near_exclusion)
+            require_groups(rules, groups, n_faces)
+            others = {name: metadata[name] for name in metadata if name not in ("rules", "groups")}
+            return replace(from_json(cls, others, "card"), rules=rules, groups=groups)
         except (ValueError, ModelFileError) as error:
             reason = getattr(error, "headline", error)
             raise ModelFileError.because(_CARD, "is damaged", reason, _ADVICE) from error

@@ -16,7 +16,7 @@ from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import RigidTransform, Topology, front_direction
+from lcollision_core.meshes import FaceGroup, RigidTransform, Topology, front_direction
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect, code_names
 from lcollision_core.model.encoded_pose import EncodedPose
@@ -345,6 +345,21 @@ class PosableBody(ABC):
             other.__dict__.pop(cached, None)
         return other
 
+    def with_rules(self, rules: ContactRules) -> Self:
+        """Return the same model with other contact rules, which are checked by being applied.
+
+        Raises
+        ------
+        ShapeError : an ignored group is unknown, or too many pairs are excluded.
+        ModelFileError : a predictor depends on the rules that there are.
+        """
+        detector = CollisionDetector(self.topology, self.reference, rules, self.groups)
+        other = self.with_card(replace(self.card, rules=rules))
+        for cached in ("pose_mirror", "resolver", "free_latent"):
+            other.__dict__.pop(cached, None)
+        other.__dict__["detector"] = detector
+        return other
+
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         codes = np.asarray(latent, dtype=np.float64)
         if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
@@ -411,7 +426,7 @@ class PosableBody(ABC):
     @cached_property
     def detector(self) -> CollisionDetector:
         """Finds exact self-collisions of this model's meshes, in the data's unit."""
-        return CollisionDetector(self.topology, self.reference, ContactRules(self.near_exclusion))
+        return CollisionDetector(self.topology, self.reference, self.rules, self.groups)
 
     @property
     def faces(self) -> npt.NDArray[np.int32]:
@@ -444,9 +459,19 @@ class PosableBody(ABC):
         return read_only(front_direction(self.reference, self.up_axis))
 
     @property
+    def rules(self) -> ContactRules:
+        """Which pairs of faces do not count."""
+        return self.card.rules
+
+    @property
+    def groups(self) -> tuple[FaceGroup, ...]:
+        """Named groups of faces, of which the rules may ignore pairs."""
+        return self.card.groups
+
+    @property
     def near_exclusion(self) -> float:
         """Normalised length along the surface within which pairs of faces are folds of the skin."""
-        return self.card.near_exclusion
+        return self.rules.near_exclusion
 
     @property
     def domain_names(self) -> tuple[str, ...]:

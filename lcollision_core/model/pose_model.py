@@ -17,6 +17,7 @@ from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.errors import ModelFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import (
+    ContactRules,
     PoseSet,
     RigidTransform,
     body_size,
@@ -121,7 +122,7 @@ class PoseModel(PosableBody):
         try:
             embedding_section, card_section = sections.pop(EMBEDDING), sections.pop(_CARD)
             embedding = Embedding.from_arrays(embedding_section.arrays, embedding_section.metadata)
-            card = ModelCard.from_metadata(card_section.metadata)
+            card = ModelCard.from_metadata(card_section.metadata, embedding.topology.n_faces)
             model = cls(path.stem, embedding, card, sections)
             # Damage is found now, not when these are used.
             _ = model.predictor_record, model.free_latent
@@ -162,13 +163,14 @@ class PoseModel(PosableBody):
         card = ModelCard(
             height=body_size(reference, pose_set.topology),
             up_axis=up,
-            near_exclusion=pose_set.near_exclusion,
             domain_names=names,
             domain_colours=domain_colours(embedding.attention_mask),
             pose_names=pose_set.names,
             source=source or (pose_set.source.name if pose_set.source else "unknown"),
             licence=licence,
             provenance=dict(provenance or {}),
+            rules=pose_set.rules,
+            groups=pose_set.groups,
         )
         return cls(name, embedding, card)
 
@@ -198,7 +200,7 @@ class PoseModel(PosableBody):
         """Return what labels samples of the model's latent box, by the model's pair rule."""
         from lcollision_core.labels import Labeller
 
-        return Labeller(self.embedding, self.body_size, self.near_exclusion, self.fingerprint)
+        return Labeller(self.embedding, self.body_size, self.rules, self.groups, self.fingerprint)
 
     def predict(self, latent: npt.ArrayLike) -> Prediction:
         """Evaluate the predictor: see `PosableBody.predict`."""
@@ -237,6 +239,16 @@ class PoseModel(PosableBody):
         """
         card = replace(self.card, up_axis=up_axis)
         return PoseModel(self.name, self.embedding, card, self._other_sections)
+
+    def with_rules(self, rules: ContactRules) -> PoseModel:
+        """Return the same model with other contact rules: see `PosableBody.with_rules`."""
+        if self.has_predictor and rules != self.rules:
+            raise ModelFileError(
+                "has a predictor, which was trained by the contact rules that it has",
+                "train its embedding again with other rules, or keep these",
+                where=f"the model {self.name!r}",
+            )
+        return super().with_rules(rules)
 
     def with_predictor(self, predictor: CollisionPredictor) -> PoseModel:
         """Return the same model with a predictor, in the place of any that it had."""

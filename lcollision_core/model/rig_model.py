@@ -15,7 +15,7 @@ from lcollision_core.characters import Character, RigPoseSpace
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes import ContactRules, RigidTransform
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect
 from lcollision_core.model.colours import domain_colours
@@ -110,12 +110,13 @@ class RigModel(PosableBody):
         card = ModelCard(
             height=space.body_size,
             up_axis=int(np.abs(character.up).argmax()),
-            near_exclusion=NEAR_EXCLUSION,
             domain_names=tuple(unique_names(shown, MAX_NAME_LENGTH)),
             domain_colours=domain_colours(space.attention_mask),
             pose_names=tuple(name[:MAX_POSE_NAME_LENGTH] for name in names[: len(poses)]),
             source=character.source.name,
             licence="unknown",
+            rules=ContactRules(NEAR_EXCLUSION),
+            groups=character.groups,
         )
         return cls(character, space, card, poses)
 

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lcollision_core.errors import ModelFileError
-from lcollision_core.meshes import FileStamp, file_stamp, locked, unused_name
+from lcollision_core.meshes import ContactRules, FileStamp, file_stamp, locked, unused_name
+from lcollision_core.meshes.face_groups import ignored_faces_digest
 from lcollision_core.model.pose_model import PoseModel
 
 
@@ -74,7 +75,7 @@ def _of_same_space(path: Path, model: PoseModel) -> PoseModel | None:
     except ModelFileError:
         return None
 
-    def space(of: PoseModel) -> tuple[str, float, float]:
-        return of.fingerprint, of.near_exclusion, of.body_size
+    def space(of: PoseModel) -> tuple[str, ContactRules, str, float]:
+        return of.fingerprint, of.rules, ignored_faces_digest(of.rules, of.groups), of.body_size
 
     return now if space(now) == space(model) else None

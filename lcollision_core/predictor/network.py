@@ -14,6 +14,7 @@ from torch import nn
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.labels import LabelRows
+from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
 from lcollision_core.predictor.config import PredictorConfig
 
 
@@ -92,7 +93,8 @@ class PredictorNetwork(nn.Module, ABC):
         config: PredictorConfig,
         rows: LabelRows | None = None,
         seed: int = 0,
-        near_exclusion: float = 0.0,
+        rules: ContactRules = STRICT,
+        groups: Sequence[FaceGroup] = (),
     ) -> PredictorNetwork:
         """Make the network of an embedding.
 
@@ -103,7 +105,7 @@ class PredictorNetwork(nn.Module, ABC):
         rows : some of those to train on, as they are in the store; None if a state dict will be
             loaded
         seed : of the initial weights
-        near_exclusion : of the rows, in normalised length
+        rules, groups : by which the rows were labelled: which pairs of faces do not count
         """
 
     @classmethod

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector, ContactRules, SelfCollisions
+from lcollision_core.contact import STRICT, CollisionDetector, ContactRules, SelfCollisions
 from lcollision_core.embedding import Embedding
+from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.inference.points import (
     farthest_points,
@@ -44,15 +46,16 @@ class FoldDetector:
     Parameters
     ----------
     embedding : of the body; poses are in normalised length
-    near_exclusion : of pairs that do not count, in normalised length
+    rules, groups : which pairs do not count
     """
 
-    def __init__(self, embedding: Embedding, near_exclusion: float) -> None:
+    def __init__(
+        self, embedding: Embedding, rules: ContactRules, groups: Sequence[FaceGroup] = ()
+    ) -> None:
         topology, rest = embedding.topology, embedding.rest_vertices
-        rules = ContactRules(near_exclusion)
-        with_folds = replace(rules, near_exclusion=near_exclusion + FOLD_RADIUS)
-        self._detector = CollisionDetector(topology, rest, with_folds)
-        self._by_rules = CollisionDetector(topology, rest, rules)
+        with_folds = replace(rules, near_exclusion=rules.near_exclusion + FOLD_RADIUS)
+        self._detector = CollisionDetector(topology, rest, with_folds, groups)
+        self._by_rules = CollisionDetector(topology, rest, rules, groups)
 
     def detect(
         self, vertices: npt.NDArray[np.floating]
@@ -65,7 +68,10 @@ class FoldDetector:
 
 
 def find_fold_sites(
-    embedding: Embedding, latent: npt.NDArray[np.floating], near_exclusion: float = 0.0
+    embedding: Embedding,
+    latent: npt.NDArray[np.floating],
+    rules: ContactRules = STRICT,
+    groups: Sequence[FaceGroup] = (),
 ) -> npt.NDArray[np.int64]:
     """Search colliding poses for the sites where the skin folds most often.
 
@@ -73,15 +79,17 @@ def find_fold_sites(
     ----------
     embedding : decodes
     latent : (n, D) poses that collide; some thousands are used
-    near_exclusion : of pairs that do not count, in normalised length
+    rules, groups : which pairs do not count
 
     Returns
     -------
     members : (S, M) vertices spread about each site, its centre first; S is 0 for a body that does
         not fold
     """
-    score = _fold_frequency(embedding, latent[:_SEARCHED_POSES], near_exclusion)
-    radius = _MEMBER_RADIUS + near_exclusion
+    score = _fold_frequency(
+        embedding, latent[:_SEARCHED_POSES], FoldDetector(embedding, rules, groups)
+    )
+    radius = _MEMBER_RADIUS + rules.near_exclusion
     graph = skin_graph(embedding)
     members: list[npt.NDArray[np.int64]] = []
     while len(members) < N_SITES and score.max(initial=0.0) > 0.0:
@@ -94,11 +102,10 @@ def find_fold_sites(
 
 
 def _fold_frequency(
-    embedding: Embedding, latent: npt.NDArray[np.floating], near_exclusion: float
+    embedding: Embedding, latent: npt.NDArray[np.floating], detector: FoldDetector
 ) -> FloatArray:
     """Return (V,) in what fraction of the poses each vertex is part of a fold."""
     faces = embedding.topology.faces
-    detector = FoldDetector(embedding, near_exclusion)
     frequency = np.zeros(len(embedding.rest_vertices))
     for start in range(0, len(latent), _POSES_AT_ONCE):
         for vertices in embedding.decode(latent[start : start + _POSES_AT_ONCE]):

@@ -14,6 +14,7 @@ What was tried, with its figures, is in docs/experiments.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple, cast
 
@@ -24,6 +25,7 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, silu, smooth_l1_loss
 
 from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
 from lcollision_core.predictor.geometric.field import ContactField
 from lcollision_core.predictor.geometric.folds import N_MEMBERS, find_fold_sites
 from lcollision_core.predictor.geometric.reduced_body import ReducedBody
@@ -128,7 +130,8 @@ class GeometricNetwork(PredictorNetwork):
         config: PredictorConfig,
         rows: LabelRows | None = None,
         seed: int = 0,
-        near_exclusion: float = 0.0,
+        rules: ContactRules = STRICT,
+        groups: Sequence[FaceGroup] = (),
     ) -> PredictorNetwork:
         """Make the network of an embedding, its points, sites and inputs fitted to the rows.
 
@@ -142,7 +145,7 @@ class GeometricNetwork(PredictorNetwork):
             )
         if rows is None:
             return cls(embedding, seed, np.empty((0, N_MEMBERS), dtype=np.int64))
-        sites = find_fold_sites(embedding, rows.latent[rows.colliding], near_exclusion)
+        sites = find_fold_sites(embedding, rows.latent[rows.colliding], rules, groups)
         network = cls(embedding, seed, sites)
         network._fit(embedding, rows.latent)
         return network

@@ -11,6 +11,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.labels import LabelRows
+from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
 from lcollision_core.predictor.config import PredictorConfig
 from lcollision_core.predictor.network import (
     NetworkOutput,
@@ -87,7 +88,8 @@ class PaperNetwork(PredictorNetwork):
         config: PredictorConfig,
         rows: LabelRows | None = None,  # noqa: ARG003
         seed: int = 0,
-        near_exclusion: float = 0.0,  # noqa: ARG003
+        rules: ContactRules = STRICT,  # noqa: ARG003
+        groups: Sequence[FaceGroup] = (),  # noqa: ARG003
     ) -> PredictorNetwork:
         """Make the network of an embedding; the rows do not matter."""
         return cls(embedding.group_sizes, config.by_domain, seed)

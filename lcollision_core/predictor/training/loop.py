@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -21,6 +22,7 @@ from lcollision_core.embedding.checkpoint import Checkpoint, run_key
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows
+from lcollision_core.meshes import STRICT, FaceGroup
 from lcollision_core.predictor.config import PredictorConfig
 from lcollision_core.predictor.network import PredictorNetwork, Targets
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
@@ -72,7 +74,7 @@ class TrainingLoop:
     embedding, config, facts : see `training.train_predictor`
     device : "auto", "cpu" or "cuda"
     checkpoint : a file, or None
-    progress, cancel : see `training.train_predictor`
+    progress, cancel, groups : see `training.train_predictor`
     """
 
     rows: LabelRows
@@ -84,11 +86,12 @@ class TrainingLoop:
     checkpoint: Path | None
     progress: StatusCallback
     cancel: CancelToken
+    groups: Sequence[FaceGroup] = ()
 
     def __post_init__(self) -> None:
         # A file of its own, for it is large, and written before the first step.
         self._patches_path = self.checkpoint and patches_path(self.checkpoint)
-        self._near_exclusion = 0.0 if self.facts.store is None else self.facts.store.near_exclusion
+        self._rules = STRICT if self.facts.store is None else self.facts.store.rules
         self._training_index = self.split.training
         self._watched = self.rows.taken(self.split.held_out[:_WATCHED_ROWS])
         self._steps_an_epoch = -(-len(self._training_index) // self.config.batch_rows)
@@ -122,7 +125,7 @@ class TrainingLoop:
         checkpoint = Checkpoint(self.checkpoint, key)
         some = self.rows.taken(self._training_index[:_BUILDING_ROWS])
         network = NETWORKS[config.preset].build(
-            self.embedding, config, some, self.facts.seed, self._near_exclusion
+            self.embedding, config, some, self.facts.seed, self._rules, self.groups
         )
         network = network.to(processes.device)
         learnt = [values for values in network.parameters() if values.requires_grad]
@@ -190,7 +193,7 @@ class TrainingLoop:
             return known
         roots[: len(known)] = known
         labeller = PatchLabeller(
-            self.embedding, self.rows, cells, self._near_exclusion, self.facts.energy_scale
+            self.embedding, self.rows, cells, self.facts.energy_scale, self._rules, self.groups
         )
         step = max(-(-n_rows // _TIMES_PATCHES_KEPT), _LEAST_PATCHES_KEPT)
         for start in range(len(known), n_rows, step):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.labels import LabelRows
+from lcollision_core.meshes import ContactRules, FaceGroup
 from lcollision_core.predictor.geometric.folds import FoldDetector
 from lcollision_core.predictor.network import SkinCells
 
@@ -27,8 +30,8 @@ class PatchLabeller:
     embedding : decodes
     rows : labelled poses
     cells : pairs within `FOLD_RADIUS` of each other along the surface go to the folds, if any
-    near_exclusion : in normalised length
     energy_scale : the mean energy of a colliding pose, in normalised length squared
+    rules, groups : by which the rows were labelled: which pairs of faces do not count
     """
 
     def __init__(
@@ -36,11 +39,12 @@ class PatchLabeller:
         embedding: Embedding,
         rows: LabelRows,
         cells: SkinCells,
-        near_exclusion: float,
         energy_scale: float,
+        rules: ContactRules,
+        groups: Sequence[FaceGroup] = (),
     ) -> None:
         self._embedding, self._rows, self._cells = embedding, rows, cells
-        self._detector = FoldDetector(embedding, near_exclusion)
+        self._detector = FoldDetector(embedding, rules, groups)
         fractions = np.repeat([_PATCH_FRACTION, _FOLD_FRACTION], [cells.n_patches, cells.n_folds])
         self._unit = fractions * energy_scale
         _ = embedding.codec, embedding.decoder

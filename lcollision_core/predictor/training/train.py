@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.labels import LabelRows, StoreIdentity
+from lcollision_core.meshes import FaceGroup
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.metrics import mean_difference
 from lcollision_core.predictor.predictor import (
@@ -28,6 +30,7 @@ def train_predictor(
     config: PredictorConfig | None = None,
     *,
     store: StoreIdentity | None = None,
+    groups: Sequence[FaceGroup] = (),
     device: str = "auto",
     checkpoint: Path | None = None,
     progress: StatusCallback = no_progress,
@@ -47,7 +50,8 @@ def train_predictor(
         Where something is chosen, some of them only do that, see `split_rows`.
     embedding : of the model that the rows label
     config : the choices, by default the preset "default"
-    store : what the rows label, kept with the predictor
+    store : what the rows label, and by which contact rules; kept with the predictor
+    groups : of faces, of which these rules may ignore pairs
     device : "cpu", "cuda", or "auto" for CUDA where there is one
     checkpoint : a file to go on from and to save to; kept when the run ends
     progress : called every few steps and after every epoch
@@ -95,7 +99,16 @@ def train_predictor(
         store=store,
     )
     loop = TrainingLoop(
-        rows, split, embedding, config, facts, device, checkpoint, progress, cancel or CancelToken()
+        rows,
+        split,
+        embedding,
+        config,
+        facts,
+        device,
+        checkpoint,
+        progress,
+        cancel or CancelToken(),
+        groups,
     )
     state = loop.run().state_dict()
     arrays = {name: values.detach().cpu().numpy() for name, values in state.items()}

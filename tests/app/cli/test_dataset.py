@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.meshes import PoseSet, Topology, read_pose_set, write_mesh, write_pose_set
+from lcollision_core.meshes import (
+    ContactRules,
+    PoseSet,
+    Topology,
+    read_pose_set,
+    write_mesh,
+    write_pose_set,
+)
 from tests.app.support import Lcollision
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -57,7 +64,7 @@ def test_near_exclusion_of_the_set_is_honoured(
     # A bridge of two faces makes the bodies one surface, so that a path joins them.
     faces = np.concatenate([two_tetrahedra.faces, [[3, 5, 6], [1, 2, 4]]])
     bridged = PoseSet(
-        two_tetrahedra.vertices, Topology(faces, 8), two_tetrahedra.names, near_exclusion=0.99
+        two_tetrahedra.vertices, Topology(faces, 8), two_tetrahedra.names, rules=ContactRules(0.99)
     )
     write_pose_set(path, bridged)
     stored = json.loads(lcollision("dataset", "check", path, "--json").stdout)

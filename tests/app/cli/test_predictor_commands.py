@@ -20,7 +20,7 @@ import torch
 
 from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
-from lcollision_core.contact import CollisionDetector
+from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
 from lcollision_core.model import PoseModel, find_model
 from lcollision_core.model_file import Section
@@ -347,7 +347,9 @@ def test_what_cannot_be_trained_or_evaluated_is_refused(
     )
     nearer = tmp_path / "nearer.safetensors"
     loaded = PoseModel.load(trained)
-    changed = PoseModel("nearer", loaded.embedding, replace(loaded.card, near_exclusion=0.2), {})
+    changed = PoseModel(
+        "nearer", loaded.embedding, replace(loaded.card, rules=ContactRules(0.2)), {}
+    )
     assert loaded.predictor is not None
     changed.with_predictor(loaded.predictor).save(nearer)
     assert "near exclusion of 0.0, not" in _refusal(lcollision, "evaluate", nearer, store)

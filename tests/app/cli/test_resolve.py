@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from app.cli import partial_output
-from lcollision_core.contact import DEPTH_TOLERANCE
+from lcollision_core.contact import DEPTH_TOLERANCE, ContactRules
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import (
     RigidTransform,
@@ -296,7 +296,7 @@ def test_the_near_exclusion_is_stated(
     lcollision: Lcollision, model: PoseModel, colliding: np.ndarray, tmp_path: Path
 ) -> None:
     path, poses, out = (tmp_path / name for name in ("m.safetensors", "poses.json", "free.json"))
-    near = PoseModel(model.name, model.embedding, replace(model.card, near_exclusion=0.05))
+    near = PoseModel(model.name, model.embedding, replace(model.card, rules=ContactRules(0.05)))
     assert model.predictor is not None
     near.with_predictor(model.predictor).with_free_poses(model.free_latent).save(path)
     write_poses(poses, model, [NamedPose("bent", colliding[0])])

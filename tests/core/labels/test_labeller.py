@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lcollision_core.contact import domain_energy
+from lcollision_core.contact import ContactRules, domain_energy
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.errors import ShapeError
 from lcollision_core.labels import (
@@ -76,7 +76,7 @@ def test_domains_share_out_all_of_the_energy(ground_truth: LabelRows) -> None:
 
 def test_near_pairs_are_counted_apart(labeller: Labeller, ground_truth: LabelRows) -> None:
     every = np.flatnonzero(ground_truth.colliding)[:20]
-    excluded = replace(labeller, near_exclusion=0.5).label(ground_truth.latent[every])
+    excluded = replace(labeller, rules=ContactRules(0.5)).label(ground_truth.latent[every])
     assert excluded.n_near_pairs.max() > 0
     assert np.array_equal(excluded.n_pairs + excluded.n_near_pairs, ground_truth.n_pairs[every])
     assert (excluded.energy <= ground_truth.energy[every] * (1.0 + 1e-12)).all()

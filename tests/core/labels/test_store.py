@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.contact import ContactRules
 from lcollision_core.errors import LabelStoreError, LCollisionError, MeshFileError
 from lcollision_core.labels import (
     ROWS_PER_CHUNK,
@@ -202,7 +203,16 @@ def test_a_store_of_something_else_is_refused_and_left_alone(
     for other, seed, difference in (
         (replace(labeller, fingerprint="0123"), SEED, "not the model of fingerprint 0123"),
         (labeller, 1, "labels samples of seed 3, not samples of seed 1"),
-        (replace(labeller, near_exclusion=0.02), SEED, "a near exclusion of 0.0, not .* of 0.02"),
+        (
+            replace(labeller, rules=ContactRules(0.02)),
+            SEED,
+            "a near exclusion of 0.0, not .* of 0.02",
+        ),
+        (
+            replace(labeller, rules=ContactRules(rest_exclusion=0.02)),
+            SEED,
+            "contact rules .*rest_exclusion=None.* not .*rest_exclusion=0.02",
+        ),
         (replace(labeller, body_size=2.0), SEED, "with a body size of 170"),
     ):
         with pytest.raises(LabelStoreError, match=difference) as excinfo:

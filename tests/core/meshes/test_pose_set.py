@@ -20,6 +20,8 @@ from lcollision_core.errors import (
 )
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import (
+    ContactRules,
+    FaceGroup,
     PoseSet,
     Topology,
     audit_mesh,
@@ -265,7 +267,7 @@ def test_npz_round_trip_keeps_everything(tmp_path: Path, dtype: type[np.floating
         Topology(FACES, 4),
         ("a.obj", "pose 1", "größer"),
         notes=("1 quad was triangulated",),
-        near_exclusion=0.025,
+        rules=ContactRules(0.025),
         up_axis=1,
         vertex_labels=np.array(["head", "left arm", "left arm", "leg"]),
     )
@@ -283,6 +285,52 @@ def test_npz_round_trip_keeps_everything(tmp_path: Path, dtype: type[np.floating
     assert again.vertex_labels.tolist() == ["head", "left arm", "left arm", "leg"]
     write_pose_set(path, again)
     assert path.read_bytes() == first
+
+
+def test_rules_and_groups_come_back(tmp_path: Path) -> None:
+    rules = ContactRules(0.01, 0.02, (("hair", "body"), ("hair", "hair")), 1e-5)
+    groups = (
+        FaceGroup("hair", np.array([0, 2])),
+        FaceGroup("body", np.array([1, 2, 3])),
+        FaceGroup("none", np.array([], dtype=np.int64)),
+    )
+    pose_set = PoseSet(_poses(1), Topology(FACES, 4), ("a",), rules=rules, groups=groups)
+    write_pose_set(tmp_path / "s.npz", pose_set)
+    again = read_pose_set(tmp_path / "s.npz")
+    assert again.rules == rules
+    assert [(group.name, group.faces.tolist()) for group in again.groups] == [
+        ("hair", [0, 2]),
+        ("body", [1, 2, 3]),
+        ("none", []),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"rules": np.array("{")}, "rules are damaged"),
+        ({"rules": np.array('{"tolerated_depth": -1}')}, "tolerated depth must be 0 or more"),
+        ({"rules": np.array('{"ignored": [["a", "b"]]}')}, "the group 'a' is unknown"),
+        ({"rules": np.array(3)}, "rules must be one string"),
+        ({"group_names": np.array(["a"])}, "group_runs must be a list of whole numbers"),
+        ({"group_runs": np.array([0, 99])}, "are not runs that ascend"),
+        ({"group_runs": np.array([2, 1])}, "are not runs that ascend"),
+        ({"group_runs": np.array([[0, 1]])}, "group_runs must be a list"),
+        ({"group_ends": np.array([3])}, "do not fit together"),
+        ({"group_ends": np.array([2, 2])}, "do not fit together"),
+        ({"group_names": np.array([1])}, "group_names must be at most"),
+    ],
+)
+def test_damaged_rules_and_groups_are_refused(
+    tmp_path: Path, changes: dict[str, Any], sentence: str
+) -> None:
+    sound = {"vertices": _poses(2), "faces": FACES}
+    if "group_runs" in changes or "group_ends" in changes:
+        sound |= {"group_names": np.array(["a"])}
+        sound |= {"group_runs": np.array([0, 1]), "group_ends": np.array([2])}
+    np.savez(tmp_path / "s.npz", **{**sound, **changes})
+    with pytest.raises(LCollisionError, match=sentence):
+        read_pose_set(tmp_path / "s.npz")
 
 
 def test_plain_npz_gets_plain_names(tmp_path: Path) -> None:
@@ -396,7 +444,11 @@ def test_failed_write_leaves_the_old_set(tmp_path: Path) -> None:
         {"vertices": np.zeros((2, 4, 3), dtype=int)},
         {"names": ("one",)},
         {"up_axis": 3},
-        {"near_exclusion": float("nan")},
+        {"rules": ContactRules(1.0)},
+        {"rules": ContactRules(ignored=(("hair", "hair"),))},
+        {"groups": (FaceGroup("hair", np.array([0, 99])),)},
+        {"groups": (FaceGroup("hair", np.array([1, 0])),)},
+        {"groups": (FaceGroup("", np.array([0])),)},
         {"vertex_labels": np.array(["a"])},
         {"vertex_labels": np.array(["a", "b", "c", ""])},
     ],

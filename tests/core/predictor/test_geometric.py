@@ -236,7 +236,7 @@ def test_patches_and_folds_share_out_the_exact_energy(
     )
     index = np.arange(0, 60, 2)
     rows = labeller_of(tube_model).label(latent)
-    roots = PatchLabeller(embedding, rows, cells, 0.0, energy_scale=1e-4).roots(index)
+    roots = PatchLabeller(embedding, rows, cells, 1e-4, ContactRules()).roots(index)
     assert roots.shape == (30, cells.n_patches + cells.n_folds)
     detector = CollisionDetector(embedding.topology, embedding.rest_vertices)
     vertices = embedding.decode(latent[index]).astype(np.float32)
@@ -250,23 +250,22 @@ def test_patches_and_folds_share_out_the_exact_energy(
     assert squares[:, cells.n_patches :].any()
 
 
-@pytest.mark.parametrize("near_exclusion", [0.0, 0.1])
-def test_every_collision_that_counts_is_taught(
-    tube_model: PoseModel, near_exclusion: float
-) -> None:
-    """With sites and without, and beyond a near exclusion, within which nothing counts."""
+@pytest.mark.parametrize(
+    "rules",
+    [ContactRules(), ContactRules(0.1), ContactRules(rest_exclusion=0.0, tolerated_depth=2e-3)],
+)
+def test_every_collision_that_counts_is_taught(tube_model: PoseModel, rules: ContactRules) -> None:
+    """With sites and without, and by rules, what these exclude being neither contact nor fold."""
     embedding, latent = tube_model.embedding, colliding_latent(tube_model)
-    detector = CollisionDetector(
-        embedding.topology, embedding.rest_vertices, rules=ContactRules(near_exclusion)
-    )
+    detector = CollisionDetector(embedding.topology, embedding.rest_vertices, rules=rules)
     found = detector.detect_batch(embedding.decode(latent).astype(np.float32))
-    rows = replace(labeller_of(tube_model), near_exclusion=near_exclusion).label(latent)
+    rows = replace(labeller_of(tube_model), rules=rules).label(latent)
     patch = skin_cells(embedding, body_points(embedding, 25))
-    sites = find_fold_sites(embedding, latent, near_exclusion)
+    sites = find_fold_sites(embedding, latent, rules)
     assert len(sites)
     for fold in (skin_cells(embedding, centres) for centres in (sites[:, 0], sites[:0, 0])):
         cells = SkinCells(patch, fold)
-        labeller = PatchLabeller(embedding, rows, cells, near_exclusion, energy_scale=1e-4)
+        labeller = PatchLabeller(embedding, rows, cells, 1e-4, rules)
         roots = labeller.roots(np.arange(60))
         assert ((roots > 0.0).any(axis=1) == found.colliding).all()
         shares = np.repeat([0.05, 0.005], [cells.n_patches, cells.n_folds])
@@ -280,7 +279,9 @@ def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
     cancel.cancel()
     zeros = np.zeros(tube_model.n_vertices, dtype=np.int64)
     rows = labeller_of(tube_model).label(colliding_latent(tube_model))
-    labeller = PatchLabeller(tube_model.embedding, rows, SkinCells(zeros, zeros - 1), 0.0, 1.0)
+    labeller = PatchLabeller(
+        tube_model.embedding, rows, SkinCells(zeros, zeros - 1), 1.0, ContactRules()
+    )
     with pytest.raises(CancelledError):
         labeller.roots(np.arange(4), cancel=cancel)
 
@@ -291,7 +292,7 @@ def test_patches_do_not_depend_on_what_is_labelled_beside_them(tube_model: PoseM
     cells = SkinCells(
         skin_cells(embedding, body_points(embedding, 25)), np.full(tube_model.n_vertices, -1)
     )
-    labeller = PatchLabeller(embedding, rows, cells, 0.0, 1e-4)
+    labeller = PatchLabeller(embedding, rows, cells, 1e-4, ContactRules())
     told = list[tuple[int, int]]()
     whole = labeller.roots(np.arange(60), progress=lambda *step: told.append(step))
     n_colliding = np.count_nonzero(rows.colliding)
