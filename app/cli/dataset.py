@@ -1,17 +1,27 @@
-"""``lcollision dataset``: check a pose set, or make one of the built-in body."""
+"""``lcollision dataset``: check a pose set, or make one of a character or the built-in body."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.inputs import NearExclusionOption, PoseSetArgument, up_sentence
+from app.cli.inputs import Axis, NearExclusionOption, PoseSetArgument, up_sentence
 from app.wording import counted
+from lcollision_core.errors import LCollisionError
 
-app = typer.Typer(help="Check a pose set, or make one of the built-in body.", no_args_is_help=True)
+if TYPE_CHECKING:
+    from lcollision_core.meshes import PoseSet
+
+_Body = Literal["body", "body-swing", "body-jump"]
+_BODIES: dict[str, _Body] = {kind: kind for kind in get_args(_Body)}
+
+app = typer.Typer(
+    help="Check a pose set, or make one of a character or the built-in body.", no_args_is_help=True
+)
 
 
 @app.command("check")
@@ -96,30 +106,87 @@ def _print(path: Path, report: dict[str, Any], up: str) -> None:
 
 @app.command("make")
 def make(
-    kind: Annotated[
-        Literal["body", "body-swing", "body-jump"],
-        typer.Argument(metavar="KIND", help="Which pose set to make."),
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="KIND|FILE...",
+            help="body, body-swing or body-jump; or files of one character with animations (GLB, "
+            "glTF, VRM), point caches (PC2, MDD) beside their mesh, folders of meshes.",
+        ),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT.npz", help="The file to write.")
     ],
     n_vertices: Annotated[
         int | None,
-        typer.Option("--vertices", min=500, max=12000, metavar="N", help="Vertices of the mesh."),
+        typer.Option(
+            "--vertices", min=500, max=12000, metavar="N", help="Vertices of the built-in body."
+        ),
     ] = None,
     seed: Annotated[
         int, typer.Option(min=0, metavar="S", help="0 gives the authored poses, others vary them.")
     ] = 0,
+    clip: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="The animation of the files. Default: all of them."),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            metavar="X", help="Frames a second. Default: the animation's keys, at most 30 a second."
+        ),
+    ] = None,
+    up: Annotated[
+        Axis | None,
+        typer.Option(help="The axis that is up. Default: what the files say, else a guess."),
+    ] = None,
 ) -> None:
-    """Make a pose set of the built-in body: 71 poses, a swing dance, or a jump."""
+    """Make a pose set of the built-in body, or of the frames of a character's animations."""
     from lcollision_core.errors import MeshFileError
     from lcollision_core.meshes import require_writable, write_pose_set
-    from lcollision_core.meshes.body import make_body
 
     if output.suffix.lower() != ".npz":
         raise MeshFileError.unwritable(output, "a pose set is an .npz file", "rename it")
     require_writable(output)
-    with progress_bar("Posing the body") as progress:
-        poses = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)
+    kind = _BODIES.get(sources[0])
+    if kind is not None:
+        _require_only_body(sources, clip=clip, fps=fps, up=up)
+        from lcollision_core.meshes.body import make_body
+
+        with progress_bar("Posing the body") as progress:
+            poses = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)
+    else:
+        if n_vertices is not None or seed:
+            raise LCollisionError(
+                "--vertices and --seed are for the built-in body", "leave them out"
+            )
+        poses = _read_all([Path(source) for source in sources], clip, fps, up)
     write_pose_set(output, poses)
     note(f"wrote {len(poses)} poses of {poses.topology.n_vertices} vertices to {output}")
+
+
+def _require_only_body(sources: list[str], **options: object) -> None:
+    if len(sources) > 1:
+        raise LCollisionError(
+            f"{sources[0]} is made alone", "name nothing else", got=", ".join(sources)
+        )
+    given = [f"--{name}" for name, value in options.items() if value is not None]
+    if given:
+        raise LCollisionError(f"{given[0]} is for files, not for {sources[0]}", "leave it out")
+
+
+def _read_all(paths: list[Path], clip: str | None, fps: float | None, up: Axis | None) -> PoseSet:
+    from lcollision_core.meshes import concatenated, read_pose_set
+
+    found = []
+    for path in paths:
+        with progress_bar(f"Reading {path.name}") as progress:
+            found.append(read_pose_set(path, progress, clip=clip, fps=fps))
+    poses = concatenated(found)
+    for remark in poses.notes:
+        note(remark)
+    if up is not None:
+        return replace(poses, up_axis="xyz".index(up))
+    if not (guess := poses.up).is_sure:
+        note(f"{up_sentence(guess)}; --up x|y|z says otherwise")
+    return poses

@@ -22,12 +22,16 @@ MeshesArgument = Annotated[
     typer.Argument(
         metavar="MESH...",
         readable=False,
-        help="OBJ, PLY, OFF, STL or GLB files, or folders of them.",
+        help="OBJ, PLY, OFF, STL, GLB, glTF or VRM files, or folders of them.",
     ),
 ]
 PoseSetArgument = Annotated[
     Path,
-    typer.Argument(metavar="DATASET", readable=False, help="A folder of meshes or an .npz file."),
+    typer.Argument(
+        metavar="DATASET",
+        readable=False,
+        help="A folder of meshes, an .npz file, a character with animations or a point cache.",
+    ),
 ]
 PosesArgument = Annotated[
     Path, typer.Argument(metavar="POSES", readable=False, help="A .json file of poses.")

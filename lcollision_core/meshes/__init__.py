@@ -1,6 +1,7 @@
 """What a pose is: topology, files, pose sets, alignment and the built-in body."""
 
 from lcollision_core.meshes.alignment import Alignment, RigidTransform, align_rigid, fit_rigid
+from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
 from lcollision_core.meshes.atomic import (
     FileStamp,
     atomic_files,
@@ -10,7 +11,9 @@ from lcollision_core.meshes.atomic import (
     unused_name,
 )
 from lcollision_core.meshes.audit import audit_mesh, inspect_pose_set
+from lcollision_core.meshes.concatenation import concatenated
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts
+from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.face_groups import FaceGroup, component_groups, part_groups
 from lcollision_core.meshes.file_names import file_stem, file_stems, has_known_suffix
 from lcollision_core.meshes.files import (
@@ -24,7 +27,6 @@ from lcollision_core.meshes.locks import locked
 from lcollision_core.meshes.pose_set import (
     PoseSet,
     PoseSetInspection,
-    degenerate_faces,
     mesh_files,
     read_pose_set,
     write_pose_set,

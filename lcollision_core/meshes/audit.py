@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.formats.polygons import first_at_each_position
-from lcollision_core.meshes.pose_set import PoseSetInspection, collect_poses, degenerate_faces
+from lcollision_core.meshes.pose_set import PoseSetInspection, collect_poses
 from lcollision_core.meshes.topology import Topology
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +10,7 @@ from scipy import sparse
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.formats.scene import MAX_FRAME_NUMBERS, Part, Scene, ScenePoses
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -35,7 +36,7 @@ class JoinedMesh:
     Attributes
     ----------
     topology : of the V joined vertices, numbered by first appearance; faces that joining makes
-        degenerate are left out
+        degenerate, and those without area at rest, are left out
     joined : (W,) int64 array: the joined vertex of each of the parts' W vertices
     bones : (B,) int64 array, nodes that move vertices; a node may be there several times
     bind : (B, 4, 4) float64 array, from the vertices' coordinates to each bone's
@@ -177,18 +178,6 @@ def join_parts(scene: Scene) -> JoinedMesh:
     kept, joined = _first_of_equal(keys)
     faces = np.concatenate([joined[part.faces + first_vertex[i]] for i, part in enumerate(parts)])
     is_flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    if is_flat.all():
-        raise MeshFileError("it holds vertices but no faces", "export it as a triangle mesh")
-    n_joined, n_flat = len(joined) - len(kept), int(is_flat.sum())
-    notes = list(scene.notes)
-    if n_joined:
-        notes.append(f"{n_joined} vertices that seams had split were joined")
-    if n_flat:
-        notes.append(
-            "1 face that names a vertex twice was left out"
-            if n_flat == 1
-            else f"{n_flat} faces that name a vertex twice were left out"
-        )
     morphs = []
     for i, part in enumerate(parts):
         local = kept[(kept >= first_vertex[i]) & (kept < first_vertex[i + 1])]
@@ -197,8 +186,8 @@ def join_parts(scene: Scene) -> JoinedMesh:
             deltas = part.morphs[:, moved - first_vertex[i]]
             morphs.append(_Morphs(i, joined[moved], deltas))
     is_skinned = np.repeat([part.is_skinned for part in parts], np.diff(first_vertex))
-    return JoinedMesh(
-        Topology(faces[~is_flat], len(kept)),
+    mesh = JoinedMesh(
+        _topology(faces, is_flat, len(kept)),
         joined,
         bones,
         bind,
@@ -207,9 +196,31 @@ def join_parts(scene: Scene) -> JoinedMesh:
         points[kept],
         is_skinned[kept],
         tuple(morphs),
-        _groups(parts, is_flat),
-        tuple(notes),
+        (),
+        (),
     )
+    # Of corners in a line, or all in one place.
+    flat = degenerate_faces(mesh.topology, mesh.posed(scene.rest)[0])
+    is_flat[np.flatnonzero(~is_flat)[flat]] = True
+    notes = list(scene.notes)
+    if n_joined := len(joined) - len(kept):
+        were = "vertex was" if n_joined == 1 else "vertices were"
+        notes.append(f"{n_joined} {were} joined with others at seams")
+    if n_flat := int(is_flat.sum()):
+        were = "face without area was" if n_flat == 1 else "faces without area were"
+        notes.append(f"{n_flat} {were} left out")
+    return replace(
+        mesh,
+        topology=_topology(faces, is_flat, len(kept)),
+        groups=_groups(parts, is_flat),
+        notes=tuple(notes),
+    )
+
+
+def _topology(faces: IntArray, is_left_out: npt.NDArray[np.bool_], n_vertices: int) -> Topology:
+    if is_left_out.all():
+        raise MeshFileError("it holds vertices but no faces", "export it as a triangle mesh")
+    return Topology(faces[~is_left_out], n_vertices)
 
 
 def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:

@@ -18,6 +18,7 @@ from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, read_animated
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules
+from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.face_groups import FaceGroup, require_groups
 from lcollision_core.meshes.files import (
     KEEP_PRECISION,
@@ -318,28 +319,6 @@ def _only(poses: PoseSet, kept: list[int]) -> PoseSet | None:
     return replace(poses, vertices=poses.vertices[kept], names=names)
 
 
-def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
-    """Return the faces without area.
-
-    Parameters
-    ----------
-    topology : F faces
-    vertices : (V, 3) array, one pose
-
-    Returns
-    -------
-    (D,) indices of the faces whose height over their longest side is below 1e-12 of that side:
-    float64's rounding, in any unit
-    """
-    corners = np.asarray(vertices, dtype=np.float64)[topology.faces.T]
-    # Below one, squares neither overflow nor vanish; a power of two rounds nothing.
-    a, b, c = np.ldexp(corners, -int(np.frexp(np.abs(corners).max())[1]))
-    sides = np.stack([b - a, c - a, c - b])
-    twice_area = np.linalg.norm(np.cross(sides[0], sides[1]), axis=1)
-    longest_squared = np.einsum("sfi,sfi->sf", sides, sides).max(axis=0)
-    return np.flatnonzero(twice_area <= 1e-12 * longest_squared).astype(np.int32)
-
-
 def _collect_folder(
     path: Path,
     report: Callable[[LCollisionError], None],
@@ -381,7 +360,7 @@ def _collect_folder(
                     return PoseSetInspection(None, len(files))
                 vertices = np.empty((len(files), topology.n_vertices, 3), dtype=np.float64)
             where = f"pose {pose} ({file.name})"
-            if (defect := _disagreement(where, mesh.topology, topology)) is not None:
+            if (defect := disagreement(where, mesh.topology, topology)) is not None:
                 same_topology = False
                 report(defect)
             elif (too_far := _too_far_to_compute(where, mesh.vertices)) is not None:
@@ -409,7 +388,8 @@ def _collect_folder(
     return PoseSetInspection(pose_set, len(files), same_topology)
 
 
-def _disagreement(where: str, found: Topology, expected: Topology) -> PoseSetError | None:
+def disagreement(where: str, found: Topology, expected: Topology) -> PoseSetError | None:
+    """Say where the topology of a mesh, named by `where`, is not that of its set."""
     if found.n_vertices != expected.n_vertices:
         what, needed, got = "number of vertices", expected.n_vertices, found.n_vertices
     elif found.n_faces != expected.n_faces:

@@ -16,7 +16,9 @@ from lcollision_core.meshes import (
     write_mesh,
     write_pose_set,
 )
+from lcollision_core.meshes.formats.point_cache import write_point_cache
 from tests.app.support import Lcollision
+from tests.core.gltf_builder import arm, rotation, tube
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
@@ -138,3 +140,74 @@ def test_made_body_is_a_pose_set(lcollision: Lcollision, tmp_path: Path) -> None
     report = json.loads(lcollision("dataset", "check", output, "--json").stdout)
     assert report["problems"] == []
     assert report["colliding_poses"] <= 5
+
+
+def test_the_frames_of_characters_become_a_pose_set(lcollision: Lcollision, tmp_path: Path) -> None:
+    output = tmp_path / "arm.npz"
+    files = [arm().write(tmp_path / name) for name in ("one.glb", "two.vrm")]
+    result = lcollision("dataset", "make", *files, "-o", output, "--clip", "wave", "--fps", 4)
+    assert result.exit_code == 0
+    assert result.stderr.splitlines()[-1].endswith(f"wrote 11 poses of 44 vertices to {output}")
+    poses = read_pose_set(output)
+    # The rest pose of the second is that of the first.
+    assert poses.names[:3] == ("one rest", "one wave 0", "one wave 1")
+    assert poses.names[6] == "two wave 0"
+    assert poses.up_axis == 1
+    assert poses.vertex_labels is not None
+    report = json.loads(lcollision("dataset", "check", files[0], "--json").stdout)
+    assert report["poses"] == 4
+    assert report["up_axis"] == "y"
+    assert report["up_is_sure"]
+    lcollision("dataset", "make", files[0], "-o", output, "--up", "z")
+    assert read_pose_set(output).up_axis == 2
+
+
+def test_a_set_whose_up_axis_is_not_sure_asks_for_it(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    vertices, faces = tube()
+    write_mesh(tmp_path / "tube.obj", vertices, faces)
+    write_point_cache(tmp_path / "tube.mdd", vertices[None])
+    output = tmp_path / "tube.npz"
+    result = lcollision("dataset", "make", tmp_path / "tube.mdd", "-o", output)
+    assert result.exit_code == 0
+    assert "--up x|y|z says otherwise" in result.stderr
+    result = lcollision("dataset", "make", tmp_path / "tube.mdd", "-o", output, "--up", "y")
+    assert "--up" not in result.stderr
+    assert read_pose_set(output).up_axis == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["body", "--clip", "wave"], "--clip is for files, not for body"),
+        (["body", "body-jump"], "body is made alone, got body, body-jump"),
+        (["arm.glb", "--seed", "1"], "--vertices and --seed are for the built-in body"),
+        (["arm.glb", "--clip", "run"], "arm.glb cannot be read: it has no clip 'run'"),
+        (["none.glb"], "none.glb does not exist"),
+        (["arm.glb", "other.glb"], "has another number of vertices than the set"),
+    ],
+)
+def test_options_and_files_that_do_not_fit_get_one_sentence(
+    lcollision: Lcollision,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    sentence: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arm().write(Path("arm.glb"))
+    builder = arm()
+    more = builder.array(np.eye(3))
+    builder.description["nodes"][3]["mesh"] = builder.add(
+        "meshes", primitives=[{"attributes": {"POSITION": more}}]
+    )
+    builder.animation(
+        "wave 2",
+        {"node": 2, "path": "rotation", "times": [0.0], "values": [rotation(0, 0.0)]},
+    )
+    builder.write(Path("other.glb"))
+    result = lcollision("dataset", "make", *arguments, "-o", "out.npz")
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert not Path("out.npz").exists()

@@ -34,7 +34,7 @@ def test_vertices_that_seams_split_are_joined_and_the_map_says_how(tmp_path: Pat
         character.joined[np.arange(faces.size)].reshape(-1, 3), character.topology.faces
     )
     assert character.notes == (
-        f"{faces.size - len(vertices)} vertices that seams had split were joined",
+        f"{faces.size - len(vertices)} vertices were joined with others at seams",
     )
     whole = read_character(arm(split=False).write(tmp_path / "whole.glb"))
     assert np.array_equal(whole.joined, np.arange(len(vertices)))

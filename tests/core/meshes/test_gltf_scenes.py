@@ -367,7 +367,7 @@ def test_faces_that_joining_makes_flat_are_left_out_of_faces_and_groups(tmp_path
     joined = _joined(builder.write(tmp_path / "m.glb"))
     assert joined.topology.n_faces == len(faces) - 1
     assert joined.groups[1].faces.tolist() == list(range(len(faces) - 1))
-    assert joined.notes[-1] == "1 face that names a vertex twice was left out"
+    assert joined.notes[-1] == "1 face without area was left out"
 
 
 @pytest.mark.parametrize(
@@ -445,3 +445,15 @@ def test_times_that_go_back_are_refused(tmp_path: Path) -> None:
 def test_frames_of_real_characters_agree_with_vtk(name: str, characters: Path) -> None:
     for clip, time in ((None, 0.0), (0, 0.0), (0, 1.0), (0, 2.05), (0, 89 / 30)):
         assert _difference_from_vtk(characters / name, clip, time) < 1e-5
+
+
+def test_faces_whose_corners_lie_in_a_line_are_left_out(tmp_path: Path) -> None:
+    builder = arm(split=False)
+    primitive = builder.description["meshes"][0]["primitives"][0]
+    vertices, faces = tube()
+    # Across the bottom through its middle, and a face that is none of the tube's.
+    more = np.concatenate([faces, [[len(vertices) - 2, 0, 3], [0, 8, 16]]])
+    primitive["indices"] = builder.array(more.reshape(-1), "u2")
+    joined = _joined(builder.write(tmp_path / "m.glb"))
+    assert joined.topology.n_faces == len(faces) + 1
+    assert joined.notes == ("1 face without area was left out",)
