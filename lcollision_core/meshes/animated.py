@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.files import Mesh, read_mesh
 from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, read_point_cache
 from lcollision_core.meshes.formats.scene import MAX_FRAME_NUMBERS, Scene, parents_first
@@ -39,6 +40,7 @@ class AnimatedMesh:
     notes : sentences on what was changed on reading
     up_axis : 0, 1 or 2 where the file says it, else None
     vertex_labels : (V,) strings, the body part of each vertex by the joints; None without joints
+    groups : named meshes and materials of a scene
     """
 
     vertices: FloatArray
@@ -47,6 +49,7 @@ class AnimatedMesh:
     notes: tuple[str, ...]
     up_axis: int | None
     vertex_labels: npt.NDArray[np.str_] | None
+    groups: tuple[FaceGroup, ...] = ()
 
 
 def read_animated(
@@ -121,6 +124,7 @@ def _read_clips(
         mesh.notes,
         int(np.abs(scene.up).argmax()),
         labels_of(scene, mesh),
+        mesh.groups,
     )
 
 

@@ -10,8 +10,9 @@ from scipy import sparse
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH
 from lcollision_core.meshes.degenerate import degenerate_faces
-from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
 from lcollision_core.meshes.formats.scene import MAX_FRAME_NUMBERS, Part, Scene, ScenePoses
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -45,7 +46,7 @@ class JoinedMesh:
     points : (V, 3) float64 array, in the coordinates of each vertex's part
     is_skinned : (V,) bool array
     morphs : what adds to `points`
-    groups : named meshes and materials
+    groups : named meshes and materials, at most `MAX_GROUPS`
     notes : sentences on what was changed
     """
 
@@ -303,6 +304,8 @@ def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tupl
         start += len(part.faces)
         rows = number[rows[~is_left_out[rows]]]
         for name in dict.fromkeys((part.mesh, part.material)):
-            if name:
-                found.setdefault(name, []).append(rows)
-    return tuple(FaceGroup(name, np.unique(np.concatenate(faces))) for name, faces in found.items())
+            printable = "".join(filter(str.isprintable, name))[:MAX_NAME_LENGTH]
+            if printable:
+                found.setdefault(printable, []).append(rows)
+    kept = list(found.items())[:MAX_GROUPS]
+    return tuple(FaceGroup(name, np.unique(np.concatenate(faces))) for name, faces in kept)

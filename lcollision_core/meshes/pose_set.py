@@ -443,6 +443,7 @@ def _collect_frames(
         held.notes,
         up_axis=held.up_axis,
         vertex_labels=held.vertex_labels,
+        groups=held.groups,
     )
     kept = []
     for pose, vertices in enumerate(held.vertices):
