@@ -40,3 +40,11 @@ from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.model.rig_model import RigModel
 from lcollision_core.model.sampling import sample_poses
 from lcollision_core.model.saving import change_model, save_trained
+from lcollision_core.model.source_file import (
+    EXPORT_FORMS,
+    ExportForm,
+    SourceFile,
+    WrittenPose,
+    offered_forms,
+    write_sequence,
+)

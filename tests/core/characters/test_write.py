@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import (
@@ -21,126 +18,11 @@ from lcollision_core.characters import (
     write_character,
 )
 from lcollision_core.errors import MeshFileError, ShapeError
-from tests.core.gltf_builder import GltfBuilder, rotation, split_corners, tube
+from tests.core.character_file import PNG, described, figure, vectors
+from tests.core.gltf_builder import GltfBuilder, split_corners, tube
 
 SIZE = 3.0
 FORMS = list(CharacterForm)
-
-
-def _picture() -> bytes:
-    file = BytesIO()
-    Image.new("RGB", (2, 2), "red").save(file, "png")
-    return file.getvalue()
-
-
-PNG = _picture()
-
-
-def figure() -> GltfBuilder:
-    """Build a skinned tube with seams, one of two parts inside it, a hat, a camera and textures.
-
-    As Mixamo's characters through Blender: meshes and joints hang on an armature of scale 0.01.
-    """
-    builder = GltfBuilder()
-    builder.view(np.arange(5, dtype=np.uint8))
-    vertices, faces = split_corners(*tube())
-    inner, inner_faces = tube(n_rings=4)
-    inner = inner * np.array([0.5, 1.0, 0.5], dtype=np.float32)
-    image = builder.add("images", bufferView=builder.view(np.frombuffer(PNG, np.uint8)))
-    builder.description["images"][image]["mimeType"] = "image/png"
-    builder.add("textures", source=image)
-    skin = builder.add(
-        "materials",
-        name="Häut",
-        pbrMetallicRoughness={"baseColorTexture": {"index": 0}},
-        extensions={"KHR_materials_unlit": {}},
-        extras={"author": [1, 2.5, None]},
-    )
-    meshes = [
-        builder.add("meshes", name="Body", primitives=[_primitive(builder, vertices, faces, skin)]),
-        builder.add(
-            "meshes",
-            name="Core",
-            primitives=[
-                _primitive(builder, inner, inner_faces[:20], skin),
-                _primitive(builder, inner, inner_faces[20:], skin),
-            ],
-        ),
-    ]
-    hat, hat_faces = tube(n_rings=2, height=0.3)
-    hat_mesh = builder.add(
-        "meshes",
-        name="Hat",
-        primitives=[
-            {
-                "attributes": {
-                    "POSITION": builder.array(hat),
-                    "NORMAL": builder.array(_normals(hat)),
-                },
-                "indices": builder.array(hat_faces.reshape(-1), "u2"),
-            }
-        ],
-    )
-    builder.add("nodes", name="Armature", children=[1, 4, 5], scale=[0.01] * 3)
-    builder.description["nodes"][0]["rotation"] = rotation(0, np.pi / 2)
-    # In the armature the tube goes along -z.
-    builder.add("nodes", name="LeftArm", children=[2], translation=[0.0, 0.0, -50.0])
-    builder.add(
-        "nodes",
-        name="LeftForeArm",
-        children=[3],
-        translation=[0.0, 0.0, -100.0],
-        rotation=rotation(1, 0.0),
-        extras={"kept": True},
-    )
-    builder.add("nodes", name="LeftHand", children=[6], translation=[0.0, 0.0, -100.0])
-    builder.add("nodes", name="Body", mesh=meshes[0], skin=0, extras={"a": 1})
-    builder.add("nodes", name="Core", mesh=meshes[1], skin=0)
-    builder.add("nodes", name="Hat", mesh=hat_mesh, scale=[80.0, 80.0, 120.0])
-    builder.description["nodes"][6]["translation"] = [0.0, 20.0, -30.0]
-    builder.add("nodes", name="Camera", camera=builder.add("cameras", type="perspective"))
-    builder.description["cameras"][0]["perspective"] = {"yfov": 1.0, "znear": 0.1}
-    bind = []
-    for height in (0.5, 1.5, 2.5):
-        place = np.eye(4)
-        place[:3, :3] = [[0.01, 0, 0], [0, 0, -0.01], [0, 0.01, 0]]
-        place[:3, 3] = [0.0, height, 0.0]
-        bind.append(np.linalg.inv(place))
-    builder.add("skins", joints=[1, 2, 3], inverseBindMatrices=builder.matrices(np.array(bind)))
-    times = [0.0, 1.0]
-    turns = [rotation(0, 0.0), rotation(0, 1.0)]
-    builder.animation("wave", {"node": 2, "path": "rotation", "times": times, "values": turns})
-    shifts = [[0.0] * 3, [1.0] * 3]
-    builder.animation("walk", {"node": 0, "path": "translation", "times": times, "values": shifts})
-    builder.animation("orbit", {"node": 7, "path": "rotation", "times": times, "values": turns})
-    builder.description["extensionsUsed"] = ["KHR_materials_unlit"]
-    builder.description["extensions"] = {"OTHER_unknown": {"humanoid": [1, 2, 3]}}
-    return builder
-
-
-def _normals(vertices: np.ndarray) -> np.ndarray:
-    radial = vertices * [1.0, 0.0, 1.0] + [0.0, 1e-3, 0.0]
-    return radial / np.linalg.norm(radial, axis=1, keepdims=True)
-
-
-def _primitive(
-    builder: GltfBuilder, vertices: np.ndarray, faces: np.ndarray, material: int
-) -> dict[str, Any]:
-    share = np.clip(vertices[:, 1] - 0.5, 0.0, 2.0)
-    low = np.minimum(share.astype(int), 1)
-    joints, weights = np.zeros((len(vertices), 4), int), np.zeros((len(vertices), 4))
-    joints[:, 0], joints[:, 1] = low, low + 1
-    weights[:, 0], weights[:, 1] = 1.0 - (share - low), share - low
-    attributes = {
-        "POSITION": builder.array(vertices),
-        "NORMAL": builder.array(_normals(vertices)),
-        "TANGENT": builder.array(np.tile([1.0, 0.0, 0.0, 1.0], (len(vertices), 1))),
-        "TEXCOORD_0": builder.array(np.random.default_rng(0).random((len(vertices), 2))),
-        "JOINTS_0": builder.array(joints, "u1"),
-        "WEIGHTS_0": builder.array(weights),
-    }
-    indices = builder.array(faces.reshape(-1), "u2")
-    return {"attributes": attributes, "indices": indices, "material": material}
 
 
 @pytest.fixture
@@ -158,22 +40,6 @@ def _pose(character: Character) -> tuple[np.ndarray, np.ndarray]:
     codes = np.random.default_rng(1).uniform(-0.4, 0.4, len(space.low))
     vertices = space.decode(codes[None])[0] * space.body_size
     return vertices.astype(np.float32), space.transforms(codes)
-
-
-def _described(path: Path) -> tuple[dict[str, Any], bytes]:
-    data = path.read_bytes()
-    length = int.from_bytes(data[12:16], "little")
-    return json.loads(data[20 : 20 + length]), data[20 + length + 8 :]
-
-
-def _array(path: Path, accessor: int) -> bytes:
-    description, binary = _described(path)
-    view = description["bufferViews"][description["accessors"][accessor]["bufferView"]]
-    return binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-
-
-def _vectors(path: Path, accessor: int) -> np.ndarray:
-    return np.frombuffer(_array(path, accessor), "<f4").reshape(-1, 3).astype(float)
 
 
 def _written(character: Character, form: CharacterForm, path: Path) -> tuple[np.ndarray, PosedFile]:
@@ -226,10 +92,10 @@ def test_a_static_mesh_holds_what_was_checked_bit_for_bit(
     path = tmp_path / "posed.glb"
     vertices, posed = _written(character, CharacterForm.MESH, path)
     assert np.array_equal(posed.vertices, vertices)
-    description, _ = _described(path)
+    description, _ = described(path)
     meshes = [node["mesh"] for node in description["nodes"] if "mesh" in node]
     stored = [
-        _vectors(path, primitive["attributes"]["POSITION"])
+        vectors(path, primitive["attributes"]["POSITION"])
         for mesh in sorted(meshes)
         for primitive in description["meshes"][mesh]["primitives"]
     ]
@@ -249,7 +115,7 @@ def test_what_makes_no_shape_stays(
 ) -> None:
     path = tmp_path / "posed.glb"
     _written(character, form, path)
-    (before, data), (after, new_data) = _described(Path(character.source)), _described(path)
+    (before, data), (after, new_data) = described(Path(character.source)), described(path)
     assert new_data.startswith(data.rstrip(b"\0"))
     for name in ("materials", "textures", "images", "cameras", "extensionsUsed", "extensions"):
         assert after[name] == before[name]
@@ -274,7 +140,7 @@ def test_clips_that_would_hide_the_pose_are_left_out(
 ) -> None:
     path = tmp_path / "posed.glb"
     _, posed = _written(character, form, path)
-    description, _ = _described(path)
+    description, _ = described(path)
     assert [animation["name"] for animation in description["animations"]] == ["orbit"]
     assert posed.notes == (
         "its clip 'wave' is left out, as it would hide the pose",
@@ -291,15 +157,15 @@ def test_an_untouched_frame_is_the_source(
     rest = character.rest_vertices
     posed = write_character(path, character, rest, form, character.rig.rest)
     assert np.abs(posed.vertices - rest).max() < 1e-6
-    before, after = _described(Path(character.source))[0], _described(path)[0]
+    before, after = described(Path(character.source))[0], described(path)[0]
     if form is CharacterForm.JOINTS:
         assert after["nodes"] == before["nodes"]
     for old, new in zip(before["meshes"], after["meshes"], strict=True):
         for one, other in zip(old["primitives"], new["primitives"], strict=True):
             for name in ("POSITION", "NORMAL"):
-                vectors = _vectors(path, other["attributes"][name])
-                stored = _vectors(Path(character.source), one["attributes"][name])
-                assert np.abs(vectors - stored).max() < 1e-6
+                written = vectors(path, other["attributes"][name])
+                stored = vectors(Path(character.source), one["attributes"][name])
+                assert np.abs(written - stored).max() < 1e-6
     # What hangs on a joint and has not moved is not touched.
     assert after["nodes"][6] == before["nodes"][6]
 
@@ -310,7 +176,7 @@ def test_joints_only_turn(character: Character, tmp_path: Path) -> None:
     vertices = space.decode(codes[None])[0] * space.body_size
     path = tmp_path / "posed.glb"
     write_character(path, character, vertices, "joints", space.transforms(codes))
-    before, after = _described(Path(character.source))[0], _described(path)[0]
+    before, after = described(Path(character.source))[0], described(path)[0]
     joint = space.joint_of_code[np.flatnonzero(codes)[0]]
     changed = [i for i in range(len(before["nodes"])) if before["nodes"][i] != after["nodes"][i]]
     assert character.rig is not None
@@ -322,7 +188,7 @@ def test_joints_only_turn(character: Character, tmp_path: Path) -> None:
 def test_a_morph_target_of_weight_0_is_the_source(character: Character, tmp_path: Path) -> None:
     path, back = tmp_path / "posed.glb", tmp_path / "back.glb"
     _written(character, CharacterForm.MORPH, path)
-    description, binary = _described(path)
+    description, binary = described(path)
     for mesh in description["meshes"]:
         assert mesh.pop("weights") == [1.0]
     builder = GltfBuilder()
@@ -346,7 +212,7 @@ def test_a_morph_target_joins_those_that_are_there(tmp_path: Path) -> None:
     again = read_character(path)
     in_file = again.rest_vertices[again.joined]
     assert np.abs(in_file - posed.vertices[character.joined]).max() < 1e-12
-    description, _ = _described(path)
+    description, _ = described(path)
     assert description["meshes"][1]["weights"] == [0.25, 1.0]
     assert description["nodes"][5]["weights"] == [0.5, 1.0]
     assert description["meshes"][1]["extras"] == {"targetNames": ["smile", "pose"]}
@@ -371,11 +237,11 @@ def test_normals_turn_with_the_pose_and_agree_at_seams(
 ) -> None:
     path = tmp_path / "posed.glb"
     vertices, _ = _written(character, form, path)
-    description, _ = _described(path)
+    description, _ = described(path)
     primitive = description["meshes"][0]["primitives"][0]
-    normals = _vectors(path, primitive["attributes"]["NORMAL"])
+    normals = vectors(path, primitive["attributes"]["NORMAL"])
     if form is CharacterForm.MORPH:
-        normals = normals + _vectors(path, primitive["targets"][0]["NORMAL"])
+        normals = normals + vectors(path, primitive["targets"][0]["NORMAL"])
     assert np.abs(np.linalg.norm(normals, axis=1) - 1.0).max() < 1e-6
     joined = character.joined[: len(normals)]
     for vertex in np.unique(joined):
@@ -396,12 +262,12 @@ def test_normals_of_a_body_that_turns_as_a_whole_turn_with_it(
     path = tmp_path / "posed.glb"
     turn = Rotation.from_rotvec([0.4, -1.0, 0.2]).as_matrix()
     write_character(path, character, character.rest_vertices @ turn.T, "mesh")
-    before, after = _described(Path(character.source))[0], _described(path)[0]
+    before, after = described(Path(character.source))[0], described(path)[0]
     for mesh in range(2):
         numbers = (one["meshes"][mesh]["primitives"][0]["attributes"] for one in (before, after))
         old, new = (number["NORMAL"] for number in numbers)
-        stored = _vectors(Path(character.source), old)
-        assert np.abs(_vectors(path, new) - stored @ turn.T).max() < 1e-6
+        stored = vectors(Path(character.source), old)
+        assert np.abs(vectors(path, new) - stored @ turn.T).max() < 1e-6
 
 
 def test_gltf_with_its_data_beside_it_becomes_one_file(tmp_path: Path) -> None:
@@ -423,7 +289,7 @@ def test_gltf_with_its_data_beside_it_becomes_one_file(tmp_path: Path) -> None:
     again = read_character(target / "posed.glb")
     in_file = again.rest_vertices[again.joined]
     assert np.array_equal(in_file, posed.vertices[character.joined])
-    after, binary = _described(target / "posed.glb")
+    after, binary = described(target / "posed.glb")
     assert "uri" not in after["buffers"][0]
     image = after["images"][0]
     view = after["bufferViews"][image["bufferView"]]

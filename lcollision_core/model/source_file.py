@@ -1,0 +1,334 @@
+"""Poses in the user's own file: which forms it offers, and what exactly is written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.characters import (
+    PATCHED_SUFFIXES,
+    Character,
+    CharacterForm,
+    read_character,
+    write_character,
+)
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes import RigidTransform, atomic_files, body_size, file_stems, read_mesh
+from lcollision_core.meshes.formats.obj_rewrite import rewrite_obj
+from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, write_point_cache
+from lcollision_core.meshes.scene_files import read_scene
+from lcollision_core.model.export import ExportFrame
+from lcollision_core.model.posable_body import PosableBody
+from lcollision_core.model.rig_model import RigModel
+
+FloatArray = npt.NDArray[np.float64]
+
+_LARGEST_SIZE_RATIO = 1.01
+"""Of a character in its file to the same in a model: beyond it, their units differ."""
+
+
+@dataclass(frozen=True)
+class ExportForm:
+    """One way to write poses so that they keep the form of the user's file.
+
+    Attributes
+    ----------
+    key : of settings and options; of a character's file one of `CharacterForm`
+    label, explanation : what people read
+    suffix : of the files that are written
+    of_sources : extensions of the user's files that offer it; empty for any, and for none
+    needs_rig : whether the poses must come from the joints of that file
+    is_sequence : whether one file holds all poses, as frames
+    has_axes : whether axes and unit can be chosen; else they are those of the source
+    """
+
+    key: str
+    label: str
+    explanation: str
+    suffix: str
+    of_sources: tuple[str, ...] = ()
+    needs_rig: bool = False
+    is_sequence: bool = False
+    has_axes: bool = False
+
+
+EXPORT_FORMS = (
+    ExportForm(
+        CharacterForm.JOINTS,
+        "GLB, joints turned",
+        "The character's own file; its joints hold the pose, its clips are left out.",
+        ".glb",
+        PATCHED_SUFFIXES,
+        needs_rig=True,
+    ),
+    ExportForm(
+        CharacterForm.MESH,
+        "GLB, static mesh",
+        "The character's own file with the pose as its shape, without joints.",
+        ".glb",
+        PATCHED_SUFFIXES,
+    ),
+    ExportForm(
+        CharacterForm.MORPH,
+        "GLB, morph target",
+        "The character's own file with the pose as a morph target of weight 1.",
+        ".glb",
+        PATCHED_SUFFIXES,
+    ),
+    ExportForm(
+        "obj",
+        "OBJ, as the source",
+        "The OBJ file with other positions; its UVs, groups, materials and quads stay.",
+        ".obj",
+        (".obj",),
+        has_axes=True,
+    ),
+    ExportForm(
+        "pc2",
+        "PC2 point cache",
+        "The positions alone, frame by frame, for the mesh that you have.",
+        ".pc2",
+        is_sequence=True,
+        has_axes=True,
+    ),
+    ExportForm(
+        "mdd",
+        "MDD point cache",
+        "The positions alone, frame by frame, for the mesh that you have.",
+        ".mdd",
+        is_sequence=True,
+        has_axes=True,
+    ),
+)
+"""In the order in which they are offered."""
+
+
+def offered_forms(
+    source: str | os.PathLike[str] | None, *, has_rig: bool = False
+) -> tuple[ExportForm, ...]:
+    """Return the forms that a user's file offers, the best first.
+
+    Parameters
+    ----------
+    source : the file, None for a model's own meshes
+    has_rig : whether the poses come from the joints of that file
+    """
+    suffix = "" if source is None else Path(source).suffix.lower()
+    return tuple(
+        form
+        for form in EXPORT_FORMS
+        if (not form.of_sources or suffix in form.of_sources) and (has_rig or not form.needs_rig)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenPose:
+    """What readers of a file get of a pose, to be checked as that.
+
+    Attributes
+    ----------
+    vertices : (V, 3) array, in the axes and the unit of the file
+    notes : sentences on what was left out of the file
+    """
+
+    vertices: npt.NDArray[Any]
+    notes: tuple[str, ...] = ()
+
+
+class SourceFile:
+    """A file of a body whose form exports keep: an OBJ file, or a character's.
+
+    Parameters
+    ----------
+    path : of the file
+    body : whose poses are written
+
+    Attributes
+    ----------
+    path : as given
+    forms : that it offers, the best first
+
+    Raises
+    ------
+    MeshFileError : it cannot be read, or no form is kept of files of its format.
+    PoseSetError : it is of another body.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], body: PosableBody) -> None:
+        self.path = Path(path)
+        self._body = body
+        self._character: Character | None = None
+        suffix = self.path.suffix.lower()
+        own = body.character if isinstance(body, RigModel) else None
+        is_own = own is not None and _is_same_file(own.source, self.path)
+        self.forms = offered_forms(path, has_rig=is_own)
+        if suffix == ".obj":
+            mesh = read_mesh(path, topology=body.topology)
+            body.require_topology(mesh.topology, str(path))
+        elif suffix in PATCHED_SUFFIXES:
+            self._character = own if own is not None and is_own else read_character(path)
+            body.require_topology(self._character.topology, str(path))
+            self._require_unit(self._character)
+        else:
+            raise MeshFileError(
+                f"has a form that is not written ({suffix or 'no extension'})",
+                f"name one of .obj, {', '.join(PATCHED_SUFFIXES)}",
+                where=path,
+            )
+
+    def _require_unit(self, character: Character) -> None:
+        ratio = body_size(character.rest_vertices, character.topology) / self._body.body_size
+        if not 1.0 / _LARGEST_SIZE_RATIO < ratio < _LARGEST_SIZE_RATIO:
+            raise MeshFileError(
+                f"is {ratio:.3g} times as large as the body of {self._body.name!r}",
+                "name the file that the model was trained on",
+                where=self.path,
+            )
+
+    def require_form(self, path: str | os.PathLike[str], key: str | None) -> ExportForm:
+        """Return the form that a file of poses gets.
+
+        Parameters
+        ----------
+        path : to be written
+        key : of the form; None for the best of those with the file's extension
+
+        Raises
+        ------
+        MeshFileError : none of the offered forms.
+        """
+        suffix = Path(path).suffix.lower()
+        vrm = self.path.suffix.lower() == ".vrm"
+        for form in self.forms:
+            fits = suffix == form.suffix or (vrm and suffix == ".vrm" and form.suffix == ".glb")
+            if fits and key in (None, form.key):
+                return form
+        offered = ", ".join(f"{form.key} ({form.suffix})" for form in self.forms)
+        wanted = suffix or "a name without extension"
+        raise MeshFileError.unwritable(
+            path,
+            f"{self.path.name} does not offer {wanted}{f' with the form {key}' if key else ''}",
+            f"choose one of its forms: {offered}",
+        )
+
+    def write(
+        self,
+        path: str | os.PathLike[str],
+        form: ExportForm,
+        vertices: npt.NDArray[Any],
+        latent: npt.NDArray[Any],
+        placement: RigidTransform | None = None,
+        frame: ExportFrame | None = None,
+    ) -> WrittenPose:
+        """Write one pose, whole or not at all.
+
+        Parameters
+        ----------
+        path : to write
+        form : that is no sequence
+        vertices : (V, 3) array, in the body's unit, placed for export
+        latent : (D,) codes of the pose
+        placement : that was applied to the vertices
+        frame : the file's axes and unit where the form has axes
+
+        Raises
+        ------
+        MeshFileError : the file cannot be written, or the form cannot hold the pose.
+        """
+        if self._character is None:
+            placed = vertices if frame is None else frame.apply(vertices)
+            rewrite_obj(path, self.path, placed)
+            return WrittenPose(placed)
+        transforms = None
+        if form.needs_rig and isinstance(self._body, RigModel):
+            transforms = _placed(self._body.space.transforms(latent), placement)
+        posed = write_character(path, self._character, vertices, form.key, transforms)
+        return WrittenPose(posed.vertices, posed.notes)
+
+    def objects(self) -> list[tuple[str, npt.NDArray[np.integer]]]:
+        """Return each mesh that a program shows of the file: its name, and its vertices.
+
+        Those are vertices of the body, in the file's order.
+        """
+        if self._character is None:
+            return [("", np.arange(self._body.n_vertices))]
+        scene = read_scene(self.path)
+        found: dict[int, list[npt.NDArray[np.integer]]] = {}
+        start = 0
+        for part in scene.parts:
+            end = start + len(part.points)
+            found.setdefault(part.node, []).append(self._character.joined[start:end])
+            start = end
+        names = {part.node: scene.node_names[part.node] or part.mesh for part in scene.parts}
+        return [(names[node], np.concatenate(rows)) for node, rows in found.items()]
+
+
+def write_sequence(
+    path: str | os.PathLike[str],
+    vertices: Sequence[npt.NDArray[Any]],
+    source: SourceFile | None = None,
+    frame: ExportFrame | None = None,
+    fps: float = 30.0,
+) -> tuple[list[Path], npt.NDArray[np.float32]]:
+    """Write poses as the frames of a point cache, in the vertex order of the user's mesh.
+
+    A file that shows several meshes gets a cache for each, called after it: all of them, or none.
+
+    Parameters
+    ----------
+    path : a .pc2 or .mdd file
+    vertices : of N poses, each (V, 3), in the body's unit
+    source : the user's file; the body's own vertex order if None
+    frame : axes and unit of the cache
+    fps : frames a second
+
+    Returns
+    -------
+    files : that were written
+    stored : (N, V, 3) float32 array, what they hold, by the body's vertices
+
+    Raises
+    ------
+    MeshFileError : the extension is of no point cache, or a file cannot be written.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in POINT_CACHE_SUFFIXES:
+        raise MeshFileError.unwritable(
+            path, "it is no point cache", f"use one of {', '.join(POINT_CACHE_SUFFIXES)}"
+        )
+    stacked = np.stack([pose if frame is None else frame.apply(pose) for pose in vertices])
+    stored = stacked.astype(np.float32)
+    objects = [("", np.arange(stored.shape[1]))] if source is None else source.objects()
+    if len(objects) == 1:
+        write_point_cache(target, stored[:, objects[0][1]], fps)
+        return [target], stored
+    stems = file_stems(f"{target.stem} {name}" for name, _ in objects)
+    names = [f"{stem}{target.suffix}" for stem in stems]
+    with atomic_files(target.parent) as folder:
+        for name, (_, rows) in zip(names, objects, strict=True):
+            write_point_cache(folder / name, stored[:, rows], fps)
+    return [target.with_name(name) for name in names], stored
+
+
+def _placed(transforms: FloatArray, placement: RigidTransform | None) -> FloatArray:
+    """Move (J, 4, 4) transforms to where a pose is exported to."""
+    if placement is None:
+        return transforms
+    matrix = np.eye(4)
+    matrix[:3, :3] = placement.scale * placement.rotation
+    matrix[:3, 3] = placement.translation
+    return np.asarray(matrix @ transforms, dtype=np.float64)
+
+
+def _is_same_file(one: Path, other: Path) -> bool:
+    try:
+        return one.samefile(other)
+    except OSError:
+        # One of them is gone; what reads it says so.
+        return False

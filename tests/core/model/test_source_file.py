@@ -1,0 +1,160 @@
+"""Poses in the user's own file: forms, axes, and that what is written is what is checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.characters import CharacterForm, read_character
+from lcollision_core.errors import MeshFileError, PoseSetError
+from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
+from lcollision_core.meshes.formats.point_cache import read_point_cache
+from lcollision_core.model import (
+    EXPORT_FORMS,
+    RigModel,
+    SourceFile,
+    export_frame,
+    offered_forms,
+    write_sequence,
+)
+from tests.core.character_file import described, figure
+from tests.core.shapes import random_rotation
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> RigModel:
+    return RigModel.of(read_character(figure().write(tmp_path / "figure.glb")))
+
+
+@pytest.fixture
+def latent(model: RigModel) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-0.4, 0.4, model.latent_size)
+
+
+def test_a_source_offers_what_it_can_hold() -> None:
+    keys = {
+        source: [form.key for form in offered_forms(source, has_rig=True)]
+        for source in ("a.glb", "a.VRM", "a.gltf", "a.obj", "a.stl", None)
+    }
+    assert keys["a.glb"] == keys["a.VRM"] == keys["a.gltf"]
+    assert keys["a.glb"] == ["joints", "mesh", "morph", "pc2", "mdd"]
+    assert keys["a.obj"] == ["obj", "pc2", "mdd"]
+    assert keys["a.stl"] == keys[None] == ["pc2", "mdd"]
+    without = [form.key for form in offered_forms("a.glb")]
+    assert without == ["mesh", "morph", "pc2", "mdd"]
+    assert len({form.key for form in EXPORT_FORMS}) == len(EXPORT_FORMS)
+    assert set(CharacterForm) <= {form.key for form in EXPORT_FORMS}
+
+
+@pytest.mark.parametrize("key", list(CharacterForm))
+@pytest.mark.parametrize("is_placed", [False, True])
+def test_a_pose_of_the_rig_goes_back_into_its_file(
+    model: RigModel, latent: np.ndarray, tmp_path: Path, key: CharacterForm, is_placed: bool
+) -> None:
+    placement = None
+    if is_placed:
+        placement = RigidTransform(
+            random_rotation(np.random.default_rng(1)), np.array([1.0, -2.0, 0.5]), 1.5
+        )
+    source = SourceFile(model.character.source, model)
+    path = tmp_path / "posed.glb"
+    form = source.require_form(path, key)
+    vertices = model.exported_vertices(latent, placement)
+    written = source.write(path, form, vertices, latent, placement)
+    assert np.abs(written.vertices - vertices).max() < 1e-5 * model.body_size
+    again = read_character(path)
+    in_file = again.rest_vertices[again.joined]
+    assert np.abs(in_file - written.vertices[model.character.joined]).max() < 1e-9
+    assert len(written.notes) == 2
+
+
+def test_a_file_of_the_same_body_has_no_joints_to_turn(
+    model: RigModel, latent: np.ndarray, tmp_path: Path
+) -> None:
+    other = SourceFile(figure().write(tmp_path / "other.glb"), model)
+    assert [form.key for form in other.forms] == ["mesh", "morph", "pc2", "mdd"]
+    path = tmp_path / "posed.glb"
+    with pytest.raises(MeshFileError, match=r"with the form joints; choose .* mesh \(\.glb\)"):
+        other.require_form(path, "joints")
+    form = other.require_form(path, None)
+    vertices = model.exported_vertices(latent)
+    assert np.array_equal(other.write(path, form, vertices, latent).vertices, vertices)
+
+
+def test_vrm_is_written_as_vrm(tmp_path: Path) -> None:
+    model = RigModel.of(read_character(figure().write(tmp_path / "figure.vrm")))
+    source = SourceFile(tmp_path / "figure.vrm", model)
+    assert source.require_form(tmp_path / "posed.vrm", None).key == "joints"
+    assert source.require_form(tmp_path / "posed.glb", None).key == "joints"
+
+
+def test_files_that_are_not_of_the_body_are_refused(model: RigModel, tmp_path: Path) -> None:
+    builder = figure()
+    builder.description["nodes"][0]["scale"] = [1.0] * 3
+    big = builder.write(tmp_path / "big.glb")
+    with pytest.raises(MeshFileError, match=r"big\.glb is 100 times as large as the body of 'fig"):
+        SourceFile(big, model)
+    write_mesh(tmp_path / "few.obj", np.eye(3), np.array([[0, 1, 2]]))
+    with pytest.raises(PoseSetError, match="has 3 vertices"):
+        SourceFile(tmp_path / "few.obj", model)
+    write_mesh(tmp_path / "own.ply", model.reference, model.faces)
+    with pytest.raises(MeshFileError, match=r"own\.ply has a form that is not written \(\.ply\)"):
+        SourceFile(tmp_path / "own.ply", model)
+
+
+@pytest.mark.parametrize("axes", ["model", "maya", "unreal"])
+def test_an_obj_file_keeps_its_form_in_any_axes(
+    model: RigModel, latent: np.ndarray, tmp_path: Path, axes: str
+) -> None:
+    own, path = tmp_path / "own.obj", tmp_path / "posed.obj"
+    write_mesh(own, model.reference, model.faces)
+    own.write_bytes(b"mtllib own.mtl\r\n" + own.read_bytes().replace(b"\nf", b"\nusemtl a\nf", 1))
+    source = SourceFile(own, model)
+    frame = export_frame(model, axes, path, scale=100.0)
+    form = source.require_form(path, None)
+    assert form.has_axes
+    vertices = model.exported_vertices(latent).astype(float)
+    written = source.write(path, form, vertices, latent, frame=frame)
+    np.testing.assert_array_equal(read_mesh(path).vertices, written.vertices)
+    np.testing.assert_array_equal(written.vertices, frame.apply(vertices))
+    assert path.read_bytes().startswith(b"mtllib own.mtl\r\nv ")
+    assert b"usemtl a" in path.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".pc2", ".mdd"])
+def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
+    model: RigModel, latent: np.ndarray, tmp_path: Path, suffix: str
+) -> None:
+    source = SourceFile(model.character.source, model)
+    poses = [model.exported_vertices(share * latent) for share in (0.0, 0.5, 1.0)]
+    path = tmp_path / f"run{suffix}"
+    frame = export_frame(model, "unreal", path)
+    files, stored = write_sequence(path, poses, source, frame, fps=24.0)
+    assert [file.name for file in files] == [f"run {n}{suffix}" for n in ("Body", "Core", "Hat")]
+    caches = [read_point_cache(file) for file in files]
+    joined = np.concatenate([cache.frames for cache in caches], axis=1)
+    np.testing.assert_array_equal(joined, stored[:, model.character.joined])
+    np.testing.assert_allclose(stored, [frame.apply(pose) for pose in poses], rtol=1e-6, atol=1e-5)
+    # As many as the file's own meshes have.
+    description, _ = described(model.character.source)
+    counts = [
+        sum(
+            description["accessors"][primitive["attributes"]["POSITION"]]["count"]
+            for primitive in mesh["primitives"]
+        )
+        for mesh in description["meshes"]
+    ]
+    assert [cache.frames.shape[1] for cache in caches] == counts
+    assert caches[0].times[1] == pytest.approx(1 / 24 if suffix == ".mdd" else 1.0)
+
+
+def test_a_model_s_own_order_needs_no_source(
+    model: RigModel, latent: np.ndarray, tmp_path: Path
+) -> None:
+    files, stored = write_sequence(tmp_path / "run.pc2", [model.exported_vertices(latent)])
+    assert files == [tmp_path / "run.pc2"]
+    np.testing.assert_array_equal(read_point_cache(files[0]).frames, stored)
+    with pytest.raises(MeshFileError, match="is no point cache; use one of"):
+        write_sequence(tmp_path / "run.glb", [model.reference])
