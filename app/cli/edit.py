@@ -13,9 +13,10 @@ def edit(
     file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[POSE|MESH]",
+            metavar="[POSE|CHARACTER|MESH]",
             readable=False,
-            help="A .json file of poses, a mesh of the model's topology, or a model.",
+            help="A .json file of poses, a rigged character, a mesh of the model's topology, or a "
+            "model.",
         ),
     ] = None,
     model_name: Annotated[
@@ -31,7 +32,7 @@ def edit(
         what, instead = "is not there", "none to start a new pose"
         if file.is_dir():
             what, instead = "is a folder", "fix all its meshes with `lcollision resolve`"
-        advice = f"name a file of poses, a mesh or a model, or {instead}"
+        advice = f"name a file of poses, a character, a mesh or a model, or {instead}"
         raise LCollisionError(what, advice, where=file)
     raise typer.Exit(open_editor(file, model_name))
 

@@ -100,6 +100,7 @@ class PoseDocument(LiveEditing):
         self._solve: int | None = None
         self._solve_began = 0.0
         self._mirroring = self._mirroring_poses = self._incoming = self._loading = 0
+        self._prepared = False
         self._exports: list[int] = []
         self._closed = False
         self.may_replace: Callable[[], bool] = lambda: True
@@ -129,7 +130,12 @@ class PoseDocument(LiveEditing):
 
     @property
     def can_resolve(self) -> bool:
-        """Whether Resolve can be asked for: the model has a predictor."""
+        """Whether Resolve can be asked for."""
+        return self._model is not None and self._model.can_resolve
+
+    @property
+    def has_predictor(self) -> bool:
+        """Whether poses are, or will be once it is loaded, predicted."""
         return self._model is not None and self._model.has_predictor
 
     @property
@@ -222,9 +228,9 @@ class PoseDocument(LiveEditing):
         self._library = PoseLibrary(opened.model, folder, self._tell_of_library)
         self._held = self._blank()
         self._saved = self._held.pose
-        self._predicts = False
+        self._predicts = self._prepared = False
         self._live.follow(self.model, self.latent, self._predicts)
-        self._load_predictor()
+        self._prepare()
         self.undo_stack.clear()
         # All of it is in place before any signal: a slot sees poses of this model only, and may
         # edit at once.
@@ -247,10 +253,27 @@ class PoseDocument(LiveEditing):
         self._tell_modified()
 
     def open_model(self, name_or_path: str | Path) -> None:
-        """Read a model in the long worker and load it."""
-        self._bring(
-            f"Opening {name_or_path}", partial(jobs.open_model, name_or_path), self._on_model
-        )
+        """Read a model, or the file of a rigged character, in the long worker and load it."""
+        work = partial(jobs.open_model, name_or_path)
+        self._bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
+
+    def look_into(
+        self,
+        path: Path,
+        done: Callable[[bool], None],
+        failed: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Find in the long worker whether a file is a character's: `done` is called with that.
+
+        Parameters
+        ----------
+        path : of any file
+        done, failed : called in this thread, the latter before `failed` tells why
+        """
+        self._long.cancel(self._incoming)
+        work = partial(jobs.is_character, path)
+        self._incoming = self._long.start(f"Opening {path.name}", work, done, failed)
+        self.busy_changed.emit(self.busy)
 
     def edit_parts(self, edits: jobs.PartEdits) -> None:
         """Rename, recolour or reorder body parts in the model's file, in the long worker.
@@ -405,10 +428,10 @@ class PoseDocument(LiveEditing):
             self.solve_finished.emit(None)
 
     def cancel_all(self) -> None:
-        """Stop all long work except loading the predictor."""
+        """Stop all long work except preparing the model."""
         self.cancel_resolve()
         self._long.cancel_all()
-        self._load_predictor()
+        self._prepare()
 
     def close(self, timeout: float = 5.0) -> bool:
         """Stop all work and end the threads, before any window closes.
@@ -460,7 +483,7 @@ class PoseDocument(LiveEditing):
         self._close_gesture()
         self._model, self.model_file = changed.model, changed.file
         self._live.follow(self.model, self.latent, self._predicts)
-        self._load_predictor()
+        self._prepare()
         self._tell_all()
         self.message.emit(f"Saved the body parts in {self.model.name}")
 
@@ -546,16 +569,18 @@ class PoseDocument(LiveEditing):
             self._push("Resolve", replace(after, outcome_seconds=seconds))
         self.solve_finished.emit(result)
 
-    def _load_predictor(self) -> None:
-        """Load the predictor in the background; the pose can be edited meanwhile."""
-        if self.can_resolve and not self._predicts and not self._closed:
-            work = partial(jobs.load_predictor, self.model)
-            self._loading = self._long.start("Loading predictions", work, self._on_predictor)
+    def _prepare(self) -> None:
+        """Load the predictor and compile drags in the background; the pose can be edited."""
+        if self._model is not None and not (self._prepared or self._closed):
+            label = "Loading predictions" if self.has_predictor else "Preparing drags"
+            work = partial(jobs.prepare, self.model)
+            self._loading = self._long.start(label, work, self._on_prepared)
 
-    def _on_predictor(self, model: PosableBody) -> None:
+    def _on_prepared(self, model: PosableBody) -> None:
         if model is self._model:
-            self._predicts = True
-            if self._drag is None:
+            self._prepared = True
+            self._predicts = model.has_predictor
+            if self._predicts and self._drag is None:
                 self._live.follow(self.model, self.latent, self._predicts)
 
     def _bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:

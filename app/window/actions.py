@@ -36,15 +36,15 @@ class Spec:
 
 
 ACTIONS: dict[str, Spec] = {
-    "new": Spec("&New pose", "Ctrl+N", "Start again from the first training pose", "new"),
-    "open": Spec("&Open…", "Ctrl+O", "Open poses, a mesh or a model", "open"),
-    "open_model": Spec("Open &model…", "Ctrl+Shift+O", "Open another model"),
+    "new": Spec("&New pose", "Ctrl+N", "Start again from the first pose of the body", "new"),
+    "open": Spec("&Open…", "Ctrl+O", "Open poses, a character, a mesh or a model", "open"),
+    "open_model": Spec("Open &model…", "Ctrl+Shift+O", "Open a character or a model"),
     "save": Spec("&Save", "Ctrl+S", "Save the pose to its file", "save"),
     "save_as": Spec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
     "import": Spec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),
     "export": Spec("&Export mesh…", "Ctrl+E", "Save the current mesh to a file", "export"),
     "upright": Spec(
-        "Turn &upright", "Ctrl+Shift+U", "Turn the model to its next axis, in its file"
+        "Turn &upright", "Ctrl+Shift+U", "Turn the body to its next axis; a model also in its file"
     ),
     "screenshot": Spec("S&creenshot…", "Ctrl+P", "Save a picture of the view", "screenshot"),
     "turntable": Spec("&Turntable…", "Ctrl+T", "Save a video of one full turn", "turntable"),
@@ -54,7 +54,7 @@ ACTIONS: dict[str, Spec] = {
     "reset": Spec(
         "Reset &all",
         "Ctrl+Backspace",
-        "Set all sliders to zero: the average of the training poses",
+        "Set all sliders to zero: the average pose, of a character the rest pose",
         "reset",
     ),
     "randomise": Spec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),
@@ -144,10 +144,10 @@ CAMERA_ACTIONS: dict[str, Spec] = {
 
 DRAG_STRENGTHS: dict[float, Spec] = {
     0.0: Spec(
-        "&Loose", "Ctrl+Alt+7", "Let drags stretch limbs and reach poses unlike any of the training"
+        "&Loose", "Ctrl+Alt+7", "Let drags stretch limbs and reach poses unlike those of the body"
     ),
     1.0: Spec("&Normal", "Ctrl+Alt+8", "Keep drags from stretching limbs"),
-    4.0: Spec("&Firm", "Ctrl+Alt+9", "Keep drags close to poses like those of the training"),
+    4.0: Spec("&Firm", "Ctrl+Alt+9", "Keep drags close to poses like those of the body"),
 }
 """How strongly drags keep to natural poses, by the setting."""
 

@@ -106,7 +106,7 @@ class EditActions(QObject):
             dialog.choose_colour()
 
     def _choose_resolve_options(self) -> None:
-        form = resolve_form(self._settings, self._window)
+        form = resolve_form(self._settings, self._window, self._document.has_predictor)
         form.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         form.open()
 

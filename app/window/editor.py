@@ -29,7 +29,7 @@ def open_editor(path: Path | None = None, model_name: str | None = None) -> int:
 
     Parameters
     ----------
-    path : a poses file, a mesh or a model to open; None opens the model with its own pose
+    path : a file of poses, a character, a mesh or a model; None opens the model with its own pose
     model_name : a model's file, or the name of a bundled or user model; by default the one that
         was used last
 

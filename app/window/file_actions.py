@@ -41,12 +41,18 @@ _VIDEOS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png
 
 
 def _kinds(*wanted: str) -> str:
-    """Return the filter of a file dialog for "poses", "meshes" and "models"."""
-    suffixes = {"poses": (POSES_SUFFIX,), "meshes": _mesh_suffixes(), "models": (MODEL_SUFFIX,)}
+    """Return the filter of a file dialog for "poses", "characters", "meshes" and "models"."""
+    suffixes = {
+        "poses": (POSES_SUFFIX,),
+        "characters": _character_suffixes(),
+        "meshes": _mesh_suffixes(),
+        "models": (MODEL_SUFFIX,),
+    }
     masks = {kind: " ".join(f"*{suffix}" for suffix in found) for kind, found in suffixes.items()}
     filters = [f"{kind.capitalize()} ({masks[kind]})" for kind in wanted]
     if len(wanted) > 1:
-        filters.insert(0, f"All supported files ({' '.join(masks[kind] for kind in wanted)})")
+        known = dict.fromkeys(" ".join(masks[kind] for kind in wanted).split())
+        filters.insert(0, f"All supported files ({' '.join(known)})")
     return ";;".join(filters)
 
 
@@ -55,6 +61,12 @@ def _mesh_suffixes() -> tuple[str, ...]:
     from lcollision_core.meshes import READABLE_SUFFIXES
 
     return READABLE_SUFFIXES
+
+
+def _character_suffixes() -> tuple[str, ...]:
+    from lcollision_core.characters import CHARACTER_SUFFIXES
+
+    return CHARACTER_SUFFIXES
 
 
 def _kind(path: Path) -> str:
@@ -97,11 +109,13 @@ class FileActions(QObject):
         self._viewport = viewport
         self.acts: dict[str, Callable[[], object]] = {
             "new": self._new_pose,
-            "open": lambda: self._ask_and_open("Open", "poses", "meshes", "models"),
-            "open_model": lambda: self._ask_and_open("Open a model", "models"),
+            "open": lambda: self._ask_and_open("Open", "poses", "characters", "meshes", "models"),
+            "open_model": lambda: self._ask_and_open(
+                "Open a character or a model", "characters", "models"
+            ),
             "save": self.save,
             "save_as": self._save_as,
-            "import": lambda: self._ask_and_open("Import mesh", "meshes"),
+            "import": self._import,
             "export": self._export,
             "upright": self.turn_upright,
             "screenshot": self._screenshot,
@@ -127,6 +141,16 @@ class FileActions(QObject):
         if path is not None:
             self.open_path(path)
 
+    def _import(self) -> None:
+        """Take a file as a mesh, also one with a rig."""
+        path = self.ask_open("Import mesh", "meshes")
+        if path is not None:
+            self._import_mesh(path)
+
+    def _import_mesh(self, path: Path) -> None:
+        self._document.import_mesh(path)
+        self._settings["last_folder"] = str(path.resolve().parent)
+
     def turn_upright(self) -> None:
         """Turn the model by the next axis, in its file, and open it again.
 
@@ -151,7 +175,9 @@ class FileActions(QObject):
         document.open_model(file)
 
     def open_path(self, path: Path) -> None:
-        """Open a file as what its extension says: poses, a model, or a mesh.
+        """Open a file as what its extension says: poses, a model, a character, or a mesh.
+
+        A file without a rig is a mesh.
 
         Raises
         ------
@@ -163,23 +189,37 @@ class FileActions(QObject):
             self._settings.forget_file(str(path.resolve()))
             kind = "it is a folder" if path.is_dir() else "there is no such file"
             raise LCollisionError(
-                f"Couldn't open {path}: {kind}", "choose a file of poses, a mesh or a model"
+                f"Couldn't open {path}: {kind}",
+                "choose a file of poses, a character, a mesh or a model",
             )
-        document, meshes = self._document, _mesh_suffixes()
+        document, meshes = self._document, (*_mesh_suffixes(), *_character_suffixes())
         openers: dict[str, Callable[[Path], None]] = {
             POSES_SUFFIX: document.open_poses,
             MODEL_SUFFIX: document.open_model,
         }
+        if suffix in _character_suffixes():
+            document.look_into(path, partial(self._open_looked_into, path))
+            return
         if suffix not in (*openers, *meshes):
             raise LCollisionError(
                 f"isn't supported ({path.name})",
-                f"open poses ({POSES_SUFFIX}), a mesh ({', '.join(meshes)}) or a model "
-                f"({MODEL_SUFFIX})",
+                f"open poses ({POSES_SUFFIX}), a character or a mesh "
+                f"({', '.join(dict.fromkeys(meshes))}) or a model ({MODEL_SUFFIX})",
                 where=_kind(path),
             )
-        # A mesh is a step that can be undone.
-        if suffix in meshes or self.may_lose_changes():
-            openers.get(suffix, document.import_mesh)(path)
+        if suffix in meshes:
+            # A step that can be undone.
+            self._import_mesh(path)
+        elif self.may_lose_changes():
+            openers[suffix](path)
+            self._settings["last_folder"] = str(path.resolve().parent)
+
+    def _open_looked_into(self, path: Path, is_character: bool) -> None:
+        """Open a rigged file as a body, another as a mesh of the one that is open."""
+        if not is_character:
+            self._import_mesh(path)
+        elif self._attempt(self.may_lose_changes):
+            self._document.open_model(path)
             self._settings["last_folder"] = str(path.resolve().parent)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:
@@ -189,7 +229,7 @@ class FileActions(QObject):
         ------
         LCollisionError : as for `open_path`.
         """
-        known = (POSES_SUFFIX, MODEL_SUFFIX, *_mesh_suffixes())
+        known = (POSES_SUFFIX, MODEL_SUFFIX, *_mesh_suffixes(), *_character_suffixes())
         path = next((held for held in paths if held.suffix.lower() in known), paths[0])
         self.open_path(path)
         if len(paths) > 1:
@@ -307,7 +347,7 @@ class FileActions(QObject):
     @Slot(object)
     def _on_arrived(self, path: Path) -> None:
         """Remember a file that is open now, and tell of those that were dropped with it."""
-        if path.suffix.lower() in _mesh_suffixes():
+        if path.suffix.lower() in (*_mesh_suffixes(), *_character_suffixes()):
             self._remember(path)
         dropped, self._dropped = self._dropped, None
         if dropped is not None and dropped[0].absolute() == path.absolute():
@@ -355,7 +395,7 @@ class FileActions(QObject):
         return f"{document.pose_name} changed" if document.changed else document.pose_name
 
     def ask_open(self, title: str, *kinds: str) -> Path | None:
-        """Ask for a file of some kinds: "poses", "meshes", "models"; None for none."""
+        """Ask for a file of some kinds, see `_kinds`; None for none."""
         name, _ = QFileDialog.getOpenFileName(
             self._window, title, str(self._folder()), _kinds(*kinds)
         )

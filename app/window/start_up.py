@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Qt, QTimer, Slot
 
 from app.window.dialogs.questions import Choice, ask_about_recovery
-from app.window.file_actions import MODEL_SUFFIX
+from app.window.file_actions import MODEL_SUFFIX, POSES_SUFFIX
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 
@@ -43,7 +43,7 @@ class StartUp(QObject):
     Parameters
     ----------
     window : shown
-    path : a poses file, a mesh or a model; None for a pose of the editor's own
+    path : a poses file, a character, a mesh or a model; None for a pose of the editor's own
     model_name : a model's file or name; the one that was used last where None
     """
 
@@ -61,10 +61,23 @@ class StartUp(QObject):
         signal.signal(signal.SIGINT, self._on_signal)
         signal.signal(signal.SIGTERM, self._on_signal)
         self._poll.start()
-        if self._path is not None and self._path.suffix.lower() == MODEL_SUFFIX:
-            self._model, self._path = self._path, None
         self._document.model_changed.connect(self._on_model, _ONCE)
+        path = self._path
+        if path is None or path.suffix.lower() in (MODEL_SUFFIX, POSES_SUFFIX):
+            self._open_model(path is not None and path.suffix.lower() == MODEL_SUFFIX)
+        else:
+            self._document.look_into(path, self._open_model, self._open_without_path)
+
+    def _open_model(self, is_in_path: bool) -> None:
+        """Open the body that the path leads to, or the one that was used last."""
+        if is_in_path and self._path is not None:
+            self._model, self._path = self._path, None
         self._document.open_model(self._model)
+
+    def _open_without_path(self) -> None:
+        """Begin as without a file, as the one that there is cannot be read."""
+        self._path = None
+        self._open_model(False)
 
     @Slot()
     def _on_model(self) -> None:
@@ -122,7 +135,7 @@ def opening_pose(model: PosableBody) -> NamedPose:
     """Return a pose worth looking at.
 
     The first of the bundled file of poses with the name of the model; for a model without
-    one, a varied training pose by its name, or the last.
+    one, a varied training pose by its name, or the last; of a character the rest pose.
     """
     from lcollision_core.model import NamedPose, read_poses
 
@@ -134,5 +147,7 @@ def opening_pose(model: PosableBody) -> NamedPose:
             # A user's own model may have a bundled one's name.
             _log.info("no opening pose: %s", error)
     names = model.pose_names
+    if not model.is_trained:
+        return NamedPose(names[0], model.training_latent[0])
     number = next((names.index(name) for name in _LIVELY if name in names), len(names) - 1)
     return NamedPose(names[number], model.training_latent[number])

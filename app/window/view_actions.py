@@ -71,7 +71,7 @@ class ViewActions(QObject):
     def _update_actions(self) -> None:
         document = self._document
         for action in (*self.shadings, *self.cameras):
-            needed = action.data() is not Shading.PREDICTED or document.can_resolve
+            needed = action.data() is not Shading.PREDICTED or document.has_predictor
             action.setEnabled(document.has_model and needed)
         for action in (self._ghost, self._reset_camera):
             action.setEnabled(document.has_model)

@@ -170,11 +170,12 @@ def dialog_vbox(*items: QWidget | QLayout | None) -> QVBoxLayout:
     return vbox(*items, spacing=WIDE, margins=(WIDE + 4, WIDE + 4, WIDE + 4, WIDE))
 
 
-def title_row(title: str, source: ElidedLabel) -> QHBoxLayout:
+def title_row(title: str | QLabel, source: ElidedLabel) -> QHBoxLayout:
     """Return a card's title, with the source of its facts at the other end."""
     source.setObjectName("caption")
     source.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
-    return hbox(labelled(title, "title"), source, wide=source)
+    named = labelled(title, "title") if isinstance(title, str) else title
+    return hbox(named, source, wide=source)
 
 
 def swatch(colour: str, side: int, sharpness: float = 1.0) -> QIcon:

@@ -95,8 +95,6 @@ def warm_up(model: PosableBody) -> None:
     latent.flags.writeable = False
     evaluator.verdict(evaluator.frame(latent, 0))
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
-    if not model.has_predictor:
-        _drag_once(model)
 
 
 def _drag_once(model: PosableBody) -> None:
@@ -108,10 +106,18 @@ def _drag_once(model: PosableBody) -> None:
     dragger.move(model.reference[0])
 
 
-def load_predictor(model: PosableBody, _: Progress, __: CancelToken) -> PosableBody:
-    """Load the predictor and use it once, then a drag: compiling and importing may take seconds."""
-    keep_torch_to_one_thread(model)
-    model.predict(np.zeros(model.latent_size))
+def is_character(path: Path, _: Progress, __: CancelToken) -> bool:
+    """Whether a file shows something that joints move, so that it opens as a body."""
+    from lcollision_core.characters import CHARACTER_SUFFIXES, is_rigged
+
+    return path.suffix.lower() in CHARACTER_SUFFIXES and is_rigged(path)
+
+
+def prepare(model: PosableBody, _: Progress, __: CancelToken) -> PosableBody:
+    """Use the predictor, if there is one, and a drag once: compiling and importing take seconds."""
+    if model.has_predictor:
+        keep_torch_to_one_thread(model)
+        model.predict(np.zeros(model.latent_size))
     _drag_once(model)
     return model
 

@@ -20,7 +20,7 @@ class LatentGroup:
     colour : "#rrggbb" of the domain, None for the whole body
     codes : slice of the group in the latent
     code_names : what each code is called within the group: for the whole body the domain that it
-        moves most, for a domain "motion 1" and so on
+        moves most, for a domain "motion 1" and so on; of a character the joint that it turns
     """
 
     name: str
@@ -42,11 +42,15 @@ class LatentSpace:
     ----------
     groups : 1 + K groups in the latent's order
     low, high : (D,) float64 arrays, read-only: the ends of the model's box, below 0 and above
+    shown : (D,) float64 array > 0, read-only: people are shown the codes times this
+    units : D texts, what the shown numbers are in, as "°"; "" for none
     """
 
     groups: tuple[LatentGroup, ...]
     low: npt.NDArray[np.float64]
     high: npt.NDArray[np.float64]
+    shown: npt.NDArray[np.float64]
+    units: tuple[str, ...]
 
     @property
     def size(self) -> int:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
+from lcollision_core.characters import CHARACTER_SUFFIXES, read_character
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_model import PoseModel
+from lcollision_core.model.rig_model import RigModel
 
 
 def open_body(name_or_path: str | os.PathLike[str]) -> PosableBody:
@@ -13,10 +16,15 @@ def open_body(name_or_path: str | os.PathLike[str]) -> PosableBody:
 
     Parameters
     ----------
-    name_or_path : a model's file, or the name of a bundled or user model
+    name_or_path : a model's file, the name of a bundled or user model, or the file of a rigged
+        character
 
     Raises
     ------
     ModelFileError : see `PoseModel.load`.
+    MeshFileError : see `read_character`.
+    LCollisionError : the character has no rig.
     """
+    if Path(name_or_path).suffix.lower() in CHARACTER_SUFFIXES:
+        return RigModel.of(read_character(name_or_path))
     return PoseModel.load(name_or_path)

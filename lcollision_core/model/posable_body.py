@@ -95,6 +95,11 @@ class PosableBody(ABC):
 
     @property
     @abstractmethod
+    def is_trained(self) -> bool:
+        """Whether the pose space was learned from the poses that the body came with."""
+
+    @property
+    @abstractmethod
     def has_predictor(self) -> bool:
         """Whether a predictor was trained; it loads nothing."""
 
@@ -416,6 +421,8 @@ class PosableBody(ABC):
             groups=tuple(groups),
             low=read_only(space.low),
             high=read_only(space.high),
+            shown=read_only(np.ones(self.latent_size)),
+            units=("",) * self.latent_size,
         )
 
     @cached_property

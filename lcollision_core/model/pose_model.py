@@ -264,6 +264,11 @@ class PoseModel(PosableBody):
         return PoseModel(self.name, self.embedding, self.card, sections)
 
     @property
+    def is_trained(self) -> bool:
+        """The latent space was learned."""
+        return True
+
+    @property
     def has_predictor(self) -> bool:
         """Whether a predictor was trained; unlike `predictor`, it loads nothing."""
         return _PREDICTOR in self._other_sections

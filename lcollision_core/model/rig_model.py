@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from lcollision_core.meshes import ContactRules, RigidTransform
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect
 from lcollision_core.model.colours import domain_colours
+from lcollision_core.model.latent_space import WHOLE_BODY, LatentSpace
 from lcollision_core.model.mirror import PoseMirror, Symmetry
 from lcollision_core.model.naming import MAX_NAME_LENGTH, MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.model.posable_body import PosableBody, read_only
@@ -44,6 +46,9 @@ _FRAMES_A_SECOND, _MOST_FRAMES = 10.0, 300
 
 _SAME = 1e-5
 """Normalised: what is alike to so much is the same rig."""
+
+_SHIFTS = 3
+"""The first codes move the whole body, by normalised lengths; the others are angles."""
 
 _MOST_FREE = 32
 """Of the poses that the character came with, evenly spaced, those that Resolve starts from."""
@@ -150,6 +155,11 @@ class RigModel(PosableBody):
         return digest_of(json.dumps(names), arrays)[:16]
 
     @property
+    def is_trained(self) -> bool:
+        """The joints are those of the character's file."""
+        return False
+
+    @property
     def has_predictor(self) -> bool:
         """Nothing is trained on a rig."""
         return False
@@ -201,6 +211,24 @@ class RigModel(PosableBody):
         """(3,) unit vector along an axis: where the character faces."""
         axis = int(np.abs(self.space.front).argmax())
         return read_only(np.sign(self.space.front[axis]) * np.eye(3)[axis])
+
+    @cached_property
+    def latent_space(self) -> LatentSpace:
+        """The groups, names, colours and ranges of the codes: angles are shown in degrees."""
+        angles = np.arange(self.latent_size) >= _SHIFTS
+        names = [
+            WHOLE_BODY.lower() if joint < 0 else self.space.rig.joint_names[joint]
+            for joint in self.space.joint_of_code.tolist()
+        ]
+        space = super().latent_space
+        return replace(
+            space,
+            groups=tuple(
+                replace(group, code_names=tuple(names[group.codes])) for group in space.groups
+            ),
+            shown=read_only(np.where(angles, np.degrees(1.0), 100.0)),
+            units=tuple("°" if angle else " %" for angle in angles),
+        )
 
     @cached_property
     def symmetry(self) -> Symmetry | None:

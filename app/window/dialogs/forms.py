@@ -279,15 +279,16 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
     return form
 
 
-def resolve_form(settings: Settings, parent: QWidget) -> Form:
-    """Ask for the options of Resolve."""
+def resolve_form(settings: Settings, parent: QWidget, has_predictor: bool = True) -> Form:
+    """Ask for the options of Resolve; those of a search only where a predictor leads it."""
     form = Form("Resolve options", "OK", settings, parent)
     metrics = {"eye": "the look of the pose", "latent": "the slider values"}
     tip = "What Resolve tries to change as little as possible"
     form.add_choice("resolve_metric", "Keep close to", metrics, tip)
-    tip = "Below it the estimate calls a pose clear; lower is safer but moves the pose more"
-    label = "Decision threshold"
-    form.add_number("resolve_threshold", label, "", 0.05, tip, decimals=2)
+    if has_predictor:
+        tip = "Below it the estimate calls a pose clear; lower is safer but moves the pose more"
+        label = "Decision threshold"
+        form.add_number("resolve_threshold", label, "", 0.05, tip, decimals=2)
     tip = "After this time Resolve falls back to a known pose without collisions"
     form.add_number("resolve_time_budget", "Time limit", " s", 1.0, tip, decimals=1)
     form.add_note("The exact check decides in any case.")

@@ -39,7 +39,7 @@ AAAI 2021.
 """
 _ABOUT_MODEL = """
 {model.name}: {model.n_vertices} vertices, {n_parts} body parts, {model.latent_size} sliders, \
-trained on {model.card.source}, licence {model.card.licence}.
+{origin} {model.card.source}, licence {model.card.licence}.
 """
 
 
@@ -47,7 +47,8 @@ def show_about(model: PosableBody | None, parent: QWidget) -> None:
     """Show name, version, licence and origin of the program and of the model."""
     box = message_box(parent, "About LCollision", "LCollision", _ABOUT.format(version=_version()))
     if model is not None:
-        text = _ABOUT_MODEL.format(model=model, n_parts=len(model.domain_names))
+        origin = "trained on" if model.is_trained else "posed by the rig of"
+        text = _ABOUT_MODEL.format(model=model, n_parts=len(model.domain_names), origin=origin)
         box.setInformativeText(box.informativeText() + text)
     box.setIconPixmap(program_icon().pixmap(72, 72))
     box.setStandardButtons(QMessageBox.StandardButton.Close)

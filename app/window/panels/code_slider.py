@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 _STEPS = 1000
 
+_DECIMALS, _DECIMALS_OF_UNITS = 3, 1
+"""Of bare codes, and of degrees and per cent."""
+
 _FIELD_WIDTH = 78
 """Width of a number of seven characters and its arrows, in device-independent pixels."""
 
@@ -150,7 +153,10 @@ class CodeRow(HoverRow):
         self.code = code
         self._name = name = heading(model.code_names[code])
         space = model.latent_space
-        self._trained = low, high = float(space.low[code]), float(space.high[code])
+        self._range = low, high = float(space.low[code]), float(space.high[code])
+        self._is_trained = model.is_trained
+        # What the field shows of a code: degrees, for example.
+        self._shown, self._unit = float(space.shown[code]), space.units[code]
         # Its end tells what the part does.
         label = ElidedLabel(name, Qt.TextElideMode.ElideMiddle)
         label.setMaximumWidth(name_width)
@@ -158,16 +164,21 @@ class CodeRow(HoverRow):
         self._explained: tuple[bool, bool] | None = None
         beyond = _BEYOND * (high - low)
         self._limits = self._field_limits = low - beyond, high + beyond
-        self.field = NumberBox(3, *self._limits)
+        decimals = _DECIMALS if self._shown == 1.0 else _DECIMALS_OF_UNITS
+        self.field = NumberBox(decimals, *(self._shown * limit for limit in self._limits))
+        self.field.setSuffix(self._unit)
         self.field.setObjectName("code")
-        self.field.setSingleStep((high - low) / 100)
+        self.field.setSingleStep(self._shown * (high - low) / 100)
         self.field.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.field.setFixedWidth(_FIELD_WIDTH)
+        source = f"motion {index + 1}"
+        if not model.is_trained:
+            source = next(g for g in space.groups if code < g.codes.stop).code_names[index]
         self.slider.setAccessibleName(name)
         self.field.setAccessibleName(f"{name}, number")
         self.slider.setToolTip(
             plain_tip(
-                f"{name} (motion {index + 1}): drag to move, hold Ctrl to move ten times finer, "
+                f"{name} ({source}): drag to move, hold Ctrl to move ten times finer, "
                 "double-click to reset"
             )
         )
@@ -182,7 +193,7 @@ class CodeRow(HoverRow):
         self.slider.drag_abandoned.connect(document.cancel_gesture)
         self.slider.valueChanged.connect(lambda: self._move(self.slider.number))
         self.slider.reset_wanted.connect(lambda: document.reset_code(code))
-        self.field.valueChanged.connect(self._move)
+        self.field.valueChanged.connect(lambda shown: self._move(shown / self._shown))
         self.field.refused.connect(lambda told: document.message.emit(f"{name}: {told}"))
 
     def show_number(self, number: float) -> None:
@@ -195,9 +206,9 @@ class CodeRow(HoverRow):
             limits = min(low, number), max(high, number)
             if limits != self._field_limits:
                 # Each time, Qt lays out the panel anew.
-                self.field.setRange(*limits)
+                self.field.setRange(*(self._shown * limit for limit in limits))
                 self._field_limits = limits
-            self.field.setValue(number)
+            self.field.setValue(self._shown * number)
         self._explain(number)
 
     def _move(self, number: float) -> None:
@@ -212,20 +223,24 @@ class CodeRow(HoverRow):
         return bool(self.field.property("verdict") == "outside")
 
     def _explain(self, number: float) -> None:
-        """Mark a number outside the trained range, and say what can be typed."""
-        low, high = self._trained
+        """Mark a number outside the slider's range, and say what can be typed."""
+        low, high = self._range
         # Half of the last digit, as the end of the range is seldom a round number.
-        slack = 0.5 * 10.0 ** -self.field.decimals()
+        slack = 0.5 * 10.0 ** -self.field.decimals() / self._shown
         outside = not low - slack <= number <= high + slack
         held = bool(self.field.property("held"))
         if (outside, held) == self._explained:
             return
         self._explained = outside, held
         show_verdict(self.field, "outside" if outside else "")
-        least, most, *limits = map(self.field.textFromValue, (low, high, *self._limits))
+        least, most, *limits = (
+            self.field.textFromValue(self._shown * number) + self._unit
+            for number in (low, high, *self._limits)
+        )
         words = f"type a number from {limits[0]} to {limits[1]}"
         if outside:
-            words += f"; this one is outside the trained range, {least} to {most}"
+            kind = "trained range" if self._is_trained else "joint's range"
+            words += f"; this one is outside the {kind}, {least} to {most}"
         if held:
             words = f"held by contact; {words}"
         self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
@@ -234,7 +249,7 @@ class CodeRow(HoverRow):
         """Mark where contact holds the number, although another was asked for; None for nowhere."""
         self.slider.show_held(number)
         self.field.setProperty("held", number is not None)
-        self._explain(self.field.value())
+        self._explain(self.field.value() / self._shown)
 
     def _on_drag_ended(self) -> None:
         self._document.end_gesture()

@@ -40,6 +40,12 @@ _HEIGHT_PER_ROW = 480
 
 _BLEND_STEPS = 100
 _ONLY = QItemSelectionModel.SelectionFlag.ClearAndSelect
+_CAME_WITH = {
+    True: ("Training", "The poses that the model learned from"),
+    False: ("Clips", "Poses of the character's file: its rest pose and frames of its clips"),
+}
+"""What the poses that the body came with are called, by whether it was trained on them."""
+
 _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
 """By whether the theme is dark."""
 
@@ -47,8 +53,8 @@ _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
 class LibraryPanel(QWidget):
     """Poses to load by a double click, to blend towards, to keep and to find again.
 
-    Three sources: the poses that the model learned from, the user's library, and the poses of the
-    file that is open, where it has some.
+    Three sources: the poses that the model learned from, or those of the character's file, the
+    user's library, and the poses of the poses file that is open, where it has some.
 
     Signals
     -------
@@ -78,7 +84,7 @@ class LibraryPanel(QWidget):
         self.list = PoseGrid()
         self.list.setAccessibleName("Poses")
         self._sources = QButtonGroup(self)
-        self.training = self._source_button("Training", "The poses that the model learned from")
+        self.training = self._source_button(*_CAME_WITH[True])
         self.own = self._source_button("Library", "Your own poses of this model")
         self.of_file = self._source_button("This file", "The poses of the file that is open")
         self.search = QLineEdit(placeholderText="Find a pose", clearButtonEnabled=True)
@@ -299,6 +305,9 @@ class LibraryPanel(QWidget):
 
     @Slot()
     def _on_model(self) -> None:
+        text, tip = _CAME_WITH[self._document.model.is_trained]
+        self.training.setText(text)
+        self.training.setToolTip(tip)
         self._pictures.clear()
         self._on_source()
 

@@ -180,6 +180,8 @@ class DomainRow(HoverRow):
 class PredictionCard(Card):
     """The estimate, beneath the exact check: small, and grey once that is known.
 
+    Of a body that has none the body parts with their locks are left.
+
     Signals
     -------
     domain_hovered : int or None, the domain of the row that the pointer is on
@@ -204,7 +206,8 @@ class PredictionCard(Card):
         for widget in (self.percent, self.meter):
             widget.setToolTip(_TIP)
         self._missing = labelled(_MISSING, "caption", wraps=True)
-        head = title_row("Estimate", self.verdict)
+        self.title = labelled("Estimate", "title")
+        head = title_row(self.title, self.verdict)
         self.verdict.setObjectName("aside")
         head.addWidget(self.percent)
         self._rows = vbox(spacing=0, margins=(0, TIGHT, 0, 0))
@@ -235,10 +238,11 @@ class PredictionCard(Card):
             row.hovered.connect(self.domain_hovered)
             row.menu_wanted.connect(self.menu_wanted)
             self._rows.addWidget(row)
-        predicts = self._document.can_resolve
+        predicts = self._document.has_predictor
         for widget in (self.meter, self.verdict, self.percent):
             widget.setVisible(predicts)
-        self._missing.setVisible(not predicts)
+        self.title.setText("Estimate" if predicts else "Body parts")
+        self._missing.setVisible(not (predicts or self._document.can_resolve))
         self._on_frame()
         self._on_locks()
 
@@ -251,7 +255,7 @@ class PredictionCard(Card):
             self.percent.setText("")
             show_verdict(self.verdict, "waiting")
             for row in self.rows:
-                row.show_energy(0.0 if self._document.can_resolve else None)
+                row.show_energy(0.0 if self._document.has_predictor else None)
             return
         probability = prediction.collision_probability
         collides = probability > EVEN_ODDS

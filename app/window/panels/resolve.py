@@ -218,6 +218,7 @@ class ResolveCard(Card):
         estimate = _ESTIMATED[predicted_free]
         overruled = None not in (exactly_free, predicted_free) and exactly_free != predicted_free
         self.predicted_free.say(estimate + ", overruled" * overruled, predicted_free)
+        self.predicted_free.setVisible(self._document.has_predictor)
         if result.energy_before is None or result.energy_after is None:
             self._energy.setText("not measured")
         else:

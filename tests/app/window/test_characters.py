@@ -1,0 +1,196 @@
+"""Rigged files in the window: opened, dropped, posed in degrees, saved, recovered, undone."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from pytestqt.qtbot import QtBot
+
+from app.editing.document import PoseDocument
+from app.editing.recovery import Autosave, find_lost_poses
+from app.view.shading import Shading
+from app.window.dialogs.failure import FailureDialog
+from app.window.main_window import MainWindow
+from app.window.start_up import StartUp
+from lcollision_core.model import RigModel, open_body
+from tests.app.windows import PATIENCE, answer, close_window, drop, rest, settings_in
+from tests.core.gltf_builder import arm
+
+
+@pytest.fixture
+def arm_file(tmp_path: Path) -> Path:
+    return arm().write(tmp_path / "arm.glb")
+
+
+def dropped(qtbot: QtBot, window: MainWindow, path: Path) -> RigModel:
+    """Drop a character on a window and return the body that it becomes."""
+    document = window.document
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        drop(window, path)
+    rest(qtbot, window)
+    assert isinstance(document.model, RigModel)
+    return document.model
+
+
+def test_a_dropped_character_is_posed_by_its_joints_in_degrees(
+    qtbot: QtBot, window: MainWindow, arm_file: Path
+) -> None:
+    model = dropped(qtbot, window, arm_file)
+    document = window.document
+    assert Path(document.model_file) == arm_file
+    np.testing.assert_array_equal(document.latent, np.zeros(model.latent_size))
+    code = int(np.flatnonzero(model.space.joint_of_code[6:] == 1)[0]) + 6
+    assert model.latent_space.groups[0].code_names[:3] == ("rig:LeftArm",) * 3
+    window.sliders.filter.setText("leftforearm")
+    row = window.sliders.row_of(code)
+    assert row.isVisible()
+    row.field.setFocus()
+    row.field.selectAll()
+    QTest.keyClicks(row.field, "30")
+    QTest.keyClick(row.field, Qt.Key.Key_Return)
+    assert document.latent[code] == pytest.approx(np.radians(30.0))
+    assert row.field.text().startswith("30.0°".replace(".", row.field.locale().decimalPoint()))
+    assert "°" in row.field.toolTip()
+    shift = window.sliders.row_of(0)
+    shift.field.setValue(10.0)
+    assert document.latent[0] == pytest.approx(0.1)
+    document.undo()
+    document.undo()
+    np.testing.assert_array_equal(document.latent, np.zeros(model.latent_size))
+    assert str(arm_file) in window.settings["recent_files"]
+
+
+def test_a_character_without_predictor_lacks_nothing(
+    qtbot: QtBot, window: MainWindow, arm_file: Path
+) -> None:
+    model = dropped(qtbot, window, arm_file)
+    panel, actions = window.collision, window.actions_by_key
+    qtbot.waitUntil(lambda: not window.document.busy, timeout=PATIENCE)
+    assert not panel.prediction.meter.isVisible()
+    assert panel.prediction.title.text() == "Body parts"
+    assert [row.lock.isVisible() for row in panel.prediction.rows] == [True] * len(
+        model.domain_names
+    )
+    assert actions["resolve"].isEnabled()
+    assert window.library.training.text() == "Clips"
+    listed = window.library.list
+    names = [listed.item(row).text() for row in range(listed.count())]
+    assert names == list(model.pose_names)
+    shadings = [a for a in window.menus["&View"].actions() if isinstance(a.data(), Shading)]
+    enabled = {action.data(): action.isEnabled() for action in shadings}
+    assert enabled == {shading: shading is not Shading.PREDICTED for shading in Shading}
+    with qtbot.waitSignal(window.document.solve_finished, timeout=PATIENCE):
+        actions["resolve"].trigger()
+    rest(qtbot, window)
+    assert panel.resolve.exactly_free.answer is True
+    assert not panel.resolve.predicted_free.isVisible()
+
+
+def test_a_file_without_rig_is_a_mesh_of_the_character(
+    qtbot: QtBot, window: MainWindow, arm_file: Path, tmp_path: Path
+) -> None:
+    model, document = dropped(qtbot, window, arm_file), window.document
+    posed = model.training_latent[2]
+    document.blend_towards(posed, 1.0)
+    document.export_mesh(tmp_path / "posed.glb")
+    document.finish_exports()
+    document.reset_all()
+    with qtbot.waitSignal(document.imported, timeout=PATIENCE):
+        drop(window, tmp_path / "posed.glb")
+    assert document.model is model
+    error = model.exported_vertices(document.latent, document.placement) - model.decode(posed)
+    assert np.abs(error).max() < 1e-3 * model.body_size
+
+
+def test_damaged_characters_leave_the_body_that_is_open(
+    qtbot: QtBot, window: MainWindow, arm_file: Path
+) -> None:
+    before, document = window.document.model, window.document
+    arm_file.write_bytes(arm_file.read_bytes()[:100])
+    with qtbot.waitSignal(document.failed, timeout=PATIENCE):
+        drop(window, arm_file)
+    (dialog,) = window.findChildren(FailureDialog)
+    assert "arm.glb" in dialog.failure.headline
+    assert document.model is before
+    assert not document.busy
+    dialog.close()
+
+
+def test_unsaved_changes_are_asked_about_before_another_character_comes(
+    qtbot: QtBot, window: MainWindow, arm_file: Path
+) -> None:
+    document = window.document
+    before = document.model
+    document.set_code(0, 0.3)
+    asked = []
+    timer = answer(lambda dialog: (asked.append(dialog.windowTitle()), dialog.reject()))
+    drop(window, arm_file)
+    qtbot.waitUntil(lambda: bool(asked), timeout=PATIENCE)
+    timer.stop()
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert asked == ["Unsaved changes"]
+    assert document.model is before
+
+
+def test_poses_of_a_character_are_saved_and_recovered_with_it(
+    qtbot: QtBot, arm_file: Path, tmp_path: Path
+) -> None:
+    document = PoseDocument(library_folder=tmp_path / "library")
+    autosave = Autosave(document, tmp_path / "sessions", seconds=0.01)
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        document.open_model(arm_file)
+    code = document.model.latent_size - 1
+    document.set_code(code, 0.4)
+    document.add_pose_to_library("bent")
+    document.save(tmp_path / "poses.json")
+    assert '"arm"' in (tmp_path / "poses.json").read_text()
+    with qtbot.waitSignal(autosave.written, timeout=PATIENCE):
+        document.set_code(code, 0.5)
+    assert autosave.close(keep=True)
+    assert document.close()
+    document.deleteLater()
+
+    (lost,) = find_lost_poses(tmp_path / "sessions")
+    after = PoseDocument(open_body(arm_file), library_folder=tmp_path / "library")
+    assert [pose.name for pose in after.poses] == ["bent"]
+    with qtbot.waitSignal(after.recovered, timeout=PATIENCE):
+        after.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
+    assert after.latent[code] == pytest.approx(0.5)
+    assert Path(after.model_file) == arm_file
+    lost.session.discard()
+    assert after.close()
+    after.deleteLater()
+
+
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_the_editor_starts_with_a_character_or_without_a_damaged_one(
+    qtbot: QtBot,
+    tmp_path: Path,
+    arm_file: Path,
+    is_whole: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if not is_whole:
+        arm_file.write_bytes(b"no character")
+    document = PoseDocument(library_folder=tmp_path / "library")
+    window = MainWindow(document, settings_in(tmp_path))
+    window.show()
+    with qtbot.waitSignal(window.ready, timeout=2 * PATIENCE):
+        start = StartUp(window, arm_file, None)
+        start.begin()
+    assert isinstance(document.model, RigModel) == is_whole
+    assert bool(window.findChildren(FailureDialog)) != is_whole
+    for dialog in window.findChildren(FailureDialog):
+        dialog.close()
+    start.setParent(None)
+    start.deleteLater()
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    close_window(window)
