@@ -35,8 +35,8 @@ from app.benchmarks.timing import Row
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.model import PoseModel
-from lcollision_core.posing import DragOptions, Grip, Pin, make_grip
+from lcollision_core.model import PosableBody, RigModel
+from lcollision_core.posing import DragOptions, Grip, Pin, far_end, make_grip
 from lcollision_core.posing.stretch import largest_stretch
 
 FloatArray = npt.NDArray[np.float64]
@@ -64,7 +64,7 @@ class _Drag(NamedTuple):
 
 
 def time_drags(
-    model: PoseModel,
+    model: PosableBody,
     n_targets: int = TARGETS,
     seed: int = 0,
     progress: Progress = no_progress,
@@ -97,19 +97,22 @@ def time_drags(
     ]
 
 
-def is_free_by_brute_force(model: PoseModel, vertices: npt.NDArray[np.floating]) -> bool:
+def is_free_by_brute_force(model: PosableBody, vertices: npt.NDArray[np.floating]) -> bool:
     """Compare all pairs of faces of a (V, 3) pose that share no vertex, without a tree."""
     faces, size = model.faces, model.body_size
     corners = vertices[faces].astype(np.float64)
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    order = np.argsort(corners[:, :, 0].min(axis=1), kind="stable")
+    low, high = corners[order].min(axis=1), corners[order].max(axis=1)
     for first in range(0, len(faces), _ROWS_AT_ONCE):
         rows = slice(first, first + _ROWS_AT_ONCE)
-        touch = (low[rows, None] <= high[None]).all(axis=2)
-        touch &= (low[None] <= high[rows, None]).all(axis=2)
-        a, b = np.nonzero(touch)
-        a += first
+        # Only those that begin later, and before the last of these ends.
+        others = slice(first, int(np.searchsorted(low[:, 0], high[rows, 0].max(), "right")))
+        touch = (low[rows, None] <= high[None, others]).all(axis=2)
+        touch &= (low[None, others] <= high[rows, None]).all(axis=2)
+        a, b = (order[first + found] for found in np.nonzero(touch))
+        a, b = np.minimum(a, b), np.maximum(a, b)
         shared = (faces[a][:, :, None] == faces[b][:, None, :]).any(axis=(1, 2))
-        pairs = np.stack([a, b], axis=1)[~shared & (a < b)]
+        pairs = np.unique(np.stack([a, b], axis=1)[~shared & (a < b)], axis=0)
         deep = penetration_depth(corners[pairs[:, 0]], corners[pairs[:, 1]]) / size
         pairs, deep = pairs[deep > DEPTH_TOLERANCE], deep[deep > DEPTH_TOLERANCE]
         if not model.detector.rules_of(pairs, deep).all():
@@ -118,7 +121,7 @@ def is_free_by_brute_force(model: PoseModel, vertices: npt.NDArray[np.floating])
 
 
 def _scripted(
-    model: PoseModel,
+    model: PosableBody,
     vertices: FloatArray,
     training: FloatArray,
     n_targets: int,
@@ -147,11 +150,14 @@ def _scripted(
     return drags
 
 
-def _places(model: PoseModel, vertices: FloatArray) -> dict[str, int]:
+def _places(model: PosableBody, vertices: FloatArray) -> dict[str, int]:
     """Return a vertex of each hand, foot, elbow and the head: the far ends of the body.
 
-    The five ends are those that are farthest from each other along the surface.
+    The five ends are those that are farthest from each other along the surface; a rig, whose
+    surface may be of many pieces, says where they are.
     """
+    if isinstance(model, RigModel):
+        return _places_on_rig(model)
     up = np.eye(3)[model.up_axis]
     graph = model.pose_space.surface_graph
 
@@ -176,8 +182,28 @@ def _places(model: PoseModel, vertices: FloatArray) -> dict[str, int]:
     return places
 
 
+def _places_on_rig(model: RigModel) -> dict[str, int]:
+    parts = {name.casefold(): domain for domain, name in enumerate(model.domain_names)}
+    sides = [f"{side} {name}" for side in ("left", "right") for name in ("foot", "hand", "forearm")]
+    missing = {"head", *sides} - parts.keys()
+    if missing:
+        raise LCollisionError(
+            f"has no {min(missing)} to drag", "name another character", where=model.name
+        )
+    space, places = model.space, {"head": far_end(model.space, parts["head"])}
+    for side in ("left", "right"):
+        for name in ("foot", "hand"):
+            places[f"{side} {name}"] = far_end(space, parts[f"{side} {name}"])
+        forearm = parts[f"{side} forearm"]
+        first = int(np.flatnonzero(space.codes_of([forearm]))[0])
+        inside = np.flatnonzero(space.vertex_domain == forearm)
+        away = space.rest_vertices[inside] - space.origins[space.joint_of_code[first]]
+        places[f"{side} elbow"] = int(inside[np.linalg.norm(away, axis=1).argmin()])
+    return places
+
+
 def _time_mode(
-    model: PoseModel,
+    model: PosableBody,
     start: FloatArray,
     drags: list[_Drag],
     solid: bool,

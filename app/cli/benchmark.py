@@ -167,7 +167,8 @@ def resolve(
 @app.command("drag")
 def drag(
     model_name: Annotated[
-        str, typer.Option("--model", metavar="M", help="A model; no predictor needed.")
+        str,
+        typer.Option("--model", metavar="M", help="A model or a character; no predictor needed."),
     ] = "body",
     n_targets: Annotated[
         int, typer.Option("-n", min=1, max=10_000, metavar="N", help="Targets of each grip.")
@@ -176,9 +177,9 @@ def drag(
 ) -> None:
     """Drag hands, feet, head and elbows to scripted targets, plain and solid."""
     from app.benchmarks.drag import time_drags
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import open_body
 
-    model = PoseModel.load(model_name)
+    model = open_body(model_name)
     with cancel_on_interrupt() as cancel, progress_bar("Dragging") as progress:
         rows = time_drags(model, n_targets, progress=progress, cancel=cancel)
     if as_json:

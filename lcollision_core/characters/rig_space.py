@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import joint_roles, rig_kernels
 from lcollision_core.characters.character import Character, Rig
+from lcollision_core.characters.joint_roles import Role
 from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.meshes.part_names import joint_labels
 from lcollision_core.meshes.topology import FloatArray, IntArray, length_graph
 from lcollision_core.meshes.units import body_size, front_direction
 
@@ -24,6 +26,9 @@ _SHIFT, _TURN = 1.0, np.pi
 
 _SLACK = np.radians(5.0)
 """By which joints may turn further than in any frame of the character's clips."""
+
+_LEAST_BEND = np.radians(10.0)
+"""Of elbows and knees, where a drag asks how patches move."""
 
 _METRIC_POSES = 8
 _METRIC_VERTICES = 3000
@@ -50,7 +55,7 @@ class RigPoseSpace:
     Parameters
     ----------
     character : with a rig
-    parts : J names of body parts, by joint; by default each joint is one
+    parts : J names of body parts, by joint; by default `meshes.part_names.joint_labels`
     frames : (N, J, 4, 4) global transforms of the joints in plausible poses, as `ClipFrames` has
         them: they widen the limits, and say what moves together
 
@@ -63,6 +68,7 @@ class RigPoseSpace:
     roles : J of them, what each joint is by its name
     origins : (J, 3) float64 array, where the joints are in the rest pose, normalised
     axes : (J, 3, 3) float64 array, the joints' axes in the rest pose, a column each
+    part_of_joint : (J,) each joint's body part, an index from 0
     up : (3,) float64 unit vector
     front : (3,) float64 unit vector, where the character faces at rest
     body_size : the unit of the normalised lengths, in the character's unit
@@ -85,7 +91,8 @@ class RigPoseSpace:
                 "has no joints to pose it by", "choose a rigged character", where=character.source
             )
         n_joints = len(rig.parents)
-        parts = rig.joint_names if parts is None else parts
+        if parts is None:
+            parts = joint_labels(rig.joint_names, rig.parents)
         if len(parts) != n_joints:
             raise ShapeError.must_be("body parts of a rig", f"{n_joints} names", len(parts))
         self.topology = character.topology
@@ -174,7 +181,8 @@ class RigPoseSpace:
             name = parts[joint] if joint >= 0 else ""
             above = part_of.get(int(rig.parents[joint]), "") if joint >= 0 else ""
             part_of[joint] = name if name in leading else above
-        fallback = parts[heaviest[0]]
+        # A root that leads no vertex goes with the first joint that does.
+        fallback = next(name for name in part_of.values() if name)
         part_of = {joint: name or fallback for joint, name in part_of.items()}
         self.part_names = tuple(dict.fromkeys(part_of.values()))
         part_of_joint = np.array(
@@ -184,7 +192,9 @@ class RigPoseSpace:
             ]
         )
         self.vertex_domain: npt.NDArray[np.intp] = part_of_joint[heaviest]
-        self._part_of_joint = part_of_joint
+        self.part_of_joint = part_of_joint
+        # No part where the root is no joint.
+        self._root_part = int(part_of_joint[self._bones[0]]) if self._bones[0] >= 0 else -1
         bones, axes, sizes = [0] * ROOT_CODES, list(range(ROOT_CODES)), [ROOT_CODES]
         low, high = [-_SHIFT] * 3 + [-_TURN] * 3, [_SHIFT] * 3 + [_TURN] * 3
         for name in self.part_names:
@@ -202,6 +212,11 @@ class RigPoseSpace:
         self._bone_of_code, self.axis_of_code = np.array(bones), np.array(axes)
         self.joint_of_code = self._bones[self._bone_of_code]
         self.group_sizes: tuple[int, ...] = tuple(sizes)
+        hinges = [
+            bool(axis == 0 and joint >= 0 and self.roles[joint] in (Role.FOREARM, Role.SHIN))
+            for joint, axis in zip(self.joint_of_code, self.axis_of_code, strict=True)
+        ]
+        self._hinges = np.flatnonzero(hinges)
         # Where a code's number lies among the shift and the turns of all bones.
         self._place = self.axis_of_code + np.where(
             self._bone_of_code == 0, 0, 3 + 3 * self._bone_of_code
@@ -222,7 +237,7 @@ class RigPoseSpace:
     def attention_mask(self) -> npt.NDArray[np.float32]:
         """(K, V) the share of each body part in each vertex: the skin weights of its joints."""
         mask = np.zeros((self.n_domains, self.topology.n_vertices))
-        part = self._part_of_joint[self.rig.joint_of]
+        part = self.part_of_joint[self.rig.joint_of]
         vertex = np.broadcast_to(np.arange(len(part))[:, None], part.shape)
         np.add.at(mask, (part, vertex), self.rig.weights)
         return mask.astype(np.float32)
@@ -296,10 +311,22 @@ class RigPoseSpace:
         return length_graph(self.topology.edges, self.rest_vertices)
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
-        """Return which codes body parts own: (D,)."""
-        group = np.repeat(np.arange(len(self.group_sizes)), self.group_sizes)
-        owned: npt.NDArray[np.bool_] = np.isin(group, [1 + domain for domain in domains])
+        """Return which codes body parts own: (D,); the root's own those of the whole body."""
+        chosen = list(domains)
+        owner = np.repeat(np.arange(-1, self.n_domains), self.group_sizes)
+        owned: npt.NDArray[np.bool_] = np.isin(owner, chosen)
+        owned[:ROOT_CODES] = self._root_part in chosen
         return owned
+
+    def held_codes(self, vertex: int, pinned: bool) -> npt.NDArray[np.bool_]:
+        """Return the codes of the whole body unless its root is dragged or patches are pinned.
+
+        See `posing.PoseSpace`: a hand that is dragged does not pull the body off its feet.
+        """
+        held = np.zeros(len(self.low), dtype=np.bool_)
+        apart = self.vertex_domain[vertex] != self._root_part >= 0
+        held[:ROOT_CODES] = apart and not pinned
+        return held
 
     def _motions(self, codes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         numbers = np.zeros(3 + 3 * len(self._bones))
@@ -335,7 +362,8 @@ class RigPoseSpace:
             *self._motions(codes),
         )
         by_numbers = np.concatenate(
-            [by_shift @ self._bone_axes[0], by_turns.reshape(len(by_vertices), -1)], axis=1
+            [by_shift @ self._bone_axes[0], by_turns.reshape(len(by_shift), 3 * len(self._bones))],
+            axis=1,
         )
         by_codes: FloatArray = by_numbers[:, self._place]
         return by_codes
@@ -353,6 +381,10 @@ class RigPoseSpace:
     def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
         """Prepare the derivatives of patches' means by the codes; see `posing.PoseSpace`.
 
+        Elbows and knees that are straight are taken as a little bent: to first order bending a
+        straight limb does not shorten it, so that a hand pulled to the shoulder would go any way
+        but that.
+
         Parameters
         ----------
         weights : (m, V) of the patches' means
@@ -361,7 +393,9 @@ class RigPoseSpace:
         means = means.reshape(-1, weights.shape[1], 3)
 
         def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
-            return self.pull_back(codes, np.concatenate([means, by_vertices]))
+            bent = np.array(codes, dtype=np.float64)
+            bent[self._hinges] = np.maximum(bent[self._hinges], _LEAST_BEND)
+            return np.concatenate([self.pull_back(bent, means), self.pull_back(codes, by_vertices)])
 
         return slopes
 

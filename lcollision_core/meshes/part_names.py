@@ -70,13 +70,8 @@ def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
     )
 
 
-def part_labels(
-    names: Sequence[str],
-    parents: npt.NDArray[np.int64],
-    joint_of: npt.NDArray[np.int32],
-    weights: FloatArray,
-) -> npt.NDArray[np.str_]:
-    """Name the body part of each vertex after the part whose joints have the most weight.
+def joint_labels(names: Sequence[str], parents: npt.NDArray[np.int64]) -> tuple[str, ...]:
+    """Name the body part of each joint.
 
     A joint whose name does not tell is part of what its parents are, and if they do not tell
     either, has its own name.
@@ -84,11 +79,10 @@ def part_labels(
     Parameters
     ----------
     names, parents : of J joints, parents before children
-    joint_of, weights : (V, I) arrays, as of a rig
 
     Returns
     -------
-    (V,) array of printable strings
+    J printable names
     """
     own = part_names(names)
     labels: list[str] = []
@@ -97,6 +91,27 @@ def part_labels(
         inherits = own[joint] is None and parent >= 0 and known[parent]
         labels.append(own[joint] or (labels[parent] if inherits else _spelled_out(name)))
         known.append(own[joint] is not None or inherits)
+    return tuple(labels)
+
+
+def part_labels(
+    names: Sequence[str],
+    parents: npt.NDArray[np.int64],
+    joint_of: npt.NDArray[np.int32],
+    weights: FloatArray,
+) -> npt.NDArray[np.str_]:
+    """Name the body part of each vertex after the part whose joints have the most weight.
+
+    Parameters
+    ----------
+    names, parents : see `joint_labels`
+    joint_of, weights : (V, I) arrays, as of a rig
+
+    Returns
+    -------
+    (V,) array of printable strings
+    """
+    labels = joint_labels(names, parents)
     parts, part_of_joint = np.unique(np.array(labels), return_inverse=True)
     share = np.zeros((len(joint_of), len(parts)))
     rows = np.arange(len(joint_of))

@@ -91,7 +91,7 @@ class RigModel(PosableBody):
         Parameters
         ----------
         character : with a rig
-        parts : names of body parts by joint, by default the joints' own
+        parts : names of body parts by joint: see `RigPoseSpace`
 
         Raises
         ------

@@ -157,8 +157,7 @@ class PoseDragger:
             raise ShapeError("a pose to drag has a number that is not finite", "repair the pose")
         self._start = start
         self._low, self._high = np.minimum(space.low, start), np.maximum(space.high, start)
-        locked = space.codes_of(self._options.locked_domains)
-        self._low[locked] = self._high[locked] = start[locked]
+        self._hold_still(space.codes_of(self._options.locked_domains))
         self._contacts = Contacts(check)
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
@@ -177,15 +176,21 @@ class PoseDragger:
         if grip is None:
             self._goal = CodesGoal(space)
         elif isinstance(grip, Grip):
+            self._hold_still(space.held_codes(grip.vertex, bool(held)))
             self._goal = PatchGoal(space, grip, held, strength)
         else:
             if not 0 <= grip.domain < space.n_domains:
                 raise LCollisionError.must_be(
                     "the body part to twist", f"1 to {space.n_domains}", grip.domain + 1
                 )
+            first = int((space.vertex_domain == grip.domain).argmax())
+            self._hold_still(space.held_codes(first, bool(held)))
             self._goal = TwistGoal(space, grip.domain, held, strength, self._here.vertices)
         self._stretch = self._stretch_of(self._here.vertices)
         return self._result(0.0, settled=True)
+
+    def _hold_still(self, codes: npt.NDArray[np.bool_]) -> None:
+        self._low[codes] = self._high[codes] = self._start[codes]
 
     def move(self, target: npt.ArrayLike) -> DragStep:
         """Go towards a target, by a few short steps at most.

@@ -86,6 +86,15 @@ class PoseSpace(Protocol):
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes body parts own: (D,)."""
 
+    def held_codes(self, vertex: int, pinned: bool) -> npt.NDArray[np.bool_]:
+        """Return which codes a drag leaves as they are: (D,).
+
+        Parameters
+        ----------
+        vertex : the middle of what is dragged
+        pinned : whether patches are pinned
+        """
+
     def decode(self, codes: FloatArray) -> FloatArray:
         """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
 
@@ -176,6 +185,10 @@ class LatentPoseSpace:
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes belong to domains: (D,); see `Embedding.codes_of`."""
         return self.embedding.codes_of(domains)
+
+    def held_codes(self, vertex: int, pinned: bool) -> npt.NDArray[np.bool_]:  # noqa: ARG002
+        """Return none: latent poses have no place of their own."""
+        return np.zeros(len(self.low), dtype=np.bool_)
 
     def decode(self, codes: FloatArray) -> FloatArray:
         """Decode (B, D) latent poses to (B, V, 3) vertices."""

@@ -107,7 +107,7 @@ def test_derivatives_are_those_of_differences(character: Character) -> None:
 def test_means_of_patches_are_differentiated_with_the_rest() -> None:
     character = CHARACTERS["body"]
     space = RigPoseSpace(character)
-    codes, by_vertices = random_codes(space), a_few(character, 2, 3)
+    codes, by_vertices = np.maximum(random_codes(space), np.radians(10.0)), a_few(character, 2, 3)
     weights = np.random.default_rng(1).random((2, space.topology.n_vertices))
     slopes = space.mean_slopes(csr_matrix(weights))(codes, by_vertices)
     assert slopes.shape == (3 * 2 + 2, len(codes))
@@ -117,6 +117,22 @@ def test_means_of_patches_are_differentiated_with_the_rest() -> None:
     np.testing.assert_array_equal(slopes[6:], space.pull_back(codes, by_vertices))
     none = np.empty((0, space.topology.n_vertices, 3))
     np.testing.assert_array_equal(space.mean_slopes(csr_matrix(weights))(codes, none), slopes[:6])
+
+
+def test_a_straight_arm_is_known_to_bend_when_its_hand_is_pulled_to_the_shoulder() -> None:
+    character = CHARACTERS["body"]
+    space, rig = RigPoseSpace(character), rig_of(character)
+    hand, elbow = (rig.joint_names.index(name) for name in ("LeftHand", "LeftForeArm"))
+    weights = np.zeros((1, space.topology.n_vertices))
+    led = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)] == hand
+    weights[0, led] = 1.0 / led.sum()
+    bend = (space.joint_of_code == elbow) & (space.axis_of_code == 0)
+    straight, none = np.zeros(len(space.low)), np.empty((0, space.topology.n_vertices, 3))
+    (along,) = space.mean_slopes(csr_matrix(weights))(straight, none)[0, bend]
+    assert along < -0.02
+    exact = np.zeros((1, space.topology.n_vertices, 3))
+    exact[0, :, 0] = weights[0]
+    assert abs(space.pull_back(straight, exact)[0, bend][0]) < 1e-3
 
 
 def test_codes_come_back_from_their_transforms(character: Character) -> None:
@@ -181,6 +197,7 @@ def test_body_parts_own_the_codes_of_their_joints() -> None:
     character = rigged_body()
     rig = rig_of(character)
     parts = [name.removesuffix("End").replace("Hand", "ForeArm") for name in rig.joint_names]
+    assert "Left forearm" in RigPoseSpace(character).part_names
     space = RigPoseSpace(character, parts)
     assert "LeftHand" not in space.part_names
     # The neck leads no vertex.
@@ -196,6 +213,41 @@ def test_body_parts_own_the_codes_of_their_joints() -> None:
     np.testing.assert_allclose(space.attention_mask.sum(axis=0), 1.0, atol=1e-6)
     led = space.attention_mask.argmax(axis=0) == space.vertex_domain
     assert led.mean() > 0.99
+
+
+def test_the_root_goes_with_its_own_part_and_stays_while_others_are_dragged() -> None:
+    space = RigPoseSpace(CHARACTERS["body"])
+    whole = np.arange(len(space.low)) < 6
+    hips = space.part_names.index("Hips")
+    np.testing.assert_array_equal(space.codes_of([hips]), whole)
+    of_hips, of_hand = (
+        int(np.flatnonzero(space.vertex_domain == space.part_names.index(part))[0])
+        for part in ("Hips", "Left hand")
+    )
+    np.testing.assert_array_equal(space.held_codes(of_hand, pinned=False), whole)
+    assert not space.held_codes(of_hand, pinned=True).any()
+    assert not space.held_codes(of_hips, pinned=False).any()
+    # Without a joint that carries all there is no part of the root.
+    tube = CHARACTERS["tube"]
+    parted = replace(tube, rig=replace(rig_of(tube), parents=np.array([-1, 0, -1])))
+    assert not RigPoseSpace(parted).held_codes(0, pinned=False).any()
+
+
+def test_a_root_that_leads_no_vertex_goes_with_what_does() -> None:
+    tube = CHARACTERS["tube"]
+    rig = rig_of(tube)
+    below = replace(
+        rig,
+        joint_names=("root", *rig.joint_names),
+        parents=np.array([-1, 0, 1, 0]),
+        rest=np.concatenate([np.eye(4)[None], rig.rest]),
+        joint_of=rig.joint_of + 1,
+    )
+    space = RigPoseSpace(replace(tube, rig=below), ["root", "one", "two", "three"])
+    assert space.part_names == ("one", "two", "three")
+    assert set(space.joint_of_code[:6]) == {0}
+    assert space.codes_of([0]).sum() == 6 + 3
+    assert not space.held_codes(int(np.argmax(space.vertex_domain == 0)), pinned=False).any()
 
 
 def test_hinges_bend_one_way_and_forward_is_where_the_toes_point() -> None:
