@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
+from app.cli.contact_options import note_rules
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import measured_model, measured_model_sentence
-from app.cli.results import note_near_exclusion
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def resolve(
         print_json([row | {"near_exclusion": model.near_exclusion} for row in rows])
         return
     print_table(rows)
-    note_near_exclusion(model)
+    note_rules(model)
     note(_RESOLVE_IN_PAPER)
 
 
@@ -188,7 +188,7 @@ def drag(
         )
         return
     print_table(rows)
-    note_near_exclusion(model)
+    note_rules(model)
 
 
 @app.command("editor")

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.inputs import Axis, NearExclusionOption, PoseSetArgument, up_sentence
+from app.cli.contact_options import (
+    IgnoreOption,
+    NearExclusionOption,
+    RestExclusionOption,
+    RuleOptions,
+    ToleratedDepthOption,
+    rules_sentence,
+)
+from app.cli.inputs import Axis, PoseSetArgument, up_sentence
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
@@ -29,13 +37,16 @@ def check(
     path: PoseSetArgument,
     as_json: JsonOption = False,
     near_exclusion: NearExclusionOption = None,
+    rest_exclusion: RestExclusionOption = None,
+    ignore: IgnoreOption = None,
+    tolerated_depth: ToleratedDepthOption = None,
 ) -> None:
     """Report the topology, size, defects and self-collisions of a pose set.
 
     Exits with 1 when the set cannot be trained on as it is: a pose is unusable, or a face of
     the first has no area.
     """
-    from lcollision_core.contact import CollisionDetector, ContactRules
+    from lcollision_core.contact import CollisionDetector, RuleCounts
     from lcollision_core.errors import MeshFileError, ShapeError
     from lcollision_core.meshes import degenerate_faces, inspect_pose_set
 
@@ -46,9 +57,12 @@ def check(
         raise inspection.defects[0]
     for remark in poses.notes:
         note(f"{path}: {remark}")
-    exclusion = poses.near_exclusion if near_exclusion is None else near_exclusion
+    options = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth)
     try:
-        detector = CollisionDetector(poses.topology, poses.vertices[0], ContactRules(exclusion))
+        rules, groups = options.applied(
+            poses.rules, poses.groups, poses.topology, poses.vertex_labels
+        )
+        detector = CollisionDetector(poses.topology, poses.vertices[0], rules, groups)
         with progress_bar("Finding self-collisions") as progress:
             found = detector.detect_batch(poses.vertices, progress=progress)
     except ShapeError as error:
@@ -62,7 +76,9 @@ def check(
         "watertight": poses.topology.is_watertight,
         "colliding_poses": int(found.colliding.sum()),
         "problems": list(inspection.problems),
-        "near_exclusion": exclusion,
+        "near_exclusion": rules.near_exclusion,
+        "rules": rules.to_json(),
+        "excluded_at_rest": RuleCounts(*found.n_excluded[0].tolist()).to_json(),
         "up_axis": "xyz"[guess.axis],
         "up_is_sure": guess.is_sure,
         "colliding": [
@@ -70,6 +86,7 @@ def check(
                 "pose": poses.names[pose],
                 "pairs": int(found.n_pairs[pose]),
                 "near_pairs": int(found.n_near_pairs[pose]),
+                "excluded_pairs": RuleCounts(*found.n_excluded[pose].tolist()).to_json(),
                 "energy": float(found.vertex_energy[pose].sum()),
             }
             for pose in found.colliding.nonzero()[0]
@@ -79,6 +96,8 @@ def check(
         print_json(report)
     else:
         _print(path, report, up_sentence(guess))
+        if not rules.exclude_nothing:
+            tell(f"  {rules_sentence(rules, report['excluded_at_rest'])}")
         if not guess.is_sure:
             note("`train embedding` takes that, unless --up x|y|z says otherwise")
     flat = degenerate_faces(poses.topology, poses.vertices[0])

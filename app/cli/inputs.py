@@ -40,16 +40,6 @@ RowsOption = Annotated[
     int | None,
     typer.Option("--rows", min=1, metavar="N", help="Use the first N rows. Default: all."),
 ]
-NearExclusionOption = Annotated[
-    float | None,
-    typer.Option(
-        min=0.0,
-        max=1.0,
-        metavar="X",
-        help="Count pairs within X body sizes along the surface separately. Default: what the "
-        "pose set says, else 0.",
-    ),
-]
 ThreadsOption = Annotated[
     int | None,
     typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one for each core."),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, status_bar, tell
+from app.cli.contact_options import excluded_at_rest, note_rules
 from app.cli.evaluate import open_store
 from app.cli.inputs import ThreadsOption
 from app.cli.interrupt import cancel_on_interrupt
@@ -99,6 +100,7 @@ def label(
         "rows": status.done,
         "labelled": status.labelled,
         "colliding_share": status.colliding_share,
+        "excluded_at_rest": excluded_at_rest(model),
         "seconds": seconds,
     }
     if status.done > count:
@@ -112,6 +114,7 @@ def label(
         f"({status.labelled} labelled now, {status.labelled / seconds:.0f}/s)"
     )
     tell(f"  {measured_model_sentence(model)}")
+    note_rules(model)
 
 
 def _check(model: PoseModel, path: Path, as_json: bool) -> None:

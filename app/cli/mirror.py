@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
+from app.cli.contact_options import note_rules
 from app.cli.inputs import PosesArgument
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
-from app.cli.results import PosesOutput, note_near_exclusion, require_output, write_result
+from app.cli.results import PosesOutput, require_output, write_result
 from app.wording import counted, mirrored_text
 from lcollision_core.errors import ModelFileError
 
@@ -55,7 +56,7 @@ def mirror(
     else:
         for source, mirrored in zip(sources, found, strict=True):
             tell(f"{source}: {mirrored_text(mirrored)}")
-        note_near_exclusion(model)
+        note_rules(model)
     colliding = [s for s, mirrored in zip(sources, found, strict=True) if mirrored.lost_freedom]
     if colliding:
         offer = (

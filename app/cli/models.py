@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, tell
+from app.cli.contact_options import rules_json, rules_sentence
 from app.cli.inputs import Axis
 from app.cli.results import require_output
 from app.wording import counted
@@ -91,10 +93,8 @@ def info(
     tell(f"  trained on {report['source']}, licence {report['licence']}")
     tell(f"  {error_sentence(report)}")
     tell(f"  {_predictor_sentence(report)}")
-    if report["near_exclusion"]:
-        tell(
-            f"  pairs of faces within {report['near_exclusion']} body sizes are counted separately"
-        )
+    if not model.rules.exclude_nothing:
+        tell(f"  {rules_sentence(model.rules, report['excluded_at_rest'])}")
     _print_domains(report)
 
 
@@ -180,6 +180,7 @@ def describe(model: PoseModel) -> dict[str, Any]:
         "masks": metrics and {name: getattr(metrics, name) for name in _MASKS},
         "predictor": _describe_predictor(model),
         "near_exclusion": model.near_exclusion,
+        **rules_json(model),
         "up_axis": "xyz"[model.up_axis],
         "height": model.body_size,
         "licence": model.card.licence,
@@ -201,11 +202,15 @@ def measured_model(model: PoseModel) -> dict[str, Any]:
 
 def measured_model_sentence(model: PoseModel) -> str:
     """Put the sizes and the pair rule of `measured_model` into words."""
+    from lcollision_core.meshes import STRICT
+
     first, *others = model.embedding.group_sizes
     least, most = min(others), max(others)
     each = f"{least}" if least == most else f"{least} to {most}"
     near = model.near_exclusion
     rule = f"near exclusion {near:g}" if near else "no near exclusion"
+    if model.rules != replace(STRICT, near_exclusion=near):
+        rule = f"not counted are {model.rules.described()}"
     return f"|Z_0| = {first}, |Z_k| = {each} for {counted(len(others), 'domain')}, {rule}"
 
 

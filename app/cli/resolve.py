@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
+from app.cli.contact_options import excluded_at_rest, note_rules
 from app.cli.inputs import ScaleOption, ThreadsOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -17,7 +18,6 @@ from app.cli.partial_output import UnfinishedPoses, unfinished_poses
 from app.cli.results import (
     FormatOption,
     FormOutput,
-    note_near_exclusion,
     output_named,
     require_format_holds,
     require_one_mesh,
@@ -181,18 +181,19 @@ def resolve(
             ],
         )
     rows: list[dict[str, Any]] = []
+    at_rest = excluded_at_rest(model)
     for request, result, file, mesh in zip(requests, results, files, detailed, strict=True):
         if result.note:
             note(f"{request.source}: {result.note}")
         row = {"source": request.source, "output": str(file), **_facts(result)}
         del row["converged"], row["note"]
-        rows.append(row | {"near_exclusion": model.near_exclusion})
+        rows.append(row | {"near_exclusion": model.near_exclusion, "excluded_at_rest": at_rest})
         if not as_json:
             tell(f"{request.source}: {_sentence(request, result, mesh is not None)}")
     if as_json:
         print_json(rows)
     else:
-        note_near_exclusion(model)
+        note_rules(model)
     if sequence:
         before = np.array([request.pose.latent for request in requests])
         change = largest_correction_change(model.embedding, before, results)
@@ -288,6 +289,7 @@ def _depends_on(
     model: PoseModel, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the inputs that determine the results: arrays, and JSON values."""
+    from lcollision_core.meshes.face_groups import ignored_faces_digest
     from lcollision_core.model import fingerprint_of_pose
 
     predictor = model.require_predictor().to_section()
@@ -301,6 +303,8 @@ def _depends_on(
         "predictor": dict(predictor.metadata),
         "height": model.body_size,
         "near_exclusion": model.near_exclusion,
+        "rules": model.rules.to_json(),
+        "ignored_faces": ignored_faces_digest(model.rules, model.groups),
         "sequence": sequence,
     }
     return arrays | {"free": model.free_latent}, values

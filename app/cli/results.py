@@ -73,15 +73,6 @@ def require_output(path: Path, suffix: str) -> Output:
     return Output(path, "poses", file_stamp(path))
 
 
-def note_near_exclusion(model: PosableBody) -> None:
-    """Report the pairs of faces that the figures leave out, if any."""
-    if model.near_exclusion:
-        note(
-            f"pairs of faces within {model.near_exclusion:g} body sizes along the surface are "
-            f"folds of the skin, which are no collisions"
-        )
-
-
 def output_named(name: str) -> Output:
     """Determine the form of an output, before the work for it is done.
 

@@ -12,8 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from app.cli.console import note, status_bar
+from app.cli.contact_options import (
+    IgnoreOption,
+    NearExclusionOption,
+    RestExclusionOption,
+    RuleOptions,
+    ToleratedDepthOption,
+)
 from app.cli.evaluate import StoreArgument, open_store, scores_sentence
-from app.cli.inputs import Axis, NearExclusionOption, PoseSetArgument, RowsOption, up_sentence
+from app.cli.inputs import Axis, PoseSetArgument, RowsOption, up_sentence
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import (
     ModelArgument,
@@ -55,6 +62,9 @@ def embedding(
         typer.Option("--domain-codes", min=1, max=64, metavar="k", help="Codes of each domain."),
     ] = 10,
     near_exclusion: NearExclusionOption = None,
+    rest_exclusion: RestExclusionOption = None,
+    ignore: IgnoreOption = None,
+    tolerated_depth: ToleratedDepthOption = None,
     up: Annotated[
         Axis | None,
         typer.Option(help="The axis that is up. Default: what the set says, else a guess."),
@@ -91,8 +101,9 @@ def embedding(
     poses = replace(poses, up_axis=guess.axis if up is None else "xyz".index(up))
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
-    if near_exclusion is not None:
-        poses = replace(poses, rules=replace(poses.rules, near_exclusion=near_exclusion))
+    options = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth)
+    rules, groups = options.applied(poses.rules, poses.groups, poses.topology, poses.vertex_labels)
+    poses = replace(poses, rules=rules, groups=groups)
     config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)
     checkpoint = checkpoint_path(destination)
     require_writable(checkpoint)

@@ -129,6 +129,19 @@ class ContactRules:
         except ValueError as error:
             raise ShapeError(str(error)) from error
 
+    def described(self) -> str:
+        """Say what is not counted, as in "pairs that touch at rest"; empty for the strict rule."""
+        groups = ", ".join(f"{a} and {b}" for a, b in self.ignored[:_NAMED_PAIRS])
+        more = len(self.ignored) - _NAMED_PAIRS
+        around = f" or within {self.rest_exclusion:g} of such a pair" if self.rest_exclusion else ""
+        said = (
+            self.near_exclusion and f"pairs within {self.near_exclusion:g} along the surface",
+            self.rest_exclusion is not None and f"pairs that touch at rest{around}",
+            groups and f"pairs of {groups}{f' and {more} more' if more > 0 else ''}",
+            self.tolerated_depth and f"pairs not deeper than {self.tolerated_depth:g}",
+        )
+        return ", ".join(what for what in said if what)
+
     def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
         """Say how many pairs are not counted, and by which rules; empty if there are none."""
         counts = counts if isinstance(counts, RuleCounts) else RuleCounts(**counts)

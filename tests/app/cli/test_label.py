@@ -104,6 +104,7 @@ def test_json_is_one_document_and_a_second_run_has_nothing_to_do(
             "level1_codes": 2,
             "domain_codes": [3, 3],
             "near_exclusion": 0.0,
+            "excluded_at_rest": {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0},
         }
         assert result.stderr == ""
 

@@ -57,6 +57,7 @@ FIELDS = [
     "evaluations",
     "seconds",
     "near_exclusion",
+    "excluded_at_rest",
 ]
 
 
@@ -300,7 +301,7 @@ def test_the_near_exclusion_is_stated(
     assert model.predictor is not None
     near.with_predictor(model.predictor).with_free_poses(model.free_latent).save(path)
     write_poses(poses, model, [NamedPose("bent", colliding[0])])
-    sentence = "pairs of faces within 0.05 body sizes along the surface are folds of the skin"
+    sentence = "not counted are pairs within 0.05 along the surface; at rest that is no pair"
     assert sentence in lcollision("resolve", path, poses, "-o", out).stderr
     rows = json.loads(lcollision("resolve", path, poses, "-o", out, "--json").stdout)
     assert [row["near_exclusion"] for row in rows] == [0.05]

@@ -1,0 +1,177 @@
+"""Options and reports of the commands that let people say which pairs of faces do not count."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli.console import note
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from lcollision_core.meshes import ContactRules, FaceGroup, Topology
+    from lcollision_core.model import PosableBody
+
+NearExclusionOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0,
+        max=1.0,
+        metavar="X",
+        help="Count pairs within X body sizes along the surface separately. Default: what the "
+        "pose set says, else 0.",
+    ),
+]
+RestExclusionOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0,
+        max=1.0,
+        metavar="R",
+        help="Do not count pairs that touch in the rest pose, or within R body sizes of such a "
+        "pair along the surface. 0: those pairs only.",
+    ),
+]
+RestOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="MESH",
+        readable=False,
+        help="The rest pose of the meshes: body size and distances are measured on it, and pairs "
+        "that touch in it are not counted.",
+    ),
+]
+IgnoreOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="A:B",
+        help="Do not count pairs of these groups of faces: meshes, materials, body parts, or "
+        "components, as in 'component 1:component 2', of which 1 has most faces. May be repeated.",
+    ),
+]
+ToleratedDepthOption = Annotated[
+    float | None,
+    typer.Option(min=0.0, max=1.0, metavar="D", help="Do not count pairs up to D body sizes deep."),
+]
+
+
+@dataclass(frozen=True)
+class RuleOptions:
+    """What the options say; None leaves the rule as it is."""
+
+    near_exclusion: float | None = None
+    rest_exclusion: float | None = None
+    ignore: Sequence[str] | None = None
+    tolerated_depth: float | None = None
+
+    def applied(
+        self,
+        rules: ContactRules,
+        groups: tuple[FaceGroup, ...],
+        topology: Topology,
+        vertex_labels: npt.NDArray[np.str_] | None = None,
+    ) -> tuple[ContactRules, tuple[FaceGroup, ...]]:
+        """Return the rules with these options, and the groups with those that they name.
+
+        Parameters
+        ----------
+        rules, groups : of the mesh or pose set
+        vertex_labels : (V,) names of body parts, where they are known
+
+        Raises
+        ------
+        LCollisionError : an ignored pair is not two names of groups.
+        """
+        from lcollision_core.meshes import component_groups, part_groups
+
+        chosen: dict[str, Any] = {
+            name: value
+            for name, value in (
+                ("near_exclusion", self.near_exclusion),
+                ("rest_exclusion", self.rest_exclusion),
+                ("tolerated_depth", self.tolerated_depth),
+            )
+            if value is not None
+        }
+        rules = replace(rules, **chosen)
+        if not self.ignore:
+            return rules, groups
+        held = {group.name for group in groups}
+        parts = () if vertex_labels is None else part_groups(topology, vertex_labels)
+        others = [
+            group for group in (*parts, *component_groups(topology)) if group.name not in held
+        ]
+        known = held | {group.name for group in others}
+        pairs = tuple(_pair(entry, known) for entry in self.ignore)
+        named = {name for pair in pairs for name in pair}
+        groups = (*groups, *(group for group in others if group.name in named))
+        return replace(rules, ignored=tuple(dict.fromkeys((*rules.ignored, *pairs)))), groups
+
+
+def _pair(entry: str, known: set[str]) -> tuple[str, str]:
+    """Split A:B where both are names; names may hold colons."""
+    splits = [
+        (entry[:at].strip(), entry[at + 1 :].strip())
+        for at, character in enumerate(entry)
+        if character == ":"
+    ]
+    for one, other in splits:
+        if one in known and other in known:
+            return one, other
+    listed = ", ".join(sorted(known)[:_LISTED]) + (" ..." if len(known) > _LISTED else "")
+    if not splits:
+        raise LCollisionError(
+            "is not A:B with the names of two groups of faces",
+            f"name two of {listed}",
+            where=f"--ignore {entry!r}",
+        )
+    unknown = next(name for name in splits[0] if name not in known)
+    raise LCollisionError(
+        f"names {unknown!r}, which is no group of faces of this mesh",
+        f"name two of {listed}",
+        where=f"--ignore {entry!r}",
+    )
+
+
+_LISTED = 8
+
+
+def note_rules(body: PosableBody) -> None:
+    """Report the pairs of faces that the figures leave out, and how many that is at rest."""
+    if not body.rules.exclude_nothing:
+        note(rules_sentence(body.rules, excluded_at_rest(body)))
+
+
+def rules_sentence(rules: ContactRules, at_rest: dict[str, int]) -> str:
+    """Write what is not counted, and how many pairs each rule excludes at rest."""
+    said = ", ".join(f"{number} {_RULES[rule]}" for rule, number in at_rest.items() if number)
+    return f"not counted are {rules.described()}; at rest that is {said or 'no pair'}"
+
+
+def excluded_at_rest(body: PosableBody) -> dict[str, int]:
+    """Return how many pairs of the rest pose each rule excludes, for JSON."""
+    from lcollision_core.meshes import RuleCounts
+
+    if body.rules.exclude_nothing:
+        return RuleCounts().to_json()
+    return body.detector.detect(body.reference).excluded.to_json()
+
+
+_RULES = {
+    "near": "near along the surface",
+    "rest": "touching at rest",
+    "ignored": "of ignored groups",
+    "tolerated": "not deeper than tolerated",
+}
+
+
+def rules_json(body: PosableBody) -> dict[str, Any]:
+    """Return the JSON fields that say which pairs do not count, and how many of them at rest."""
+    return {"rules": body.rules.to_json(), "excluded_at_rest": excluded_at_rest(body)}

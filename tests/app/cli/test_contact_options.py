@@ -1,0 +1,129 @@
+"""The options that say which pairs of faces do not count, and how commands report them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.meshes import (
+    ContactRules,
+    FaceGroup,
+    PoseSet,
+    Topology,
+    read_mesh,
+    write_pose_set,
+)
+from lcollision_core.model import PoseModel
+from tests.app.support import Lcollision
+
+NONE = {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0}
+
+
+@pytest.fixture
+def touching_set(stabbed: Path, tmp_path: Path) -> Path:
+    """Return a set whose faces 0 and 1 pierce each other at rest, and deeper in pose 1."""
+    mesh = read_mesh(stabbed)
+    deeper = mesh.vertices - np.repeat([[0.0, 0, 0], [0, 0, 0.2]], 3, axis=0)
+    poses = PoseSet(
+        np.stack([mesh.vertices, deeper]),
+        Topology(mesh.faces, 6),
+        ("rest", "deeper"),
+        groups=(FaceGroup("skin", np.array([0])), FaceGroup("belt: front", np.array([1]))),
+        vertex_labels=np.array(["trunk"] * 3 + ["hand"] * 3),
+    )
+    write_pose_set(tmp_path / "touching.npz", poses)
+    return tmp_path / "touching.npz"
+
+
+def test_pairs_that_touch_in_the_rest_pose_are_not_counted(
+    lcollision: Lcollision, stabbed: Path, apart: Path
+) -> None:
+    result = lcollision("check", stabbed, "--rest", stabbed)
+    assert result.exit_code == 0, result.stderr
+    assert "no collisions; 1 pair that touches at rest is not counted (6 vert" in result.stdout
+    exact = json.loads(lcollision("check", "--json", stabbed, "--rest", stabbed).stdout)[0]
+    assert exact["excluded_pairs"] == {**NONE, "rest": 1}
+    assert exact["rules"]["rest_exclusion"] == 0.02
+    counted = lcollision("check", "--json", stabbed, "--rest", apart, "--rest-exclusion", 0)
+    assert counted.exit_code == 1
+    assert json.loads(counted.stdout)[0]["excluded_pairs"] == NONE
+
+
+def test_components_and_depths_are_left_out_by_check(lcollision: Lcollision, stabbed: Path) -> None:
+    ignored = lcollision("check", stabbed, "--ignore", "component 2:component 1")
+    assert ignored.exit_code == 0
+    assert "no collisions; 1 pair of component 2 and component 1 is not" in ignored.stdout
+    tolerated = lcollision("check", stabbed, "--tolerated-depth", 0.11)
+    assert tolerated.exit_code == 0
+    assert "; 1 pair not deeper than 0.11 is not counted" in tolerated.stdout
+    assert lcollision("check", stabbed, "--tolerated-depth", 0.09).exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--rest-exclusion", 0.1), "--rest-exclusion needs a rest pose; name it with --rest MESH"),
+        (("--ignore", "hair"), "--ignore 'hair' is not A:B with the names of two groups"),
+        (("--ignore", "component 1:hair"), "names 'hair', which is no group of faces of this mesh"),
+        (("--tolerated-depth", -1), "--tolerated-depth"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(
+    lcollision: Lcollision, stabbed: Path, options: tuple[object, ...], sentence: str
+) -> None:
+    result = lcollision("check", stabbed, *options)
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+
+
+def test_a_rest_pose_of_another_mesh_is_refused(
+    lcollision: Lcollision, stabbed: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    result = lcollision("check", stabbed, "--rest", tmp_path / "one.obj")
+    assert result.exit_code == 2
+    assert "has other faces than the rest pose; name a rest pose of this mesh" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "excluded"),
+    [
+        ((), None),
+        (("--rest-exclusion", 0), "rest"),
+        (("--ignore", "skin:belt: front"), "ignored"),
+        (("--ignore", "hand:trunk"), "ignored"),
+        (("--ignore", "component 1:skin"), None),
+        (("--tolerated-depth", 0.5), "tolerated"),
+    ],
+)
+def test_dataset_check_names_the_rules(
+    lcollision: Lcollision, touching_set: Path, options: tuple[object, ...], excluded: str | None
+) -> None:
+    report = json.loads(lcollision("dataset", "check", touching_set, "--json", *options).stdout)
+    assert report["colliding_poses"] == (2 if excluded is None else 0)
+    assert report["excluded_at_rest"] == (NONE if excluded is None else {**NONE, excluded: 1})
+    said = lcollision("dataset", "check", touching_set, *options).stdout
+    assert ("not counted are" in said) == bool(options)
+    if excluded == "rest":
+        assert "not counted are pairs that touch at rest; at rest that is 1 touching" in said
+
+
+def test_a_trained_model_keeps_the_rules_and_says_them(
+    lcollision: Lcollision, editor_model: PoseModel, tmp_path: Path
+) -> None:
+    path = tmp_path / "m.safetensors"
+    rules = ContactRules(0.02, 0.0, (("a", "a"),), 0.001)
+    card = replace(editor_model.card, rules=rules, groups=(FaceGroup("a", np.array([0, 1])),))
+    editor_model.with_card(card).save(path)
+    report = json.loads(lcollision("info", path, "--json").stdout)
+    assert report["rules"] == rules.to_json()
+    assert report["excluded_at_rest"] == NONE
+    said = lcollision("info", path).stdout
+    assert (
+        "not counted are pairs within 0.02 along the surface, pairs that touch at rest, pairs of "
+        "a and a, pairs not deeper than 0.001; at rest that is no pair"
+    ) in said
