@@ -15,7 +15,7 @@ from PySide6.QtGui import (
 )
 from PySide6.QtWidgets import QGridLayout, QLabel, QSizePolicy, QVBoxLayout, QWidget
 
-from app.view.shading import COLLIDING_FACE, UNIT, Legend
+from app.view.shading import COLLIDING_FACE, UNCOUNTED_FACE, UNIT, Legend
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE, current_theme
 
 _RAMP_WIDTHS, _RAMP_HEIGHT = (100, 168), 10
@@ -45,8 +45,11 @@ class LegendStrip(QWidget):
         column.addWidget(self._title)
         column.addWidget(self._note)
         self._ramp = _Ramp(self)
-        self._crossing = QLabel(self)
-        self._blocks = (words, self._ramp, self._crossing)
+        self._crossing, self._uncounted = QLabel(self), QLabel(self)
+        self._uncounted.setToolTip(
+            "Crossing triangles that the contact rules leave out: see Edit > Contacts"
+        )
+        self._blocks = (words, self._ramp, self._crossing, self._uncounted)
         self._rows: list[list[QWidget]] = [[]]
         self._grid = QGridLayout(self)
         self._grid.setHorizontalSpacing(WIDE)
@@ -68,6 +71,7 @@ class LegendStrip(QWidget):
         self._note.setMinimumWidth(max(width(legend.note), width(UNIT)) + 1)
         self._ramp.set_legend(legend)
         self._crossing.setText(with_swatch(legend.crossing, COLLIDING_FACE))
+        self._uncounted.setText(with_swatch(legend.uncounted, UNCOUNTED_FACE))
         self.setAccessibleName(f"{legend.title} {legend.note}")
         self._fit(anew=is_other)
 
@@ -91,7 +95,12 @@ class LegendStrip(QWidget):
         """Take the rows that are needed; unless `anew`, no fewer than before."""
         rows: list[list[QWidget]] = [[]]
         used = NORMAL + CLOSE
-        shown = (True, bool(self.legend.ramp), bool(self.legend.crossing))
+        shown = (
+            True,
+            bool(self.legend.ramp),
+            bool(self.legend.crossing),
+            bool(self.legend.uncounted),
+        )
         for block, is_shown in zip(self._blocks, shown, strict=True):
             if not is_shown:
                 continue

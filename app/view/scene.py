@@ -9,10 +9,11 @@ import numpy.typing as npt
 import pyvista as pv
 
 from app.view.camera import VIEW_ANGLE, View
+from app.view.highlight import FaceHighlight
 from app.view.marks import Marks
 from app.view.outline import Outline, PartShape
 from app.view.patch import Patch
-from app.view.shading import COLLIDING_FACE
+from app.view.shading import COLLIDING_FACE, UNCOUNTED_FACE
 from app.view.surface import Surface, actor_of
 
 if TYPE_CHECKING:
@@ -24,8 +25,6 @@ _GHOST_OPACITY = 0.4
 _GHOST_NEAR, _GHOST_FAR = 0.004, 0.015
 """Normalised distances from the body at which the ghost begins to show and shows in full."""
 
-_THROUGH_OPACITY = 0.22
-_TO_THE_FRONT = -3.0e7  # in steps of a depth buffer of 24 bits: all of its range
 _FLOOR_RADIUS = 0.62
 
 
@@ -37,6 +36,10 @@ class Scene:
     plotter : its content is removed
     model : of the poses to show
     theme : whose colours are used
+
+    Attributes
+    ----------
+    crossing, uncounted : the faces that intersect another, and those of pairs that do not count
     """
 
     def __init__(self, plotter: pv.BasePlotter, model: PosableBody, theme: Theme) -> None:
@@ -57,22 +60,8 @@ class Scene:
         self._ghost_actor.ForceTranslucentOn()
         self._ghost_actor.SetVisibility(False)
 
-        self._crossing = pv.PolyData()
-        self._crossing.SetPoints(self.surface.polydata.GetPoints())
-        self._crossing_actors = (
-            actor_of(self._crossing, color=COLLIDING_FACE, ambient=0.55, diffuse=0.5),
-            # A collision on the far side, or inside a limb, shines through.
-            actor_of(
-                self._crossing, color=COLLIDING_FACE, opacity=_THROUGH_OPACITY, lighting=False
-            ),
-        )
-        # The same triangles are in the body: without an offset, rounding decides which is seen.
-        for actor, offset in zip(
-            self._crossing_actors, ((-2.0, -4.0), (0.0, _TO_THE_FRONT)), strict=True
-        ):
-            actor.mapper.SetResolveCoincidentTopologyToPolygonOffset()
-            actor.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(*offset)
-            actor.SetVisibility(False)
+        self.uncounted = FaceHighlight(self.surface, model.faces, UNCOUNTED_FACE, 1)
+        self.crossing = FaceHighlight(self.surface, model.faces, COLLIDING_FACE, 2)
 
         disc = pv.Disc(
             inner=0.0,
@@ -83,8 +72,11 @@ class Scene:
         self._floor = actor_of(disc, lighting=False, culling="back")
         self._shadow = actor_of(self.surface.polydata, lighting=False)
         self._lift = 2e-3 * model.body_size
-        nearer, through = self._crossing_actors
-        for actor in (self._floor, self._shadow, self.body, nearer, self._ghost_actor, through):
+        for actor in (
+            *(self._floor, self._shadow, self.body),
+            *(self.uncounted.nearer, self.crossing.nearer, self._ghost_actor),
+            *(self.uncounted.through, self.crossing.through),
+        ):
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)
         self._patch = Patch(self.body, self.surface.polydata, model.pose_space)
@@ -143,19 +135,6 @@ class Scene:
             self._fade_ghost()
         self._ghost_actor.SetVisibility(vertices is not None)
 
-    def show_crossing(self, pairs: npt.NDArray[np.int32] | None) -> None:
-        """Draw the faces that intersect another in red.
-
-        Parameters
-        ----------
-        pairs : (P, 2) array, indices of faces; None for no face
-        """
-        chosen = np.unique(pairs) if pairs is not None else ()
-        if len(chosen):
-            self._crossing.SetPolys(pv.CellArray.from_regular_cells(self._faces[chosen]))
-        for actor in self._crossing_actors:
-            actor.SetVisibility(len(chosen) > 0)
-
     def outline_domain(self, domain: int | None) -> None:
         """Outline a domain, by its index from 0, or none."""
         shape = None if domain is None else PartShape.of(self._mask, self._faces, domain)
@@ -188,21 +167,14 @@ class Scene:
         self.show(other.surface.vertices, other.surface.normals, other.surface.colours)
         if other.ghost_shown:
             self.show_ghost(other._ghost.vertices, other._ghost.normals)
-        self._crossing.SetPolys(other._crossing.GetPolys())
-        for actor in self._crossing_actors:
-            actor.SetVisibility(other.n_crossing > 0)
+        self.crossing.look_like(other.crossing)
+        self.uncounted.look_like(other.uncounted)
         self.view = other.view
 
     @property
     def ghost_shown(self) -> bool:
         """Whether a second pose is drawn."""
         return bool(self._ghost_actor.GetVisibility())
-
-    @property
-    def n_crossing(self) -> int:
-        """How many faces are drawn in red."""
-        shown = self._crossing_actors[0].GetVisibility()
-        return int(self._crossing.GetNumberOfPolys()) if shown else 0
 
     @property
     def view(self) -> View:

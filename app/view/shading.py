@@ -23,6 +23,9 @@ FULL_EXACT = 0.006
 COLLIDING_FACE = "#e0191f"
 """Faces that intersect another, in both themes."""
 
+UNCOUNTED_FACE = "#8a3fd1"
+"""Faces that intersect another where the contact rules do not count it, in both themes."""
+
 CONTACT = "#ffb000"
 """Marks of where contact holds the body, in both themes."""
 
@@ -75,6 +78,7 @@ class Legend:
     title : one line; "" if there is nothing to explain
     note : one line beneath it, or ""
     crossing : what faces in the colour `COLLIDING_FACE` are, "" if there are none
+    uncounted : likewise of `UNCOUNTED_FACE`
     ramp : "#rrggbb" from none to most, evenly spread; empty without a scale
     ticks : (position from 0 to 1 along the ramp, text)
     """
@@ -82,6 +86,7 @@ class Legend:
     title: str = ""
     note: str = ""
     crossing: str = ""
+    uncounted: str = ""
     ramp: tuple[str, ...] = ()
     ticks: tuple[tuple[float, str], ...] = ()
 
@@ -127,7 +132,13 @@ class Shader:
         picked: ColourArray = ramp((self.skin, *_RAMPS[shading]))[step.astype(np.intp)]
         return picked
 
-    def legend(self, shading: Shading, known: Known, has_predictor: bool = True) -> Legend:
+    def legend(
+        self,
+        shading: Shading,
+        known: Known,
+        has_predictor: bool = True,
+        excludes: bool = False,
+    ) -> Legend:
         """Explain what `colours` returns for the same arguments.
 
         Its scale stays while its numbers come and go, so that nothing round it moves.
@@ -135,17 +146,19 @@ class Shader:
         Parameters
         ----------
         has_predictor : False if no estimate will ever come
+        excludes : whether there are pairs that do not count
         """
         if shading is Shading.PLAIN:
             return Legend()
         if shading is Shading.DOMAINS:
             # The panels, and a label at the pointer, name the colours.
             greys, ends = ("#ffffff", "#565b63"), ((0.0, "shared"), (1.0, "alone"))
-            return Legend(shading.value, "stronger colour = only this part", "", greys, ends)
+            note = "stronger colour = only this part"
+            return Legend(shading.value, note, ramp=greys, ticks=ends)
         if shading is Shading.PREDICTED and not has_predictor:
             return Legend(shading.value, "this model does not predict")
         is_free = known.vertex_energy is not None and not known.vertex_energy.any()
-        crossing = ""
+        crossing = uncounted = ""
         if shading is Shading.PREDICTED:
             note = "computing…" if known.domain_energy is None else UNIT
             note = "the check found none" if is_free else note
@@ -155,13 +168,14 @@ class Shader:
             note = "no collisions" if is_free else note
             ticks = _ticks(FULL_EXACT, " or more")
             crossing = "crossing triangles"
+            uncounted = "not counted" if excludes else ""
         else:
             most = 0.0 if known.movement is None else float(known.movement.max())
             note = UNIT if most else "nothing moved"
             note = "shown after Resolve" if known.movement is None else note
             ticks = _ticks(most) if most else ((0.0, "none"), (1.0, "most"))
         scale = ramp_texts((self.skin, *_RAMPS[shading]))
-        return Legend(shading.value, note, crossing, scale, ticks)
+        return Legend(shading.value, note, crossing, uncounted, scale, ticks)
 
 
 def mask_colours(attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ...]) -> ColourArray:

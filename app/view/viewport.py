@@ -365,8 +365,10 @@ class Viewport(QWidget):
         if self._crossing_stale:
             self._crossing_stale = False
             exact = self._document.exact
-            shown = self.shading is Shading.EXACT and exact is not None
-            scene.show_crossing(exact.pairs if exact is not None and shown else None)
+            if self.shading is not Shading.EXACT:
+                exact = None
+            scene.crossing.show(None if exact is None else exact.pairs)
+            scene.uncounted.show(None if exact is None else exact.excluded_pairs)
         if self.mouse is not None:
             self.mouse.mark(scene, frame.vertices)
         scene.marks.show_contacts(frame.contacts)
@@ -426,9 +428,14 @@ class Viewport(QWidget):
         frame = self._document.frame
         if self._shader is None or frame is None:
             return
-        has_predictor = self._document.model.has_predictor
+        model = self._document.model
         self._legend.set_legend(
-            self._shader.legend(self.shading, self._known_of(frame), has_predictor)
+            self._shader.legend(
+                self.shading,
+                self._known_of(frame),
+                model.has_predictor,
+                not model.rules.exclude_nothing,
+            )
         )
 
     def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:

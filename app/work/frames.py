@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from lcollision_core.contact import SelfCollisions
+    from lcollision_core.contact import RuleCounts, SelfCollisions
     from lcollision_core.model import PosableBody
     from lcollision_core.posing import PoseDragger
 
@@ -51,7 +51,8 @@ class ExactVerdict:
     ----------
     request_id : of the frame that was checked
     pairs : (P, 2) int32 array, read-only, the colliding faces, the smaller first
-    n_near_pairs : pairs that are folds of the skin and do not count
+    excluded_pairs : (Q, 2) int32 array, read-only, colliding faces that the contact rules leave out
+    excluded : how many of them each rule leaves out
     energy : of the whole pose, in normalised lengths squared
     vertex_energy : (V,) float64 array, read-only, in normalised lengths squared
     colliding : whether there is a pair that counts
@@ -59,7 +60,8 @@ class ExactVerdict:
 
     request_id: int
     pairs: npt.NDArray[np.int32]
-    n_near_pairs: int
+    excluded_pairs: npt.NDArray[np.int32]
+    excluded: RuleCounts
     energy: float
     vertex_energy: FloatArray
     colliding: bool
@@ -70,7 +72,8 @@ class ExactVerdict:
         return cls(
             request_id=request_id,
             pairs=_frozen(found.pairs),
-            n_near_pairs=len(found.near_pairs),
+            excluded_pairs=_frozen(found.excluded_pairs),
+            excluded=found.excluded,
             energy=found.energy,
             vertex_energy=_frozen(found.vertex_energy),
             colliding=found.colliding,

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from app.window.widgets import Card, ElidedLabel, Sign, hbox, labelled, show_verdict, title_row
+from app.window.widgets import (
+    Card,
+    ElidedLabel,
+    Sign,
+    hbox,
+    labelled,
+    plain_tip,
+    show_verdict,
+    title_row,
+)
 from app.wording import counted, overlap_text
 
 if TYPE_CHECKING:
@@ -57,8 +66,8 @@ class ExactCard(Card):
         self.verdict.setText("Checking…" if has_model else "No pose yet")
         self.details.setText("Follows when the pose rests")
         if has_model:
-            # Folds that do not count are reported on a separate line.
-            lines = 2 if self._document.model.near_exclusion else 1
+            # What does not count is reported on a separate line.
+            lines = 1 if self._document.model.rules.exclude_nothing else 2
             self.details.setMinimumHeight(lines * self.details.fontMetrics().lineSpacing())
         self._on_exact()
 
@@ -75,22 +84,29 @@ class ExactCard(Card):
 
     def _say(self, verdict: ExactVerdict) -> None:
         document = self._document
-        frame, folds = document.frame, ""
+        frame, left_out = document.frame, verdict.excluded.total
         is_held = frame is not None and len(frame.contacts) > 0
-        if verdict.n_near_pairs:
-            folds = f"\n{counted(verdict.n_near_pairs, 'skin fold')} not counted"
+        headline = "Colliding (checked)" if verdict.colliding else "No collisions (checked)"
+        said, tips = [], []
         if verdict.colliding:
-            self.verdict.setText("Colliding (checked)")
             pairs = counted(len(verdict.pairs), "pair")
-            said = f"{pairs} of triangles, overlap {overlap_text(verdict.energy)}{folds}"
-            # Why a drag goes no further.
-            self.details.setText(f"{said}\n{_NO_DEEPER}" if is_held else said)
-            self.details.setToolTip(
-                "How deep all crossing triangles penetrate each other, combined, in per cent "
-                "of the body size"
+            said.append(f"{pairs} of triangles, overlap {overlap_text(verdict.energy)}")
+            tips.append(
+                "Overlap: how deep all crossing triangles penetrate each other, combined, in per "
+                "cent of the body size"
             )
-        else:
-            self.verdict.setText("No collisions (checked)")
-            said = _HELD if is_held else "No triangle crosses another"
-            self.details.setText(f"{said}{folds}")
-            self.details.setToolTip("")
+        elif is_held:
+            said.append(_HELD)
+        elif not left_out:
+            said.append("No triangle crosses another")
+        if left_out:
+            said.append(f"{counted(left_out, 'pair')} of triangles not counted")
+            sentence = document.model.rules.sentence(verdict.excluded)
+            tips.insert(0, f"{headline}; {sentence}: see Edit > Contacts")
+        if is_held and verdict.colliding:
+            # Why a drag goes no further.
+            said.append(_NO_DEEPER)
+        self.verdict.setText(headline)
+        self.details.setText("\n".join(said))
+        for label in (self.verdict, self.details):
+            label.setToolTip(plain_tip("\n".join(tips)) if tips else "")

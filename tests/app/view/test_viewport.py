@@ -26,6 +26,7 @@ from app.view.theme import DARK, LIGHT, apply_theme
 from app.view.turntable import TurntableStyle
 from app.view.viewport import Viewport
 from app.work.threads import Failure
+from lcollision_core.contact import ContactRules
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.model import PoseModel, sample_poses
 from tests.app.views import (
@@ -336,7 +337,7 @@ def test_intersecting_faces_are_red_while_the_truth_is_known(
     exact, scene = document.exact, viewport.scene
     assert exact is not None
     assert scene is not None
-    assert scene.n_crossing == len(np.unique(exact.pairs)) > 0
+    assert scene.crossing.n_faces == len(np.unique(exact.pairs)) > 0
 
     def n_red() -> int:
         colours = pixels(viewport)
@@ -350,7 +351,7 @@ def test_intersecting_faces_are_red_while_the_truth_is_known(
     assert document.exact is not None
     assert not document.exact.colliding
     rest(qtbot, viewport)
-    assert scene.n_crossing == 0
+    assert scene.crossing.n_faces == 0
     assert n_red() < n_while_colliding - 20
 
 
@@ -538,3 +539,28 @@ def test_a_closed_viewport_leaves_no_vtk_object_no_timer_and_no_thread(
     before = vtk_objects()
     assert show_and_close() > len(before) + 20
     assert vtk_objects() == before
+
+
+def test_pairs_that_do_not_count_have_a_colour_of_their_own(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
+) -> None:
+    strict = document.model
+    assert isinstance(strict, PoseModel)
+    bare = PoseModel("bare", strict.embedding, strict.card)
+    document.set_model(bare.with_rules(ContactRules(tolerated_depth=1.0)))
+    viewport.set_shading(Shading.EXACT)
+    document.blend_towards(colliding, 1.0)
+    qtbot.waitUntil(lambda: document.exact is not None)
+    rest(qtbot, viewport)
+    exact, scene = document.exact, viewport.scene
+    assert exact is not None
+    assert scene is not None
+    assert not exact.colliding
+    assert exact.excluded.tolerated == len(exact.excluded_pairs) > 0
+    assert (scene.crossing.n_faces, viewport.legend.uncounted) == (0, "not counted")
+    assert scene.uncounted.n_faces == len(np.unique(exact.excluded_pairs))
+    red, green, blue = np.moveaxis(pixels(viewport), 2, 0)
+    assert ((red > 1.3 * green) & (blue > 1.3 * red) & (blue > 90)).sum() > 20
+    viewport.set_shading(Shading.PLAIN)
+    rest(qtbot, viewport)
+    assert scene.uncounted.n_faces == 0
