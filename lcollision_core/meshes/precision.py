@@ -12,7 +12,7 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.topology import Topology
 
-SINGLE_PRECISION = (".stl", ".glb")
+SINGLE_PRECISION = (".stl", ".glb", ".vrm", ".pc2", ".mdd")
 """Formats that hold only float32; the others hold either precision."""
 
 LARGEST_RATIO = 0.01

@@ -43,7 +43,7 @@ EXPORT_SCALES = {
 }
 """The file's units in a metre, the assumed unit of models."""
 
-_ALREADY_FIXED = ".glb"
+_ALREADY_FIXED = (".glb", ".vrm")
 """glTF's own axes and unit are y up, z forward and the metre."""
 
 
@@ -85,7 +85,7 @@ def export_frame(
     """
     chosen = ExportAxes(axes)
     suffix = Path(path).suffix.lower()
-    if suffix == _ALREADY_FIXED:
+    if suffix in _ALREADY_FIXED:
         return ExportFrame(np.eye(3), 1.0)
     factor = EXPORT_SCALES[chosen] if scale is None else scale
     if chosen is ExportAxes.MODEL:

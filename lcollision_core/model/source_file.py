@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters import (
+    CHARACTER_SUFFIXES,
     PATCHED_SUFFIXES,
     Character,
     CharacterForm,
@@ -19,11 +20,18 @@ from lcollision_core.characters import (
     write_character,
 )
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes import RigidTransform, atomic_files, body_size, file_stems, read_mesh
+from lcollision_core.meshes import (
+    RigidTransform,
+    as_stored,
+    atomic_files,
+    body_size,
+    file_stems,
+    read_mesh,
+)
 from lcollision_core.meshes.formats.obj_rewrite import rewrite_obj
 from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, write_point_cache
 from lcollision_core.meshes.scene_files import read_scene
-from lcollision_core.model.export import ExportFrame
+from lcollision_core.model.export import export_frame, export_mesh
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.rig_model import RigModel
 
@@ -134,11 +142,17 @@ class WrittenPose:
     Attributes
     ----------
     vertices : (V, 3) array, in the axes and the unit of the file
+    unit : the body's units in one of the file's
     notes : sentences on what was left out of the file
     """
 
     vertices: npt.NDArray[Any]
+    unit: float
     notes: tuple[str, ...] = ()
+
+    def count_colliding_pairs(self, body: PosableBody) -> int:
+        """Return how many pairs of faces collide by the exact check of what the file holds."""
+        return len(body.detector.detect(self.vertices, unit=self.unit).pairs)
 
 
 class SourceFile:
@@ -171,14 +185,14 @@ class SourceFile:
         if suffix == ".obj":
             mesh = read_mesh(path, topology=body.topology)
             body.require_topology(mesh.topology, str(path))
-        elif suffix in PATCHED_SUFFIXES:
+        elif suffix in CHARACTER_SUFFIXES:
             self._character = own if own is not None and is_own else read_character(path)
             body.require_topology(self._character.topology, str(path))
             self._require_unit(self._character)
         else:
             raise MeshFileError(
                 f"has a form that is not written ({suffix or 'no extension'})",
-                f"name one of .obj, {', '.join(PATCHED_SUFFIXES)}",
+                f"name one of .obj, {', '.join(CHARACTER_SUFFIXES)}",
                 where=path,
             )
 
@@ -224,32 +238,34 @@ class SourceFile:
         vertices: npt.NDArray[Any],
         latent: npt.NDArray[Any],
         placement: RigidTransform | None = None,
-        frame: ExportFrame | None = None,
-    ) -> WrittenPose:
+    ) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
         """Write one pose, whole or not at all.
 
         Parameters
         ----------
         path : to write
         form : that is no sequence
-        vertices : (V, 3) array, in the body's unit, placed for export
+        vertices : (V, 3) array, placed for export, in the axes and the unit of the file
         latent : (D,) codes of the pose
         placement : that was applied to the vertices
-        frame : the file's axes and unit where the form has axes
+
+        Returns
+        -------
+        stored : (V, 3) array, what readers of the file get
+        notes : sentences on what was left out
 
         Raises
         ------
         MeshFileError : the file cannot be written, or the form cannot hold the pose.
         """
         if self._character is None:
-            placed = vertices if frame is None else frame.apply(vertices)
-            rewrite_obj(path, self.path, placed)
-            return WrittenPose(placed)
+            rewrite_obj(path, self.path, vertices)
+            return vertices, ()
         transforms = None
         if form.needs_rig and isinstance(self._body, RigModel):
             transforms = _placed(self._body.space.transforms(latent), placement)
         posed = write_character(path, self._character, vertices, form.key, transforms)
-        return WrittenPose(posed.vertices, posed.notes)
+        return posed.vertices, posed.notes
 
     def objects(self) -> list[tuple[str, npt.NDArray[np.integer]]]:
         """Return each mesh that a program shows of the file: its name, and its vertices.
@@ -269,13 +285,84 @@ class SourceFile:
         return [(names[node], np.concatenate(rows)) for node, rows in found.items()]
 
 
+def source_for(
+    suffix: str, body: PosableBody, like: str | os.PathLike[str] | None = None
+) -> SourceFile | None:
+    """Return the user's file whose form an output keeps.
+
+    Parameters
+    ----------
+    suffix : of the output
+    body : of the poses
+    like : the file, if the user names one; else a character's own where that offers the suffix
+
+    Raises
+    ------
+    MeshFileError, PoseSetError : as of `SourceFile`.
+    """
+    if like is not None:
+        return SourceFile(like, body)
+    if isinstance(body, RigModel):
+        own = body.character.source
+        suffixes = {form.suffix for form in offered_forms(own, has_rig=True)}
+        if suffix.lower() in suffixes or suffix.lower() == own.suffix.lower() == ".vrm":
+            return SourceFile(own, body)
+    return None
+
+
+def write_pose(
+    path: str | os.PathLike[str],
+    body: PosableBody,
+    latent: npt.NDArray[Any],
+    vertices: npt.NDArray[Any],
+    placement: RigidTransform | None = None,
+    *,
+    source: SourceFile | None = None,
+    form: str | None = None,
+    axes: str = "model",
+    scale: float | None = None,
+) -> WrittenPose:
+    """Write one pose as a mesh or in the user's own file, whole or not at all.
+
+    Parameters
+    ----------
+    path : to write; its extension says the format
+    body : of the pose
+    latent : (D,) its codes
+    vertices : (V, 3) array, in the body's unit, placed for export
+    placement : that was applied to them
+    source : the user's file, by `source_for`; None for a mesh of the body's own
+    form : the key of one of the source's forms; None for the best
+    axes, scale : see `export_frame`
+
+    Raises
+    ------
+    MeshFileError : the file cannot be written, or cannot hold the pose there or in that form.
+    """
+    frame = export_frame(body, axes, path, scale)
+    unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
+    if source is None:
+        if form is not None:
+            raise MeshFileError.unwritable(
+                path, f"the form {form} is one of a character's file", "name that, with --like"
+            )
+        return WrittenPose(export_mesh(path, body, vertices, placement, frame), unit)
+    chosen = source.require_form(path, form)
+    placed = as_stored(path, frame.apply(vertices), body.topology)
+    stored, notes = source.write(path, chosen, placed, latent, placement)
+    return WrittenPose(stored, unit, notes)
+
+
 def write_sequence(
     path: str | os.PathLike[str],
+    body: PosableBody,
     vertices: Sequence[npt.NDArray[Any]],
+    *,
     source: SourceFile | None = None,
-    frame: ExportFrame | None = None,
+    axes: str = "model",
+    scale: float | None = None,
     fps: float = 30.0,
-) -> tuple[list[Path], npt.NDArray[np.float32]]:
+) -> tuple[list[Path], list[WrittenPose]]:
     """Write poses as the frames of a point cache, in the vertex order of the user's mesh.
 
     A file that shows several meshes gets a cache for each, called after it: all of them, or none.
@@ -283,15 +370,16 @@ def write_sequence(
     Parameters
     ----------
     path : a .pc2 or .mdd file
-    vertices : of N poses, each (V, 3), in the body's unit
-    source : the user's file; the body's own vertex order if None
-    frame : axes and unit of the cache
+    body : of the poses
+    vertices : of N poses, each (V, 3), in the body's unit and coordinates
+    source : the user's file, by `source_for`; the body's own vertex order if None
+    axes, scale : see `export_frame`
     fps : frames a second
 
     Returns
     -------
     files : that were written
-    stored : (N, V, 3) float32 array, what they hold, by the body's vertices
+    written : what they hold of each pose
 
     Raises
     ------
@@ -302,18 +390,19 @@ def write_sequence(
         raise MeshFileError.unwritable(
             path, "it is no point cache", f"use one of {', '.join(POINT_CACHE_SUFFIXES)}"
         )
-    stacked = np.stack([pose if frame is None else frame.apply(pose) for pose in vertices])
-    stored = stacked.astype(np.float32)
-    objects = [("", np.arange(stored.shape[1]))] if source is None else source.objects()
+    frame = export_frame(body, axes, path, scale)
+    stored = np.stack([as_stored(path, frame.apply(pose), body.topology) for pose in vertices])
+    written = [WrittenPose(pose, 1.0 / frame.scale) for pose in stored]
+    objects = [("", np.arange(body.n_vertices))] if source is None else source.objects()
     if len(objects) == 1:
         write_point_cache(target, stored[:, objects[0][1]], fps)
-        return [target], stored
+        return [target], written
     stems = file_stems(f"{target.stem} {name}" for name, _ in objects)
     names = [f"{stem}{target.suffix}" for stem in stems]
     with atomic_files(target.parent) as folder:
         for name, (_, rows) in zip(names, objects, strict=True):
             write_point_cache(folder / name, stored[:, rows], fps)
-    return [target.with_name(name) for name in names], stored
+    return [target.with_name(name) for name in names], written
 
 
 def _placed(transforms: FloatArray, placement: RigidTransform | None) -> FloatArray:

@@ -17,6 +17,8 @@ from lcollision_core.model import (
     SourceFile,
     export_frame,
     offered_forms,
+    source_for,
+    write_pose,
     write_sequence,
 )
 from tests.core.character_file import described, figure
@@ -58,29 +60,58 @@ def test_a_pose_of_the_rig_goes_back_into_its_file(
         placement = RigidTransform(
             random_rotation(np.random.default_rng(1)), np.array([1.0, -2.0, 0.5]), 1.5
         )
-    source = SourceFile(model.character.source, model)
+    source = source_for(".glb", model)
     path = tmp_path / "posed.glb"
-    form = source.require_form(path, key)
     vertices = model.exported_vertices(latent, placement)
-    written = source.write(path, form, vertices, latent, placement)
+    written = write_pose(path, model, latent, vertices, placement, source=source, form=key)
     assert np.abs(written.vertices - vertices).max() < 1e-5 * model.body_size
     again = read_character(path)
     in_file = again.rest_vertices[again.joined]
     assert np.abs(in_file - written.vertices[model.character.joined]).max() < 1e-9
     assert len(written.notes) == 2
+    assert written.unit == (1.0 / 1.5 if is_placed else 1.0)
+
+
+def test_what_is_checked_is_what_the_file_holds(model: RigModel, tmp_path: Path) -> None:
+    latent = np.zeros(model.latent_size)
+    folded = np.where(model.space.joint_of_code > 0, model.space.high, 0.0)
+    for codes in (latent, folded):
+        vertices = model.exported_vertices(codes)
+        path = tmp_path / "posed.glb"
+        written = write_pose(path, model, codes, vertices, source=source_for(".glb", model))
+        again = RigModel.of(read_character(path))
+        expected = model.detector.detect(again.character.rest_vertices)
+        assert written.count_colliding_pairs(model) == len(expected.pairs) > 0
 
 
 def test_a_file_of_the_same_body_has_no_joints_to_turn(
     model: RigModel, latent: np.ndarray, tmp_path: Path
 ) -> None:
-    other = SourceFile(figure().write(tmp_path / "other.glb"), model)
+    other = source_for(".glb", model, figure().write(tmp_path / "other.glb"))
+    assert other is not None
     assert [form.key for form in other.forms] == ["mesh", "morph", "pc2", "mdd"]
     path = tmp_path / "posed.glb"
-    with pytest.raises(MeshFileError, match=r"with the form joints; choose .* mesh \(\.glb\)"):
-        other.require_form(path, "joints")
-    form = other.require_form(path, None)
     vertices = model.exported_vertices(latent)
-    assert np.array_equal(other.write(path, form, vertices, latent).vertices, vertices)
+    with pytest.raises(MeshFileError, match=r"with the form joints; choose .* mesh \(\.glb\)"):
+        write_pose(path, model, latent, vertices, source=other, form="joints")
+    assert not path.exists()
+    written = write_pose(path, model, latent, vertices, source=other)
+    assert np.array_equal(written.vertices, vertices)
+
+
+def test_a_character_s_own_file_is_the_source_where_it_can_be(
+    model: RigModel, latent: np.ndarray, tmp_path: Path
+) -> None:
+    for suffix in (".glb", ".GLB", ".pc2", ".mdd"):
+        source = source_for(suffix, model)
+        assert source is not None
+        assert source.path == model.character.source
+    assert source_for(".stl", model) is None
+    assert source_for(".vrm", model) is None
+    written = write_pose(tmp_path / "a.stl", model, latent, model.exported_vertices(latent))
+    np.testing.assert_array_equal(written.vertices, model.exported_vertices(latent))
+    with pytest.raises(MeshFileError, match="the form morph is one of a character's file"):
+        write_pose(tmp_path / "a.obj", model, latent, model.reference, form="morph")
 
 
 def test_vrm_is_written_as_vrm(tmp_path: Path) -> None:
@@ -113,10 +144,10 @@ def test_an_obj_file_keeps_its_form_in_any_axes(
     own.write_bytes(b"mtllib own.mtl\r\n" + own.read_bytes().replace(b"\nf", b"\nusemtl a\nf", 1))
     source = SourceFile(own, model)
     frame = export_frame(model, axes, path, scale=100.0)
-    form = source.require_form(path, None)
-    assert form.has_axes
-    vertices = model.exported_vertices(latent).astype(float)
-    written = source.write(path, form, vertices, latent, frame=frame)
+    assert source.require_form(path, None).has_axes
+    vertices = model.exported_vertices(latent)
+    written = write_pose(path, model, latent, vertices, source=source, axes=axes, scale=100.0)
+    assert written.unit == 0.01
     np.testing.assert_array_equal(read_mesh(path).vertices, written.vertices)
     np.testing.assert_array_equal(written.vertices, frame.apply(vertices))
     assert path.read_bytes().startswith(b"mtllib own.mtl\r\nv ")
@@ -131,7 +162,9 @@ def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
     poses = [model.exported_vertices(share * latent) for share in (0.0, 0.5, 1.0)]
     path = tmp_path / f"run{suffix}"
     frame = export_frame(model, "unreal", path)
-    files, stored = write_sequence(path, poses, source, frame, fps=24.0)
+    files, written = write_sequence(path, model, poses, source=source, axes="unreal", fps=24.0)
+    stored = np.stack([pose.vertices for pose in written])
+    assert {pose.unit for pose in written} == {0.01}
     assert [file.name for file in files] == [f"run {n}{suffix}" for n in ("Body", "Core", "Hat")]
     caches = [read_point_cache(file) for file in files]
     joined = np.concatenate([cache.frames for cache in caches], axis=1)
@@ -153,8 +186,13 @@ def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
 def test_a_model_s_own_order_needs_no_source(
     model: RigModel, latent: np.ndarray, tmp_path: Path
 ) -> None:
-    files, stored = write_sequence(tmp_path / "run.pc2", [model.exported_vertices(latent)])
+    vertices = model.exported_vertices(latent)
+    files, (written,) = write_sequence(tmp_path / "run.pc2", model, [vertices])
     assert files == [tmp_path / "run.pc2"]
-    np.testing.assert_array_equal(read_point_cache(files[0]).frames, stored)
+    np.testing.assert_array_equal(read_point_cache(files[0]).frames[0], vertices)
+    np.testing.assert_array_equal(written.vertices, vertices)
     with pytest.raises(MeshFileError, match="is no point cache; use one of"):
-        write_sequence(tmp_path / "run.glb", [model.reference])
+        write_sequence(tmp_path / "run.glb", model, [model.reference])
+    with pytest.raises(MeshFileError, match=r"\.pc2 rounds coordinates"):
+        write_sequence(tmp_path / "far.pc2", model, [model.reference + 1e6])
+    assert not (tmp_path / "far.pc2").exists()
