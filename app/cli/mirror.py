@@ -52,7 +52,7 @@ def mirror(
     sources = [f"{poses}: {pose.name}" for pose in named]
     if as_json:
         rows = zip(sources, found, strict=True)
-        print_json([_row(model, source, written, mirrored) for source, mirrored in rows])
+        print_json([_row(model, source, written.path, mirrored) for source, mirrored in rows])
     else:
         for source, mirrored in zip(sources, found, strict=True):
             tell(f"{source}: {mirrored_text(mirrored)}")

@@ -13,17 +13,23 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.partial_output import unfinished_poses
 from app.cli.results import (
+    AxesOption,
     FormatOption,
     FormOutput,
-    MeshAxes,
+    FpsOption,
+    LikeOption,
+    MeshStyle,
+    PoseFormOption,
     PosesOutput,
+    UnitOption,
     output_named,
-    require_format_holds,
+    require_mesh_style,
     require_output,
+    require_style,
     write_result,
 )
 from app.wording import fit_error
-from lcollision_core.errors import LCollisionError, PoseSetError
+from lcollision_core.errors import PoseSetError
 
 
 def encode(
@@ -78,40 +84,33 @@ def decode(
     model_name: ModelArgument,
     poses: PosesArgument,
     output: FormOutput,
-    mesh_format: FormatOption = "obj",
-    axes: Annotated[
-        MeshAxes,
-        typer.Option(help="For which program: its axes, and its unit for a model in metres."),
-    ] = "model",
-    scale: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-6,
-            max=1e6,
-            metavar="X",
-            help="The file's units in one of the model's. By default 100 for maya and unreal.",
-        ),
-    ] = None,
+    mesh_format: FormatOption = None,
+    axes: AxesOption = "model",
+    scale: UnitOption = None,
+    like: LikeOption = None,
+    form: PoseFormOption = None,
+    fps: FpsOption = 30.0,
 ) -> None:
     """Turn latent poses into meshes; one that was imported returns to its placement.
 
     With --axes they come in upright, facing the front, with the settings that the program's own
     importer begins with: y-up; blender; maya and unreal, in centimetres. A GLB file is y up and
     in the model's unit whatever is asked for, as its standard fixes both.
+
+    With --like FILE what comes is your own file with the pose in it: an OBJ file with its UVs,
+    groups, materials and quads; a GLB with its textures, UVs and vertex order, without the clips
+    that would hide the pose. FBX files are not written: name a .glb, .obj, .pc2 or .mdd file.
     """
     from lcollision_core.model import open_body, read_poses
 
     destination = output_named(output)
-    if destination.form == "poses" and (axes != "model" or scale is not None):
-        raise LCollisionError(
-            "would hold codes, which have neither --axes nor --scale",
-            "name a mesh or a folder",
-            where=output,
-        )
+    style = MeshStyle(mesh_format, axes, scale, like, form, fps)
+    if destination.form == "poses":
+        require_mesh_style(destination, style)
     model = open_body(model_name)
     named = read_poses(poses, model)
-    require_format_holds(destination, model, named, mesh_format)
-    write_result(destination, model, named, mesh_format, axes=axes, scale=scale)
+    source = require_style(destination, model, named, style)
+    write_result(destination, model, named, style, source=source)
 
 
 def sample(

@@ -18,9 +18,14 @@ from app.cli.partial_output import UnfinishedPoses, unfinished_poses
 from app.cli.results import (
     FormatOption,
     FormOutput,
+    FpsOption,
+    LikeOption,
+    MeshStyle,
+    PoseFormOption,
+    WrittenFile,
     output_named,
-    require_format_holds,
     require_one_mesh,
+    require_style,
     write_result,
 )
 from app.wording import counted, fit_error
@@ -96,7 +101,10 @@ def resolve(
     ] = None,
     workers: ThreadsOption = None,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the solver's starts.")] = 0,
-    mesh_format: FormatOption = "obj",
+    mesh_format: FormatOption = None,
+    like: LikeOption = None,
+    form: PoseFormOption = None,
+    fps: FpsOption = 30.0,
     as_json: JsonOption = False,
 ) -> None:
     """Move poses to the nearest ones that are free of self-collisions.
@@ -131,6 +139,7 @@ def resolve(
     )
     resolver = model.resolver
     target = output_named(output)
+    style = MeshStyle(mesh_format, like=like, form=form, fps=fps)
     if keep_detail and target.form == "poses":
         raise LCollisionError(
             "would hold codes, which cannot keep detail",
@@ -144,7 +153,7 @@ def resolve(
     if not requests:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     require_one_mesh(target, len(requests))
-    require_format_holds(target, model, [request.pose for request in requests], mesh_format)
+    source = require_style(target, model, [request.pose for request in requests], style)
     with (
         unfinished_poses(
             target.path, model, *_depends_on(model, requests, options, sequence), len(requests)
@@ -170,22 +179,23 @@ def resolve(
                 keep=keep,
             )
         detailed = _detailed(model, requests, results) if keep_detail else [None] * len(requests)
-        files = write_result(
+        written = write_result(
             target,
             model,
             [replace(r.pose, latent=f.latent) for r, f in zip(requests, results, strict=True)],
-            mesh_format,
+            style,
             [
                 result.vertices if mesh is None else mesh
                 for result, mesh in zip(results, detailed, strict=True)
             ],
+            source,
         )
     rows: list[dict[str, Any]] = []
     at_rest = excluded_at_rest(model)
-    for request, result, file, mesh in zip(requests, results, files, detailed, strict=True):
+    for request, result, file, mesh in zip(requests, results, written, detailed, strict=True):
         if result.note:
             note(f"{request.source}: {result.note}")
-        row = {"source": request.source, "output": str(file), **_facts(result)}
+        row = {"source": request.source, "output": str(file.path), **_facts(result)}
         del row["converged"], row["note"]
         rows.append(row | {"near_exclusion": model.near_exclusion, "excluded_at_rest": at_rest})
         if not as_json:
@@ -204,7 +214,8 @@ def resolve(
     if failed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     ends = (r.predicted_free if r.exactly_free is None else r.exactly_free for r in results)
-    if not all(ends):
+    is_kept = source is None or _stay_free(model, requests, results, written)
+    if not all(ends) or not is_kept:
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
@@ -346,6 +357,27 @@ def _detailed(
         if mesh is not None and detailed[-1] is None:
             note(f"{request.source}: with its detail the fixed mesh would collide, so it has none")
     return detailed
+
+
+def _stay_free(
+    model: PoseModel,
+    requests: Sequence[_Request],
+    results: Sequence[ResolveResult],
+    written: Sequence[WrittenFile],
+) -> bool:
+    """Check free poses as the user's own file holds them, and say where rounding made contact."""
+    stay_free = True
+    for request, result, file in zip(requests, results, written, strict=True):
+        if result.exactly_free and file.mesh is not None:
+            n_pairs = file.mesh.count_colliding_pairs(model)
+            if n_pairs:
+                stay_free = False
+                pairs = counted(n_pairs, "pair of faces collides", "pairs of faces collide")
+                note(
+                    f"{request.source}: as {file.path} holds it, {pairs} by rounding; --form mesh "
+                    f"holds the vertices that were checked"
+                )
+    return stay_free
 
 
 def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str:

@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from lcollision_core.meshes import FileStamp
-    from lcollision_core.model import NamedPose, PosableBody
+    from lcollision_core.model import NamedPose, PosableBody, SourceFile, WrittenPose
 
 
 MeshFormat = Literal["obj", "ply", "off", "stl", "glb"]
 MeshAxes = Literal["model", "y-up", "blender", "maya", "unreal"]
 """The axes that a mesh may be written in: `ExportAxes`, which takes long to import."""
+PoseForm = Literal["joints", "mesh", "morph"]
+"""How a character's file holds a pose: `CharacterForm`, which takes long to import."""
 
 PosesOutput = Annotated[
     Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
@@ -36,10 +38,84 @@ FormOutput = Annotated[
         "--output",
         "-o",
         metavar="OUT",
-        help="A mesh file for one pose, a folder for several, or a .json file.",
+        help="A mesh file for one pose, a folder for several, a .pc2 or .mdd file with all as "
+        "frames, or a .json file.",
     ),
 ]
-FormatOption = Annotated[MeshFormat, typer.Option("--format", help="Of the meshes in a folder.")]
+FormatOption = Annotated[
+    MeshFormat | None,
+    typer.Option("--format", help="Of the meshes in a folder. Default: obj, or glb by --like."),
+]
+LikeOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--like",
+        metavar="FILE",
+        readable=False,
+        help="Your own OBJ, GLB or VRM file of this body: the output is that file with another "
+        "pose in it, or point caches of its meshes. A character's is its own by default.",
+    ),
+]
+PoseFormOption = Annotated[
+    PoseForm | None,
+    typer.Option(
+        "--form",
+        help="How a GLB holds the pose: its joints turned, a static mesh or a morph target. "
+        "Default: joints where the pose came from them, else mesh.",
+    ),
+]
+AxesOption = Annotated[
+    MeshAxes, typer.Option(help="For which program: its axes, and its unit for a model in metres.")
+]
+UnitOption = Annotated[
+    float | None,
+    typer.Option(
+        "--scale",
+        min=1e-6,
+        max=1e6,
+        metavar="X",
+        help="The file's units in one of the model's. By default 100 for maya and unreal.",
+    ),
+]
+FpsOption = Annotated[
+    float, typer.Option(min=0.01, max=1000.0, metavar="N", help="Frames a second of an .mdd file.")
+]
+
+
+@dataclass(frozen=True)
+class MeshStyle:
+    """How meshes are written.
+
+    Attributes
+    ----------
+    mesh_format : of the meshes in a folder, None for that of `like`, else obj
+    axes, scale : see `export_frame`
+    like : the user's file whose form they keep
+    form : how a character's file holds a pose
+    fps : frames a second of a point cache
+    """
+
+    mesh_format: MeshFormat | None = None
+    axes: MeshAxes = "model"
+    scale: float | None = None
+    like: Path | None = None
+    form: PoseForm | None = None
+    fps: float = 30.0
+
+    def suffix(self, output: Output) -> str:
+        """Return the extension of the files that an output of meshes gets."""
+        if output.form != "folder":
+            return output.path.suffix.lower()
+        is_like_glb = self.like is not None and self.like.suffix.lower() != ".obj"
+        return f".{self.mesh_format or ('glb' if is_like_glb else 'obj')}"
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenFile:
+    """Where a pose was written, and what a mesh file holds of it."""
+
+    path: Path
+    mesh: WrittenPose | None = None
 
 
 @dataclass(frozen=True)
@@ -54,7 +130,7 @@ class Output:
     """
 
     path: Path
-    form: Literal["poses", "mesh", "folder"]
+    form: Literal["poses", "mesh", "folder", "frames"]
     before: FileStamp | None
 
 
@@ -91,6 +167,7 @@ def output_named(name: str) -> Output:
         has_known_suffix,
         require_writable,
     )
+    from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
 
     path = Path(name)
     suffix = path.suffix.lower()
@@ -98,14 +175,18 @@ def output_named(name: str) -> Output:
         require_writable(path / "pose.obj")
         return Output(path, "folder", None)
     must_be_folder = name.endswith(("/", os.sep))
-    if not must_be_folder and suffix in {".json", *WRITABLE_SUFFIXES}:
+    forms: dict[str, Literal["poses", "mesh", "frames"]] = {".json": "poses", ".vrm": "mesh"}
+    forms |= dict.fromkeys(WRITABLE_SUFFIXES, "mesh")
+    forms |= dict.fromkeys(POINT_CACHE_SUFFIXES, "frames")
+    if not must_be_folder and suffix in forms:
         require_writable(path)
-        return Output(path, "poses" if suffix == ".json" else "mesh", file_stamp(path))
+        return Output(path, forms[suffix], file_stamp(path))
     if not must_be_folder and has_known_suffix(path):
         raise LCollisionError.unwritable(
             path,
             f"{suffix} is not a known format",
-            f"use one of {', '.join(WRITABLE_SUFFIXES)}, .json or a folder",
+            f"use one of {', '.join((*WRITABLE_SUFFIXES, *POINT_CACHE_SUFFIXES))}, .json or a "
+            "folder",
         )
     require_writable(path)
     if path.exists():
@@ -128,51 +209,76 @@ def require_one_mesh(output: Output, n_poses: int) -> None:
         )
 
 
-def require_format_holds(
-    output: Output,
-    model: PosableBody,
-    poses: Sequence[NamedPose],
-    mesh_format: MeshFormat = "obj",
-) -> None:
-    """Refuse a format that cannot hold a pose at its location, before the work for it is done.
+def require_mesh_style(output: Output, style: MeshStyle) -> None:
+    """Refuse options of meshes where the output holds codes.
 
     Raises
     ------
-    MeshFileError : its rounding steps there exceed a small fraction of an edge.
+    LCollisionError : one is given.
+    """
+    if output.form == "poses" and style != MeshStyle(style.mesh_format, fps=style.fps):
+        raise LCollisionError(
+            "would hold codes, which have neither --axes nor --scale, --like or --form",
+            "name a mesh or a folder",
+            where=output.path,
+        )
+
+
+def require_style(
+    output: Output, model: PosableBody, poses: Sequence[NamedPose], style: MeshStyle
+) -> SourceFile | None:
+    """Refuse a style that the output or the poses cannot have, before the work for it is done.
+
+    Returns
+    -------
+    the user's file whose form the output keeps, None for none
+
+    Raises
+    ------
+    MeshFileError : the format's rounding steps where a pose lies exceed a small fraction of an
+        edge, or the file of `like` cannot be read, is of another body or does not offer the form.
+    PoseSetError : the file of `like` is of another body.
+    LCollisionError : the output holds codes.
     """
     from lcollision_core.meshes import as_stored
+    from lcollision_core.model import source_for
 
+    require_mesh_style(output, style)
     if output.form == "poses":
-        return
+        return None
+    suffix = style.suffix(output)
+    source = source_for(suffix, model, style.like)
+    if source is not None:
+        source.require_form(f"{output.path}{suffix if output.form == 'folder' else ''}", style.form)
     for pose in poses:
         if pose.placement is not None:
-            name = f"{pose.name}.{mesh_format}"
+            name = f"{pose.name}{suffix}"
             path = output.path / name if output.form == "folder" else output.path
             as_stored(path, pose.placement.apply(model.reference), model.topology)
+    return source
 
 
 def write_result(
     output: Output,
     model: PosableBody,
     poses: Sequence[NamedPose],
-    mesh_format: MeshFormat = "obj",
+    style: MeshStyle | None = None,
     vertices: Sequence[npt.NDArray[np.floating]] | None = None,
-    axes: str = "model",
-    scale: float | None = None,
-) -> list[Path]:
-    """Write poses as a .json file, one pose as a mesh, or each as a mesh of a folder, and say so.
+    source: SourceFile | None = None,
+) -> list[WrittenFile]:
+    """Write poses as a .json file, meshes or frames, and say so.
 
-    All of them come into a folder, or none. A file that others have written since the command
-    began stays, and the poses go beside it.
+    One pose is a mesh, several are meshes in a folder: all of them come there, or none. A file
+    that others have written since the command began stays, and the poses go beside it.
 
     Parameters
     ----------
     output : a folder is made where there is none
     model : of the poses
     poses : a pose with a placement returns to it
-    mesh_format : of the meshes in a folder
+    style : of meshes
     vertices : of each pose, (V, 3) to write; what the poses decode to where None
-    axes, scale : of meshes, see `export_frame`
+    source : the user's file whose form is kept, by `require_style`
 
     Returns
     -------
@@ -183,25 +289,37 @@ def write_result(
     LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
     from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, unused_name
-    from lcollision_core.model import export_frame, export_mesh, write_poses
+    from lcollision_core.model import write_pose, write_poses, write_sequence
 
     require_one_mesh(output, len(poses))
+    style = style or MeshStyle()
     decoded = (model.exported_vertices(pose.latent, pose.placement) for pose in poses)
 
-    def write(files: Sequence[Path]) -> None:
-        for file, pose, mesh in zip(files, poses, vertices or decoded, strict=True):
-            # OBJ and OFF would get short decimals of float32, which are other numbers in float64.
-            frame = export_frame(model, axes, file, scale)
-            export_mesh(file, model, mesh.astype(float), pose.placement, frame)
+    def write(files: Sequence[Path]) -> list[WrittenPose]:
+        return [
+            write_pose(
+                file,
+                model,
+                pose.latent,
+                mesh,
+                pose.placement,
+                source=source,
+                form=style.form,
+                axes=style.axes,
+                scale=style.scale,
+            )
+            for file, pose, mesh in zip(files, poses, vertices or decoded, strict=True)
+        ]
 
     path = output.path
     if output.form == "folder":
-        names = [f"{stem}.{mesh_format}" for stem in file_stems(pose.name for pose in poses)]
+        suffix = style.suffix(output)
+        names = [f"{stem}{suffix}" for stem in file_stems(pose.name for pose in poses)]
         n_replaced = sum((path / name).exists() for name in names)
         with atomic_files(path) as unfinished:
-            write([unfinished / name for name in names])
-        _tell_written(path, len(poses), n_replaced)
-        return [path / name for name in names]
+            in_folder = write([unfinished / name for name in names])
+        _tell_written(path, len(poses), n_replaced, in_folder)
+        return [WrittenFile(path / name, mesh) for name, mesh in zip(names, in_folder, strict=True)]
     with locked(path):
         n_replaced = int(path.exists())
         if n_replaced and file_stamp(path) != output.before:
@@ -210,15 +328,35 @@ def write_result(
                 f"{output.path} was changed by another command meanwhile and stays as it is; the "
                 f"result goes to {path}"
             )
+        meshes: list[WrittenPose] = []
         if output.form == "poses":
             write_poses(path, model, poses)
+        elif output.form == "frames":
+            files, meshes = write_sequence(
+                path,
+                model,
+                list(vertices or decoded),
+                source=source,
+                axes=style.axes,
+                scale=style.scale,
+                fps=style.fps,
+            )
+            path, n_replaced = files[0], n_replaced if files == [path] else 0
+            for file in files[1:]:
+                note(f"wrote {file}")
         else:
-            write([path])
-    _tell_written(path, len(poses), n_replaced)
-    return [path] * len(poses)
+            meshes = write([path])
+    _tell_written(path, len(poses), n_replaced, meshes)
+    if output.form == "poses":
+        return [WrittenFile(path)] * len(poses)
+    return [WrittenFile(path, mesh) for mesh in meshes]
 
 
-def _tell_written(output: Path, n_poses: int, n_replaced: int) -> None:
+def _tell_written(
+    output: Path, n_poses: int, n_replaced: int, meshes: Sequence[WrittenPose]
+) -> None:
+    for sentence in dict.fromkeys(sentence for mesh in meshes for sentence in mesh.notes):
+        note(sentence)
     told = f"wrote {counted(n_poses, 'pose')} to {output}"
     if n_replaced:
         replaced = counted(n_replaced, "file of the same name", "files of the same names")

@@ -1,0 +1,161 @@
+"""``lcollision decode --like`` and ``resolve --like``: the user's own file with another pose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.characters import read_character
+from lcollision_core.meshes import read_mesh, write_mesh
+from lcollision_core.meshes.formats.point_cache import read_point_cache
+from lcollision_core.model import (
+    NamedPose,
+    PoseModel,
+    open_body,
+    read_poses,
+    sample_poses,
+    write_poses,
+)
+from tests.app.support import Lcollision
+from tests.core.character_file import described, figure
+
+
+@pytest.fixture(scope="module")
+def body() -> PoseModel:
+    return PoseModel.load("body")
+
+
+@pytest.fixture
+def poses(body: PoseModel, tmp_path: Path) -> Path:
+    path = tmp_path / "poses.json"
+    latent = sample_poses(body, 2, seed=1, colliding=True)
+    write_poses(path, body, [NamedPose(f"pose {n}", row) for n, row in enumerate(latent)])
+    return path
+
+
+@pytest.fixture
+def own(body: PoseModel, tmp_path: Path) -> Path:
+    """Write the body as an OBJ file with what programs add: materials, UVs, groups."""
+    path = tmp_path / "own.obj"
+    write_mesh(path, body.reference, body.faces)
+    content = path.read_bytes().replace(b"\nf", b"\nvt 0 1\ng all\nusemtl skin\nf", 1)
+    path.write_bytes(b"mtllib own.mtl\n" + content)
+    return path
+
+
+def _rest_of(path: Path) -> list[bytes]:
+    return [line for line in path.read_bytes().splitlines() if not line.startswith(b"v ")]
+
+
+def test_decode_gives_back_the_user_s_obj(
+    lcollision: Lcollision, body: PoseModel, poses: Path, own: Path, tmp_path: Path
+) -> None:
+    plain, like = tmp_path / "plain", tmp_path / "like"
+    assert lcollision("decode", "body", poses, "-o", plain).exit_code == 0
+    done = lcollision("decode", "body", poses, "-o", like, "--like", own)
+    assert done.exit_code == 0, done.output
+    for name in ("pose 0.obj", "pose 1.obj"):
+        assert _rest_of(like / name) == _rest_of(own)
+        vertices = read_mesh(like / name, topology=body.topology).vertices
+        np.testing.assert_array_equal(vertices, read_mesh(plain / name).vertices)
+
+
+@pytest.mark.parametrize("suffix", [".pc2", ".mdd"])
+@pytest.mark.parametrize("has_source", [False, True])
+def test_decode_writes_all_poses_as_frames(
+    lcollision: Lcollision,
+    body: PoseModel,
+    poses: Path,
+    own: Path,
+    tmp_path: Path,
+    suffix: str,
+    has_source: bool,
+) -> None:
+    path = tmp_path / f"run{suffix}"
+    like = ("--like", own) if has_source else ()
+    done = lcollision("decode", "body", poses, "-o", path, "--axes", "maya", "--fps", 25, *like)
+    assert done.exit_code == 0, done.output
+    assert f"wrote 2 poses to {path}" in done.stderr
+    cache = read_point_cache(path)
+    expected = [body.decode(pose.latent) for pose in read_poses(poses, body)]
+    turned = 100.0 * np.stack(expected)[:, :, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    np.testing.assert_allclose(cache.frames, turned, rtol=1e-5, atol=1e-5)
+    assert cache.times[1] == pytest.approx(1 / 25 if suffix == ".mdd" else 1.0)
+
+
+def test_resolve_writes_what_it_checked(
+    lcollision: Lcollision, body: PoseModel, poses: Path, own: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "free"
+    done = lcollision("resolve", "body", poses, "-o", out, "--like", own)
+    assert done.exit_code == 0, done.output
+    for name in ("pose 0.obj", "pose 1.obj"):
+        assert _rest_of(out / name) == _rest_of(own)
+        vertices = read_mesh(out / name, topology=body.topology).vertices
+        assert not body.detector.detect(vertices).colliding
+
+
+@pytest.mark.parametrize(
+    ("output", "options", "sentence"),
+    [
+        ("out.ply", ("--like", "own.obj"), "own.obj does not offer .ply; choose one of its forms"),
+        ("out.obj", ("--like", "own.obj", "--form", "mesh"), "does not offer .obj with the form"),
+        ("out.obj", ("--like", "none.obj"), "there is no such file"),
+        ("out.obj", ("--like", "poses.json"), "has a form that is not written (.json)"),
+        ("out.obj", ("--like", "other.obj"), "has 3 vertices"),
+        ("out.json", ("--like", "own.obj"), "would hold codes"),
+        ("out.glb", ("--form", "morph"), "is one of a character's file"),
+        ("out.fbx", (), ".fbx is not a known format; use one of"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence_and_writes_nothing(
+    lcollision: Lcollision,
+    body: PoseModel,
+    poses: Path,
+    own: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    output: str,
+    options: tuple[str, ...],
+    sentence: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_mesh("other.obj", np.eye(3), np.array([[0, 1, 2]]))
+    one = read_poses(poses, body)[:1]
+    write_poses(poses, body, one)
+    refused = lcollision("decode", "body", poses, "-o", output, *options)
+    assert refused.exit_code == 2
+    assert sentence in refused.stderr
+    assert refused.stderr.count("\n") == 1
+    assert not Path(output).exists()
+    assert own.exists()
+
+
+def test_a_character_s_own_file_comes_back(lcollision: Lcollision, tmp_path: Path) -> None:
+    own = figure().write(tmp_path / "figure.glb")
+    model = open_body(own)
+    latent = np.random.default_rng(0).uniform(-0.4, 0.4, model.latent_size)
+    write_poses(tmp_path / "poses.json", model, [NamedPose("bow", latent)])
+    expected = model.decode(latent)
+    for form in ((), ("--form", "joints"), ("--form", "mesh"), ("--form", "morph")):
+        out = tmp_path / "posed.glb"
+        done = lcollision("decode", own, tmp_path / "poses.json", "-o", out, *form)
+        assert done.exit_code == 0, done.output
+        assert "its clip 'wave' is left out, as it would hide the pose" in done.stderr
+        posed = read_character(out)
+        assert np.abs(posed.rest_vertices[posed.joined] - expected[_joined(own)]).max() < 1e-5
+        has_skin = any("skin" in node for node in described(out)[0]["nodes"])
+        assert has_skin == ("mesh" not in form)
+    done = lcollision("decode", own, tmp_path / "poses.json", "-o", tmp_path / "run.pc2")
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in tmp_path.glob("*.pc2")} == {
+        "run Body.pc2",
+        "run Core.pc2",
+        "run Hat.pc2",
+    }
+
+
+def _joined(path: Path) -> np.ndarray:
+    return read_character(path).joined
