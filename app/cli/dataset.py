@@ -130,7 +130,7 @@ def make(
         typer.Argument(
             metavar="KIND|FILE...",
             help="body, body-swing or body-jump; or files of one character with animations (GLB, "
-            "glTF, VRM), point caches (PC2, MDD) beside their mesh, folders of meshes.",
+            "glTF, VRM, FBX), point caches (PC2, MDD) beside their mesh, folders of meshes.",
         ),
     ],
     output: Annotated[

@@ -22,7 +22,7 @@ MeshesArgument = Annotated[
     typer.Argument(
         metavar="MESH...",
         readable=False,
-        help="OBJ, PLY, OFF, STL, GLB, glTF or VRM files, or folders of them.",
+        help="OBJ, PLY, OFF, STL, GLB, glTF, VRM or FBX files, or folders of them.",
     ),
 ]
 PoseSetArgument = Annotated[

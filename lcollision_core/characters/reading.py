@@ -15,6 +15,7 @@ from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.part_names import part_labels
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin, one_sentence, read_scene
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.upright import guess_up
 
 CHARACTER_SUFFIXES = SCENE_SUFFIXES
 """Extensions that `read_character` reads, in lower case."""
@@ -25,13 +26,14 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
 
     Parameters
     ----------
-    path : a .glb, .gltf or .vrm file
+    path : a .glb, .gltf, .vrm or .fbx file
     up : the up axis where the file is wrong about it: 0, 1, 2, "x", "y" or "z"
 
     Raises
     ------
     MeshFileError : the file is missing, damaged, compressed or too large, or shows no triangles.
         The sentence names the file.
+    MissingExtraError : the extra `fbx`, which reads FBX, is not installed.
     ShapeError : `up` is no axis.
     """
     axis = None if up is None else _axis(up)
@@ -48,6 +50,12 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
         transforms = None if rig is None else found.poses.transforms[:, rig.nodes]
         return ClipFrames(clip, names, found.times, found.vertices, transforms)
 
+    up_direction, is_sure = scene.up, True
+    if axis is not None:
+        up_direction = np.eye(3)[axis]
+    elif up_direction is None:
+        guess = guess_up(mesh.topology, rest[None])
+        up_direction, is_sure = np.eye(3)[guess.axis], guess.is_sure
     source = Path(path)
     return Character(
         source.stem,
@@ -55,8 +63,8 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
         mesh.topology,
         rest,
         mesh.joined,
-        scene.up if axis is None else np.eye(3)[axis],
-        True,
+        up_direction,
+        is_sure,
         scene.metres,
         mesh.groups,
         rig,

@@ -122,7 +122,7 @@ def _read_clips(
         mesh.topology,
         tuple(names),
         mesh.notes,
-        int(np.abs(scene.up).argmax()),
+        None if scene.up is None else int(np.abs(scene.up).argmax()),
         labels_of(scene, mesh),
         mesh.groups,
     )

@@ -1,4 +1,4 @@
-"""Mesh files: OBJ, PLY, OFF, STL, GLB, glTF and VRM, read and written in unchanged vertex order."""
+"""Mesh files: OBJ, PLY, OFF, STL and scenes, read and written in unchanged vertex order."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
 
     Parameters
     ----------
-    path : an .obj, .ply, .off, .stl, .glb, .gltf or .vrm file
+    path : an .obj, .ply, .off, .stl, .glb, .gltf, .vrm or .fbx file
     topology : the connectivity that an STL file, or a glTF file of other vertices, is expected to
         have: when its triangles fit, they are put back into this vertex order. A mesh with the
         same faces shares the object.

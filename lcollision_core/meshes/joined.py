@@ -302,10 +302,13 @@ def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tupl
     for part in parts:
         rows = np.arange(start, start + len(part.faces))
         start += len(part.faces)
-        rows = number[rows[~is_left_out[rows]]]
-        for name in dict.fromkeys((part.mesh, part.material)):
+        is_kept = ~is_left_out[rows]
+        named = [(part.mesh, is_kept)]
+        for index, name in enumerate(part.materials):
+            named.append((name, is_kept & (part.material_of == index)))
+        for name, chosen in named:
             printable = "".join(filter(str.isprintable, name))[:MAX_NAME_LENGTH]
-            if printable:
-                found.setdefault(printable, []).append(rows)
+            if printable.strip():
+                found.setdefault(printable, []).append(number[rows[chosen]])
     kept = list(found.items())[:MAX_GROUPS]
     return tuple(FaceGroup(name, np.unique(np.concatenate(faces))) for name, faces in kept)

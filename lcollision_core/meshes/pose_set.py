@@ -185,9 +185,9 @@ def read_pose_set(
     Parameters
     ----------
     path : a folder of mesh files of one format, read in natural order; an .npz file with
-        `vertices` (N, V, 3) and `faces` (F, 3), also called `V` and `F`; a .glb, .gltf or .vrm file
-        with animations, of which pose 0 is the rest pose; or a .pc2 or .mdd file with its mesh
-        beside it, which is pose 0
+        `vertices` (N, V, 3) and `faces` (F, 3), also called `V` and `F`; a .glb, .gltf, .vrm or
+        .fbx file with animations, of which pose 0 is the rest pose; or a .pc2 or .mdd file with
+        its mesh beside it, which is pose 0
     progress : called with (poses done, poses in all)
     cancel : polled between poses
     clip : the animation of a file that has several; None for all

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lcollision_core.errors import MeshFileError, PoseSetError
-from lcollision_core.meshes.formats import gltf
+from lcollision_core.meshes.formats import fbx, gltf
 from lcollision_core.meshes.formats.scene import Scene
 from lcollision_core.regular_files import open_regular
 
-SCENE_SUFFIXES = (".glb", ".gltf", ".vrm")
+SCENE_SUFFIXES = (".glb", ".gltf", ".vrm", ".fbx")
 """Extensions that `read_scene` reads, in lower case."""
 
 
@@ -38,7 +38,7 @@ def has_skin(path: str | os.PathLike[str]) -> bool:
     MeshFileError : as of `read_scene`, as far as the file's description tells.
     """
     with one_sentence(path), _opened(path) as file:
-        return gltf.has_skin(file, Path(path))
+        return fbx.has_skin(file) if _is_fbx(path) else gltf.has_skin(file, Path(path))
 
 
 @contextmanager
@@ -57,7 +57,11 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 def scene_of(file: BinaryIO, path: Path) -> Scene:
     """Read an open file at its start, as `read_scene`; the sentence does not name it."""
-    return gltf.read_scene(file, path)
+    return fbx.read_scene(file) if _is_fbx(path) else gltf.read_scene(file, path)
+
+
+def _is_fbx(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == ".fbx"
 
 
 @contextmanager

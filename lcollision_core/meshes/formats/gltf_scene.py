@@ -12,7 +12,7 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.gltf_animation import read_clips, stored_transform
 from lcollision_core.meshes.formats.gltf_document import GltfDocument, element, numbers, whole
 from lcollision_core.meshes.formats.polygons import MAX_FACES, require_plausible_count
-from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses, parents_first
+from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses, is_mirrored, parents_first
 from lcollision_core.meshes.formats.transforms import compose, global_transforms
 from lcollision_core.meshes.topology import FloatArray
 
@@ -162,17 +162,16 @@ def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Pa
         bone_of, weights = _influences(document, primitive, where, n, len(bones))
     faces = _faces(document, primitive, where, n)
     # Mirrored triangles are wound the other way.
-    with np.errstate(all="ignore"):
-        signs = np.sign(np.linalg.det((rest[bones] @ bind)[:, :3, :3]))
-    if (signs[bone_of] * weights).sum() < 0.0:
+    if is_mirrored(rest[bones] @ bind, bone_of, weights):
         faces = faces[:, [0, 2, 1]]
-    material = ""
+    materials: tuple[str, ...] = ()
     if primitive.material is not None:
         named = element(description.materials, primitive.material, "a material")
-        material = str(named.name or f"material {primitive.material}")
+        materials = (str(named.name or f"material {primitive.material}"),)
     return Part(
         str(mesh.name or node.name or where),
-        material,
+        materials,
+        np.zeros(len(faces), dtype=np.int64),
         shown.node,
         points,
         faces,

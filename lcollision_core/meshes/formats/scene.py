@@ -37,14 +37,16 @@ class ScenePoses:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Triangles of one mesh and one material, moved by nodes.
+    """Triangles of one mesh, moved by nodes.
 
     In a pose whose nodes have the global transforms G, vertex v, its morph deltas added, is
     sum_i weights[v, i] G_b bind[j] points[v] with j = bone_of[v, i] and b = bones[j].
 
     Attributes
     ----------
-    mesh, material : names
+    mesh : its name
+    materials : names
+    material_of : (F,) int64 array, each face's material; what is no index is none
     node : the node that shows it
     points : (W, 3) float64 array
     faces : (F, 3) int64 array, indices from 0 into the part's vertices, checked
@@ -58,7 +60,8 @@ class Part:
     """
 
     mesh: str
-    material: str
+    materials: tuple[str, ...]
+    material_of: npt.NDArray[np.int64]
     node: int
     points: FloatArray
     faces: npt.NDArray[np.int64]
@@ -138,7 +141,7 @@ class Scene:
     parts : in the order of the file's meshes, then of the nodes that show each, then of its
         primitives
     clips : its animations
-    up : (3,) float64 array, a signed unit axis
+    up : (3,) float64 array, a signed unit axis; None where the file does not say it
     metres : length of the file's unit
     notes : sentences on what was left out
     """
@@ -148,7 +151,7 @@ class Scene:
     rest: ScenePoses
     parts: tuple[Part, ...]
     clips: tuple[Clip, ...]
-    up: FloatArray
+    up: FloatArray | None
     metres: float
     notes: tuple[str, ...] = ()
 
@@ -170,6 +173,20 @@ def parents_first(parents: npt.NDArray[np.int64]) -> list[int]:
         lost = min(set(range(len(parents))) - set(order))
         raise MeshFileError(f"is damaged: node {lost} (from 0) is its own ancestor", where="it")
     return order
+
+
+def is_mirrored(turns: FloatArray, bone_of: npt.NDArray[np.int32], weights: FloatArray) -> bool:
+    """Whether most weight is of bones that turn faces inside out.
+
+    Parameters
+    ----------
+    turns : (B, 4, 4) array, from a part's coordinates to the scene's by each bone
+    bone_of, weights : of the part
+    """
+    # Too large a number is refused where the vertices are.
+    with np.errstate(all="ignore"):
+        signs = np.sign(np.linalg.det(turns[:, :3, :3]))
+    return bool((signs[bone_of] * weights).sum() < 0.0)
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:

@@ -433,7 +433,8 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
             ': [{"attributes": {"POSITION": 0}}]}]}',
             "count of positions of mesh 0 must be a whole number from 0 to 5000000, got 900000000",
         ),
-        ("a.fbx", "x", r"\.fbx is not a known mesh format"),
+        ("a.fbx", "x", "damaged or unsupported FBX"),
+        ("a.dae", "x", r"\.dae is not a known mesh format"),
         ("a", "x", "without extension"),
     ],
 )

@@ -1,0 +1,236 @@
+"""FBX, read by ufbx in a process of its own."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import zipfile
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError, MissingExtraError
+from lcollision_core.meshes.formats.gltf_document import MAX_NUMBERS
+from lcollision_core.meshes.formats.polygons import (
+    MAX_FACES,
+    Polygons,
+    read_rest,
+    require_plausible_count,
+    triangulate,
+)
+from lcollision_core.meshes.formats.scene import (
+    Clip,
+    Part,
+    Scene,
+    ScenePoses,
+    is_mirrored,
+    unique_names,
+)
+from lcollision_core.meshes.topology import FloatArray
+
+_MOST_MEMORY = 1 << 33
+"""Address space of the process that reads, in bytes; less than a quarter of it is data."""
+
+_MOST_SECONDS = 300
+_REFUSED = 3
+_WORKER = Path(__file__).with_name("fbx_worker.py")
+_UNKNOWN_AXIS = 6
+_MOST_FRAMES = 1_000_000
+
+
+def read_scene(file: BinaryIO) -> Scene:
+    """Read what the file shows.
+
+    Vertices are the file's control points, in its order of nodes. A clip's own frames are those of
+    the file's frame rate. Skins are blended linearly, and where the file asks for dual quaternions
+    the notes say so.
+
+    Raises
+    ------
+    MissingExtraError : the extra `fbx` is not installed.
+    MeshFileError : the file is damaged or too large, or shows no faces.
+    """
+    source = _FbxFile(read_rest(file))
+    held = source.asked()
+    notes: list[str] = []
+    shown = held["shown"].tolist()
+    numbers, parts = [], []
+    for number, node in enumerate(shown):
+        part = _part(_only(held, number), node, held["transforms"], notes)
+        if part is not None:
+            numbers.append(number)
+            parts.append(part)
+    if not parts:
+        raise MeshFileError(f"it holds {len(shown)} meshes, none of which shows faces")
+    require_plausible_count(sum(len(part.points) for part in parts), "vertices")
+    weights = tuple(held[f"{number} weights"][None] for number in numbers)
+    up = int(held["up"])
+    metres = float(held["metres"])
+    return Scene(
+        tuple(held["names"].tolist()),
+        held["parents"],
+        ScenePoses(held["transforms"][None], weights),
+        tuple(parts),
+        tuple(_clips(source, held, tuple(numbers))),
+        up=None if up == _UNKNOWN_AXIS else (1.0 - 2.0 * (up % 2)) * np.eye(3)[up // 2],
+        metres=metres if 0.0 < metres < np.inf else 0.01,
+        notes=tuple(dict.fromkeys(notes)),
+    )
+
+
+def has_skin(file: BinaryIO) -> bool:
+    """Whether the file names clusters of a skin; the names of its objects are never compressed."""
+    return b"Cluster" in read_rest(file)
+
+
+@dataclass(frozen=True, eq=False)
+class _FbxFile:
+    """The bytes of a file, and what ufbx says of them."""
+
+    data: bytes
+
+    def asked(self, clip: int | None = None, times: FloatArray | None = None) -> dict[str, Any]:
+        """Return the arrays of `fbx_worker`."""
+        if find_spec("ufbx") is None:
+            raise MissingExtraError(
+                "reading FBX needs the package ufbx, which is not installed",
+                "run: pip install 'lcollision[fbx]'",
+            )
+        request = {
+            "clip": clip,
+            "times": None if times is None else times.tolist(),
+            "most_memory": _MOST_MEMORY,
+            "most_elements": min(4 * MAX_FACES, MAX_NUMBERS // 3),
+        }
+        try:
+            done = subprocess.run(
+                [sys.executable, "-P", str(_WORKER)],
+                input=json.dumps(request).encode() + b"\n" + self.data,
+                capture_output=True,
+                timeout=_MOST_SECONDS,
+                check=False,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise MeshFileError(f"reading it took more than {_MOST_SECONDS} s") from error
+        if done.returncode == _REFUSED:
+            reason = done.stderr.decode(errors="replace").strip()[-200:]
+            raise MeshFileError(f"it is a damaged or unsupported FBX file ({reason})")
+        try:
+            with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+                return dict(arrays)
+        except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+            raise MeshFileError("it is a damaged FBX file, on which its reader crashed") from error
+
+
+@dataclass(frozen=True, eq=False)
+class _FbxClip:
+    """Samples an animation of a file; `parts` are those of its meshes that have faces."""
+
+    source: _FbxFile
+    clip: int
+    parts: tuple[int, ...]
+
+    def __call__(self, times: FloatArray) -> ScenePoses:
+        """Return the poses at (N,) times."""
+        held = self.source.asked(self.clip, times)
+        weights = tuple(held[f"{number} weights"] for number in self.parts)
+        return ScenePoses(held["transforms"], weights)
+
+
+def _clips(source: _FbxFile, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
+    fps = float(held["fps"]) if 0.0 < float(held["fps"]) < np.inf else 24.0
+    names = unique_names([name or "clip" for name in held["clips"].tolist()])
+    clips = []
+    for number, (name, (start, end)) in enumerate(zip(names, held["spans"], strict=True)):
+        n_steps = (end - start) * fps + 1e-6
+        if not (np.isfinite([start, end]).all() and 0.0 <= n_steps < _MOST_FRAMES):
+            raise MeshFileError.must_be(
+                f"clip {name!r}", f"of 0 to {_MOST_FRAMES} frames", f"{start:g} to {end:g} s"
+            )
+        key_times = start + np.arange(int(n_steps) + 1) / fps
+        moved = frozenset(held[f"moved {number}"].tolist())
+        clips.append(Clip(name, key_times, moved, _FbxClip(source, number, parts)))
+    return clips
+
+
+def _only(held: dict[str, Any], number: int) -> dict[str, Any]:
+    """Return the arrays of one mesh."""
+    prefix = f"{number} "
+    return {name[len(prefix) :]: held[name] for name in held if name.startswith(prefix)}
+
+
+def _part(held: dict[str, Any], node: int, transforms: FloatArray, notes: list[str]) -> Part | None:
+    """Return one mesh where a node shows it; None without faces."""
+    sizes, is_face = held["faces"][:, 1], held["faces"][:, 1] >= 3
+    corners = held["corners"][np.repeat(is_face, sizes)]
+    points = held["points"]
+    if not is_face.all():
+        notes.append("edges and points without faces were left out")
+    if not is_face.any():
+        return None
+    faces, sentences = triangulate(Polygons(points, sizes[is_face], corners))
+    notes += sentences
+    material_of = held["material_of"]
+    if not len(material_of):
+        material_of = np.zeros(len(sizes), dtype=np.int64)
+    bones, bind = held["bones"], held["bind"]
+    bone_of, weights = _influences(held, len(points))
+    if len(bones) > 1 and bone_of[weights > 0.0].all():
+        # No vertex follows the node itself.
+        bones, bind, bone_of = bones[1:], bind[1:], np.maximum(bone_of - 1, 0)
+    if int(held["skins"]) > 1:
+        notes.append("of the several skins of a mesh only the first was read")
+    if not held.get("is_linear", True):
+        notes.append("a skin of dual quaternions is blended linearly")
+    if is_mirrored(transforms[bones] @ bind, bone_of, weights):
+        faces = faces[:, [0, 2, 1]]
+    return Part(
+        str(held["name"]),
+        tuple(held["materials"].tolist()),
+        np.repeat(material_of[is_face], sizes[is_face] - 2),
+        node,
+        points,
+        faces,
+        bones,
+        bind,
+        bone_of,
+        weights,
+        is_skinned="shares" in held,
+        morphs=_morphs(held, len(points)),
+    )
+
+
+def _influences(held: dict[str, Any], n_vertices: int) -> tuple[npt.NDArray[np.int32], FloatArray]:
+    """Return the bones and weights of each vertex; the node itself, number 0, of those without."""
+    if "shares" not in held:
+        return np.zeros((n_vertices, 1), dtype=np.int32), np.ones((n_vertices, 1))
+    vertices, movers, shares = held["moved"], held["movers"], held["shares"]
+    used = (shares > 0.0) & np.isfinite(shares) & (vertices >= 0) & (vertices < n_vertices)
+    vertices, movers, shares = vertices[used], movers[used], shares[used]
+    order = np.argsort(vertices, kind="stable")
+    vertices, movers, shares = vertices[order], movers[order], shares[order]
+    counts = np.bincount(vertices, minlength=n_vertices)
+    width = max(int(counts.max(initial=0)), 1)
+    if n_vertices * width > MAX_NUMBERS:
+        raise MeshFileError(f"a vertex of it is moved by {width} bones", "limit them to 8")
+    column = np.arange(len(vertices)) - np.repeat(np.cumsum(counts) - counts, counts)
+    bone_of, weights = np.zeros((n_vertices, width), np.int32), np.zeros((n_vertices, width))
+    bone_of[vertices, column], weights[vertices, column] = movers, shares
+    weights[counts == 0, 0] = 1.0
+    return bone_of, weights / weights.sum(axis=1, keepdims=True)
+
+
+def _morphs(held: dict[str, Any], n_vertices: int) -> npt.NDArray[np.float32]:
+    n_shapes = len(held["weights"])
+    morphs = np.zeros((n_shapes, n_vertices, 3), dtype=np.float32)
+    for number in range(n_shapes):
+        changed, offsets = held[f"changed {number}"], held[f"offsets {number}"]
+        inside = (changed >= 0) & (changed < n_vertices)
+        np.add.at(morphs[number], changed[inside], offsets[inside])
+    return morphs

@@ -1,0 +1,242 @@
+"""Reads one FBX file by ufbx; run as a process of its own, so that a crash ends it alone.
+
+The bindings of ufbx count references to a scene's objects wrongly, so that they end the process
+when an object is asked for twice and then released; and a hostile file may do so, or fill the
+memory. What goes in by standard input is one line of JSON (`clip` and `times` to sample, or
+neither; `most_memory` in bytes, `most_elements`), then the file. What comes out is an .npz
+archive, or one line of reason at standard error and status 3.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import io
+import json
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import ufbx
+
+REFUSED = 3
+
+_ANIMATED = ("Lcl ", "DeformPercent", "Geometric", "RotationPivot", "ScalingPivot")
+"""How the names of properties begin whose change moves vertices."""
+
+
+class _TooLargeError(Exception):
+    pass
+
+
+def _kept(item: Any) -> Any:
+    """Count a reference more, so that an object of ufbx lives as long as the process."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(item))
+    return item
+
+
+def _items(items: Any) -> Iterator[Any]:
+    held = _kept(items)
+    for index in range(len(held)):
+        yield _kept(held[index])
+
+
+def _array(items: Any, dtype: type, width: int | None = None) -> np.ndarray:
+    """Copy a list of numbers; an empty one of ufbx has no type."""
+    held = _kept(items)
+    if not len(held):
+        return np.empty((0,) if width is None else (0, width), dtype)
+    return np.array(held, dtype=dtype)
+
+
+def _matrix(matrix: Any) -> np.ndarray:
+    result = np.eye(4)
+    # Column by column.
+    result[:3] = np.array(matrix).T
+    return result
+
+
+def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
+    nodes = list(_items(scene.nodes))
+    parents = [_kept(node.parent) for node in nodes]
+    settings = _kept(scene.settings)
+    shown = [(node, mesh) for node in nodes if (mesh := _kept(node.mesh)) is not None]
+    if sum(mesh.num_vertices + mesh.num_indices for _, mesh in shown) > most_elements:
+        raise _TooLargeError(f"its meshes have more than {most_elements} vertices and corners")
+    found: dict[str, np.ndarray] = {
+        "names": np.array([node.name for node in nodes], dtype=np.str_),
+        "parents": np.array(
+            [-1 if one is None else one.typed_id for one in parents], dtype=np.int64
+        ),
+        "transforms": np.stack([_matrix(node.node_to_world) for node in nodes]),
+        "up": np.array(int(settings.axes.up)),
+        "metres": np.array(settings.unit_meters),
+        "fps": np.array(settings.frames_per_second),
+        "shown": np.array([node.typed_id for node, _ in shown], dtype=np.int64),
+    }
+    for number, (node, mesh) in enumerate(shown):
+        part = _part(node, mesh, most_elements)
+        found |= {f"{number} {name}": value for name, value in part.items()}
+    clips = list(_clips(scene))
+    found["clips"] = np.array([stack.name for stack, _ in clips], dtype=np.str_)
+    found["spans"] = np.array([_span(stack) for stack, _ in clips], np.float64).reshape(-1, 2)
+    for number, (_, moved) in enumerate(clips):
+        found[f"moved {number}"] = np.array(sorted(moved), dtype=np.int64)
+    return found
+
+
+def _clips(scene: Any) -> Iterator[tuple[Any, set[int]]]:
+    """Yield the animations that move something, with the nodes that they move."""
+    for stack in _items(scene.anim_stacks):
+        moved: set[int] = set()
+        is_moving = False
+        for layer in _items(stack.layers):
+            for one in _items(layer.anim_props):
+                if one.prop_name.startswith(_ANIMATED):
+                    is_moving = True
+                    element = _kept(one.element)
+                    if isinstance(element, ufbx.Node):
+                        moved.add(element.typed_id)
+        if is_moving:
+            yield stack, moved
+
+
+def _span(stack: Any) -> tuple[float, float]:
+    """Return when an animation begins and ends; as its curves do where the file does not say it."""
+    if stack.time_end > stack.time_begin:
+        return stack.time_begin, stack.time_end
+    curves = [
+        curve
+        for layer in _items(stack.layers)
+        for value in _items(layer.anim_values)
+        for curve in value.curves
+        if _kept(curve) is not None
+    ]
+    if not curves:
+        return stack.time_begin, stack.time_end
+    return min(one.min_time for one in curves), max(one.max_time for one in curves)
+
+
+def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
+    part = {
+        "name": np.array(mesh.name or node.name),
+        "points": _array(mesh.vertices, np.float64, 3).reshape(-1, 3),
+        "corners": _array(mesh.vertex_indices, np.int64),
+        "faces": _array(mesh.faces, np.int64, 2).reshape(-1, 2),
+        "material_of": _array(mesh.face_material, np.int64),
+        "materials": np.array([one.name for one in _items(mesh.materials)], dtype=np.str_),
+        "bind": _matrix(node.geometry_to_node)[None],
+        "bones": np.array([node.typed_id], dtype=np.int64),
+    }
+    skins = list(_items(mesh.skin_deformers))
+    part["skins"] = np.array(len(skins))
+    for skin in skins[:1]:
+        part["is_linear"] = np.array(int(skin.skinning_method) <= 1)
+        clusters = [
+            (bone, cluster)
+            for cluster in _items(skin.clusters)
+            if (bone := _kept(cluster.bone_node)) is not None
+        ]
+        bind = [_matrix(cluster.geometry_to_bone)[None] for _, cluster in clusters]
+        part["bind"] = np.concatenate([part["bind"], *bind])
+        joints = np.array([bone.typed_id for bone, _ in clusters], dtype=np.int64)
+        part["bones"] = np.concatenate([part["bones"], joints])
+        moved = [_array(cluster.vertices, np.int64) for _, cluster in clusters]
+        shares = [_array(cluster.weights, np.float64) for _, cluster in clusters]
+        part["moved"] = np.concatenate([np.empty(0, np.int64), *moved])
+        part["shares"] = np.concatenate([np.empty(0), *shares])
+        counts = [len(some) for some in moved]
+        part["movers"] = np.repeat(np.arange(len(counts)) + 1, counts)
+    shapes = list(_shapes(mesh))
+    if len(shapes) * len(part["points"]) > most_elements:
+        raise _TooLargeError(f"its blend shapes have more than {most_elements} vertices")
+    for number, shape in enumerate(shapes):
+        part[f"changed {number}"] = _array(shape.offset_vertices, np.int64)
+        part[f"offsets {number}"] = _array(shape.position_offsets, np.float64, 3).reshape(-1, 3)
+    part["weights"] = _weights(mesh)
+    return part
+
+
+def _keyframes(mesh: Any) -> Iterator[Any]:
+    for deformer in _items(mesh.blend_deformers):
+        for channel in _items(deformer.channels):
+            yield from _items(channel.keyframes)
+
+
+def _shapes(mesh: Any) -> Iterator[Any]:
+    for keyframe in _keyframes(mesh):
+        yield _kept(keyframe.shape)
+
+
+def _weights(mesh: Any) -> np.ndarray:
+    return np.array([one.effective_weight for one in _keyframes(mesh)], dtype=np.float64)
+
+
+def _sampled(scene: Any, clip: int, times: list[float]) -> dict[str, np.ndarray]:
+    stack, _ = list(_clips(scene))[clip]
+    animation = _kept(stack.anim)
+    transforms, weights = [], []
+    for time in times:
+        posed = _kept(ufbx.evaluate_scene(scene, animation, time))
+        nodes = list(_items(posed.nodes))
+        transforms.append(np.stack([_matrix(node.node_to_world) for node in nodes]))
+        shown = [mesh for node in nodes if (mesh := _kept(node.mesh)) is not None]
+        weights.append([_weights(mesh) for mesh in shown])
+        posed.free()
+    found = {"transforms": np.stack(transforms)}
+    for number in range(len(weights[0])):
+        found[f"{number} weights"] = np.stack([frame[number] for frame in weights])
+    return found
+
+
+def _limit_memory(n_bytes: int) -> None:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    resource.setrlimit(resource.RLIMIT_AS, (n_bytes, n_bytes))
+    # A crash is expected of some files, and needs no dump.
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def main() -> int:
+    """Read from standard input, write to standard output, and return the status."""
+    gc.disable()
+    asked = json.loads(sys.stdin.buffer.readline())
+    _limit_memory(asked["most_memory"])
+    try:
+        scene = _kept(
+            ufbx.load_memory(
+                sys.stdin.buffer.read(),
+                ignore_embedded=True,
+                load_external_files=False,
+                clean_skin_weights=True,
+                skip_mesh_parts=True,
+                # Not by its name, and no other format than FBX.
+                file_format=ufbx.FileFormat.FBX,
+            )
+        )
+        if asked["times"] is None:
+            found = _described(scene, asked["most_elements"])
+        else:
+            found = _sampled(scene, asked["clip"], asked["times"])
+        held = io.BytesIO()
+        np.savez(held, allow_pickle=False, **found)
+    except (ufbx.UfbxError, _TooLargeError) as error:
+        print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)  # noqa: T201
+        return REFUSED
+    except MemoryError:
+        print("it needs too much memory", file=sys.stderr)  # noqa: T201
+        return REFUSED
+    sys.stdout.buffer.write(held.getvalue())
+    return 0
+
+
+if __name__ == "__main__":
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Releasing the objects of ufbx would crash.
+    os._exit(status)

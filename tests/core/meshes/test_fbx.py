@@ -1,0 +1,114 @@
+"""FBX files, against ufbx's own evaluation."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.characters import is_rigged, joint_parts, read_character
+from lcollision_core.errors import MeshFileError, MissingExtraError
+from lcollision_core.meshes import read_mesh, read_pose_set
+from tests.core.fbx_builder import arm_fbx, ufbx_frames
+from tests.core.gltf_builder import tube
+
+pytest.importorskip("ufbx")
+
+
+def test_frames_agree_with_ufbx(tmp_path: Path) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    character = read_character(path)
+    height = float(np.ptp(character.rest_vertices[:, 1]))
+    rest = ufbx_frames(path, None, [0.0])[0]
+    assert np.abs(character.rest_vertices[character.joined] - rest).max() < 1e-6 * height
+    frames = character.sample("wave", 10.0)
+    assert len(frames.times) == 11
+    expected = ufbx_frames(path, 0, frames.times.tolist())
+    assert np.abs(frames.vertices[:, character.joined] - expected).max() < 1e-6 * height
+    assert np.abs(expected[-1] - expected[0]).max() > 0.3 * height
+
+
+def test_a_clip_without_a_span_is_as_long_as_its_curves(tmp_path: Path) -> None:
+    frames = [
+        read_character(arm_fbx(tmp_path / "arm.fbx", is_long=is_long)).sample("wave", None)
+        for is_long in (False, True)
+    ]
+    assert np.array_equal(frames[0].times, frames[1].times)
+    assert np.array_equal(frames[0].vertices, frames[1].vertices)
+
+
+def test_a_character_of_fbx_has_its_rig_parts_and_clips(tmp_path: Path) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    character = read_character(path)
+    vertices, faces = tube()
+    assert np.array_equal(character.joined, np.arange(len(vertices)))
+    assert np.array_equal(character.topology.faces, faces)
+    assert [group.name for group in character.groups] == ["Tube", "Skin"]
+    assert character.clips == ("wave",)
+    rig = character.rig
+    assert rig is not None
+    # The bottom of the tube follows the mesh itself.
+    assert rig.joint_names == ("Body", "Lower", "Upper")
+    assert rig.parents.tolist() == [-1, -1, 1]
+    assert set(joint_parts(rig)) == {"Body", "Lower", "Upper"}
+    # The clip's own frames are at the rate of the file, 30 a second.
+    frames = character.sample("wave", None)
+    assert frames.transforms is not None
+    assert np.allclose(frames.times, np.arange(31) / 30.0)
+    turns = frames.transforms[0] @ np.linalg.inv(rig.rest)
+    assert np.abs(turns[1] - np.eye(4)).max() > 0.1
+    assert is_rigged(path)
+
+
+def test_the_poses_of_fbx_know_their_axis(tmp_path: Path) -> None:
+    for up in (0, 1, 2):
+        path = arm_fbx(tmp_path / f"arm{up}.fbx", up=up, metres=1.0)
+        poses = read_pose_set(path, fps=5.0)
+        assert poses.up_axis == up
+        assert poses.names[:2] == ("rest", "wave 0")
+        character = read_character(path)
+        assert character.up.tolist() == np.eye(3)[up].tolist()
+        assert character.metres == pytest.approx(1.0)
+    assert read_character(arm_fbx(tmp_path / "arm.fbx")).metres == pytest.approx(0.01)
+    assert np.array_equal(read_mesh(path).vertices, poses.vertices[0])
+
+
+@pytest.mark.parametrize(
+    "name", ["blender_279_sausage_7400_binary.fbx", "maya_advanced_skinned_pivot_7700_binary.fbx"]
+)
+def test_frames_of_real_files_agree_with_ufbx(name: str, characters: Path) -> None:
+    path = characters / name
+    character = read_character(path)
+    size = float(np.ptp(character.rest_vertices, axis=0).max())
+    rest = ufbx_frames(path, None, [0.0])[0]
+    assert np.abs(character.rest_vertices[character.joined] - rest).max() < 1e-6 * size
+    for number, clip in enumerate(character.clips):
+        frames = character.sample(clip, None)
+        expected = ufbx_frames(path, number, frames.times.tolist())
+        assert np.abs(frames.vertices[:, character.joined] - expected).max() < 1e-6 * size
+
+
+def test_what_is_no_fbx_gets_one_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "m.fbx"
+    for data, message in (
+        (b"x", "damaged or unsupported FBX"),
+        (b"Kaydara FBX Binary  \0\x1a\0\xe8\x1c\0\0" + b"\xff" * 100, "damaged or unsupported FBX"),
+        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "damaged or unsupported FBX|0 meshes"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(MeshFileError, match=message) as caught:
+            read_mesh(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_without_ufbx_a_sentence_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    monkeypatch.setitem(sys.modules, "ufbx", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'lcollision\[fbx\]'"):
+        read_mesh(path)
+    with pytest.raises(MissingExtraError, match=r"pip install 'lcollision\[fbx\]'"):
+        read_pose_set(path)
