@@ -1,6 +1,7 @@
 """Characters: files with meshes, a rig and clips, and posing by the rig."""
 
 from lcollision_core.characters.character import Character, ClipFrames, Rig
+from lcollision_core.characters.default_rules import default_rules
 from lcollision_core.characters.posed_gltf import CharacterForm, PosedFile, posed_gltf
 from lcollision_core.characters.reading import (
     CHARACTER_SUFFIXES,

@@ -25,6 +25,10 @@ _CELLS_AT_ONCE = 1 << 23
 """Entries of a dense block of distances, or of rows of a table before they are cut in half."""
 
 _MAX_REGIONS = 4096
+
+_SAMPLED = 200
+"""Vertices whose neighbourhoods are measured for an estimate of all."""
+
 _NEAR, _REST = "near exclusion", "rest exclusion"
 
 
@@ -86,6 +90,20 @@ def rules_of(
     rule = np.empty(len(pairs), dtype=np.uint8)
     find_rules(pairs, np.asarray(penetration_depth, dtype=np.float64) ** 2, exclusions, rule)
     return rule
+
+
+def near_pairs_estimate(topology: Topology, reference: FloatArray, distance: float) -> float:
+    """Estimate how many pairs of faces a near exclusion lists, from some of the vertices.
+
+    Parameters
+    ----------
+    reference : (V, 3) float64 array, the rest pose
+    distance : > 0, in its unit
+    """
+    used = topology.used_vertices
+    some = used[np.linspace(0, len(used) - 1, min(len(used), _SAMPLED)).astype(np.int64)]
+    reached = _reached(topology, reference, distance, _NEAR, some).nnz / len(some)
+    return float(0.5 * topology.n_faces**2 * reached / len(used))
 
 
 def require_room(n_excluded: int, rule: str) -> None:

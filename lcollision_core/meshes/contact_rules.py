@@ -17,7 +17,7 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.json_values import from_json
 
 CHARACTER_REST_EXCLUSION = 0.02
-"""Normalised length: the rest exclusion of characters whose rest pose does not ask for more."""
+"""Normalised length: the rest exclusion of characters, by measurement on some of them."""
 
 MAX_IGNORED = 1000
 """The most pairs of groups that are ignored."""

@@ -17,7 +17,7 @@ from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError,
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, read_animated
 from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.contact_rules import STRICT, ContactRules
+from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION, STRICT, ContactRules
 from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.face_groups import FaceGroup, require_groups
 from lcollision_core.meshes.files import (
@@ -443,6 +443,7 @@ def _collect_frames(
         held.notes,
         up_axis=held.up_axis,
         vertex_labels=held.vertex_labels,
+        rules=ContactRules(rest_exclusion=CHARACTER_REST_EXCLUSION),
         groups=held.groups,
     )
     kept = []

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from lcollision_core.characters import Character, RigPoseSpace
+from lcollision_core.characters import Character, RigPoseSpace, default_rules, joint_parts
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import ContactRules, RigidTransform
+from lcollision_core.meshes import RigidTransform, part_groups
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect
 from lcollision_core.model.colours import domain_colours
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
-
-NEAR_EXCLUSION = 0.1
-"""Normalised: folds at the joints of a skin that bends."""
 
 REST = "rest"
 """The name of the rest pose."""
@@ -120,8 +117,8 @@ class RigModel(PosableBody):
             pose_names=tuple(name[:MAX_POSE_NAME_LENGTH] for name in names[: len(poses)]),
             source=character.source.name,
             licence="unknown",
-            rules=ContactRules(NEAR_EXCLUSION),
-            groups=character.groups,
+            rules=default_rules(character),
+            groups=(*character.groups, *part_groups(character.topology, joint_parts(space.rig))),
         )
         return cls(character, space, card, poses)
 
