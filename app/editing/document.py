@@ -368,8 +368,20 @@ class PoseDocument(LiveEditing):
         path : of the file
         axes, scale : see `export_frame`
         """
+        self.export_pose(path, jobs.ExportStyle(axes, scale))
+
+    def export_pose(self, path: str | Path, style: jobs.ExportStyle) -> None:
+        """Write the pose on the screen, back in its place, as a mesh or in the user's own file."""
         path = Path(path)
-        work = partial(jobs.export, self.model, self.pose, self.outcome, path, axes, scale)
+        work = partial(jobs.export, self.model, self.pose, self.outcome, path, style)
+        self.write(f"Exporting {path.name}", work)
+
+    def export_motion(
+        self, path: str | Path, poses: Sequence[NamedPose], style: jobs.ExportStyle
+    ) -> None:
+        """Write poses as the frames of a point cache."""
+        path = Path(path)
+        work = partial(jobs.export_motion, self.model, tuple(poses), path, style)
         self.write(f"Exporting {path.name}", work)
 
     def write(self, label: str, work: Job) -> None:

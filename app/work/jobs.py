@@ -76,6 +76,25 @@ class PartEdits:
     copy_name: str | None = None
 
 
+@dataclass(frozen=True)
+class ExportStyle:
+    """How poses are written as meshes.
+
+    Attributes
+    ----------
+    axes, scale : see `export_frame`
+    like : the user's file whose form is kept; None for a character's own where that can be written
+    form : the key of one of the forms that it offers; None for the best
+    fps : frames a second of a motion
+    """
+
+    axes: str = "model"
+    scale: float | None = None
+    like: Path | None = None
+    form: str | None = None
+    fps: float = 30.0
+
+
 def open_model(name_or_path: str | Path, _: Progress, cancel: CancelToken) -> OpenedModel:
     """Read a model and use it once, so that nothing is left to compile before the first frame."""
     from lcollision_core.model import find_model, open_body
@@ -191,8 +210,7 @@ def export(
     pose: NamedPose,
     outcome: ResolveResult | None,
     path: Path,
-    axes: str,
-    scale: float | None,
+    style: ExportStyle,
     _: Progress,
     __: CancelToken,
 ) -> str:
@@ -201,19 +219,65 @@ def export(
     A pose that Resolve ended in is written with the vertices of its `outcome`. The check is of what
     the file holds, in its axes and unit. Returns a sentence for the status bar.
     """
-    from lcollision_core.model import export_frame, export_mesh
+    from lcollision_core.model import source_for, write_pose
 
     placement = pose.placement
     if outcome is not None and np.array_equal(outcome.latent, pose.latent):
         vertices = outcome.vertices
     else:
         vertices = model.exported_vertices(pose.latent, placement)
-    frame = export_frame(model, axes, path, scale)
-    written = export_mesh(path, model, vertices, placement, frame)
-    unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
-    n_pairs = len(model.detector.detect(written, unit=unit).pairs)
+    written = write_pose(
+        path,
+        model,
+        pose.latent,
+        vertices,
+        placement,
+        source=source_for(path.suffix, model, style.like),
+        form=style.form,
+        axes=style.axes,
+        scale=style.scale,
+    )
+    n_pairs = written.count_colliding_pairs(model)
     collide = f"{counted(n_pairs, 'pair')} of its triangles collide"
-    return f"Exported {path.name}: {collide if n_pairs else 'no collisions (checked)'}"
+    told = f"Exported {path.name}: {collide if n_pairs else 'no collisions (checked)'}"
+    return "; ".join((told, *written.notes))
+
+
+def export_motion(
+    model: PosableBody,
+    poses: Sequence[NamedPose],
+    path: Path,
+    style: ExportStyle,
+    progress: Progress,
+    cancel: CancelToken,
+) -> str:
+    """Write poses as the frames of one file, in the model's coordinates, and check each.
+
+    Returns a sentence for the status bar.
+    """
+    from lcollision_core.model import source_for, write_sequence
+
+    frames = []
+    for pose in poses:
+        cancel.raise_if_cancelled()
+        frames.append(model.exported_vertices(pose.latent))
+    files, written = write_sequence(
+        path,
+        model,
+        frames,
+        source=source_for(path.suffix, model, style.like),
+        axes=style.axes,
+        scale=style.scale,
+        fps=style.fps,
+    )
+    n_colliding = 0
+    for done, frame in enumerate(written, 1):
+        cancel.raise_if_cancelled()
+        n_colliding += frame.count_colliding_pairs(model) > 0
+        progress(done, len(written))
+    collide = f"{n_colliding} of {counted(len(poses), 'frame')} collide"
+    names = ", ".join(file.name for file in files)
+    return f"Exported {names}: {collide if n_colliding else 'no collisions (checked)'}"
 
 
 def resolve(

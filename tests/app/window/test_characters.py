@@ -17,6 +17,7 @@ from app.view.shading import Shading
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
+from app.work.jobs import ExportStyle
 from lcollision_core.model import RigModel, open_body
 from tests.app.windows import PATIENCE, answer, close_window, drop, rest, settings_in
 from tests.core.gltf_builder import arm
@@ -97,7 +98,7 @@ def test_a_file_without_rig_is_a_mesh_of_the_character(
     model, document = dropped(qtbot, window, arm_file), window.document
     posed = model.training_latent[2]
     document.blend_towards(posed, 1.0)
-    document.export_mesh(tmp_path / "posed.glb")
+    document.export_pose(tmp_path / "posed.glb", ExportStyle(form="mesh"))
     document.finish_exports()
     document.reset_all()
     with qtbot.waitSignal(document.imported, timeout=PATIENCE):

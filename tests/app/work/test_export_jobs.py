@@ -1,0 +1,95 @@
+"""The window's exports: into the user's own file, and motions, each checked as it is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.work.jobs import ExportStyle, export, export_motion
+from lcollision_core.characters import read_character
+from lcollision_core.errors import CancelledError
+from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.meshes.formats.point_cache import read_point_cache
+from lcollision_core.model import NamedPose, PoseModel, RigModel, sample_poses
+from tests.core.character_file import figure
+
+
+@pytest.fixture
+def character(tmp_path: Path) -> RigModel:
+    return RigModel.of(read_character(figure().write(tmp_path / "figure.glb")))
+
+
+@pytest.fixture(scope="module")
+def body() -> PoseModel:
+    return PoseModel.load("body")
+
+
+@pytest.mark.parametrize("form", [None, "joints", "mesh", "morph"])
+def test_a_pose_goes_into_the_character_s_own_file(
+    character: RigModel, tmp_path: Path, form: str | None
+) -> None:
+    latent = np.random.default_rng(0).uniform(-0.4, 0.4, character.latent_size)
+    path = tmp_path / "posed.glb"
+    told = export(
+        character,
+        NamedPose("bow", latent),
+        None,
+        path,
+        ExportStyle(form=form),
+        no_progress,
+        CancelToken(),
+    )
+    again = read_character(path)
+    vertices = np.empty_like(character.reference)
+    vertices[character.character.joined] = again.rest_vertices[again.joined]
+    n_pairs = len(character.detector.detect(vertices).pairs)
+    verdict = f"{n_pairs} pairs of its triangles collide"
+    assert told.startswith(f"Exported posed.glb: {verdict}; its clip 'wave' is left out, as it")
+    assert np.abs(vertices - character.decode(latent)).max() < 1e-5
+
+
+def test_a_motion_says_how_many_of_its_frames_collide(body: PoseModel, tmp_path: Path) -> None:
+    free = body.training_latent[:3]
+    colliding = sample_poses(body, 2, seed=0, colliding=True)
+    steps: list[tuple[int, int]] = []
+    for name, latent, verdict in (
+        ("free.pc2", free, "no collisions (checked)"),
+        ("bad.mdd", np.concatenate([free, colliding]), "2 of 5 frames collide"),
+    ):
+        poses = [NamedPose(f"pose {n}", row) for n, row in enumerate(latent)]
+        told = export_motion(
+            body,
+            poses,
+            tmp_path / name,
+            ExportStyle("maya", fps=10.0),
+            lambda done, all_of_them: steps.append((done, all_of_them)),
+            CancelToken(),
+        )
+        assert told == f"Exported {name}: {verdict}"
+        frames = read_point_cache(tmp_path / name).frames
+        drawn = np.stack([body.exported_vertices(row) for row in latent])
+        expected = 100.0 * drawn.astype(float)[:, :, [0, 2, 1]] * [1.0, 1.0, -1.0]
+        np.testing.assert_array_equal(frames, expected.astype(np.float32))
+    assert steps[-1] == (5, 5)
+
+
+def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
+    character: RigModel, tmp_path: Path
+) -> None:
+    poses = [NamedPose("rest", np.zeros(character.latent_size))] * 2
+    told = export_motion(
+        character, poses, tmp_path / "run.pc2", ExportStyle(), no_progress, CancelToken()
+    )
+    assert told.startswith("Exported run Body.pc2, run Core.pc2, run Hat.pc2: 2 of 2 frames coll")
+    assert read_point_cache(tmp_path / "run Hat.pc2").frames.shape[0] == 2
+
+
+def test_a_cancelled_motion_leaves_nothing(body: PoseModel, tmp_path: Path) -> None:
+    cancel = CancelToken()
+    cancel.cancel()
+    poses = [NamedPose("rest", body.training_latent[0])]
+    with pytest.raises(CancelledError):
+        export_motion(body, poses, tmp_path / "run.pc2", ExportStyle(), no_progress, cancel)
+    assert not list(tmp_path.iterdir())
