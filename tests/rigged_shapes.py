@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import Character, ClipFrames, Rig
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import FaceGroup, Topology
 from tests.bending_tube import RINGS, SIDES, bent_tube, tube_topology
+from tests.core.gltf_builder import GltfBuilder
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -170,8 +172,6 @@ def character_of(
     def sample(clip: str, fps: float | None) -> ClipFrames:  # noqa: ARG001
         if clip != "moves" or not n_frames:
             raise LCollisionError.must_be("a clip", "moves", clip)
-        from scipy.spatial.transform import Rotation
-
         ways = np.random.default_rng(11).normal(size=(len(rig.parents), 3))
         times = np.arange(n_frames) / 30.0
         transforms = np.stack(
@@ -233,3 +233,45 @@ def _limb_faces() -> npt.NDArray[np.int32]:
     kept = faces[wall | bottom | top].copy()
     kept[kept >= last] -= removed
     return kept
+
+
+def write_gltf(character: Character, path: Path) -> Path:
+    """Write a character that is z up, with its rig and its clip's turns, as glTF, which is y up."""
+    rig = character.rig
+    assert rig is not None
+    builder = GltfBuilder()
+    upright = np.eye(4)
+    upright[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
+    vertices = character.rest_vertices @ upright[:3, :3].T
+    columns = [np.pad(values, ((0, 0), (0, 1))) for values in (rig.joint_of, rig.weights)]
+    attributes = {
+        "POSITION": builder.array(vertices),
+        "JOINTS_0": builder.array(columns[0], "u1"),
+        "WEIGHTS_0": builder.array(columns[1]),
+    }
+    faces = builder.array(character.topology.faces.ravel(), "u4")
+    builder.add("meshes", name="Body", primitives=[{"attributes": attributes, "indices": faces}])
+    first = 2
+    builder.add("nodes", name="Body", mesh=0, skin=0)
+    roots = np.flatnonzero(rig.parents < 0) + first
+    builder.add("nodes", name="Up", matrix=upright.T.ravel().tolist(), children=roots.tolist())
+    for joint, (name, parent) in enumerate(zip(rig.joint_names, rig.parents, strict=True)):
+        place = rig.rest[joint, :3, 3] - (rig.rest[parent, :3, 3] if parent >= 0 else 0.0)
+        children = (np.flatnonzero(rig.parents == joint) + first).tolist()
+        own = {"children": children} if children else {}
+        builder.add("nodes", name=name, translation=place.tolist(), **own)
+    joints = [first + joint for joint in range(len(rig.joint_names))]
+    bind = np.linalg.inv(upright @ rig.rest)
+    builder.add("skins", joints=joints, inverseBindMatrices=builder.matrices(bind))
+    if character.clips:
+        frames = character.sample(character.clips[0], None)
+        assert frames.transforms is not None
+        moved = frames.transforms @ np.linalg.inv(rig.rest)
+        channels = []
+        for joint, parent in enumerate(rig.parents):
+            above = np.linalg.inv(moved[:, parent]) if parent >= 0 else np.eye(4)
+            turns = Rotation.from_matrix((above @ moved[:, joint])[:, :3, :3]).as_quat()
+            channel = {"node": first + joint, "path": "rotation", "values": turns}
+            channels.append(channel | {"times": frames.times})
+        builder.animation(character.clips[0], *channels)
+    return builder.write(path)

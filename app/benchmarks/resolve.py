@@ -1,12 +1,15 @@
 """Resolve on colliding poses, solver by solver, beside bisection without learning.
 
+Of a character, which has no predictor, the steps of Resolve run once on each pose, and what they
+find is compared with all pairs of faces, without a tree.
+
 Each solver runs twice on each pose, on one core: alone, for the paper's figures of merit (whether
 the point that it returns is feasible for the classifier, and how much of the exact energy is
 gone), and with the whole ladder, for time, distances and the exact check.
 
 The fields of a row, means over the poses:
 
-solver : the name of a `Solver`, or "bisection"
+solver : the name of a `Solver`, "bisection", or "steps" of a character
 poses : colliding ones that were resolved
 median_ms, p95_ms : of a whole resolve, on one core
 feasible_rate : of the poses that the predictor calls colliding, how many the solver alone
@@ -16,6 +19,7 @@ free_before_walk_back : exactly free without the ladder's last step; None for th
 energy_decrease : mean fraction of the exact energy that is gone at the solver's feasible points
 latent_distance : mean ||Z - Z*|| / ||Z*||
 vertex_distance : mean distance over vertices, in normalised lengths
+confirmed_free_rate : of a character's poses, how many are free by all pairs of faces
 """
 
 from __future__ import annotations
@@ -27,11 +31,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from app.benchmarks.drag import is_free_by_brute_force
 from app.benchmarks.timing import Row
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, RigidTransform
-from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.model import PoseModel, RigModel, sample_poses
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Solver, Step
 
 FloatArray = npt.NDArray[np.float64]
@@ -69,7 +74,7 @@ class CollidingPoses:
 
 
 def sampled_poses(
-    model: PoseModel, n_poses: int, seed: int, progress: Progress = no_progress
+    model: PoseModel | RigModel, n_poses: int, seed: int, progress: Progress = no_progress
 ) -> CollidingPoses:
     """Draw colliding poses from the latent box."""
     latents = sample_poses(model, n_poses, seed, colliding=True, progress=progress)
@@ -77,7 +82,7 @@ def sampled_poses(
 
 
 def real_poses(
-    model: PoseModel, pose_set: PoseSet, n_poses: int, progress: Progress = no_progress
+    model: PoseModel | RigModel, pose_set: PoseSet, n_poses: int, progress: Progress = no_progress
 ) -> CollidingPoses:
     """Encode those poses of a set that intersect themselves, the first `n_poses` of them.
 
@@ -99,7 +104,7 @@ def real_poses(
     )
 
 
-def score_baseline(model: PoseModel, poses: CollidingPoses) -> Row:
+def score_baseline(model: PoseModel | RigModel, poses: CollidingPoses) -> Row:
     """Bisect towards the first known free pose.
 
     Raises
@@ -204,6 +209,52 @@ def score_solver(
     return score, runs
 
 
+def score_steps(
+    model: RigModel,
+    poses: CollidingPoses,
+    metric: str,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> Row:
+    """Resolve all poses of a character, on the calling thread, and confirm what comes back.
+
+    Parameters
+    ----------
+    metric : as in `ResolveOptions`
+    progress : in poses
+    cancel : polled at every evaluation
+
+    Raises
+    ------
+    CancelledError : `cancel` was set.
+    """
+    options = ResolveOptions(metric=metric)
+    # What is built once for all poses is not timed.
+    model.resolver.resolve(poses.latents[0], options)
+    found, confirmed = [], []
+    for target, placement in zip(poses.latents, poses.placements, strict=True):
+        result = model.resolver.resolve(target, options, cancel=cancel, placement=placement)
+        found.append(result)
+        confirmed.append(is_free_by_brute_force(model, result.vertices))
+        progress(len(found), len(poses.latents))
+    seconds = [result.seconds for result in found]
+    free = np.array([bool(result.exactly_free) for result in found])
+    before = free & np.array([result.step != Step.FALL_BACK for result in found])
+    return {
+        "solver": "steps",
+        "poses": len(found),
+        "median_ms": _milliseconds(seconds, 0.5),
+        "p95_ms": _milliseconds(seconds, 0.95),
+        "feasible_rate": None,
+        "exactly_free_rate": float(free.mean()),
+        "free_before_walk_back": float(before.mean()),
+        "energy_decrease": None,
+        "latent_distance": float(np.mean([result.latent_distance for result in found])),
+        "vertex_distance": float(np.mean([result.vertex_distance_mean for result in found])),
+        "confirmed_free_rate": float(np.mean(confirmed)),
+    }
+
+
 def _energy_change(
     model: PoseModel,
     poses: CollidingPoses,
@@ -223,7 +274,7 @@ def _energy_change(
     return np.array(changes)
 
 
-def _are_colliding(model: PoseModel, latents: FloatArray) -> npt.NDArray[np.bool_]:
+def _are_colliding(model: PoseModel | RigModel, latents: FloatArray) -> npt.NDArray[np.bool_]:
     vertices = model.decode(latents, 1).astype(np.float32)
     return model.detector.are_colliding(vertices, workers=1)
 

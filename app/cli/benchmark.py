@@ -127,18 +127,27 @@ def resolve(
 ) -> None:
     """Compare the solvers, and a bisection that uses nothing learned, on colliding poses."""
     from app.benchmarks.histograms import draw_histograms
-    from app.benchmarks.resolve import real_poses, sampled_poses, score_baseline, score_solver
+    from app.benchmarks.resolve import (
+        real_poses,
+        sampled_poses,
+        score_baseline,
+        score_solver,
+        score_steps,
+    )
     from lcollision_core.meshes import read_pose_set
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PoseModel, RigModel, open_body
     from lcollision_core.resolve import ResolveOptions, Solver
 
     chosen = [Solver(ResolveOptions(solver=name).solver) for name in solvers or list(Solver)]
     ResolveOptions(metric=metric)
     if figure is not None:
         _require_folder(figure)
-    model = PoseModel.load(model_name)
+    model = open_body(model_name)
+    if not isinstance(model, PoseModel | RigModel):
+        raise TypeError(f"{type(model).__name__} has no resolver")
     _ = model.resolver
-    rows, runs = [], []
+    rows: list[Row] = []
+    runs = []
     with cancel_on_interrupt() as cancel:
         with progress_bar("Choosing poses") as progress:
             poses = (
@@ -147,11 +156,16 @@ def resolve(
                 else real_poses(model, read_pose_set(data), n_poses, progress)
             )
         rows.append(score_baseline(model, poses))
-        for solver in chosen:
-            with progress_bar(f"Resolving with {solver}") as progress:
-                score, run = score_solver(model, poses, solver, metric, progress, cancel)
-            rows.append(score)
-            runs.append(run)
+        if isinstance(model, RigModel):
+            rows[0]["confirmed_free_rate"] = None
+            with progress_bar("Resolving") as progress:
+                rows.append(score_steps(model, poses, metric, progress, cancel))
+        else:
+            for solver in chosen:
+                with progress_bar(f"Resolving with {solver}") as progress:
+                    score, run = score_solver(model, poses, solver, metric, progress, cancel)
+                rows.append(score)
+                runs.append(run)
     if figure is not None:
         for run in runs:
             draw_histograms(run, figure)
@@ -161,7 +175,8 @@ def resolve(
         return
     print_table(rows)
     note_rules(model)
-    note(_RESOLVE_IN_PAPER)
+    if runs:
+        note(_RESOLVE_IN_PAPER)
 
 
 @app.command("drag")

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from lcollision_core.characters import Character, RigPoseSpace, default_rules, joint_parts
+from lcollision_core.characters.rig_space import ROOT_CODES
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
@@ -225,6 +226,7 @@ class RigModel(PosableBody):
             ),
             shown=read_only(np.where(angles, np.degrees(1.0), 100.0)),
             units=tuple("°" if angle else " %" for angle in angles),
+            n_placing=ROOT_CODES,
         )
 
     @cached_property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from app.benchmarks.drag import is_free_by_brute_force
 from lcollision_core.model import PoseModel, sample_poses
 from tests.app.support import Lcollision
+from tests.rigged_shapes import rigged_body, write_gltf
 
 
 def test_the_command_prints_both_modes(lcollision: Lcollision) -> None:
@@ -34,3 +36,20 @@ def test_all_pairs_agree_with_the_tree(colliding: bool) -> None:
     for latent in sample_poses(body, 3, seed=2, colliding=colliding):
         vertices = body.decode(latent).astype(np.float32)
         assert is_free_by_brute_force(body, vertices) is not colliding
+
+
+def test_a_character_file_is_dragged_and_resolved(lcollision: Lcollision, tmp_path: Path) -> None:
+    path = write_gltf(rigged_body(n_frames=4), tmp_path / "body.glb")
+    plain, solid = json.loads(
+        lcollision("benchmark", "drag", "--model", str(path), "-n", "1", "--json").stdout
+    )
+    assert (plain["drags"], plain["vertices"]) == (7, len(rigged_body().rest_vertices))
+    assert plain["miss_reachable"] < 0.02
+    assert solid["exactly_free_rate"] == 1.0
+    _, steps = json.loads(
+        lcollision("benchmark", "resolve", "--model", str(path), "-n", "6", "--json").stdout
+    )
+    assert (steps["solver"], steps["poses"]) == ("steps", 6)
+    assert steps["exactly_free_rate"] == steps["confirmed_free_rate"] == 1.0
+    assert steps["feasible_rate"] is None
+    assert 0.0 < steps["vertex_distance"] < 0.3

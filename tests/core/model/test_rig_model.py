@@ -12,13 +12,13 @@ import pytest
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.meshes import RigidTransform
-from lcollision_core.model import PosableBody, RigModel, sample_poses
+from lcollision_core.model import PosableBody, RigModel, open_body, sample_poses
 from lcollision_core.model.pose_file import NamedPose, read_poses, write_poses
 from lcollision_core.posing import DragOptions, Pin, Twist, make_grip
 from lcollision_core.resolve import ResolveOptions, Step
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import random_rotation
-from tests.rigged_shapes import rigged_body, rigged_tube
+from tests.rigged_shapes import rigged_body, rigged_tube, write_gltf
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -102,6 +102,9 @@ def test_limits_are_kept_and_reset_is_the_rest_pose(model: RigModel) -> None:
     assert np.degrees(space.high[bend]) >= 150.0
     poses = space.sample(20, np.random.default_rng(0))
     assert np.isfinite(model.decode(poses)).all()
+    # Random poses leave the body in its place.
+    assert not poses[:, :6].any()
+    assert (np.ptp(poses[:, 6:], axis=0) > 0.0).all()
 
 
 def test_other_characters_are_told_apart() -> None:
@@ -153,7 +156,6 @@ def test_a_hand_is_dragged_while_the_feet_stay(model: RigModel) -> None:
 
 def test_colliding_poses_are_resolved_and_confirmed_by_brute_force(model: RigModel) -> None:
     poses = 0.8 * sample_poses(model, 12, seed=4, colliding=True)
-    poses[:, :6] = 0.0
     steps = []
     for latent in poses:
         result = model.resolve(latent)
@@ -229,3 +231,19 @@ def test_poses_are_saved_and_read_again(model: RigModel, tmp_path: Path) -> None
     read = read_poses(path, model)
     assert [pose.name for pose in read] == ["one", "rest"]
     np.testing.assert_allclose(read[0].latent, model.training_latent[3])
+
+
+def test_a_character_file_is_opened_as_a_body(tmp_path: Path) -> None:
+    made = rigged_body(n_frames=6)
+    body = open_body(write_gltf(made, tmp_path / "walker.glb"))
+    assert isinstance(body, RigModel)
+    assert (body.name, body.up_axis, body.body_size) == ("walker", 1, pytest.approx(1.8, rel=0.05))
+    np.testing.assert_allclose(body.front, [0.0, 0.0, 1.0])
+    assert set(body.domain_names) == set(RigModel.of(made).domain_names)
+    assert body.pose_names[0] == "rest"
+    frames = body.character.sample("moves", None)
+    assert frames.transforms is not None
+    codes = body.space.codes_of_transforms(frames.transforms)
+    np.testing.assert_allclose(body.decode(codes), frames.vertices, atol=1e-5)
+    rest = made.rest_vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    np.testing.assert_allclose(body.reference, rest[np.argsort(body.character.joined)], atol=1e-6)
