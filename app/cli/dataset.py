@@ -15,6 +15,7 @@ from app.cli.contact_options import (
     RestExclusionOption,
     RuleOptions,
     ToleratedDepthOption,
+    all_groups,
     rules_sentence,
 )
 from app.cli.inputs import Axis, PoseSetArgument, up_sentence
@@ -22,7 +23,16 @@ from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lcollision_core.contact import ContactRules, ProposedPair
     from lcollision_core.meshes import PoseSet
+
+_MOST_POSES_ASKED = 50
+"""Poses in which groups are looked at for contact, evenly spaced."""
+
+_LISTED = 5
+"""Most proposed pairs of groups that are named."""
 
 _Body = Literal["body", "body-swing", "body-jump"]
 _BODIES: dict[str, _Body] = {kind: kind for kind in get_args(_Body)}
@@ -46,9 +56,10 @@ def check(
     Exits with 1 when the set cannot be trained on as it is: a pose is unusable, or a face of
     the first has no area.
     """
-    from lcollision_core.contact import CollisionDetector, RuleCounts
+    from lcollision_core.contact import CollisionDetector, RuleCounts, propose_ignored
     from lcollision_core.errors import MeshFileError, ShapeError
     from lcollision_core.meshes import degenerate_faces, inspect_pose_set
+    from lcollision_core.meshes.face_groups import MAX_GROUPS
 
     with progress_bar("Reading poses") as progress:
         inspection = inspect_pose_set(path, progress)
@@ -67,6 +78,11 @@ def check(
             found = detector.detect_batch(poses.vertices, progress=progress)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
+    proposed = propose_ignored(
+        detector,
+        poses.vertices[:: -(-len(poses) // _MOST_POSES_ASKED)],
+        all_groups(groups, poses.topology, poses.vertex_labels)[:MAX_GROUPS],
+    )
     guess = poses.up
     report: dict[str, Any] = {
         "poses": inspection.n_found,
@@ -79,6 +95,9 @@ def check(
         "near_exclusion": rules.near_exclusion,
         "rules": rules.to_json(),
         "excluded_at_rest": RuleCounts(*found.n_excluded[0].tolist()).to_json(),
+        "proposed_ignored": [
+            {"groups": list(pair.groups), "share": pair.share} for pair in proposed
+        ],
         "up_axis": "xyz"[guess.axis],
         "up_is_sure": guess.is_sure,
         "colliding": [
@@ -98,11 +117,26 @@ def check(
         _print(path, report, up_sentence(guess))
         if not rules.exclude_nothing:
             tell(f"  {rules_sentence(rules, report['excluded_at_rest'])}")
+        _print_proposed(proposed, rules)
         if not guess.is_sure:
             note("`train embedding` takes that, unless --up x|y|z says otherwise")
     flat = degenerate_faces(poses.topology, poses.vertices[0])
     if len(poses) < inspection.n_found or len(flat):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+
+
+def _print_proposed(proposed: Sequence[ProposedPair], rules: ContactRules) -> None:
+    """Name the groups that are nearly always in contact, and the option that ignores them."""
+    known = {frozenset(pair) for pair in rules.ignored}
+    new = [pair for pair in proposed if frozenset(pair.groups) not in known]
+    for pair in new[:_LISTED]:
+        first, second = pair.groups
+        tell(
+            f"  {first} and {second} are in contact in {100.0 * pair.share:.0f} % of the poses; "
+            f'--ignore "{first}:{second}" leaves them out'
+        )
+    if len(new) > _LISTED:
+        tell(f"  and {len(new) - _LISTED} more pairs of groups, see --json")
 
 
 def _print(path: Path, report: dict[str, Any], up: str) -> None:

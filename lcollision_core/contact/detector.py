@@ -200,7 +200,7 @@ class CollisionDetector:
             vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
             raise ShapeError("is not finite", where=f"vertex {vertex} of the reference")
         self.topology = topology
-        self.rules = rules
+        self.rules, self.groups = rules, tuple(groups)
         self.body_size = body_size(vertices, topology)
         if self.body_size == 0.0:
             raise ShapeError("all vertices are in one point", "give it a mesh with an extent")

@@ -1,0 +1,94 @@
+"""Proposals of groups to ignore: those in contact in nearly every pose, with their share."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lcollision_core.contact import (
+    CollisionDetector,
+    ContactRules,
+    ProposedPair,
+    propose_ignored,
+)
+from lcollision_core.errors import CancelledError, ShapeError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes import FaceGroup, component_groups, part_groups
+from tests.core.shapes import Mesh, soup, strip
+
+FLOOR = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
+BLADE = [[1, 1, -1], [1, 1, 1], [2, 1, 1]]
+POST = [[0.5, 0.5, -1], [0.5, 0.5, 1], [0.6, 0.5, 1]]
+MESH = soup([FLOOR, BLADE, POST])
+"""The blade and the post stand in the floor, and not in each other."""
+FLOOR_GROUP, BLADE_GROUP, POST_GROUP = (
+    FaceGroup(name, np.array([n])) for n, name in enumerate(("floor", "blade", "post"))
+)
+GROUPS = (FLOOR_GROUP, BLADE_GROUP, POST_GROUP)
+
+
+def poses() -> np.ndarray:
+    """Return 10 poses; the blade is out of the floor in two of them."""
+    moved = np.stack([MESH.vertices] * 10)
+    moved[:2, 3:6] += [0.0, 0.0, 5.0]
+    return moved
+
+
+def detector(rules: ContactRules | None = None) -> CollisionDetector:
+    return CollisionDetector(MESH.topology, MESH.vertices, rules or ContactRules(), GROUPS)
+
+
+def test_contacts_are_proposed_with_their_share() -> None:
+    always = ProposedPair(("floor", "post"), 1.0)
+    often = ProposedPair(("floor", "blade"), 0.8)
+    assert propose_ignored(detector(), poses(), GROUPS) == (always,)
+    assert propose_ignored(detector(), poses(), GROUPS, 0.8) == (always, often)
+    assert propose_ignored(detector(), poses(), GROUPS, 0.81) == (always,)
+
+
+def test_what_is_excluded_at_rest_or_ignored_is_in_contact_too() -> None:
+    for rules in (ContactRules(rest_exclusion=0.0), ContactRules(ignored=(("post", "floor"),))):
+        found = propose_ignored(detector(rules), poses(), GROUPS)
+        assert [proposal.groups for proposal in found] == [("floor", "post")]
+
+
+def test_folds_of_the_skin_are_no_contact() -> None:
+    loop = strip(
+        [[0, 0], [2, 0], [4, 0], [4, 2], [3, 3], [1.5, 1.5], [0, -1], [0, -2], [0, -3]]
+    )  # fmt: skip
+    straight = strip([[x, 0.0] for x in range(9)])
+    groups = (FaceGroup("start", np.array([0, 1])), FaceGroup("end", np.arange(10, 16)))
+    for near, n_found in ((0.0, 1), (2.0, 0)):
+        bent = CollisionDetector(straight.topology, straight.vertices, ContactRules(near))
+        assert len(propose_ignored(bent, loop.vertices[None], groups)) == n_found
+
+
+def test_groups_that_overlap_or_are_equal_are_not_proposed() -> None:
+    everything = FaceGroup("mesh", np.array([0, 1, 2]))
+    again = FaceGroup("post's material", np.array([2]))
+    found = propose_ignored(detector(), poses(), (everything, *GROUPS, again))
+    assert [proposal.groups for proposal in found] == [("floor", "post")]
+    assert propose_ignored(detector(), poses(), (everything,)) == ()
+
+
+def test_components_and_parts_are_groups() -> None:
+    sheet = strip([[x, 0.0] for x in range(4)])
+    mesh = Mesh(
+        np.concatenate([MESH.vertices, sheet.vertices + 9.0]),
+        np.concatenate([MESH.faces, sheet.faces + 9]),
+    )
+    components = component_groups(mesh.topology)
+    assert [group.name for group in components] == [f"component {n}" for n in range(1, 5)]
+    assert components[0].faces.tolist() == [3, 4, 5, 6, 7, 8]
+    assert [group.faces.tolist() for group in components[1:]] == [[0], [1], [2]]
+    parts = part_groups(MESH.topology, np.array(["a", "b", "b", *"acc", *"abc"]))
+    assert {group.name: group.faces.tolist() for group in parts} == {"a": [2], "b": [0], "c": [1]}
+
+
+def test_bad_groups_are_refused_and_cancelling_is_heard() -> None:
+    with pytest.raises(ShapeError, match="the group 'far' must be of faces from 0 to 2, got 3"):
+        propose_ignored(detector(), poses(), (*GROUPS, FaceGroup("far", np.array([3]))))
+    cancel = CancelToken()
+    cancel.cancel()
+    with pytest.raises(CancelledError):
+        propose_ignored(detector(), poses(), GROUPS, cancel=cancel)
