@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.formats.gltf_document import GltfDocument, element, numbers
+from lcollision_core.meshes.formats.gltf_document import GltfDocument, as_float, element, numbers
 from lcollision_core.meshes.formats.scene import Clip, Part, ScenePoses, unique_names
 from lcollision_core.meshes.formats.transforms import (
     compose,
@@ -210,15 +210,14 @@ def _channel(
             f"the interpolation of {where}", "STEP, LINEAR or CUBICSPLINE", interpolation
         )
     what = f"the times of {where}"
-    times = document.array(sampler.input, what, ("SCALAR",))[:, 0].astype(np.float64)
+    times = as_float(document.array(sampler.input, what, ("SCALAR",))[:, 0])
     if not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0.0).any():
         raise MeshFileError.must_be(what, "finite and ascending", f"{len(times)} others")
     what = f"the {path} values of {where}"
     types = {3: ("VEC3",), 4: ("VEC4",)}.get(width) if path in _PATHS else ("SCALAR",)
     per_key = 3 if interpolation == "CUBICSPLINE" else 1
     n_values = len(times) * per_key * (1 if path in _PATHS else width)
-    values = document.array(sampler.output, what, types or ("SCALAR",), n_values)
-    values = values.astype(np.float64)
+    values = as_float(document.array(sampler.output, what, types or ("SCALAR",), n_values))
     if not np.isfinite(values).all():
         raise MeshFileError("are not all finite", where=what)
     shape = (len(times), 3, width) if per_key == 3 else (len(times), width)

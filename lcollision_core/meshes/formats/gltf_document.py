@@ -33,6 +33,16 @@ _COMPRESSIONS = {
     "KHR_meshopt_compression": "meshopt",
 }
 
+_LISTS = (
+    *("accessors", "animations", "bufferViews", "buffers", "materials", "meshes", "nodes"),
+    *("scenes", "skins"),
+)
+_FREE = ("extras", "extensions")
+"""Keys whose values may be anything."""
+
+_LARGEST = 1e100
+"""Largest number of the description; products of a few are finite."""
+
 T = TypeVar("T")
 
 
@@ -168,6 +178,12 @@ class GltfDocument:
         return self._buffers[number]
 
 
+def as_float(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Return numbers of a file as float64; a NaN of any kind is none to warn of."""
+    with np.errstate(invalid="ignore"):
+        return values.astype(np.float64)
+
+
 def element(items: Sequence[T] | None, index: object, what: str) -> T:
     """Return one of a list of the file, or raise `MeshFileError` where it has none such."""
     n = len(items or ())
@@ -189,7 +205,7 @@ def numbers(values: object, what: str, count: int) -> npt.NDArray[np.float64]:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         array = np.empty(0)
-    if array.shape != (count,) or not np.isfinite(array).all():
+    if array.shape != (count,) or not (np.abs(array) <= _LARGEST).all():
         raise MeshFileError.must_be(what, f"{count} finite numbers", quoted(values))
     return array
 
@@ -227,13 +243,31 @@ def _parsed(text: bytes) -> tuple[GLTF2, dict[str, Any]]:
 
     try:
         values = parse_json(text)
-        if not isinstance(values, dict):
-            raise ValueError("it is no object")
-        return GLTF2.gltf_from_json(text.decode("utf-8-sig")), values
+        if not isinstance(values, dict) or _has_empty_place(values):
+            raise ValueError("it is no object, or a list in it has an empty place")
+        description = GLTF2.gltf_from_json(text.decode("utf-8-sig"))
     # On a damaged description pygltflib raises whatever its line at hand raises; nothing of ours
     # runs here.
     except Exception as error:
         raise MeshFileError("it holds no readable glTF description") from error
+    for name in _LISTS:
+        if getattr(description, name) is None:
+            setattr(description, name, [])
+    return description, values
+
+
+def _has_empty_place(values: dict[str, Any]) -> bool:
+    """Whether a list of a document has a null in it; as a value of a key it says nothing."""
+    left: list[Any] = [values]
+    while left:
+        one = left.pop()
+        if isinstance(one, dict):
+            left += [held for key, held in one.items() if key not in _FREE and held is not None]
+        elif isinstance(one, list):
+            if None in one:
+                return True
+            left += [held for held in one if isinstance(held, dict | list)]
+    return False
 
 
 def resource(uri: object, path: Path, most_bytes: int) -> bytes:

@@ -10,7 +10,13 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.gltf_animation import read_clips, stored_transform
-from lcollision_core.meshes.formats.gltf_document import GltfDocument, element, numbers, whole
+from lcollision_core.meshes.formats.gltf_document import (
+    GltfDocument,
+    as_float,
+    element,
+    numbers,
+    whole,
+)
 from lcollision_core.meshes.formats.polygons import MAX_FACES, require_plausible_count
 from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses, is_mirrored, parents_first
 from lcollision_core.meshes.formats.transforms import compose, global_transforms
@@ -151,7 +157,7 @@ def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Pa
     node = description.nodes[shown.node]
     where = f"mesh {shown.mesh}"
     stored = document.array(primitive.attributes.POSITION, f"the positions of {where}", ("VEC3",))
-    points = stored.astype(np.float64)
+    points = as_float(stored)
     n = len(points)
     bones, bind = np.array([shown.node]), np.eye(4)[None]
     bone_of, weights = np.zeros((n, 1), dtype=np.int32), np.ones((n, 1))
@@ -238,7 +244,7 @@ def _skin(document: GltfDocument, index: object) -> tuple[npt.NDArray[np.int64],
     if len(stored) < len(bones):
         raise MeshFileError(f"have {len(stored)} values, {len(bones)} are needed", where=what)
     # Column by column.
-    bind = stored[: len(bones)].reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
+    bind = as_float(stored[: len(bones)].reshape(-1, 4, 4).transpose(0, 2, 1))
     bind[:, 3] = 0.0, 0.0, 0.0, 1.0
     _require_finite(bind, what)
     return bones, bind
@@ -258,11 +264,8 @@ def _influences(
             raise MeshFileError.must_be(what, "whole numbers", stored.dtype)
         joints.append(stored.astype(np.int64))
         what = f"the weights {name} of {where}"
-        weights.append(
-            document.array(
-                getattr(primitive.attributes, f"WEIGHTS_{name}", None), what, ("VEC4",), n
-            ).astype(np.float64)
-        )
+        given = getattr(primitive.attributes, f"WEIGHTS_{name}", None)
+        weights.append(as_float(document.array(given, what, ("VEC4",), n)))
     bone_of, shares = np.concatenate(joints, axis=1), np.concatenate(weights, axis=1)
     _require_finite(shares, f"the weights of {where}")
     shares = np.maximum(shares, 0.0)
@@ -292,7 +295,7 @@ def _morphs(document: GltfDocument, primitive: Any, where: str, n: int) -> npt.N
             deltas.append(np.zeros((n, 3), dtype=np.float32))
         else:
             stored = document.array(target["POSITION"], what, ("VEC3",), n)
-            deltas.append(stored.astype(np.float32))
+            deltas.append(as_float(stored).astype(np.float32))
     stacked = np.stack(deltas) if deltas else np.empty((0, n, 3), dtype=np.float32)
     _require_finite(stacked, f"the morph targets of {where}")
     return stacked
