@@ -23,6 +23,7 @@ from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
 
 if TYPE_CHECKING:
+    from lcollision_core.contact import ContactRules
     from lcollision_core.meshes import FileStamp
     from lcollision_core.model import MirroredPose, NamedPose, OtherModelError, PosableBody
     from lcollision_core.resolve import ResolveOptions, ResolveResult
@@ -74,6 +75,7 @@ class PoseDocument(LiveEditing):
     imported : Path, the mesh that has become the pose
     of_other_model : OtherModelError, where a file of poses needs another model that is known
     recovered : Path, the poses file that `recover` has put in
+    contacts_counted : ContactsAtRest
     """
 
     model_changed = Signal()
@@ -86,6 +88,7 @@ class PoseDocument(LiveEditing):
     of_other_model = Signal(object)
     wrong_scale = Signal(object, object)
     recovered = Signal(object)
+    contacts_counted = Signal(object)
 
     def __init__(
         self,
@@ -100,6 +103,7 @@ class PoseDocument(LiveEditing):
         self._solve: int | None = None
         self._solve_began = 0.0
         self._mirroring = self._mirroring_poses = self._incoming = self._loading = 0
+        self._counting = self._ruling = 0
         self._prepared = False
         self._exports: list[int] = []
         self._closed = False
@@ -218,8 +222,10 @@ class PoseDocument(LiveEditing):
         self.locked_domains = frozenset()
         self.cancel_resolve()
         # What is being exported is a snapshot, and goes on.
-        others = (self._mirroring, self._mirroring_poses, self._incoming, self._loading)
-        for number in others:
+        for number in (
+            *(self._mirroring, self._mirroring_poses, self._incoming),
+            *(self._loading, self._counting, self._ruling),
+        ):
             self._long.cancel(number)
         self.frame = self.exact = self.file = None
         self._gesture = self._drag = self._last_grip = None
@@ -286,6 +292,27 @@ class PoseDocument(LiveEditing):
         """
         work = partial(jobs.edit_parts, self.model, self.model_file, edits)
         self._long.start("Saving the body parts", work, self._on_parts)
+
+    def count_contacts(self) -> None:
+        """Count the pairs of the rest pose by contact rule; `contacts_counted` tells."""
+        self._long.cancel(self._counting)
+        work = partial(jobs.contacts_at_rest, self.model)
+        self._counting = self._long.start(
+            "Counting pairs at rest", work, self.contacts_counted.emit
+        )
+
+    @property
+    def changing_rules(self) -> bool:
+        """Whether other contact rules are being applied."""
+        return bool(self._long.label_of(self._ruling))
+
+    def set_rules(self, rules: ContactRules) -> None:
+        """Apply other contact rules in the long worker, and keep them in the model's own file.
+
+        The pose, its history and the locks stay; nothing of it can be undone.
+        """
+        work = partial(jobs.change_rules, self.model, self.model_file, rules)
+        self._ruling = self._long.start("Applying the contact rules", work, self._on_rules)
 
     def new_pose(self) -> None:
         """Start again from the reference pose: unnamed, no file, no history; the library stays."""
@@ -493,11 +520,25 @@ class PoseDocument(LiveEditing):
             return
         # The slider that is being dragged goes with its old name.
         self._close_gesture()
+        self._exchange(changed)
+        self.message.emit(f"Saved the body parts in {self.model.name}")
+
+    def _on_rules(self, changed: jobs.OpenedModel) -> None:
+        if changed.model.fingerprint != self.model.fingerprint:
+            return
+        self._close_gesture()
+        # What was found by other rules.
+        self.exact = None
+        self._amend(replace(self._state, outcome=None))
+        self._exchange(changed)
+        self.message.emit("The new contact rules apply")
+
+    def _exchange(self, changed: jobs.OpenedModel) -> None:
+        """Put in the same model with something else changed; the pose stays."""
         self._model, self.model_file = changed.model, changed.file
         self._live.follow(self.model, self.latent, self._predicts)
         self._prepare()
         self._tell_all()
-        self.message.emit(f"Saved the body parts in {self.model.name}")
 
     def _on_recovered(
         self, name: str, file: Path | None, read: jobs.ReadPoses | OtherModelError

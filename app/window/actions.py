@@ -64,6 +64,9 @@ ACTIONS: dict[str, Spec] = {
     "filter": Spec("&Find a slider", "Ctrl+F", "Type part of a slider's name", "search"),
     "unlock": Spec("Un&lock all", "Ctrl+L", "Unlock all body parts"),
     "parts": Spec("Body &parts…", "Ctrl+Alt+B", "Rename, recolour and reorder the body parts"),
+    "contacts": Spec(
+        "&Contacts…", "Ctrl+Alt+C", "Choose which crossing triangles don't count as collisions"
+    ),
     "solid": Spec(
         "&Solid", "Ctrl+Alt+S", "Keep the body from moving into itself", "solid", checkable=True
     ),

@@ -26,6 +26,7 @@ from app.view.viewport import Viewport
 from app.window import actions
 from app.window.actions import ACTIONS, DOCKS, THEMES
 from app.window.body_menus import BodyMenus
+from app.window.contact_actions import ContactActions
 from app.window.dialogs.failure import FailureDialog, open_log_file
 from app.window.dialogs.help import show_about, show_shortcuts
 from app.window.drag_actions import DragActions
@@ -147,6 +148,7 @@ class MainWindow(QMainWindow):
             "about": lambda: show_about(document.model if document.has_model else None, self),
             **self.files.acts,
             **self._edits.acts,
+            **ContactActions(self, document, self.viewport).acts,
             **drags.acts,
             **library_actions.acts,
             **views.acts,
@@ -369,7 +371,7 @@ class MainWindow(QMainWindow):
         has_model = self.document.has_model
         for dock in self.docks.values():
             dock.widget().setEnabled(has_model)
-        for key in self.files.acts:
+        for key in (*self.files.acts, "contacts"):
             self.actions_by_key[key].setEnabled(has_model or key == "open_model")
         if has_model:
             model = self.document.model

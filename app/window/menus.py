@@ -21,7 +21,7 @@ MENUS: dict[str, tuple[str, ...]] = {
     ),
     "&Edit": (
         *("undo", "redo", SEPARATOR),
-        *("reset", "randomise", "mirror", SEPARATOR, "filter", "unlock", "parts"),
+        *("reset", "randomise", "mirror", SEPARATOR, "filter", "unlock", "parts", "contacts"),
     ),
     "&Pose": (
         *("solid", SEPARATOR),

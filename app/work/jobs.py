@@ -19,6 +19,7 @@ from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
+    from lcollision_core.contact import ContactRules, RuleCounts
     from lcollision_core.meshes import FileStamp, RigidTransform
     from lcollision_core.model import (
         MirroredPose,
@@ -57,6 +58,20 @@ class ReadPoses:
     held: PoseFile
     stamp: FileStamp | None
     opened: OpenedModel | None
+
+
+@dataclass(frozen=True)
+class ContactsAtRest:
+    """What the contact rules make of the rest pose.
+
+    Attributes
+    ----------
+    n_counted : colliding pairs that count
+    excluded : how many each rule leaves out
+    """
+
+    n_counted: int
+    excluded: RuleCounts
 
 
 @dataclass(frozen=True)
@@ -306,6 +321,32 @@ def resolve(
     return replace(result, seconds=searched), ghost
 
 
+def contacts_at_rest(model: PosableBody, _: Progress, __: CancelToken) -> ContactsAtRest:
+    """Count the colliding pairs of the rest pose by the rules that leave them out."""
+    found = model.detector.detect(model.reference)
+    return ContactsAtRest(len(found.pairs), found.excluded)
+
+
+def change_rules(
+    model: PosableBody, model_file: str, rules: ContactRules, _: Progress, __: CancelToken
+) -> OpenedModel:
+    """Apply other contact rules to a model, and write them into its file.
+
+    Those of a character, or of a bundled model, change in the window alone.
+    """
+    from lcollision_core.model import PoseModel, change_model
+
+    changed = model.with_rules(rules)
+    if isinstance(model, PoseModel) and not is_bundled(model_file):
+
+        def change(held: PoseModel) -> PoseModel:
+            _require_same(held, model, model_file, "its contact rules")
+            return held.with_rules(rules)
+
+        change_model(model_file, change)
+    return OpenedModel(changed, model_file)
+
+
 def is_bundled(model_file: str) -> bool:
     """Whether a model came with the program, or from no file, so that it is changed in a copy."""
     from lcollision_core.bundled import bundled_folder
@@ -329,12 +370,7 @@ def edit_parts(
         return OpenedModel(changed, model_file)
 
     def change(held: PoseModel) -> PoseModel:
-        if held.fingerprint != model.fingerprint:
-            raise ModelFileError(
-                "holds another model by now",
-                "open it again to change its body parts",
-                where=model_file,
-            )
+        _require_same(held, model, model_file, "its body parts")
         return held.edit_domains(edits.names, edits.colours, edits.order)
 
     if edits.copy_name is None:
@@ -350,3 +386,10 @@ def edit_parts(
             written.save(path)
     # What the open model has loaded and compiled stays.
     return OpenedModel(model.with_card(written.card, path.stem), str(path))
+
+
+def _require_same(held: PosableBody, model: PosableBody, model_file: str, what: str) -> None:
+    if held.fingerprint != model.fingerprint:
+        raise ModelFileError(
+            "holds another model by now", f"open it again to change {what}", where=model_file
+        )

@@ -97,8 +97,8 @@ class ExactCard(Card):
             )
         elif is_held:
             said.append(_HELD)
-        elif not left_out:
-            said.append("No triangle crosses another")
+        else:
+            said.append(f"No {'other ' if left_out else ''}triangle crosses another")
         if left_out:
             said.append(f"{counted(left_out, 'pair')} of triangles not counted")
             sentence = document.model.rules.sentence(verdict.excluded)

@@ -1,0 +1,131 @@
+"""The dialog of the contact rules: what they leave out of the rest pose, seen and changed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from pytestqt.qtbot import QtBot
+
+from app.view.shading import Shading
+from app.window.dialogs.contacts import ContactsDialog
+from app.window.main_window import MainWindow
+from app.work.jobs import contacts_at_rest
+from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.meshes import ContactRules
+from lcollision_core.model import PoseModel, RigModel
+from tests.app.windows import PATIENCE, rest, take_picture
+from tests.rigged_shapes import rigged_body
+
+LEFT = Qt.MouseButton.LeftButton
+
+
+def dialog_of(qtbot: QtBot, window: MainWindow) -> ContactsDialog:
+    window.actions_by_key["contacts"].trigger()
+    qtbot.waitUntil(lambda: not window.document.busy, timeout=PATIENCE)
+    (dialog,) = window.findChildren(ContactsDialog)
+    return dialog
+
+
+@pytest.fixture
+def body(qtbot: QtBot, window: MainWindow) -> RigModel:
+    """Open a body whose left forearm goes through its right one at rest, which counts at first."""
+    body = rigged_body()
+    assert body.rig is not None
+    moved = np.where(body.rest_vertices[:, :1] > 0.5, [-1.2, 0.0, -0.01], 0.0)
+    rig = replace(body.rig, points=body.rig.points + moved[:, None])
+    touching = replace(body, rest_vertices=body.rest_vertices + moved, rig=rig)
+    model = RigModel.of(touching).with_rules(ContactRules())
+    window.document.set_model(model)
+    rest(qtbot, window)
+    qtbot.waitUntil(lambda: not window.document.busy, timeout=PATIENCE)
+    return model
+
+
+def test_rules_are_applied_counted_and_tinted(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    document, viewport = window.document, window.viewport
+    viewport.set_shading(Shading.DOMAINS)
+    dialog = dialog_of(qtbot, window)
+    assert viewport.shading is Shading.EXACT
+    pairs = contacts_at_rest(body, no_progress, CancelToken()).n_counted
+    assert pairs > 0
+    assert dialog.total.text().startswith(f"At rest 0 pairs not counted, {pairs} pairs counted.")
+    assert not dialog.apply.isEnabled()
+    document.set_code(10, 0.2)
+    latent = document.latent
+    dialog.at_rest.setChecked(True)
+    dialog.rest.setValue(5.0)
+    QTest.mouseClick(dialog.apply, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    rest(qtbot, window)
+    assert document.model.rules == ContactRules(rest_exclusion=0.05)
+    assert isinstance(document.model, RigModel)
+    np.testing.assert_array_equal(document.latent, latent)
+    assert document.undo_stack.canUndo()
+    assert dialog.counts["rest"].text() == f"{pairs} pairs at rest"
+    assert dialog.total.text() == f"At rest {pairs} pairs not counted, 0 pairs counted."
+    exact, scene = document.exact, viewport.scene
+    assert exact is not None
+    assert scene is not None
+    assert exact.excluded.rest > 0
+    assert scene.uncounted.n_faces == len(np.unique(exact.excluded_pairs)) > 0
+    tip = window.collision.exact.verdict.toolTip()
+    assert f"{exact.excluded.rest} pairs that touch at rest are not counted" in tip
+    assert "not counted" in window.collision.exact.details.text()
+    take_picture(window, "contacts")
+    dialog.close()
+    assert viewport.shading is Shading.DOMAINS
+
+
+def test_pairs_of_groups_are_ignored_and_counted_again(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    document, dialog = window.document, dialog_of(qtbot, window)
+    names = [dialog.first.itemText(row) for row in range(dialog.first.count())]
+    assert names == list(dict.fromkeys(group.name for group in body.groups))
+    dialog.second.setCurrentIndex(1)
+    for _ in range(2):
+        QTest.mouseClick(dialog.add, LEFT)
+    assert dialog.rules().ignored == ((names[0], names[1]),)
+    QTest.mouseClick(dialog.apply, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert document.model.rules.ignored == ((names[0], names[1]),)
+    dialog.ignored.setCurrentRow(0)
+    QTest.mouseClick(dialog.remove, LEFT)
+    QTest.mouseClick(dialog.apply, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert document.model.rules == ContactRules()
+    dialog.close()
+
+
+def test_rules_that_a_predictor_was_trained_by_stay(qtbot: QtBot, window: MainWindow) -> None:
+    dialog = dialog_of(qtbot, window)
+    fields = (dialog.near, dialog.at_rest, dialog.rest, dialog.tolerated, dialog.add, dialog.apply)
+    assert [field.isEnabled() for field in fields] == [False] * len(fields)
+    assert dialog.locked.isVisible()
+    assert window.document.model.name in dialog.locked.text()
+    dialog.close()
+
+
+def test_rules_of_a_model_without_predictor_are_kept_in_its_file(
+    qtbot: QtBot, window: MainWindow, editor_model: PoseModel, tmp_path: Path
+) -> None:
+    document, path = window.document, tmp_path / "bare.safetensors"
+    PoseModel("bare", editor_model.embedding, editor_model.card).save(path)
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        document.open_model(path)
+    dialog = dialog_of(qtbot, window)
+    dialog.tolerated.setValue(1.5)
+    dialog.near.setValue(dialog.near.value())
+    QTest.mouseClick(dialog.apply, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    kept = PoseModel.load(path).rules
+    assert kept == document.model.rules
+    assert (kept.tolerated_depth, kept.near_exclusion) == (0.015, editor_model.near_exclusion)
+    dialog.close()
