@@ -103,7 +103,7 @@ def decode(
     """
     from lcollision_core.model import open_body, read_poses
 
-    destination = output_named(output)
+    destination = output_named(output, form)
     style = MeshStyle(mesh_format, axes, scale, like, form, fps)
     if destination.form == "poses":
         require_mesh_style(destination, style)

@@ -138,7 +138,7 @@ def resolve(
         seed=seed,
     )
     resolver = model.resolver
-    target = output_named(output)
+    target = output_named(output, form)
     style = MeshStyle(mesh_format, like=like, form=form, fps=fps)
     if keep_detail and target.form == "poses":
         raise LCollisionError(

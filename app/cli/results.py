@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MeshFormat = Literal["obj", "ply", "off", "stl", "glb"]
 MeshAxes = Literal["model", "y-up", "blender", "maya", "unreal"]
 """The axes that a mesh may be written in: `ExportAxes`, which takes long to import."""
-PoseForm = Literal["joints", "mesh", "morph"]
+PoseForm = Literal["joints", "mesh", "morph", "clip"]
 """How a character's file holds a pose: `CharacterForm`, which takes long to import."""
 
 PosesOutput = Annotated[
@@ -60,8 +60,8 @@ PoseFormOption = Annotated[
     PoseForm | None,
     typer.Option(
         "--form",
-        help="How a GLB holds the pose: its joints turned, a static mesh or a morph target. "
-        "Default: joints where the pose came from them, else mesh.",
+        help="How a GLB holds the pose: its joints turned, a static mesh or a morph target; or all "
+        "poses as the frames of a clip. Default: joints where the pose came from them, else mesh.",
     ),
 ]
 AxesOption = Annotated[
@@ -78,7 +78,10 @@ UnitOption = Annotated[
     ),
 ]
 FpsOption = Annotated[
-    float, typer.Option(min=0.01, max=1000.0, metavar="N", help="Frames a second of an .mdd file.")
+    float,
+    typer.Option(
+        min=0.01, max=1000.0, metavar="N", help="Frames a second of a clip or an .mdd file."
+    ),
 ]
 
 
@@ -149,7 +152,7 @@ def require_output(path: Path, suffix: str) -> Output:
     return Output(path, "poses", file_stamp(path))
 
 
-def output_named(name: str) -> Output:
+def output_named(name: str, pose_form: PoseForm | None = None) -> Output:
     """Determine the form of an output, before the work for it is done.
 
     An existing folder and what ends in a slash are folders whatever they are called; else the
@@ -177,6 +180,8 @@ def output_named(name: str) -> Output:
     must_be_folder = name.endswith(("/", os.sep))
     forms: dict[str, Literal["poses", "mesh", "frames"]] = {".json": "poses", ".vrm": "mesh"}
     forms |= dict.fromkeys(WRITABLE_SUFFIXES, "mesh")
+    if pose_form == "clip":
+        forms |= {".glb": "frames", ".vrm": "frames"}
     forms |= dict.fromkeys(POINT_CACHE_SUFFIXES, "frames")
     if not must_be_folder and suffix in forms:
         require_writable(path)
@@ -335,6 +340,7 @@ def write_result(
             files, meshes = write_sequence(
                 path,
                 model,
+                [pose.latent for pose in poses],
                 list(vertices or decoded),
                 source=source,
                 axes=style.axes,

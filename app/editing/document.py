@@ -406,7 +406,7 @@ class PoseDocument(LiveEditing):
     def export_motion(
         self, path: str | Path, poses: Sequence[NamedPose], style: jobs.ExportStyle
     ) -> None:
-        """Write poses as the frames of a point cache."""
+        """Write poses as the frames of a point cache, or of a clip of the character's own file."""
         path = Path(path)
         work = partial(jobs.export_motion, self.model, tuple(poses), path, style)
         self.write(f"Exporting {path.name}", work)

@@ -279,6 +279,7 @@ def export_motion(
     files, written = write_sequence(
         path,
         model,
+        [pose.latent for pose in poses],
         frames,
         source=source_for(path.suffix, model, style.like),
         axes=style.axes,
@@ -292,7 +293,8 @@ def export_motion(
         progress(done, len(written))
     collide = f"{n_colliding} of {counted(len(poses), 'frame')} collide"
     names = ", ".join(file.name for file in files)
-    return f"Exported {names}: {collide if n_colliding else 'no collisions (checked)'}"
+    told = f"Exported {names}: {collide if n_colliding else 'no collisions (checked)'}"
+    return "; ".join((told, *dict.fromkeys(note for frame in written for note in frame.notes)))
 
 
 def resolve(

@@ -10,4 +10,8 @@ from lcollision_core.characters.reading import (
     read_character,
 )
 from lcollision_core.characters.rig_space import RigPoseSpace
-from lcollision_core.characters.write import PATCHED_SUFFIXES, write_character
+from lcollision_core.characters.write import (
+    PATCHED_SUFFIXES,
+    write_character,
+    write_character_clip,
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import StrEnum
@@ -14,7 +15,7 @@ import numpy.typing as npt
 from lcollision_core.characters.character import Character, Rig
 from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.meshes.formats.gltf_document import GltfDocument
-from lcollision_core.meshes.formats.gltf_patch import GltfPatch
+from lcollision_core.meshes.formats.gltf_patch import VERTEX_DATA, GltfPatch
 from lcollision_core.meshes.formats.gltf_scene import ShownPrimitive, read_shown, shown_primitives
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 from lcollision_core.meshes.formats.scene import Part, ScenePoses, parents_first
@@ -39,6 +40,11 @@ _SAME_NUMBER = 1e-6
 """Of a joint's translation or scale: what changes less keeps its text."""
 
 _IDENTITY = np.eye(4)
+_PARTS = ("translation", "rotation", "scale")
+_DEFAULTS = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0))
+
+_CLIP = "poses"
+"""The name of the clip that poses become."""
 
 
 class CharacterForm(StrEnum):
@@ -111,18 +117,47 @@ def posed_gltf(
             stored = source.bake(pose)
         else:
             stored = source.add_morph(pose)
-        error = float(np.abs(stored - pose).max()) / source.size
-        if not error <= _LARGEST_ERROR:
-            raise MeshFileError(
-                f"cannot hold this pose in its {form}: vertices would be off by {error:.2g} of "
-                "the body size",
-                f"choose {CharacterForm.MESH}",
-                where="it",
-            )
+        source.require_near(stored, pose, form)
         clips = source.drop_clips()
         data = source.patch.encoded()
     notes = [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
     return PosedFile(data, stored, tuple(notes))
+
+
+def animated_gltf(
+    character: Character, vertices: npt.NDArray[Any], transforms: FloatArray, fps: float
+) -> tuple[PosedFile, ...]:
+    """Put poses into the character's own file as a clip of its joints, which it opens with.
+
+    Parameters
+    ----------
+    character : with a rig, read from a file as of `posed_gltf`
+    vertices : (N, V, 3) finite array, in its frame and unit
+    transforms : (N, J, 4, 4) global transforms of the joints
+    fps : frames a second
+
+    Returns
+    -------
+    for each frame the one file, and the vertices that readers get
+
+    Raises
+    ------
+    ShapeError, MeshFileError : as of `posed_gltf`.
+    """
+    shape = (len(transforms), *character.rest_vertices.shape)
+    if not shape[0] or vertices.shape != shape or character.rig is None:
+        raise ShapeError.must_be(
+            f"frames of {character.name}", f"of a rig, of shape {shape}", vertices.shape
+        )
+    with one_sentence(character.source):
+        source = _Source(character)
+        clips = source.drop_clips()
+        frames = source.animate(character.rig, transforms, fps)
+        for stored, wanted in zip(frames, vertices, strict=True):
+            source.require_near(stored, wanted, CharacterForm.JOINTS)
+        data = source.patch.encoded()
+    notes = tuple(f"its clip {clip!r} is left out" for clip in clips)
+    return tuple(PosedFile(data, stored, notes) for stored in frames)
 
 
 class _Source:
@@ -150,6 +185,7 @@ class _Source:
         self._joined = character.joined
         self._faces = character.topology.faces
         self._rest = self._mesh.posed(scene.rest)[0]
+        self._locals = [_stored_transform(node) for node in self._nodes]
         shown, _ = shown_primitives(document, scene.parents)
         ends = np.cumsum([len(part.points) for part in scene.parts]).tolist()
         rows = [
@@ -157,8 +193,90 @@ class _Source:
         ]
         self._parts = list(zip(scene.parts, shown, rows, strict=True))
 
+    def require_near(
+        self, stored: FloatArray, wanted: npt.NDArray[Any], form: CharacterForm
+    ) -> None:
+        """Refuse a form whose vertices are not those that were asked for."""
+        error = float(np.abs(stored - wanted).max()) / self.size
+        if not error <= _LARGEST_ERROR:
+            raise MeshFileError(
+                f"cannot hold this pose in its {form}: vertices would be off by {error:.2g} of "
+                "the body size",
+                f"choose {CharacterForm.MESH}",
+                where="it",
+            )
+
     def turn_joints(self, rig: Rig, transforms: FloatArray) -> FloatArray:
         """Give the joints' nodes these global transforms, and return where the vertices come."""
+
+        def hold(number: int, local: FloatArray) -> FloatArray:
+            node, held = self._nodes[number], _held(self._nodes[number], local)
+            for name, stored, new in zip(_PARTS, _stored_parts(node), held, strict=True):
+                if "matrix" in node or not np.array_equal(stored, new):
+                    node[name] = new.tolist()
+            node.pop("matrix", None)
+            return compose(*held)
+
+        return self._posed(rig, transforms, hold)
+
+    def animate(self, rig: Rig, transforms: FloatArray, fps: float) -> list[FloatArray]:
+        """Add a clip that gives the joints' nodes (N, J, 4, 4) global transforms.
+
+        Returns
+        -------
+        where the vertices come in each frame
+        """
+        keys: dict[int, list[FloatArray]] = {}
+        for number in rig.nodes.tolist():
+            stored_parts = _stored_parts(self._nodes[number])
+            keys[number] = [np.tile(part, (len(transforms), 1)) for part in stored_parts]
+        frames = []
+        for frame, pose in enumerate(transforms):
+
+            def hold(number: int, local: FloatArray, frame: int = frame) -> FloatArray:
+                held = _held(self._nodes[number], local)
+                for key, part in zip(keys[number], held, strict=True):
+                    key[frame] = part
+                return compose(*held)
+
+            frames.append(self._posed(rig, pose, hold))
+        times = self.patch.add_array((np.arange(len(frames)) / fps)[:, None], has_bounds=True)
+        samplers: list[dict[str, Any]] = []
+        channels: list[dict[str, Any]] = []
+        for number, tracks in keys.items():
+            node = self._nodes[number]
+            for name, stored, values in zip(_PARTS, _stored_parts(node), tracks, strict=True):
+                if "matrix" not in node and (values == stored).all():
+                    continue
+                if name == "rotation":
+                    # The shorter way between neighbours.
+                    turned = np.einsum("ni,ni->n", values[1:], values[:-1]) < 0.0
+                    values[1:][np.cumsum(turned) % 2 == 1] *= -1.0
+                sampler = {"input": times, "output": self.patch.add_array(values)}
+                channels.append(
+                    {"sampler": len(samplers), "target": {"node": number, "path": name}}
+                )
+                samplers.append({**sampler, "interpolation": "LINEAR"})
+            if node.pop("matrix", None) is not None:
+                # What is animated has no matrix.
+                node |= {
+                    part: track[0].tolist() for part, track in zip(_PARTS, tracks, strict=True)
+                }
+        if channels:
+            animation = {"name": _CLIP, "samplers": samplers, "channels": channels}
+            self.patch.description.setdefault("animations", []).insert(0, animation)
+        return frames
+
+    def _posed(
+        self, rig: Rig, transforms: FloatArray, hold: Callable[[int, FloatArray], FloatArray]
+    ) -> FloatArray:
+        """Return where the vertices come when the joints' nodes have these global transforms.
+
+        Parameters
+        ----------
+        hold : gives a node, by its number, a new local transform, and returns what the file holds
+            of it
+        """
         if transforms.shape != rig.rest.shape or not np.isfinite(transforms).all():
             raise ShapeError.must_be("transforms", f"of shape {rig.rest.shape}", transforms.shape)
         parents, rest = self._scene.parents, self._scene.rest.transforms[0]
@@ -167,11 +285,11 @@ class _Source:
         for number in parents_first(parents):
             # The parent as the file will have it, so that rounding does not add up.
             above = placed[parents[number]] if parents[number] >= 0 else _IDENTITY
-            local = _stored_transform(self._nodes[number])
+            local = self._locals[number]
             if number in wanted:
                 new = _relative(above, wanted[number])
                 if np.abs(new - local).max() > _SAME_TRANSFORM * np.abs(new).max():
-                    local = _set_transform(self._nodes[number], new)
+                    local = hold(number, new)
             placed[number] = above @ local
         poses = ScenePoses(placed[None], self._scene.rest.weights)
         posed: FloatArray = self._mesh.posed(poses)[0]
@@ -283,7 +401,7 @@ class _Source:
         ]
 
     def _vectors(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
-        return self.patch.add_vectors(values.astype(np.float32), has_bounds=has_bounds)
+        return self.patch.add_array(values, has_bounds=has_bounds, target=VERTEX_DATA)
 
     def _own_mesh(self, shown: ShownPrimitive) -> dict[str, Any]:
         """Return the mesh of a node, after copying it where other nodes show it too."""
@@ -371,32 +489,38 @@ def _stored_transform(node: dict[str, Any]) -> FloatArray:
     if "matrix" in node:
         # Column by column.
         return np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
-    return compose(
-        np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64),
-        np.array(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64),
-        np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64),
+    return compose(*_stored_parts(node))
+
+
+def _stored_parts(node: dict[str, Any]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the translation, rotation and scale of a node of the file."""
+    if "matrix" in node:
+        return decompose(_stored_transform(node))
+    translation, rotation, scale = (
+        np.array(node.get(name, default), np.float64)
+        for name, default in zip(_PARTS, _DEFAULTS, strict=True)
+    )
+    return translation, rotation, scale
+
+
+def _held(node: dict[str, Any], local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the translation, rotation and scale that a file holds of a node's local transform.
+
+    A translation or a scale that stays, as where a joint only turns, is the one of the node.
+    """
+    old_translation, _, old_scale = _stored_parts(node)
+    translation, rotation, scale = decompose(local)
+    return (
+        _kept(old_translation, translation),
+        rotation.astype(np.float32).astype(np.float64),
+        _kept(old_scale, scale),
     )
 
 
-def _set_transform(node: dict[str, Any], local: FloatArray) -> FloatArray:
-    """Give a node a local transform, and return it as the file holds it.
-
-    A translation or a scale that stays, as where a joint only turns, keeps its text.
-    """
-    if node.pop("matrix", None) is not None:
-        node["translation"], node["scale"] = ([0.0] * 3, [0.0] * 3)
-    given = {
-        "translation": np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64),
-        "scale": np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64),
-    }
-    translation, rotation, scale = decompose(local)
-    for name, new in (("translation", translation), ("scale", scale)):
-        if np.abs(new - given[name]).max() > _SAME_NUMBER * np.abs(new).max():
-            given[name] = new.astype(np.float32).astype(np.float64)
-            node[name] = given[name].tolist()
-    turned = rotation.astype(np.float32).astype(np.float64)
-    node["rotation"] = turned.tolist()
-    return _stored_transform(node)
+def _kept(old: FloatArray, new: FloatArray) -> FloatArray:
+    if np.abs(new - old).max() <= _SAME_NUMBER * np.abs(new).max():
+        return old
+    return new.astype(np.float32).astype(np.float64)
 
 
 def _blended(part: Part, transforms: FloatArray) -> FloatArray:

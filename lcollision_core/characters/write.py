@@ -9,7 +9,12 @@ from typing import Any
 import numpy.typing as npt
 
 from lcollision_core.characters.character import Character
-from lcollision_core.characters.posed_gltf import CharacterForm, PosedFile, posed_gltf
+from lcollision_core.characters.posed_gltf import (
+    CharacterForm,
+    PosedFile,
+    animated_gltf,
+    posed_gltf,
+)
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.topology import FloatArray
@@ -43,6 +48,43 @@ def write_character(
     MeshFileError : the format of the source or of `path` cannot be written, or as of `posed_gltf`.
     ShapeError : as of `posed_gltf`.
     """
+    _require_written(path, character)
+    posed = posed_gltf(character, vertices, CharacterForm(form), transforms)
+    with atomic_write(path) as file:
+        file.write(posed.data)
+    return posed
+
+
+def write_character_clip(
+    path: str | os.PathLike[str],
+    character: Character,
+    vertices: npt.NDArray[Any],
+    transforms: FloatArray,
+    fps: float = 30.0,
+) -> tuple[PosedFile, ...]:
+    """Write a character's file with a clip of N poses, whole or not at all: see `animated_gltf`.
+
+    Parameters
+    ----------
+    path : as of `write_character`
+    character, vertices, transforms, fps : as of `animated_gltf`
+
+    Returns
+    -------
+    what was written, for each frame; the `vertices` are those to check
+
+    Raises
+    ------
+    MeshFileError, ShapeError : as of `write_character`.
+    """
+    _require_written(path, character)
+    frames = animated_gltf(character, vertices, transforms, fps)
+    with atomic_write(path) as file:
+        file.write(frames[0].data)
+    return frames
+
+
+def _require_written(path: str | os.PathLike[str], character: Character) -> None:
     suffix, target = Path(character.source).suffix.lower(), Path(path).suffix.lower()
     if suffix not in PATCHED_SUFFIXES:
         raise MeshFileError.unwritable(
@@ -54,7 +96,3 @@ def write_character(
         raise MeshFileError.unwritable(
             path, f"the character of a {suffix} file is written as .glb", "rename it"
         )
-    posed = posed_gltf(character, vertices, CharacterForm(form), transforms)
-    with atomic_write(path) as file:
-        file.write(posed.data)
-    return posed

@@ -18,6 +18,7 @@ from lcollision_core.characters import (
     CharacterForm,
     read_character,
     write_character,
+    write_character_clip,
 )
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes import (
@@ -39,6 +40,10 @@ FloatArray = npt.NDArray[np.float64]
 
 _LARGEST_SIZE_RATIO = 1.01
 """Of a character in its file to the same in a model: beyond it, their units differ."""
+
+
+CLIP = "clip"
+"""The key of the form in which a character's file holds poses as frames."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,15 @@ EXPORT_FORMS = (
         "The character's own file with the pose as a morph target of weight 1.",
         ".glb",
         PATCHED_SUFFIXES,
+    ),
+    ExportForm(
+        CLIP,
+        "GLB, animated",
+        "The character's own file; its joints hold the poses as the frames of one clip.",
+        ".glb",
+        PATCHED_SUFFIXES,
+        needs_rig=True,
+        is_sequence=True,
     ),
     ExportForm(
         "obj",
@@ -267,6 +281,37 @@ class SourceFile:
         posed = write_character(path, self._character, vertices, form.key, transforms)
         return posed.vertices, posed.notes
 
+    def write_clip(
+        self,
+        path: str | os.PathLike[str],
+        vertices: npt.NDArray[Any],
+        latents: Sequence[npt.NDArray[Any]],
+        fps: float,
+    ) -> list[tuple[npt.NDArray[Any], tuple[str, ...]]]:
+        """Write the poses of a rig as a clip of its file, whole or not at all.
+
+        Parameters
+        ----------
+        path : to write
+        vertices : (N, V, 3) array
+        latents : N poses' (D,) codes
+        fps : frames a second
+
+        Returns
+        -------
+        for each pose, as of `write`
+
+        Raises
+        ------
+        MeshFileError : the file cannot be written, or the joints cannot hold a pose.
+        """
+        if self._character is None or not isinstance(self._body, RigModel):
+            raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
+        space = self._body.space
+        transforms = np.stack([space.transforms(latent) for latent in latents])
+        frames = write_character_clip(path, self._character, vertices, transforms, fps)
+        return [(frame.vertices, frame.notes) for frame in frames]
+
     def objects(self) -> list[tuple[str, npt.NDArray[np.integer]]]:
         """Return each mesh that a program shows of the file: its name, and its vertices.
 
@@ -356,6 +401,7 @@ def write_pose(
 def write_sequence(
     path: str | os.PathLike[str],
     body: PosableBody,
+    latents: Sequence[npt.NDArray[Any]],
     vertices: Sequence[npt.NDArray[Any]],
     *,
     source: SourceFile | None = None,
@@ -363,14 +409,16 @@ def write_sequence(
     scale: float | None = None,
     fps: float = 30.0,
 ) -> tuple[list[Path], list[WrittenPose]]:
-    """Write poses as the frames of a point cache, in the vertex order of the user's mesh.
+    """Write poses as the frames of one file, in the vertex order of the user's mesh.
 
-    A file that shows several meshes gets a cache for each, called after it: all of them, or none.
+    A file that shows several meshes gets a point cache for each, called after it: all of them, or
+    none.
 
     Parameters
     ----------
-    path : a .pc2 or .mdd file
+    path : a .pc2 or .mdd file; a .glb file gets a clip of the joints of its source
     body : of the poses
+    latents : N poses' (D,) codes
     vertices : of N poses, each (V, 3), in the body's unit and coordinates
     source : the user's file, by `source_for`; the body's own vertex order if None
     axes, scale : see `export_frame`
@@ -383,9 +431,14 @@ def write_sequence(
 
     Raises
     ------
-    MeshFileError : the extension is of no point cache, or a file cannot be written.
+    MeshFileError : the extension is of no form for frames, or a file cannot be written.
     """
     target = Path(path)
+    if source is not None and source.require_form(path, None).suffix == ".glb":
+        source.require_form(path, CLIP)
+        frames = np.stack([as_stored(path, pose, body.topology) for pose in vertices])
+        clip = source.write_clip(path, frames, latents, fps)
+        return [target], [WrittenPose(stored, 1.0, notes) for stored, notes in clip]
     if target.suffix.lower() not in POINT_CACHE_SUFFIXES:
         raise MeshFileError.unwritable(
             path, "it is no point cache", f"use one of {', '.join(POINT_CACHE_SUFFIXES)}"

@@ -7,7 +7,6 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
@@ -16,7 +15,11 @@ from lcollision_core.meshes.formats.gltf_document import chunks, resource, whole
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 
 _MOST_BYTES = (1 << 32) - 1
-_FLOAT, _ARRAY_BUFFER = 5126, 34962
+_FLOAT = 5126
+_TYPES = ("SCALAR", "VEC2", "VEC3", "VEC4")
+VERTEX_DATA = 34962
+"""The target of a buffer view whose numbers are of the vertices of a mesh."""
+
 _MEDIA_TYPES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp"}
 
 
@@ -93,22 +96,27 @@ class GltfPatch:
         views.append({"buffer": 0, "byteOffset": start, "byteLength": len(content), **fields})
         return len(views) - 1
 
-    def add_vectors(self, vectors: npt.NDArray[np.float32], *, has_bounds: bool) -> int:
-        """Add an accessor of (n, 3) float32 vectors and return its number.
+    def add_array(
+        self, values: npt.NDArray[Any], *, has_bounds: bool = False, target: int | None = None
+    ) -> int:
+        """Add an accessor of (n, k) float32 numbers, k from 1 to 4, and return its number.
 
         Parameters
         ----------
-        has_bounds : whether it says its least and greatest numbers, as positions have to
+        has_bounds : whether it says its least and greatest numbers, as positions and times have to
+        target : `VERTEX_DATA` for what the vertices of a mesh have
         """
+        stored = values.astype("<f4")
+        fields = {} if target is None else {"target": target}
         accessor: dict[str, Any] = {
-            "bufferView": self._view(vectors.astype("<f4").tobytes(), target=_ARRAY_BUFFER),
+            "bufferView": self._view(stored.tobytes(), **fields),
             "componentType": _FLOAT,
-            "count": len(vectors),
-            "type": "VEC3",
+            "count": len(stored),
+            "type": _TYPES[stored.shape[1] - 1],
         }
         if has_bounds:
-            accessor["min"] = vectors.min(axis=0).tolist()
-            accessor["max"] = vectors.max(axis=0).tolist()
+            accessor["min"] = stored.min(axis=0).tolist()
+            accessor["max"] = stored.max(axis=0).tolist()
         accessors = self.description.setdefault("accessors", [])
         accessors.append(accessor)
         return len(accessors) - 1

@@ -157,5 +157,25 @@ def test_a_character_s_own_file_comes_back(lcollision: Lcollision, tmp_path: Pat
     }
 
 
+def test_poses_of_a_character_become_a_clip_of_its_file(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    own = figure().write(tmp_path / "figure.glb")
+    model = open_body(own)
+    latents = np.linspace(0.0, 0.3, 3)[:, None] * np.ones(model.latent_size)
+    poses = [NamedPose(f"frame {n}", row) for n, row in enumerate(latents)]
+    write_poses(tmp_path / "poses.json", model, poses)
+    out = tmp_path / "run.glb"
+    words = ("decode", own, tmp_path / "poses.json", "-o", out)
+    refused = lcollision(*words)
+    assert refused.exit_code == 2
+    assert "is one mesh, but there are 3 poses" in refused.stderr
+    done = lcollision(*words, "--form", "clip", "--fps", 10)
+    assert done.exit_code == 0, done.output
+    frames = read_character(out).sample("poses", None)
+    np.testing.assert_allclose(frames.times, [0.0, 0.1, 0.2], rtol=1e-6)
+    assert np.abs(frames.vertices - model.decode(latents)).max() < 1e-5
+
+
 def _joined(path: Path) -> np.ndarray:
     return read_character(path).joined

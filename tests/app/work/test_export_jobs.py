@@ -30,7 +30,7 @@ def body() -> PoseModel:
 def test_a_pose_goes_into_the_character_s_own_file(
     character: RigModel, tmp_path: Path, form: str | None
 ) -> None:
-    latent = np.random.default_rng(0).uniform(-0.4, 0.4, character.latent_size)
+    latent = np.where(character.space.joint_of_code > 0, character.space.high, 0.1)
     path = tmp_path / "posed.glb"
     told = export(
         character,
@@ -45,6 +45,7 @@ def test_a_pose_goes_into_the_character_s_own_file(
     vertices = np.empty_like(character.reference)
     vertices[character.character.joined] = again.rest_vertices[again.joined]
     n_pairs = len(character.detector.detect(vertices).pairs)
+    assert n_pairs > 1
     verdict = f"{n_pairs} pairs of its triangles collide"
     assert told.startswith(f"Exported posed.glb: {verdict}; its clip 'wave' is left out, as it")
     assert np.abs(vertices - character.decode(latent)).max() < 1e-5
@@ -78,12 +79,18 @@ def test_a_motion_says_how_many_of_its_frames_collide(body: PoseModel, tmp_path:
 def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
     character: RigModel, tmp_path: Path
 ) -> None:
-    poses = [NamedPose("rest", np.zeros(character.latent_size))] * 2
-    told = export_motion(
-        character, poses, tmp_path / "run.pc2", ExportStyle(), no_progress, CancelToken()
+    folded = np.where(character.space.joint_of_code > 0, character.space.high, 0.0)
+    poses = [NamedPose("rest", 0.0 * folded), NamedPose("folded", folded)]
+    caches, clip = (
+        export_motion(character, poses, tmp_path / name, ExportStyle(), no_progress, CancelToken())
+        for name in ("run.pc2", "run.glb")
     )
-    assert told.startswith("Exported run Body.pc2, run Core.pc2, run Hat.pc2: 2 of 2 frames coll")
+    assert caches == "Exported run Body.pc2, run Core.pc2, run Hat.pc2: 1 of 2 frames collide"
     assert read_point_cache(tmp_path / "run Hat.pc2").frames.shape[0] == 2
+    assert clip.startswith("Exported run.glb: 1 of 2 frames collide; its clip 'wave' is left out;")
+    frames = read_character(tmp_path / "run.glb").sample("poses", None)
+    drawn = np.stack([character.decode(pose.latent) for pose in poses])
+    assert np.abs(frames.vertices - drawn).max() < 1e-5
 
 
 def test_a_cancelled_motion_leaves_nothing(body: PoseModel, tmp_path: Path) -> None:
