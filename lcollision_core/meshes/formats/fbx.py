@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import subprocess
 import sys
 import zipfile
@@ -34,8 +35,8 @@ from lcollision_core.meshes.formats.scene import (
 )
 from lcollision_core.meshes.topology import FloatArray
 
-_MOST_MEMORY = 1 << 33
-"""Address space of the process that reads, in bytes; less than a quarter of it is data."""
+_MOST_MEMORY = 1 << 32
+"""Address space of the process that reads, in bytes, where the system can limit it."""
 
 _MOST_SECONDS = 300
 _REFUSED = 3
@@ -106,12 +107,14 @@ class _FbxFile:
             "clip": clip,
             "times": None if times is None else times.tolist(),
             "most_memory": _MOST_MEMORY,
-            "most_elements": min(4 * MAX_FACES, MAX_NUMBERS // 3),
+            "most_elements": 4 * MAX_FACES,
         }
         try:
             done = subprocess.run(
                 [sys.executable, "-P", str(_WORKER)],
                 input=json.dumps(request).encode() + b"\n" + self.data,
+                # Each thread of OpenBLAS reserves address space.
+                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
                 capture_output=True,
                 timeout=_MOST_SECONDS,
                 check=False,

@@ -59,9 +59,9 @@ def test_the_window_uses_standard_words(qtbot: QtBot, window: MainWindow) -> Non
 def test_what_is_not_supported_is_said_so(window: MainWindow, tmp_path: object) -> None:
     from pathlib import Path
 
-    path = Path(str(tmp_path)) / "dancer.fbx"
-    path.write_bytes(b"Kaydara FBX Binary")
-    with pytest.raises(LCollisionError, match="FBX isn't supported"):
+    path = Path(str(tmp_path)) / "dancer.dae"
+    path.write_bytes(b"<COLLADA>")
+    with pytest.raises(LCollisionError, match="DAE isn't supported"):
         window.files.open_path(path)
     with pytest.raises(LCollisionError, match=r"Couldn't open .*: there is no such file"):
         window.files.open_path(path.with_suffix(".json"))

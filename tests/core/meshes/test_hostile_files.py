@@ -53,6 +53,27 @@ def test_a_gltf_buffer_elsewhere_is_refused_shortly(uri: str, tmp_path: Path) ->
     assert len(str(caught.value)) < 400
 
 
+def test_a_gltf_buffer_below_the_file_is_found_by_its_escaped_name(tmp_path: Path) -> None:
+    (tmp_path / "a part").mkdir()
+    (tmp_path / "a part" / "b.bin").write_bytes(VERTICES[:3].astype("<f4").tobytes())
+    (tmp_path / "m.gltf").write_bytes(_scene("a%20part/b.bin"))
+    assert np.array_equal(read_mesh(tmp_path / "m.gltf").vertices, VERTICES[:3])
+
+
+@pytest.mark.parametrize(
+    "uri",
+    ["%2e%2e/b.bin", "//host/b.bin", "\\\\host\\b.bin", "http://host/b.bin", "C:b.bin", "link.bin"],
+)
+def test_a_gltf_buffer_outside_its_folder_is_never_opened(tmp_path: Path, uri: str) -> None:
+    (tmp_path / "b.bin").write_bytes(VERTICES[:3].astype("<f4").tobytes())
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (folder / "link.bin").symlink_to(tmp_path / "b.bin")
+    (folder / "m.gltf").write_bytes(_scene(uri))
+    with pytest.raises(MeshFileError, match="cannot be read: it is not beside the file"):
+        read_mesh(folder / "m.gltf")
+
+
 def _glb(faces: np.ndarray, n_vertices: int) -> bytes:
     corners = faces.astype("<u4").tobytes()
     points = np.resize(VERTICES, (n_vertices, 3)).astype("<f4").tobytes()
