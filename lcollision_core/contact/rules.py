@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from lcollision_core.contact.arrays import Exclusions
 from lcollision_core.contact.kernels import NEAR, REST, find_rules
+from lcollision_core.contact.reach import (
+    NOTHING_TOUCHES,
+    faces_within,
+    later_faces,
+    surface_of,
+    touching_faces,
+)
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.contact_rules import ContactRules
 from lcollision_core.meshes.face_groups import FaceGroup, require_groups
@@ -21,13 +27,10 @@ Pairs = npt.NDArray[np.integer]
 MAX_EXCLUDED = 250_000_000
 """The most pairs of faces that are listed: 1.25 GB. All pairs of 20 000 faces are 200 million."""
 
-_CELLS_AT_ONCE = 1 << 23
-"""Entries of a dense block of distances, or of rows of a table before they are cut in half."""
-
 _MAX_REGIONS = 4096
 
 _SAMPLED = 200
-"""Vertices whose neighbourhoods are measured for an estimate of all."""
+"""Faces whose neighbourhoods are measured for an estimate of all."""
 
 _NEAR, _REST = "near exclusion", "rest exclusion"
 
@@ -55,22 +58,19 @@ def exclusions_of(
         too many pairs are excluded.
     """
     require_groups(rules, groups, topology.n_faces)
-    none: sparse.csr_matrix = sparse.csr_matrix(2 * (topology.n_faces,), dtype=np.uint8)
-    near = rest = none
-    if rules.near_exclusion > 0.0:
-        corners = _corner_table(topology)
-        reached = _reached(topology, reference, rules.near_exclusion * body_size, _NEAR)
-        near = _later_faces(corners @ reached, corners.T.tocsr(), _NEAR)
+    surface, touched = surface_of(topology, reference), NOTHING_TOUCHES
     if rules.rest_exclusion is not None and len(touching):
-        rest = _near_touching(topology, reference, rules.rest_exclusion * body_size, touching)
-    # Codes add up to 3 where both apply; the first rule is the one that is reported.
-    table = (near + 2 * rest if near.nnz else 2 * rest).tocsr() if rest.nnz else near
-    table.sort_indices()
+        distance = rules.rest_exclusion * body_size
+        touched = touching_faces(surface, touching, distance, partial(require_room, rule=_REST))
+    # Below 0 no face is near another one, not even one that shares a corner.
+    distance = rules.near_exclusion * body_size if rules.near_exclusion > 0.0 else -1.0
+    rule = _NEAR if rules.near_exclusion > 0.0 else _REST
+    lists, by_touch = later_faces(surface, distance, touched, partial(require_room, rule=rule))
     region, ignored = _regions(rules.ignored, groups, topology.n_faces)
     return Exclusions(
-        start=table.indptr.astype(np.int64),
-        face=table.indices.astype(np.int32),
-        rule=np.where(table.data == 2, REST, NEAR).astype(np.uint8),
+        start=lists.start,
+        face=lists.face,
+        rule=np.where(by_touch, REST, NEAR).astype(np.uint8),
         region=region,
         ignored=ignored,
         squared_tolerance=rules.tolerated_depth**2,
@@ -93,17 +93,18 @@ def rules_of(
 
 
 def near_pairs_estimate(topology: Topology, reference: FloatArray, distance: float) -> float:
-    """Estimate how many pairs of faces a near exclusion lists, from some of the vertices.
+    """Estimate how many pairs of faces a near exclusion lists, from some of the faces.
 
     Parameters
     ----------
     reference : (V, 3) float64 array, the rest pose
     distance : > 0, in its unit
     """
-    used = topology.used_vertices
-    some = used[np.linspace(0, len(used) - 1, min(len(used), _SAMPLED)).astype(np.int64)]
-    reached = _reached(topology, reference, distance, _NEAR, some).nnz / len(some)
-    return float(0.5 * topology.n_faces**2 * reached / len(used))
+    some = np.linspace(0, topology.n_faces - 1, min(topology.n_faces, _SAMPLED)).astype(np.int32)
+    listed = faces_within(
+        surface_of(topology, reference), some, distance, partial(require_room, rule=_NEAR)
+    )
+    return 0.5 * topology.n_faces * len(listed.face) / len(some)
 
 
 def require_room(n_excluded: int, rule: str) -> None:
@@ -114,74 +115,6 @@ def require_room(n_excluded: int, rule: str) -> None:
             "make it smaller or leave it out",
             where=f"the {rule}",
         )
-
-
-def _corner_table(topology: Topology) -> sparse.csr_matrix:
-    """Return (F, V) bool: which vertices are corners of each face."""
-    n_faces, corners = topology.n_faces, topology.faces
-    start = np.arange(0, 3 * n_faces + 1, 3)
-    ones = np.ones(3 * n_faces, dtype=np.bool_)
-    return sparse.csr_matrix((ones, corners.ravel(), start), shape=(n_faces, topology.n_vertices))
-
-
-def _reached(
-    topology: Topology,
-    reference: FloatArray,
-    distance: float,
-    rule: str,
-    sources: npt.NDArray[np.integer] | None = None,
-) -> sparse.csr_matrix:
-    """Return (S, V) bool: the vertices that an edge path of at most `distance` leads to.
-
-    `sources` are all vertices by default.
-    """
-    n_vertices = topology.n_vertices
-    i, j = topology.edges.T
-    lengths = topology.edge_lengths(reference)
-    # Duplicate vertices give edges of length 0, which a sparse graph stores like any other.
-    graph = sparse.coo_matrix((lengths, (i, j)), shape=2 * (n_vertices,)).tocsr()
-    sources = np.arange(n_vertices) if sources is None else sources
-    blocks, n_related = [], 0
-    at_once = max(1, _CELLS_AT_ONCE // n_vertices)
-    for first in range(0, len(sources), at_once):
-        block = sources[first : first + at_once]
-        distances = csgraph.dijkstra(graph, directed=False, indices=block, limit=distance)
-        blocks.append(sparse.csr_matrix(distances <= distance))
-        n_related += blocks[-1].nnz
-        require_room(n_related, rule)
-    return sparse.vstack(blocks, format="csr")
-
-
-def _near_touching(
-    topology: Topology, reference: FloatArray, distance: float, touching: Pairs
-) -> sparse.csr_matrix:
-    """Return (F, F) uint8, its upper half: the pairs near pairs that touch at rest."""
-    n_faces = topology.n_faces
-    ones = np.ones(len(touching), dtype=np.bool_)
-    half = sparse.csr_matrix((ones, touching.T), shape=2 * (n_faces,))
-    touches = (half + half.T).tocsr()
-    if distance == 0.0:
-        return sparse.triu(touches, format="csr").astype(np.uint8)
-    faces = np.unique(touching)
-    corners = _corner_table(topology)
-    vertices = np.unique(topology.faces[faces])
-    reached = _reached(topology, reference, distance, _REST, vertices)
-    # Rows of the faces that touch: the faces within the distance of each.
-    around = corners[faces][:, vertices] @ reached @ corners.T.tocsr()
-    return _later_faces(around.T.tocsr(), touches[faces][:, faces] @ around, _REST)
-
-
-def _later_faces(left: sparse.csr_matrix, right: sparse.csr_matrix, rule: str) -> sparse.csr_matrix:
-    """Return the upper half of a symmetric product of tables (F, n) and (n, F), as uint8 ones."""
-    n_faces = left.shape[0]
-    blocks, n_excluded = [], 0
-    at_once = max(1, _CELLS_AT_ONCE // n_faces)
-    for first in range(0, n_faces, at_once):
-        product = left[first : first + at_once] @ right
-        blocks.append(sparse.triu(product, k=first + 1, format="csr").astype(np.uint8))
-        n_excluded += blocks[-1].nnz
-        require_room(n_excluded, rule)
-    return sparse.vstack(blocks, format="csr")
 
 
 def _regions(
