@@ -110,7 +110,8 @@ def _rig(scene: Scene, mesh: JoinedMesh) -> tuple[Rig | None, tuple[str, ...]]:
         return None, ()
     anchors = _anchors(scene, in_skins)
     rest = scene.rest.transforms[0]
-    used = {anchors[bone] for bone in mesh.bones[np.unique(mesh.bone_of)].tolist()}
+    moving = np.unique(mesh.bone_of[mesh.weights > 0.0])
+    used = {anchors[bone] for bone in mesh.bones[moving].tolist()}
     order = [
         node
         for node in parents_first(scene.parents)
@@ -119,9 +120,10 @@ def _rig(scene: Scene, mesh: JoinedMesh) -> tuple[Rig | None, tuple[str, ...]]:
     flat = [node for node in order if not _is_regular(rest[node])]
     if flat:
         name = scene.node_names[flat[0]] or f"node {flat[0]}"
-        return None, (f"joint {name} is scaled to nothing, so no pose is made by the joints",)
+        return None, (f"joint {name} is scaled to nothing, so its joints make no poses",)
     joint = {node: number for number, node in enumerate(order)}
-    joint_of_bone = np.array([joint.get(anchors[bone], -1) for bone in mesh.bones.tolist()])
+    # A bone of no weight may be no joint.
+    joint_of_bone = np.array([joint.get(anchors[bone], 0) for bone in mesh.bones.tolist()])
     placed = rest[mesh.bones] @ mesh.bind
     points = mesh.morphed(tuple(weights[0] for weights in scene.rest.weights))
     turns = placed[mesh.bone_of]
@@ -153,13 +155,17 @@ def _parent_joint(scene: Scene, node: int, joint: dict[int, int]) -> int:
 def _anchors(scene: Scene, in_skins: set[int]) -> dict[int, int]:
     """Return for each node that moves vertices the one that is to be the joint.
 
-    What hangs on a joint of a skin without moving in any clip is part of that joint.
+    What hangs on a joint of a skin without moving in any clip is part of that joint, and so is what
+    a joint scaled to nothing moves, as accessories are hidden.
     """
     moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
+    rest = scene.rest.transforms[0]
     anchors = {}
     for bone in {bone for part in scene.parts for bone in part.bones.tolist()}:
         node = bone
         while node >= 0 and node not in in_skins and node not in moved:
+            node = int(scene.parents[node])
+        while node in in_skins and not _is_regular(rest[node]):
             node = int(scene.parents[node])
         anchors[bone] = node if node in in_skins else bone
     return anchors

@@ -185,10 +185,22 @@ def test_a_character_without_joints_has_no_rig(tmp_path: Path) -> None:
     assert is_rigged(arm().write(path))
 
 
-def test_a_joint_scaled_to_nothing_leaves_no_rig_and_a_sentence(tmp_path: Path) -> None:
+def test_what_a_joint_scaled_to_nothing_moves_is_part_of_its_parent(tmp_path: Path) -> None:
     builder = arm()
-    builder.description["nodes"][2]["scale"] = [0.0, 0.0, 0.0]
+    builder.description["nodes"][3]["scale"] = [0.0, 0.0, 0.0]
+    character = read_character(builder.write(tmp_path / "arm.glb"))
+    rig = _rig_of(character)
+    assert rig.joint_names == ("rig:LeftArm", "rig:LeftForeArm")
+    assert np.abs(_skinned(rig, rig.rest) - character.rest_vertices).max() < 1e-12
+    frames = character.sample("wave", None)
+    assert frames.transforms is not None
+    assert np.abs(_skinned(rig, frames.transforms[1]) - frames.vertices[1]).max() < 1e-12
+
+
+def test_a_root_scaled_to_nothing_leaves_no_rig_and_a_sentence(tmp_path: Path) -> None:
+    builder = arm()
+    builder.description["nodes"][1]["scale"] = [1.0, 0.0, 1.0]
     character = read_character(builder.write(tmp_path / "arm.glb"))
     assert character.rig is None
-    assert any("LeftForeArm is scaled to nothing" in note for note in character.notes)
+    assert any("LeftArm is scaled to nothing" in note for note in character.notes)
     assert np.isfinite(character.sample("wave", None).vertices).all()
