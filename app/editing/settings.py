@@ -51,6 +51,8 @@ SETTINGS: dict[str, Setting] = {
     "resolve_threshold": Setting(0.5, 0.01, 0.99),
     "resolve_metric": Setting("eye", choices=("eye", "latent")),
     "resolve_time_budget": Setting(20.0, 0.1, 3600.0),
+    "export_form": Setting("joints", choices=("joints", "mesh", "morph", "obj", "mesh-alone")),
+    "export_rate": Setting(30, 1, 240),
     "export_axes": Setting("model", choices=("model", "y-up", "blender", "maya", "unreal")),
     "export_scale": Setting(1.0, 1e-6, 1e6),
     "screenshot_width": Setting(1920, 16, 16384),

@@ -42,7 +42,7 @@ ACTIONS: dict[str, Spec] = {
     "save": Spec("&Save", "Ctrl+S", "Save the pose to its file", "save"),
     "save_as": Spec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
     "import": Spec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),
-    "export": Spec("&Export mesh…", "Ctrl+E", "Save the current mesh to a file", "export"),
+    "export": Spec("&Export mesh…", "Ctrl+E", "Save the pose as a mesh or in your file", "export"),
     "upright": Spec(
         "Turn &upright", "Ctrl+Shift+U", "Turn the body to its next axis; a model also in its file"
     ),
@@ -102,6 +102,9 @@ ACTIONS: dict[str, Spec] = {
     ),
     "export_poses": Spec(
         "E&xport selected poses…", "Ctrl+Shift+E", "Save the selected poses to a file"
+    ),
+    "export_motion": Spec(
+        "Export moti&on…", "Ctrl+Alt+M", "Save the selected poses as the frames of a point cache"
     ),
     "export_library": Spec("Export libr&ary…", "Ctrl+Alt+E", "Save your whole library to a file"),
     "find_pose": Spec("&Find a pose", "Ctrl+Shift+F", "Search the poses by name or tag"),

@@ -12,7 +12,8 @@ from PySide6.QtCore import QObject, Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
-from app.window.dialogs.forms import export_form, screenshot_form, turntable_form
+from app.window.dialogs.export import ExportDialog
+from app.window.dialogs.forms import screenshot_form, turntable_form
 from app.window.dialogs.questions import (
     Choice,
     ask_about_another_s,
@@ -36,7 +37,6 @@ POSES_SUFFIX = ".json"
 MODEL_SUFFIX = ".safetensors"
 """As in `lcollision_core.model`, which takes too long to import before the window is there."""
 
-_EXPORTS = {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
 _VIDEOS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png"}
 
 
@@ -89,6 +89,7 @@ class FileActions(QObject):
 
     Attributes
     ----------
+    settings : as given
     acts : callables by the actions' keys
     recent_menu, models_menu : list what can be opened by a click
     """
@@ -105,7 +106,7 @@ class FileActions(QObject):
         self._attempt = attempt
         self._window = window
         self._document = document
-        self._settings = settings
+        self.settings = settings
         self._viewport = viewport
         self.acts: dict[str, Callable[[], object]] = {
             "new": self._new_pose,
@@ -149,7 +150,7 @@ class FileActions(QObject):
 
     def _import_mesh(self, path: Path) -> None:
         self._document.import_mesh(path)
-        self._settings["last_folder"] = str(path.resolve().parent)
+        self.settings["last_folder"] = str(path.resolve().parent)
 
     def turn_upright(self) -> None:
         """Turn the model by the next axis, in its file, and open it again.
@@ -186,7 +187,7 @@ class FileActions(QObject):
         self._dropped = None
         suffix = path.suffix.lower()
         if not path.is_file():
-            self._settings.forget_file(str(path.resolve()))
+            self.settings.forget_file(str(path.resolve()))
             kind = "it is a folder" if path.is_dir() else "there is no such file"
             raise LCollisionError(
                 f"Couldn't open {path}: {kind}",
@@ -212,7 +213,7 @@ class FileActions(QObject):
             self._import_mesh(path)
         elif self.may_lose_changes():
             openers[suffix](path)
-            self._settings["last_folder"] = str(path.resolve().parent)
+            self.settings["last_folder"] = str(path.resolve().parent)
 
     def _open_looked_into(self, path: Path, is_character: bool) -> None:
         """Open a rigged file as a body, another as a mesh of the one that is open."""
@@ -220,7 +221,7 @@ class FileActions(QObject):
             self._import_mesh(path)
         elif self._attempt(self.may_lose_changes):
             self._document.open_model(path)
-            self._settings["last_folder"] = str(path.resolve().parent)
+            self.settings["last_folder"] = str(path.resolve().parent)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:
         """Open the first of some files that can be opened, and report the others afterwards.
@@ -264,36 +265,38 @@ class FileActions(QObject):
         return True
 
     def _export(self) -> None:
-        settings, model = self._settings, self._document.model
-        form = export_form(settings, self._window, model.up_axis, model.front)
-        path = self._ask_save_after(form, "Export mesh", _EXPORTS)
+        form = ExportDialog(self.settings, self._window, self._document.model)
+        accepted = form.exec() == QDialog.DialogCode.Accepted
+        kinds, style = form.kinds, form.export_style
+        form.deleteLater()
+        path = self.ask_save("Export mesh", self._name, kinds) if accepted else None
         if path is not None:
-            self._document.export_mesh(path, settings["export_axes"], settings["export_scale"])
+            self._document.export_pose(path, style)
 
     def _screenshot(self) -> None:
-        form = screenshot_form(self._settings, self._window)
+        form = screenshot_form(self.settings, self._window)
         path = self._ask_save_after(form, "Save screenshot", {"PNG": ".png"})
         if path is not None:
             names = ("width", "height", "transparent")
-            values = (self._settings[f"screenshot_{name}"] for name in names)
+            values = (self.settings[f"screenshot_{name}"] for name in names)
             self._viewport.pictures.screenshot(path, *values)
             self._document.message.emit(f"Saved {path.name}")
 
     def _turntable(self) -> None:
         from app.view.turntable import TurntableStyle
 
-        form = turntable_form(self._settings, self._window)
+        form = turntable_form(self.settings, self._window)
         path = self._ask_save_after(form, "Save turntable", _VIDEOS)
         if path is not None:
             names = ("seconds", "width", "height", "rate", "background", "colour")
-            style = TurntableStyle(*(self._settings[f"turntable_{name}"] for name in names))
+            style = TurntableStyle(*(self.settings[f"turntable_{name}"] for name in names))
             self._viewport.pictures.turntable(path, style)
 
     def _ask_save_after(self, form: QDialog, title: str, kinds: dict[str, str]) -> Path | None:
         """Ask for a file to write once a form is accepted, a turntable's format first."""
         accepted = form.exec() == QDialog.DialogCode.Accepted
         form.deleteLater()
-        first = f".{self._settings['turntable_format']}"
+        first = f".{self.settings['turntable_format']}"
         kinds = dict(sorted(kinds.items(), key=lambda kind: kind[1] != first))
         return self.ask_save(title, self._name, kinds) if accepted else None
 
@@ -323,7 +326,7 @@ class FileActions(QObject):
     @Slot()
     def _fill_recent(self) -> None:
         self.recent_menu.clear()
-        for index, name in enumerate(self._settings["recent_files"], start=1):
+        for index, name in enumerate(self.settings["recent_files"], start=1):
             path = Path(name)
             self._list(self.recent_menu, f"&{index}  {menu_text(path.name)}", path)
         if self.recent_menu.isEmpty():
@@ -370,13 +373,13 @@ class FileActions(QObject):
         file = Path(self._document.model_file)
         # By its name a bundled one is found after the program has moved.
         is_bundled = file.parent == bundled_folder("models")
-        self._settings["model"] = file.stem if is_bundled else str(file)
+        self.settings["model"] = file.stem if is_bundled else str(file)
         if file.is_file() and not is_bundled:
             self._remember(file)
 
     @Slot(object)
     def _remember(self, path: Path) -> None:
-        self._settings.remember_file(str(path.resolve()))
+        self.settings.remember_file(str(path.resolve()))
 
     @Slot(object, object)
     def _offer_scale(self, path: Path, found: WrongScaleError) -> None:
@@ -385,7 +388,7 @@ class FileActions(QObject):
             self._document.import_mesh(path, found.factor)
 
     def _folder(self) -> Path:
-        folder = Path(self._settings["last_folder"] or Path.home())
+        folder = Path(self.settings["last_folder"] or Path.home())
         return folder if folder.is_dir() else Path.home()
 
     @property
@@ -440,7 +443,7 @@ class FileActions(QObject):
                     path = None
         dialog.deleteLater()
         if path is not None:
-            self._settings["last_folder"] = str(path.resolve().parent)
+            self.settings["last_folder"] = str(path.resolve().parent)
         return path
 
 

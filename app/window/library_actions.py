@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, QPoint, Qt, Slot
 from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QMenu, QWidget
+from PySide6.QtWidgets import QDialog, QMenu, QWidget
 
 from app.editing.commands import Source
 from app.window.actions import ACTIONS, explain_action
+from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.names import ask_for_name
 from app.window.dialogs.questions import ask_to_replace
 from app.window.menus import MENUS, SEPARATOR
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from lcollision_core.model import NamedPose
 
 LIBRARY_MENU = "&Library"
+
+_CACHES = {"PC2": ".pc2", "MDD": ".mdd"}
 
 
 class LibraryActions(QObject):
@@ -69,6 +72,7 @@ class LibraryActions(QObject):
             "add": lambda: self._tell_added(document.add_to_library(self._addable())),
             "import_poses": self._import,
             "export_poses": lambda: self._export(panel.chosen_poses, "Export poses"),
+            "export_motion": self._export_motion,
             "export_library": lambda: self._export(document.poses, "Export library"),
             "find_pose": panel.find_pose,
         }
@@ -101,6 +105,7 @@ class LibraryActions(QObject):
             "remove": own,
             "add": bool(addable),
             "export_poses": bool(chosen),
+            "export_motion": bool(chosen),
             "export_library": has_model and bool(document.poses),
         }
         for key in self.acts:
@@ -197,6 +202,16 @@ class LibraryActions(QObject):
             if added
             else "Your library has these poses already"
         )
+
+    def _export_motion(self) -> None:
+        form = MotionDialog(self._files.settings, self._window)
+        accepted = form.exec() == QDialog.DialogCode.Accepted
+        style = form.export_style
+        form.deleteLater()
+        poses = self._panel.chosen_poses
+        path = self._files.ask_save("Export motion", poses[0].name, _CACHES) if accepted else None
+        if path is not None:
+            self._document.export_motion(path, poses, style)
 
     def _export(self, poses: tuple[NamedPose, ...], title: str) -> None:
         from lcollision_core.model import write_poses

@@ -42,7 +42,14 @@ MENUS: dict[str, tuple[str, ...]] = {
         *("load", "blend", SEPARATOR),
         *("rename", "tags", "duplicate", "mirror_poses", "remove", "add", SEPARATOR),
         *("keep", "update", SEPARATOR),
-        *("import_poses", "export_poses", "export_library", SEPARATOR, "find_pose"),
+        *(
+            "import_poses",
+            "export_poses",
+            "export_motion",
+            "export_library",
+            SEPARATOR,
+            "find_pose",
+        ),
     ),
     "&View": (
         *("shading", SEPARATOR, "ghost", SEPARATOR),

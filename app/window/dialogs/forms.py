@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from PySide6.QtCore import Qt, Slot
 from PySide6.QtGui import QColor
@@ -24,21 +24,7 @@ from app.view.theme import NORMAL, WIDE
 from app.window.number_box import NumberBox
 from app.window.widgets import dialog_vbox, labelled, swatch
 
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-
 _WIDTH, _BORDER = 400, WIDE + 4
-
-EXPORT_NAMES = {
-    "model": "As the model's",
-    "y-up": "Y up",
-    "blender": "Blender",
-    "maya": "Maya",
-    "unreal": "Unreal",
-}
-"""Names of the export's axes, by `ExportAxes`."""
 
 
 class ColourButton(QPushButton):
@@ -137,7 +123,8 @@ class Form(QDialog):
         field = QComboBox()
         for value, name in names.items():
             field.addItem(name, value)
-        field.setCurrentIndex(list(names).index(self._settings[key]))
+        # What was remembered may not be offered now.
+        field.setCurrentIndex(max(0, field.findData(self._settings[key])))
         self._add(key, label, field, field.currentData, tip)
         return field
 
@@ -152,6 +139,10 @@ class Form(QDialog):
         field = ColourButton(self._settings[key], label)
         self._add(key, label, field, field.text)
         return field
+
+    def add_widget(self, label: str, widget: QWidget) -> None:
+        """Add what no setting remembers."""
+        self._form.addRow(label, widget)
 
     def add_note(self, text: str) -> QLabel:
         """Add some lines of explanation."""
@@ -191,48 +182,6 @@ def screenshot_form(settings: Settings, parent: QWidget) -> Form:
     form.add_number("screenshot_width", "Width", " px")
     form.add_number("screenshot_height", "Height", " px")
     form.add_check("screenshot_transparent", "Transparent background")
-    return form
-
-
-def export_form(
-    settings: Settings, parent: QWidget, up_axis: int, front: npt.NDArray[np.float64]
-) -> Form:
-    """Ask for the axes and the unit of a mesh to write.
-
-    Parameters
-    ----------
-    settings, parent : see `Form`
-    up_axis : of the model, 0, 1 or 2
-    front : (3,) direction along an axis that the model faces
-    """
-    from lcollision_core.model import EXPORT_SCALES, ExportAxes
-
-    looks = int(abs(front).argmax())
-    own = f"{'xyz'[up_axis]} is up, front is {'-' if front[looks] < 0.0 else '+'}{'xyz'[looks]}"
-    meanings = {
-        ExportAxes.MODEL: f"As the model's: {own}.",
-        ExportAxes.Y_UP: "y is up, front is +z, in the model's unit.",
-        ExportAxes.BLENDER: "Upright and facing you in Blender's front view, with the settings "
-        "that its importers begin with.",
-        ExportAxes.MAYA: "y is up, front is +z; 100 turns metres into Maya's centimetres.",
-        ExportAxes.UNREAL: "z is up, front is +x once imported; 100 turns metres into Unreal's "
-        "centimetres.",
-    }
-    form = Form("Export mesh", "Choose file…", settings, parent)
-    axes = form.add_choice("export_axes", "Axes", EXPORT_NAMES, "Which way is up in the file")
-    scale = form.add_number(
-        "export_scale", "Scale by", "", 1.0, "How many units of the file make one of the model", 6
-    )
-    # Six decimals are for those who type them.
-    scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
-    meaning = form.add_note(meanings[axes.currentData()])
-    form.add_note("A GLB file is always y up and not scaled, as its standard fixes both.")
-
-    def follow() -> None:
-        scale.setValue(EXPORT_SCALES[axes.currentData()])
-        form.explain(meaning, meanings[axes.currentData()])
-
-    axes.currentIndexChanged.connect(follow)
     return form
 
 

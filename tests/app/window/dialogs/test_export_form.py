@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PySide6.QtCore import QTimer
 from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QLineEdit
 from pytestqt.qtbot import QtBot
 
 from app.editing.settings import SETTINGS
 from app.view.theme import DARK, LIGHT, apply_theme
-from app.window.dialogs.forms import EXPORT_NAMES, Form, export_form
+from app.window.dialogs.export import EXPORT_NAMES, MESH, ExportDialog
+from app.window.dialogs.forms import Form
 from app.window.main_window import MainWindow
+from lcollision_core.characters import read_character
 from lcollision_core.meshes import read_mesh
-from lcollision_core.model import ExportAxes
+from lcollision_core.meshes.formats.point_cache import read_point_cache
+from lcollision_core.model import ExportAxes, RigModel, export_mesh
 from tests.app.windows import PATIENCE, answer, shown, take_picture
+from tests.core.gltf_builder import arm
 
 
 def fields(form: Form) -> tuple[object, object]:
@@ -30,7 +36,7 @@ def test_the_scale_follows_the_axes_and_both_are_remembered(
     qtbot: QtBot, window: MainWindow
 ) -> None:
     model = window.document.model
-    form = export_form(window.settings, window, model.up_axis, model.front)
+    form = ExportDialog(window.settings, window, model)
     qtbot.addWidget(form)
     axes, scale = fields(form)
     assert axes.currentData() == "model"
@@ -42,7 +48,7 @@ def test_the_scale_follows_the_axes_and_both_are_remembered(
     axes.setCurrentIndex(axes.findData("unreal"))
     scale.setValue(2.54)
     form.accept()
-    again = export_form(window.settings, window, model.up_axis, model.front)
+    again = ExportDialog(window.settings, window, model)
     qtbot.addWidget(again)
     axes, scale = fields(again)
     assert (axes.currentData(), scale.value()) == ("unreal", 2.54)
@@ -83,3 +89,94 @@ def test_an_export_is_written_as_the_form_says(
     np.testing.assert_array_equal(read[:, 1], 100.0 * on_screen[:, model.up_axis].astype(float))
     assert window.settings["export_axes"] == "maya"
     apply_theme(QApplication.instance(), LIGHT)
+
+
+def named(path: Path, timers: list[QTimer]) -> Callable[[QDialog], None]:
+    """Return what accepts a form, and chooses a file in the dialog that follows."""
+
+    def choose(dialog: QDialog) -> None:
+        name = dialog.findChild(QLineEdit, "fileNameEdit")
+        assert isinstance(name, QLineEdit)
+        name.setText(str(path))
+        dialog.accept()
+
+    def accept(dialog: QDialog) -> None:
+        timers.append(answer(choose))
+        dialog.accept()
+
+    return accept
+
+
+@pytest.fixture
+def arm_model(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> RigModel:
+    """Open a character whose file offers its forms."""
+    with qtbot.waitSignal(window.document.opened, timeout=PATIENCE):
+        window.document.open_model(arm().write(tmp_path / "arm.glb"))
+    assert isinstance(window.document.model, RigModel)
+    return window.document.model
+
+
+@pytest.mark.parametrize("form", ["joints", "mesh", "morph"])
+def test_a_character_is_given_back_in_the_form_that_is_chosen(
+    qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path, form: str
+) -> None:
+    document, path = window.document, tmp_path / "posed.glb"
+    document.blend_towards(arm_model.training_latent[2], 1.0)
+    timers: list[QTimer] = []
+    accept = named(path, timers)
+
+    def fill(dialog: QDialog) -> None:
+        assert isinstance(dialog, ExportDialog)
+        keys = [dialog.form.itemData(row) for row in range(dialog.form.count())]
+        assert keys == ["joints", "mesh", "morph", MESH]
+        dialog.form.setCurrentIndex(keys.index(form))
+        assert dialog.kinds == {"GLB": ".glb"}
+        assert not dialog.axes.isEnabled()
+        take_picture(dialog, f"export_{form}")
+        accept(dialog)
+
+    timers.append(answer(fill))
+    with qtbot.waitSignal(document.message, timeout=PATIENCE) as told:
+        window.actions_by_key["export"].trigger()
+    assert "no collisions (checked)" in told.args[0]
+    assert window.settings["export_form"] == form
+    written = read_character(path)
+    expected = arm_model.decode(document.latent)
+    assert (written.rig is None) == (form == "mesh")
+    np.testing.assert_allclose(written.rest_vertices, expected, atol=1e-5 * arm_model.body_size)
+
+
+def test_a_model_keeps_the_form_of_a_file_that_is_named(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = window.document.model
+    mine = tmp_path / "mine.obj"
+    export_mesh(mine, model, model.reference)
+    mine.write_text("# mine\n" + mine.read_text())
+    form = ExportDialog(window.settings, window, model)
+    qtbot.addWidget(form)
+    assert not form.form.isEnabled()
+    assert set(form.kinds) == {"OBJ", "PLY", "STL", "GLB"}
+    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_: (str(mine), ""))
+    form.source.click()
+    assert form.source.text() == "mine.obj"
+    assert (form.form.currentData(), form.kinds) == ("obj", {"OBJ": ".obj"})
+    assert form.axes.isEnabled()
+    assert (form.export_style.like, form.export_style.form) == (mine, "obj")
+    form.accept()
+    window.document.export_pose(tmp_path / "out.obj", form.export_style)
+    window.document.finish_exports()
+    assert (tmp_path / "out.obj").read_text().startswith("# mine\n")
+
+
+def test_selected_poses_are_the_frames_of_a_point_cache(
+    qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path
+) -> None:
+    path = tmp_path / "wave.pc2"
+    timers: list[QTimer] = []
+    window.library.list.selectAll()
+    timers.append(answer(named(path, timers)))
+    with qtbot.waitSignal(window.document.message, timeout=PATIENCE):
+        window.actions_by_key["export_motion"].trigger()
+    cache = read_point_cache(path)
+    assert len(cache.frames) == len(arm_model.pose_names)

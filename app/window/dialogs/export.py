@@ -1,0 +1,198 @@
+"""What a pose is exported as: the user's own file in one of its forms, or a mesh; axes and unit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import Slot
+from PySide6.QtWidgets import QComboBox, QFileDialog, QPushButton, QWidget
+
+from app.editing.settings import Settings
+from app.window.dialogs.forms import Form
+from app.window.number_box import NumberBox
+from app.wording import menu_text
+from app.work.jobs import ExportStyle
+
+if TYPE_CHECKING:
+    from lcollision_core.model import ExportForm, PosableBody
+
+EXPORT_NAMES = {
+    "model": "As the model's",
+    "y-up": "Y up",
+    "blender": "Blender",
+    "maya": "Maya",
+    "unreal": "Unreal",
+}
+"""Names of the export's axes, by `ExportAxes`."""
+
+MESH = "mesh-alone"
+"""The form of a mesh of the body's own: no file of the user's is kept."""
+
+_MESHES = {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
+_FOLLOWS = "As OBJ, PLY or STL: faces and positions alone."
+
+
+class ExportDialog(Form):
+    """Asks for the form, the axes and the unit of a pose to write.
+
+    Parameters
+    ----------
+    settings, parent : see `Form`
+    model : of the pose; a character offers the forms of its own file
+
+    Attributes
+    ----------
+    form, axes : fields
+    source : the button that asks for a file of the user's; not of a character, which has its own
+    like : that file, None for none
+    """
+
+    def __init__(self, settings: Settings, parent: QWidget, model: PosableBody) -> None:
+        from lcollision_core.model import EXPORT_SCALES, RigModel
+
+        super().__init__("Export mesh", "Choose file…", settings, parent)
+        self._scales = EXPORT_SCALES
+        self._meanings = _meanings(model)
+        self._character = model.character.source if isinstance(model, RigModel) else None
+        self.like: Path | None = None
+        self._forms: dict[str, ExportForm] = {}
+        if self._character is None:
+            self.source = QPushButton("None: write a mesh")
+            self.source.setAutoDefault(False)
+            self.source.setToolTip("Your OBJ or GLB file of this body, whose UVs and groups stay")
+            self.source.clicked.connect(self._ask_for_source)
+            self.add_widget("Keep file", self.source)
+        self.form = self.add_choice("export_form", "Form", {MESH: "Mesh"}, "What is written")
+        self._readers["export_form"] = self._remembered_form
+        self.axes, self._scale = _add_frame(self)
+        self._about, self._meaning = self.add_note(""), self.add_note("")
+        self._offer()
+        self.axes.currentIndexChanged.connect(self._on_axes)
+        self.form.currentIndexChanged.connect(self._explain)
+
+    @property
+    def kinds(self) -> dict[str, str]:
+        """The file formats of the chosen form, extensions by name."""
+        form = self._forms.get(self.form.currentData())
+        if form is not None:
+            return {form.suffix.removeprefix(".").upper(): form.suffix}
+        # As GLB a character has forms of its own.
+        return {k: s for k, s in _MESHES.items() if s != ".glb" or self._character is None}
+
+    @property
+    def export_style(self) -> ExportStyle:
+        """What the fields say."""
+        form = self._forms.get(self.form.currentData())
+        key = None if form is None else form.key
+        like = None if form is None else self.like
+        return ExportStyle(self.axes.currentData(), self._scale.value(), like, key)
+
+    @Slot()
+    def _ask_for_source(self) -> None:
+        from lcollision_core.model import EXPORT_FORMS
+
+        suffixes = dict.fromkeys(suffix for form in EXPORT_FORMS for suffix in form.of_sources)
+        masks = " ".join(f"*{suffix}" for suffix in suffixes)
+        folder = self._settings["last_folder"]
+        name, _ = QFileDialog.getOpenFileName(
+            self, "Keep the form of", folder, f"Files of this body ({masks})"
+        )
+        self.like = Path(name) if name else None
+        self.source.setText(menu_text(self.like.name) if self.like else "None: write a mesh")
+        self._offer()
+
+    def _offer(self) -> None:
+        """List the forms of the user's file, the best first, and the mesh alone."""
+        from lcollision_core.model import offered_forms
+
+        source = self._character or self.like
+        has_rig = self._character is not None
+        offered = offered_forms(source, has_rig=has_rig) if source is not None else ()
+        self._forms = {form.key: form for form in offered if not form.is_sequence}
+        wanted = self._settings["export_form"]
+        self.form.clear()
+        for key, form in self._forms.items():
+            self.form.addItem(form.label, key)
+        self.form.addItem("Mesh", MESH)
+        self.form.setCurrentIndex(max(0, self.form.findData(wanted)))
+        self.form.setEnabled(bool(self._forms))
+        self._explain()
+
+    def _remembered_form(self) -> str:
+        """Return the form that was chosen, where there was a choice."""
+        form: str = self.form.currentData() if self._forms else self._settings["export_form"]
+        return form
+
+    @Slot()
+    def _on_axes(self) -> None:
+        self._scale.setValue(self._scales[self.axes.currentData()])
+        self._explain()
+
+    @Slot()
+    def _explain(self) -> None:
+        form = self._forms.get(self.form.currentData())
+        has_axes = form is None or form.has_axes
+        self.axes.setEnabled(has_axes)
+        self._scale.setEnabled(has_axes)
+        mesh = _FOLLOWS if self._character is not None else _GLB
+        self.explain(self._about, mesh if form is None else form.explanation)
+        meaning = self._meanings[self.axes.currentData()]
+        self.explain(self._meaning, meaning if has_axes else "Axes and unit stay as in that file.")
+
+
+class MotionDialog(Form):
+    """Asks for the frame rate, the axes and the unit of poses to write as frames."""
+
+    def __init__(self, settings: Settings, parent: QWidget) -> None:
+        from lcollision_core.model import EXPORT_SCALES
+
+        super().__init__("Export motion", "Choose file…", settings, parent)
+        tip = "One pose is one frame"
+        self._rate = self.add_number("export_rate", "Frames per second", tip=tip)
+        self.axes, self._scale = _add_frame(self)
+        self.add_note(
+            "A point cache holds positions alone: keep it beside your mesh, whose vertex order it "
+            "has. Each frame is checked."
+        )
+        self.axes.currentIndexChanged.connect(
+            lambda: self._scale.setValue(EXPORT_SCALES[self.axes.currentData()])
+        )
+
+    @property
+    def export_style(self) -> ExportStyle:
+        """What the fields say."""
+        return ExportStyle(
+            self.axes.currentData(), self._scale.value(), fps=float(self._rate.value())
+        )
+
+
+def _add_frame(form: Form) -> tuple[QComboBox, NumberBox]:
+    """Add fields for axes and unit."""
+    axes = form.add_choice("export_axes", "Axes", EXPORT_NAMES, "Which way is up in the file")
+    tip = "How many units of the file make one of the model"
+    scale = form.add_number("export_scale", "Scale by", "", 1.0, tip, 6)
+    # Six decimals are for those who type them.
+    scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
+    return axes, scale
+
+
+_GLB = "A GLB file is always y up and not scaled, as its standard fixes both."
+
+
+def _meanings(model: PosableBody) -> dict[str, str]:
+    """Say what the presets of axes mean for a body."""
+    from lcollision_core.model import ExportAxes
+
+    looks = int(abs(model.front).argmax())
+    sign = "-" if model.front[looks] < 0.0 else "+"
+    own = f"{'xyz'[model.up_axis]} is up, front is {sign}{'xyz'[looks]}"
+    return {
+        ExportAxes.MODEL: f"As the model's: {own}.",
+        ExportAxes.Y_UP: "y is up, front is +z, in the model's unit.",
+        ExportAxes.BLENDER: "Upright and facing you in Blender's front view, with the settings "
+        "that its importers begin with.",
+        ExportAxes.MAYA: "y is up, front is +z; 100 turns metres into Maya's centimetres.",
+        ExportAxes.UNREAL: "z is up, front is +x once imported; 100 turns metres into Unreal's "
+        "centimetres.",
+    }
