@@ -24,7 +24,7 @@ from lcollision_core.meshes.units import body_size
 ANIMATED_SUFFIXES = (*SCENE_SUFFIXES, *POINT_CACHE_SUFFIXES)
 """Extensions that `read_animated` reads, in lower case."""
 
-_MESHES_OF_CACHES = (".obj", ".ply", ".off", ".stl", *SCENE_SUFFIXES)
+_MESHES_OF_CACHES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf", ".vrm")
 """Which file beside a point cache is its mesh: the first that is there."""
 
 
@@ -153,19 +153,25 @@ def _read_cache(path: Path) -> AnimatedMesh:
         )
     cache = read_point_cache(path)
     mesh = read_mesh(found[0])
-    n_vertices = cache.frames.shape[1]
-    if mesh.topology.n_vertices != n_vertices:
+    frames, n_vertices = cache.frames, cache.frames.shape[1]
+    is_scene = found[0].suffix.lower() in SCENE_SUFFIXES
+    if is_scene and n_vertices != mesh.topology.n_vertices:
+        joined = join_parts(read_scene(found[0])).joined
+        if len(joined) == n_vertices:
+            # Of the file's own vertices, those that seams split among them.
+            frames = frames[:, np.unique(joined, return_index=True)[1]]
+    if mesh.topology.n_vertices != frames.shape[1]:
         raise MeshFileError(
             f"holds {n_vertices} vertices a frame, its mesh {found[0].name} has "
             f"{mesh.topology.n_vertices}",
             "export both from the same mesh, without modifiers that add vertices",
             where=path,
         )
-    _require_same_body(path, found[0], mesh, cache.frames[0].astype(np.float64))
-    vertices = np.concatenate([mesh.vertices[None], cache.frames])
-    names = ("rest", *(f"frame {frame}" for frame in range(len(cache.frames))))
+    _require_same_body(path, found[0], mesh, frames[0].astype(np.float64))
+    vertices = np.concatenate([mesh.vertices[None], frames])
+    names = ("rest", *(f"frame {frame}" for frame in range(len(frames))))
     notes = (f"{found[0].name} is its mesh and rest pose", *mesh.notes)
-    is_scene = found[0].suffix.lower() in SCENE_SUFFIXES
+    # y is up in glTF, by its standard.
     up_axis = 1 if is_scene else None
     return AnimatedMesh(vertices, mesh.topology, names, notes, up_axis, None)
 

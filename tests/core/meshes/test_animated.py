@@ -122,6 +122,16 @@ def test_a_point_cache_finds_its_mesh(tmp_path: Path, cache: str, suffix: str) -
     assert f"tube{suffix} is its mesh and rest pose" in poses.notes
 
 
+def test_a_point_cache_of_a_character_has_its_files_vertices(tmp_path: Path) -> None:
+    character = read_character(arm().write(tmp_path / "arm.glb"))
+    frames = character.sample("wave", None).vertices
+    write_point_cache(tmp_path / "arm.pc2", frames[:, character.joined])
+    poses = read_pose_set(tmp_path / "arm.pc2")
+    assert poses.topology == character.topology
+    assert np.array_equal(poses.vertices[0], character.rest_vertices)
+    assert np.array_equal(poses.vertices[1:], frames.astype(np.float32))
+
+
 def test_a_point_cache_without_its_mesh_gets_a_sentence(tmp_path: Path) -> None:
     vertices, faces = tube(20, 24)
     path = tmp_path / "tube.pc2"
