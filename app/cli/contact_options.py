@@ -101,27 +101,27 @@ class RuleOptions:
         rules = replace(rules, **chosen)
         if not self.ignore:
             return rules, groups
-        offered = all_groups(groups, topology, vertex_labels)
-        others = offered[len(groups) :]
-        known = {group.name for group in offered}
+        _, parts, components = groups_by_kind(groups, topology, vertex_labels)
+        others = (*parts, *components)
+        known = {group.name for group in (*groups, *others)}
         pairs = tuple(_pair(entry, known) for entry in self.ignore)
         named = {name for pair in pairs for name in pair}
         groups = (*groups, *(group for group in others if group.name in named))
         return replace(rules, ignored=tuple(dict.fromkeys((*rules.ignored, *pairs)))), groups
 
 
-def all_groups(
+def groups_by_kind(
     groups: tuple[FaceGroup, ...],
     topology: Topology,
     vertex_labels: npt.NDArray[np.str_] | None = None,
-) -> tuple[FaceGroup, ...]:
-    """Return the groups of a mesh, then its body parts and components of other names."""
+) -> tuple[tuple[FaceGroup, ...], ...]:
+    """Return the groups of a mesh, and its body parts and components of other names."""
     from lcollision_core.meshes import component_groups, part_groups
 
     held = {group.name for group in groups}
     parts = () if vertex_labels is None else part_groups(topology, vertex_labels)
-    others = (*parts, *component_groups(topology))
-    return (*groups, *(group for group in others if group.name not in held))
+    others = (parts, component_groups(topology))
+    return groups, *(tuple(group for group in kind if group.name not in held) for kind in others)
 
 
 def _pair(entry: str, known: set[str]) -> tuple[str, str]:

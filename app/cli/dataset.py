@@ -15,7 +15,7 @@ from app.cli.contact_options import (
     RestExclusionOption,
     RuleOptions,
     ToleratedDepthOption,
-    all_groups,
+    groups_by_kind,
     rules_sentence,
 )
 from app.cli.inputs import Axis, PoseSetArgument, up_sentence
@@ -78,11 +78,12 @@ def check(
             found = detector.detect_batch(poses.vertices, progress=progress)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
-    proposed = propose_ignored(
-        detector,
-        poses.vertices[:: -(-len(poses) // _MOST_POSES_ASKED)],
-        all_groups(groups, poses.topology, poses.vertex_labels)[:MAX_GROUPS],
-    )
+    asked = poses.vertices[:: -(-len(poses) // _MOST_POSES_ASKED)]
+    proposed = [
+        pair
+        for kind in groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
+        for pair in propose_ignored(detector, asked, kind[:MAX_GROUPS])
+    ]
     guess = poses.up
     report: dict[str, Any] = {
         "poses": inspection.n_found,

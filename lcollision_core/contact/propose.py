@@ -65,7 +65,10 @@ def propose_ignored(
     """
     n_faces = detector.topology.n_faces
     require_groups(detector.rules, (*groups, *detector.groups), n_faces)
-    distinct = list({group.faces.tobytes(): group for group in reversed(groups)}.values())[::-1]
+    by_faces: dict[bytes, FaceGroup] = {}
+    for group in groups:
+        by_faces.setdefault(group.faces.tobytes(), group)
+    distinct = list(by_faces.values())
     if len(distinct) < 2:
         return ()
     member = _members(distinct, n_faces)

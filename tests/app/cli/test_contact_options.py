@@ -106,8 +106,8 @@ def test_dataset_check_names_the_rules(
     report = json.loads(lcollision("dataset", "check", touching_set, "--json", *options).stdout)
     assert report["colliding_poses"] == (2 if excluded is None else 0)
     assert report["excluded_at_rest"] == (NONE if excluded is None else {**NONE, excluded: 1})
-    always = [{"groups": ["skin", "belt: front"], "share": 1.0}]
-    assert report["proposed_ignored"] == always
+    always = [["skin", "belt: front"], ["hand", "trunk"], ["component 1", "component 2"]]
+    assert report["proposed_ignored"] == [{"groups": pair, "share": 1.0} for pair in always]
     said = lcollision("dataset", "check", touching_set, *options).stdout
     offer = '--ignore "skin:belt: front" leaves them out'
     assert (offer in said) == ("skin:belt: front" not in options)
