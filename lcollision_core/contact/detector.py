@@ -364,8 +364,8 @@ class CollisionDetector:
 
         def search(searcher: _Searcher, pose: int) -> None:
             for n_found in searcher.search(poses[pose], first_only=True, number=pose, unit=unit):
-                # The search ends at a pair that counts, so the last one found tells.
-                colliding[pose] = n_found > 0 and searcher.found.rule[n_found - 1] == COUNTED
+                # The search ends where a pair counts, so the last ones found tell.
+                colliding[pose] = (searcher.found.rule[:n_found] == COUNTED).any()
 
         self._for_each(len(poses), search, workers, progress, cancel)
         return colliding

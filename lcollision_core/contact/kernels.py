@@ -264,7 +264,9 @@ def _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
 
 @compiled
 def _rule_of(face_a, face_b, squared_depth, exclusions):
-    """Return the first rule by which two faces do not count, or `COUNTED`."""
+    """Return the first rule by which two faces do not count, or `COUNTED`; depth 0 coincides."""
+    if squared_depth == 0.0:
+        return np.uint8(COINCIDENT)
     first = min(face_a, face_b)
     second = max(face_a, face_b)
     low = exclusions.start[first]
@@ -349,26 +351,25 @@ def _coincide(triangles, a, b, tolerance):
 
 @compiled
 def _search_leaves(
-    tree,
-    work,
-    exclusions,
+    corners,
+    boxes,
+    triangles,
     leaf_a,
     leaf_b,
     box_b,
     tolerance,
-    first_only,
-    found,
+    slots,
+    squared_depths,
     n_found,
     with_coincident,
     leaf_size,
 ):
     """Append the pairs that penetrate between two leaves, or within one.
 
-    Returns the number found so far, and whether a search for the first may stop. `leaf_size` is
-    `LEAF_SIZE`, handed in because a loop of constant length is unrolled rather than vectorised.
+    Returns the number found so far. `leaf_size` is `LEAF_SIZE`, handed in because a loop of
+    constant length is unrolled rather than vectorised. Arrays are handed in one by one, because
+    every array of a tuple costs its reference count at every call.
     """
-    corners = tree.corners
-    boxes = work.boxes
     corner_base = uint64(leaf_b) * _LEAF_CORNERS
     box_base = uint64(leaf_b) * _LEAF_BOXES
     for i in range(LEAF_SIZE):
@@ -407,25 +408,28 @@ def _search_leaves(
             if _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1) == 0:
                 continue
             slot_b = leaf_b * LEAF_SIZE + j
-            squared_depth = _pair_depth_squared(work.triangles, slot_a, slot_b, tolerance)
-            if squared_depth == 0.0:
-                if not with_coincident:
-                    continue
-                if not _coincide(work.triangles, slot_a, slot_b, tolerance):
-                    continue
-                rule = np.uint8(COINCIDENT)
-            else:
-                face_a = tree.slot_face[slot_a]
-                face_b = tree.slot_face[slot_b]
-                rule = _rule_of(face_a, face_b, squared_depth, exclusions)
-            found.slots[n_found, 0] = slot_a
-            found.slots[n_found, 1] = slot_b
-            found.squared_depth[n_found] = squared_depth
-            found.rule[n_found] = rule
+            squared_depth = _pair_depth_squared(triangles, slot_a, slot_b, tolerance)
+            if squared_depth == 0.0 and not (
+                with_coincident and _coincide(triangles, slot_a, slot_b, tolerance)
+            ):
+                continue
+            slots[n_found, 0] = slot_a
+            slots[n_found, 1] = slot_b
+            squared_depths[n_found] = squared_depth
             n_found += 1
-            if first_only and rule == COUNTED:
-                return n_found, True
-    return n_found, False
+    return n_found
+
+
+@compiled
+def _judge(tree, exclusions, found, start, stop):
+    """Fill in the rules of pairs from `start` to `stop`; return whether one of them counts."""
+    some_count = False
+    for n in range(start, stop):
+        face_a = tree.slot_face[found.slots[n, 0]]
+        face_b = tree.slot_face[found.slots[n, 1]]
+        found.rule[n] = _rule_of(face_a, face_b, found.squared_depth[n], exclusions)
+        some_count |= found.rule[n] == COUNTED
+    return some_count
 
 
 @compiled
@@ -452,7 +456,7 @@ def search_pose(
     scale : factor from the pose's unit to normalised length
     tolerance : depth in normalised length up to which two faces touch rather than penetrate
     tree, exclusions, work : of one topology; `work` is overwritten
-    first_only : end the search at the first pair that counts
+    first_only : end the search at the first leaves that have a pair that counts
     found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
     with_coincident : whether pairs that lie on each other are found too, with depth 0
     n_waiting : 0 to begin, else what the call before returned
@@ -482,22 +486,25 @@ def search_pose(
         if tree.leaf[a] >= 0 and tree.leaf[b] >= 0:
             if n_found + LEAF_SIZE * LEAF_SIZE > len(found.slots):
                 return n_found, n_waiting + 1
-            n_found, stop = _search_leaves(
-                tree,
-                work,
-                exclusions,
+            n_before = n_found
+            n_found = _search_leaves(
+                tree.corners,
+                work.boxes,
+                work.triangles,
                 tree.leaf[a],
                 tree.leaf[b],
                 boxes[b],
                 tolerance,
-                first_only,
-                found,
+                found.slots,
+                found.squared_depth,
                 n_found,
                 with_coincident,
                 leaf_size,
             )
-            if stop:
-                return n_found, 0
+            if n_found > n_before:
+                some_count = _judge(tree, exclusions, found, n_before, n_found)
+                if first_only and some_count:
+                    return n_found, 0
             continue
         first = n_waiting
         part = fraction[first]
