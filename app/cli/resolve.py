@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.model import NamedPose, PoseModel
+    from lcollision_core.model import NamedPose, PosableBody
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 
@@ -122,10 +122,10 @@ def resolve(
     """
     import numpy as np
 
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import open_body
     from lcollision_core.resolve import ResolveOptions, largest_correction_change
 
-    model = PoseModel.load(model_name)
+    model = open_body(model_name)
     options = ResolveOptions(
         solver=solver,
         metric=metric,
@@ -206,7 +206,7 @@ def resolve(
         note_rules(model)
     if sequence:
         before = np.array([request.pose.latent for request in requests])
-        change = largest_correction_change(model.embedding, before, results)
+        change = largest_correction_change(model.pose_space.decode, before, results)
         note(
             f"from frame to frame the correction changes by at most {100.0 * change:.3f} % of "
             f"the body size, in the mean over vertices"
@@ -219,7 +219,7 @@ def resolve(
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
-def _domain(model: PoseModel, name: str) -> int:
+def _domain(model: PosableBody, name: str) -> int:
     """Find a domain by its name, or by its number from 1."""
     names = [known.casefold() for known in model.domain_names]
     if name.casefold() in names:
@@ -232,7 +232,7 @@ def _domain(model: PoseModel, name: str) -> int:
     )
 
 
-def _group_weights(model: PoseModel, wanted: Sequence[str]) -> tuple[float, ...] | None:
+def _group_weights(model: PosableBody, wanted: Sequence[str]) -> tuple[float, ...] | None:
     """Read DOMAIN=W options; the whole body's codes keep the weight 1."""
     if not wanted:
         return None
@@ -252,7 +252,7 @@ def _group_weights(model: PoseModel, wanted: Sequence[str]) -> tuple[float, ...]
     return tuple(weights)
 
 
-def _read(model: PoseModel, inputs: Sequence[Path], scale: float) -> tuple[list[_Request], bool]:
+def _read(model: PosableBody, inputs: Sequence[Path], scale: float) -> tuple[list[_Request], bool]:
     """Read and encode what can be; say of each other input in a sentence why it cannot."""
     from lcollision_core.model import unique_names
 
@@ -274,7 +274,7 @@ def _read(model: PoseModel, inputs: Sequence[Path], scale: float) -> tuple[list[
     return named, failed
 
 
-def _requests_of(model: PoseModel, path: Path, scale: float) -> Iterator[_Request]:
+def _requests_of(model: PosableBody, path: Path, scale: float) -> Iterator[_Request]:
     from lcollision_core.meshes.files import KEEP_PRECISION
     from lcollision_core.model import encode_mesh, read_model_mesh, read_poses
 
@@ -297,28 +297,32 @@ def _requests_of(model: PoseModel, path: Path, scale: float) -> Iterator[_Reques
 
 
 def _depends_on(
-    model: PoseModel, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
+    model: PosableBody, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the inputs that determine the results: arrays, and JSON values."""
     from lcollision_core.meshes.face_groups import ignored_faces_digest
-    from lcollision_core.model import fingerprint_of_pose
+    from lcollision_core.model import PoseModel, fingerprint_of_pose
 
-    predictor = model.require_predictor().to_section()
-    arrays = {f"predictor/{name}": array for name, array in predictor.arrays.items()}
+    arrays: dict[str, npt.NDArray[Any]] = {"free": model.free_latent}
+    metadata: dict[str, Any] = {}
+    if isinstance(model, PoseModel):
+        predictor = model.require_predictor().to_section()
+        arrays |= {f"predictor/{name}": array for name, array in predictor.arrays.items()}
+        metadata = dict(predictor.metadata)
     poses = [request.pose for request in requests]
     values = {
         "command": "resolve",
         **asdict(options),
         "locked_domains": sorted(options.locked_domains),
         "poses": [fingerprint_of_pose(pose.latent, pose.placement) for pose in poses],
-        "predictor": dict(predictor.metadata),
+        "predictor": metadata,
         "height": model.body_size,
         "near_exclusion": model.near_exclusion,
         "rules": model.rules.to_json(),
         "ignored_faces": ignored_faces_digest(model.rules, model.groups),
         "sequence": sequence,
     }
-    return arrays | {"free": model.free_latent}, values
+    return arrays, values
 
 
 def _facts(result: ResolveResult) -> dict[str, Any]:
@@ -327,7 +331,7 @@ def _facts(result: ResolveResult) -> dict[str, Any]:
     return {name: getattr(result, name) for name in names if name not in ("latent", "vertices")}
 
 
-def _results(model: PoseModel, unfinished: UnfinishedPoses) -> dict[int, ResolveResult]:
+def _results(model: PosableBody, unfinished: UnfinishedPoses) -> dict[int, ResolveResult]:
     """Return the results of an earlier run, by index."""
     from lcollision_core.resolve import ResolveResult, Step
 
@@ -345,7 +349,7 @@ def _results(model: PoseModel, unfinished: UnfinishedPoses) -> dict[int, Resolve
 
 
 def _detailed(
-    model: PoseModel, requests: Sequence[_Request], results: Sequence[ResolveResult]
+    model: PosableBody, requests: Sequence[_Request], results: Sequence[ResolveResult]
 ) -> list[npt.NDArray[np.float64] | None]:
     """Return the resolved meshes with what encoding lost of them, None if that collides."""
     from lcollision_core.model import with_detail
@@ -360,7 +364,7 @@ def _detailed(
 
 
 def _stay_free(
-    model: PoseModel,
+    model: PosableBody,
     requests: Sequence[_Request],
     results: Sequence[ResolveResult],
     written: Sequence[WrittenFile],

@@ -33,7 +33,7 @@ from lcollision_core.model.mirror import (
 if TYPE_CHECKING:
     from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
     from lcollision_core.predictor import Prediction
-    from lcollision_core.resolve import ResolveOptions, ResolveResult
+    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -107,6 +107,22 @@ class PosableBody(ABC):
     @abstractmethod
     def can_resolve(self) -> bool:
         """Whether colliding poses can be resolved; it loads nothing."""
+
+    @property
+    @abstractmethod
+    def free_latent(self) -> FloatArray:
+        """(F, D) collision-free poses that are known, read-only."""
+
+    @property
+    @abstractmethod
+    def resolver(self) -> PoseResolver:
+        """Resolves the self-collisions of this body's poses.
+
+        Raises
+        ------
+        ModelFileError : the body cannot resolve: it needs a predictor, and has none or a damaged
+            one.
+        """
 
     @property
     def prediction_needs_torch(self) -> bool:

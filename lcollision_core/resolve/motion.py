@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
 
-from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve.options import ResolveResult
 
 
 def largest_correction_change(
-    embedding: Embedding, latents: FloatArray, results: Sequence[ResolveResult]
+    decode: Callable[[FloatArray], FloatArray],
+    latents: FloatArray,
+    results: Sequence[ResolveResult],
 ) -> float:
     """Measure how much a resolved motion flickers.
 
     Parameters
     ----------
-    embedding : decodes
+    decode : from (B, D) latent poses to (B, V, 3) vertices, normalised
     latents : (B, D) array, the frames as they were
     results : of them, in order
 
@@ -30,7 +31,7 @@ def largest_correction_change(
         one frame
     """
     displacements = (
-        np.subtract(*embedding.decode(np.stack([result.latent, latent])))
+        np.subtract(*decode(np.stack([result.latent, latent])))
         for latent, result in zip(latents, results, strict=True)
     )
     changes = (

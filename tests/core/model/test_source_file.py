@@ -11,18 +11,21 @@ from lcollision_core.characters import CharacterForm, read_character
 from lcollision_core.errors import MeshFileError, PoseSetError
 from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
 from lcollision_core.meshes.formats.point_cache import read_point_cache
+from lcollision_core.meshes.scene_files import read_scene
 from lcollision_core.model import (
     EXPORT_FORMS,
     RigModel,
     SourceFile,
     export_frame,
     offered_forms,
+    open_body,
     source_for,
     write_pose,
     write_sequence,
 )
-from tests.core.character_file import described, figure
+from tests.core.character_file import array, described, figure
 from tests.core.shapes import random_rotation
+from tests.core.vtk_gltf import vtk_corners
 
 
 @pytest.fixture
@@ -222,3 +225,43 @@ def test_a_model_s_own_order_needs_no_source(
     with pytest.raises(MeshFileError, match=r"\.pc2 rounds coordinates"):
         write_sequence(tmp_path / "far.pc2", model, [latent], [model.reference + 1e6])
     assert not (tmp_path / "far.pc2").exists()
+
+
+@pytest.mark.parametrize("name", ["mannequin-moves.glb", "xbot-moves.glb"])
+def test_characters_of_artists_come_back_as_vtk_reads_them(
+    characters: Path, tmp_path: Path, name: str
+) -> None:
+    own, path = characters / name, tmp_path / "posed.glb"
+    model = open_body(own)
+    assert isinstance(model, RigModel)
+    latent = np.random.default_rng(0).uniform(model.space.low, model.space.high)
+    parts = read_scene(own).parts
+    ends = np.cumsum([0] + [len(part.points) for part in parts])
+    corners = np.concatenate(
+        [end + part.faces.reshape(-1) for end, part in zip(ends, parts, strict=False)]
+    )
+    for form in CharacterForm:
+        for codes in (np.zeros_like(latent), latent):
+            vertices = model.exported_vertices(codes)
+            source = source_for(".glb", model)
+            write_pose(path, model, codes, vertices, source=source, form=form)
+            seen = vtk_corners(path)
+            expected = vertices[model.character.joined][corners]
+            assert np.abs(seen - expected).max() < 1e-6 * model.body_size
+            assert _texture_coordinates(path) == _texture_coordinates(own)
+    latents = [np.zeros_like(latent), latent]
+    poses = [model.exported_vertices(codes) for codes in latents]
+    write_sequence(path, model, latents, poses, source=source_for(".glb", model), fps=10.0)
+    for frame, vertices in enumerate(poses):
+        seen = vtk_corners(path, 0, 0.1 * frame)
+        expected = vertices[model.character.joined][corners]
+        assert np.abs(seen - expected).max() < 1e-5 * model.body_size
+
+
+def _texture_coordinates(path: Path) -> list[bytes]:
+    description, _ = described(path)
+    return [
+        array(path, primitive["attributes"]["TEXCOORD_0"])
+        for mesh in description["meshes"]
+        for primitive in mesh["primitives"]
+    ]

@@ -421,7 +421,7 @@ def test_a_sequence_does_not_depend_on_threads_nor_jump(
     assert {Step.UNCHANGED, Step.NEIGHBOUR} <= {result.step for result in one}
     decoded = tube_model.embedding.decode(frames)
     motion = np.linalg.norm(np.diff(decoded, axis=0), axis=2).mean(axis=1).max()
-    assert 0.0 < largest_correction_change(tube_model.embedding, frames, one) < 2.0 * motion
+    assert 0.0 < largest_correction_change(tube_model.embedding.decode, frames, one) < 2.0 * motion
 
 
 def test_the_change_of_corrections_is_measured_in_heights(
@@ -439,9 +439,9 @@ def test_the_change_of_corrections_is_measured_in_heights(
         for before, after in pairwise(moved)
     ]
     assert max(changes) > 0.0
-    measured = largest_correction_change(tube_model.embedding, frames, results)
+    measured = largest_correction_change(tube_model.embedding.decode, frames, results)
     assert measured == pytest.approx(max(changes), rel=1e-9)
-    assert largest_correction_change(tube_model.embedding, frames[:1], results[:1]) == 0.0
+    assert largest_correction_change(tube_model.embedding.decode, frames[:1], results[:1]) == 0.0
 
 
 class _Cancelling:
