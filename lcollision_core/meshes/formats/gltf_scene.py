@@ -278,6 +278,10 @@ def _influences(
             where=f"vertex {wrong[0]} of {where}",
             expected=f"0 to {n_bones - 1}",
         )
+    # Sorted, so that equal shares in another order have the same sum to the bit.
+    order = np.argsort(np.where(shares > 0.0, bone_of, n_bones), axis=1, kind="stable")
+    bone_of = np.take_along_axis(bone_of, order, axis=1)
+    shares = np.take_along_axis(shares, order, axis=1)
     total = shares.sum(axis=1)
     # What nothing moves follows the first joint.
     shares[total == 0.0, 0] = 1.0

@@ -457,3 +457,26 @@ def test_faces_whose_corners_lie_in_a_line_are_left_out(tmp_path: Path) -> None:
     joined = _joined(builder.write(tmp_path / "m.glb"))
     assert joined.topology.n_faces == len(faces) + 1
     assert joined.notes == ("1 face without area was left out",)
+
+
+def test_equal_weights_in_another_order_are_equal(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    vertices, faces = split_corners(*tube())
+    generator = np.random.default_rng(4)
+    joints, weights = [], []
+    share = np.array([23, 51, 77, 94])
+    for _ in vertices:
+        order = generator.permutation(4)
+        joints.append(order)
+        weights.append(share[order])
+    attributes = {
+        "POSITION": builder.array(vertices),
+        "JOINTS_0": builder.array(joints, "u1"),
+        "WEIGHTS_0": builder.array(weights, "u1", normalized=True),
+    }
+    indices = builder.array(faces.reshape(-1), "u4")
+    mesh = builder.add("meshes", primitives=[{"attributes": attributes, "indices": indices}])
+    builder.add("nodes", mesh=mesh, skin=0)
+    bones = [builder.add("nodes", translation=[0.1 * n, 0.0, 0.0]) for n in range(4)]
+    builder.add("skins", joints=bones)
+    assert _joined(builder.write(tmp_path / "m.glb")).topology.n_vertices == len(tube()[0])
