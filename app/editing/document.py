@@ -76,6 +76,7 @@ class PoseDocument(LiveEditing):
     of_other_model : OtherModelError, where a file of poses needs another model that is known
     recovered : Path, the poses file that `recover` has put in
     contacts_counted : ContactsAtRest
+    pairs_proposed : tuple of ProposedPair
     """
 
     model_changed = Signal()
@@ -89,6 +90,7 @@ class PoseDocument(LiveEditing):
     wrong_scale = Signal(object, object)
     recovered = Signal(object)
     contacts_counted = Signal(object)
+    pairs_proposed = Signal(object)
 
     def __init__(
         self,
@@ -103,7 +105,7 @@ class PoseDocument(LiveEditing):
         self._solve: int | None = None
         self._solve_began = 0.0
         self._mirroring = self._mirroring_poses = self._incoming = self._loading = 0
-        self._counting = self._ruling = 0
+        self._counting = self._proposing = self._ruling = 0
         self._prepared = False
         self._exports: list[int] = []
         self._closed = False
@@ -224,7 +226,7 @@ class PoseDocument(LiveEditing):
         # What is being exported is a snapshot, and goes on.
         for number in (
             *(self._mirroring, self._mirroring_poses, self._incoming),
-            *(self._loading, self._counting, self._ruling),
+            *(self._loading, self._counting, self._proposing, self._ruling),
         ):
             self._long.cancel(number)
         self.frame = self.exact = self.file = None
@@ -299,6 +301,17 @@ class PoseDocument(LiveEditing):
         work = partial(jobs.contacts_at_rest, self.model)
         self._counting = self._long.start(
             "Counting pairs at rest", work, self.contacts_counted.emit
+        )
+
+    def propose_pairs(self) -> None:
+        """Find groups that touch in nearly every pose that the body came with, in the long worker.
+
+        `pairs_proposed` tells.
+        """
+        self._long.cancel(self._proposing)
+        work = partial(jobs.propose_pairs, self.model)
+        self._proposing = self._long.start(
+            "Looking for pairs in contact", work, self.pairs_proposed.emit
         )
 
     @property

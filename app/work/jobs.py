@@ -19,7 +19,7 @@ from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
-    from lcollision_core.contact import ContactRules, RuleCounts
+    from lcollision_core.contact import ContactRules, ProposedPair, RuleCounts
     from lcollision_core.meshes import FileStamp, RigidTransform
     from lcollision_core.model import (
         MirroredPose,
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
         PoseFile,
     )
     from lcollision_core.resolve import ResolveOptions, ResolveResult
+
+_MOST_PROPOSING = 40
+"""Poses, evenly spaced, that tell which groups are always in contact."""
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
@@ -327,6 +330,18 @@ def contacts_at_rest(model: PosableBody, _: Progress, __: CancelToken) -> Contac
     """Count the colliding pairs of the rest pose by the rules that leave them out."""
     found = model.detector.detect(model.reference)
     return ContactsAtRest(len(found.pairs), found.excluded)
+
+
+def propose_pairs(
+    model: PosableBody, progress: Progress, cancel: CancelToken
+) -> tuple[ProposedPair, ...]:
+    """Propose groups to ignore, by some of the poses that the body came with."""
+    from lcollision_core.contact import propose_ignored
+
+    count = len(model.training_latent)
+    chosen = np.unique(np.linspace(0, count - 1, _MOST_PROPOSING).round().astype(int))
+    poses = model.decode(model.training_latent[chosen])
+    return propose_ignored(model.detector, poses, model.groups, progress=progress, cancel=cancel)
 
 
 def change_rules(

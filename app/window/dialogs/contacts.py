@@ -28,7 +28,7 @@ from app.wording import counted
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.work.jobs import ContactsAtRest
-    from lcollision_core.contact import ContactRules
+    from lcollision_core.contact import ContactRules, ProposedPair
 
 _WIDTH, _BORDER = 420, WIDE + 4
 _COUNTING = "Counting pairs at rest…"
@@ -41,6 +41,7 @@ _DEFAULT_REST = 2.0
 
 _LIST_HEIGHT = 84
 _PAIR = Qt.ItemDataRole.UserRole
+_CHECKED, _UNCHECKED = Qt.CheckState.Checked, Qt.CheckState.Unchecked
 
 
 class ContactsDialog(QDialog):
@@ -55,8 +56,8 @@ class ContactsDialog(QDialog):
     ----------
     near, rest, tolerated : fields, in per cent of the body size
     at_rest : whether there is a rest exclusion
-    ignored : the pairs of groups that are ignored
-    first, second, add, remove : what changes these
+    ignored : pairs of groups, ticked where they are ignored
+    first, second, add, propose : what adds to these
     apply : the button
     total : says how many pairs count at rest
     locked : says why nothing can be changed, where that is so
@@ -87,6 +88,7 @@ class ContactsDialog(QDialog):
         document.model_changed.connect(self._on_model)
         document.busy_changed.connect(self._on_edited)
         document.contacts_counted.connect(self._on_counted)
+        document.pairs_proposed.connect(self._on_proposed)
         self._on_model()
 
     def _lay_out(self) -> None:
@@ -138,20 +140,20 @@ class ContactsDialog(QDialog):
             box.setAccessibleName(name)
             box.setMinimumContentsLength(8)
             box.setToolTip("Meshes, materials and body parts of the file")
-        self.add, self.remove = QPushButton("Ignore"), QPushButton("Remove")
+        self.add, self.propose = QPushButton("Ignore"), QPushButton("Propose")
         self.add.setToolTip("Don't count any contact between these two")
-        self.remove.setToolTip("Count contacts between the selected two again")
-        for button in (self.add, self.remove):
+        self.propose.setToolTip("List the groups that touch in nearly every pose, to be ticked")
+        for button in (self.add, self.propose):
             button.setAutoDefault(False)
         self.add.clicked.connect(self._add_pair)
-        self.remove.clicked.connect(self._remove_pair)
-        self.ignored.currentRowChanged.connect(self._on_edited)
+        self.propose.clicked.connect(self._document.propose_pairs)
+        self.ignored.itemChanged.connect(self._on_edited)
         held = QWidget()
         title = hbox(labelled("Ignored pairs", "title"), None, self.counts["ignored"])
         choice = hbox(self.first, labelled("and", "caption"), self.second, self.add)
         for box in (self.first, self.second):
             choice.setStretchFactor(box, 1)
-        listed = hbox(self.ignored, vbox(self.remove, None))
+        listed = hbox(self.ignored, vbox(self.propose, None))
         held.setLayout(vbox(title, listed, choice, spacing=CLOSE))
         return held
 
@@ -171,7 +173,7 @@ class ContactsDialog(QDialog):
         return ContactRules(
             _length(self.near, held.near_exclusion),
             _length(self.rest, held.rest_exclusion) if self.at_rest.isChecked() else None,
-            tuple(self.ignored.item(row).data(_PAIR) for row in range(self.ignored.count())),
+            tuple(item.data(_PAIR) for item in self._items if item.checkState() is _CHECKED),
             _length(self.tolerated, held.tolerated_depth),
         )
 
@@ -186,7 +188,7 @@ class ContactsDialog(QDialog):
         self.tolerated.setValue(_PERCENT * rules.tolerated_depth)
         self.ignored.clear()
         for pair in rules.ignored:
-            self._list(pair)
+            self._list(pair, _CHECKED)
         names = list(dict.fromkeys(group.name for group in model.groups))
         for box in (self.first, self.second):
             box.clear()
@@ -223,9 +225,8 @@ class ContactsDialog(QDialog):
             widget.setEnabled(can_change)
         self.rest.setEnabled(can_change and self.at_rest.isChecked())
         several = can_change and self.first.count() > 1
-        for choice in (self.first, self.second, self.add):
+        for choice in (self.first, self.second, self.add, self.propose):
             choice.setEnabled(several)
-        self.remove.setEnabled(can_change and self.ignored.currentRow() >= 0)
         self.apply.setEnabled(
             can_change
             and not self._document.changing_rules
@@ -240,19 +241,33 @@ class ContactsDialog(QDialog):
     @Slot()
     def _add_pair(self) -> None:
         pair = self.first.currentText(), self.second.currentText()
-        if set(pair) not in [set(known) for known in self.rules().ignored]:
-            self._list(pair)
-        self._on_edited()
+        self._list(pair).setCheckState(_CHECKED)
 
-    @Slot()
-    def _remove_pair(self) -> None:
-        self.ignored.takeItem(self.ignored.currentRow())
-        self._on_edited()
+    @Slot(object)
+    def _on_proposed(self, proposals: tuple[ProposedPair, ...]) -> None:
+        """List pairs of groups that touch in nearly every pose, for the user to tick."""
+        for proposal in proposals:
+            share = f"in contact in {100 * proposal.share:.0f} % of the poses"
+            self._list(proposal.groups).setText(f"{' and '.join(proposal.groups)}: {share}")
+        if not proposals:
+            self.total.setText("No two groups touch in nearly every pose.")
 
-    def _list(self, pair: tuple[str, str]) -> None:
+    def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QListWidgetItem:
+        """Return the item of a pair, which is listed now if it was not."""
+        for item in self._items:
+            if set(item.data(_PAIR)) == set(pair):
+                return item
         item = QListWidgetItem(" and ".join(pair))
         item.setData(_PAIR, pair)
+        item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
+        item.setCheckState(state)
+        item.setToolTip("Ticked: contacts between these two are not counted")
         self.ignored.addItem(item)
+        return item
+
+    @property
+    def _items(self) -> list[QListWidgetItem]:
+        return [self.ignored.item(row) for row in range(self.ignored.count())]
 
 
 def _length(field: NumberBox, held: float | None) -> float:

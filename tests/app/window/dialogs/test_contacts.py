@@ -15,6 +15,7 @@ from app.view.shading import Shading
 from app.window.dialogs.contacts import ContactsDialog
 from app.window.main_window import MainWindow
 from app.work.jobs import contacts_at_rest
+from lcollision_core.contact import propose_ignored
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes import ContactRules
 from lcollision_core.model import PoseModel, RigModel
@@ -96,8 +97,8 @@ def test_pairs_of_groups_are_ignored_and_counted_again(
     QTest.mouseClick(dialog.apply, LEFT)
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
     assert document.model.rules.ignored == ((names[0], names[1]),)
-    dialog.ignored.setCurrentRow(0)
-    QTest.mouseClick(dialog.remove, LEFT)
+    (item,) = dialog.ignored.findItems(names[0], Qt.MatchFlag.MatchContains)
+    item.setCheckState(Qt.CheckState.Unchecked)
     QTest.mouseClick(dialog.apply, LEFT)
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
     assert document.model.rules == ContactRules()
@@ -128,4 +129,24 @@ def test_rules_of_a_model_without_predictor_are_kept_in_its_file(
     kept = PoseModel.load(path).rules
     assert kept == document.model.rules
     assert (kept.tolerated_depth, kept.near_exclusion) == (0.015, editor_model.near_exclusion)
+    dialog.close()
+
+
+def test_groups_that_always_touch_are_proposed_with_their_share(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    document, dialog = window.document, dialog_of(qtbot, window)
+    with qtbot.waitSignal(document.pairs_proposed, timeout=PATIENCE) as proposed:
+        QTest.mouseClick(dialog.propose, LEFT)
+    expected = propose_ignored(body.detector, body.decode(body.training_latent), body.groups)
+    assert proposed.args[0] == expected
+    assert [dialog.ignored.item(row).text() for row in range(dialog.ignored.count())] == [
+        f"{pair.groups[0]} and {pair.groups[1]}: in contact in {100 * pair.share:.0f} % of the "
+        "poses"
+        for pair in expected
+    ]
+    assert dialog.rules() == body.rules
+    dialog.ignored.item(0).setCheckState(Qt.CheckState.Checked)
+    assert dialog.rules().ignored == (expected[0].groups,)
+    assert dialog.apply.isEnabled()
     dialog.close()
