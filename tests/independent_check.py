@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,7 @@ def excluding_rules(
         for corner in corners:
             faces_of.setdefault(corner, set()).add(face)
 
+    @cache
     def around(face: int, radius: float) -> set[int]:
         """Faces with a corner at most so far from one of this face, along edges, by Dijkstra."""
         reached: set[int] = set()

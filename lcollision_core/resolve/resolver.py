@@ -53,6 +53,7 @@ class PoseResolver:
         cancel: CancelToken | None = None,
         placement: RigidTransform | None = None,
         near: npt.ArrayLike | None = None,
+        before: npt.ArrayLike | None = None,
     ) -> ResolveResult:
         """Find the nearest collision-free pose.
 
@@ -64,6 +65,8 @@ class PoseResolver:
         cancel : polled at every evaluation
         placement : where the pose is exported to; the exact check is of the vertices there
         near : (D,) array, a correction Z - Z* to try first, as of the neighbouring frame
+        before : (D,) array, a collision-free pose that is known besides, as of the neighbouring
+            frame; without a predictor the way to Z* may begin there
 
         Returns
         -------
@@ -89,11 +92,14 @@ class PoseResolver:
             f"{outside} of {len(target)} sliders {'is' if outside == 1 else 'are'} outside the "
             f"trained range"
         )
+        known = self._free_latents
+        if before is not None and self._predictor is None:
+            known = np.concatenate([self._checked(before)[None], known])
         ladder = Ladder(
             self._problem(target, chosen, cancel),
             replace(self._check, placement=placement),
             chosen,
-            self._free_latents,
+            known,
             None if near is None else self._checked(near),
             progress,
             remark if outside else None,
@@ -148,12 +154,14 @@ class PoseResolver:
         guard = Lock()
 
         def solve(run: range) -> None:
-            near = None
+            near = before = None
             for index in run:
                 result = known.get(index) or self.resolve(
-                    rows[index], options, no_progress, cancel, placed[index], near
+                    rows[index], options, no_progress, cancel, placed[index], near, before
                 )
-                near = result.latent - rows[index] if sequence else None
+                if sequence:
+                    near = result.latent - rows[index]
+                    before = result.latent if result.exactly_free else None
                 with guard:
                     results[index] = result
                     if keep is not None and index not in known:
