@@ -18,7 +18,7 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PosableBody, PoseModel
 
 _ERRORS = ("level1_mean", "mean", "max", "held_out_mean", "held_out_max", "pca_held_out_mean")
 _MASKS = ("connected_share", "domains_per_vertex")
@@ -74,12 +74,12 @@ def info(
         typer.Option(metavar="MASKS.png", help="Draw the domains, darker where they own more."),
     ] = None,
 ) -> None:
-    """Say what a model holds and how exact it is; lengths are normalised."""
-    from lcollision_core.model import PoseModel
+    """Say what a model or a character holds, and how exact it is; lengths are normalised."""
+    from lcollision_core.model import open_body
 
     if figure is not None:
         require_output(figure, ".png")
-    model = PoseModel.load(model_name)
+    model = open_body(model_name)
     report = describe(model)
     if figure is not None:
         from app.view.masks_figure import draw_masks
@@ -90,9 +90,12 @@ def info(
         print_json(report)
         return
     tell(f"{report['name']}: {_size_sentence(report)}")
-    tell(f"  trained on {report['source']}, licence {report['licence']}")
-    tell(f"  {error_sentence(report)}")
-    tell(f"  {_predictor_sentence(report)}")
+    if model.is_trained:
+        tell(f"  trained on {report['source']}, licence {report['licence']}")
+        tell(f"  {error_sentence(report)}")
+        tell(f"  {_predictor_sentence(report)}")
+    else:
+        tell(f"  posed by the joints of {report['source']}, without training")
     if not model.rules.exclude_nothing:
         tell(f"  {rules_sentence(model.rules, report['excluded_at_rest'])}")
     _print_domains(report)
@@ -146,21 +149,24 @@ def _changed(name: str, change: Callable[[PoseModel], PoseModel] | None) -> Pose
     return change_model(path, change)
 
 
-def describe(model: PoseModel) -> dict[str, Any]:
+def describe(model: PosableBody) -> dict[str, Any]:
     """Return the fields of ``lcollision info --json``; lengths are normalised.
 
-    A domain's vertices are those where its weight is the largest.
+    A domain's vertices are those where its weight is the largest. What only trained models have is
+    None for a character.
     """
     import numpy as np
 
+    from lcollision_core.model import PoseModel
     from lcollision_core.model_file import FORMAT_VERSION
 
-    metrics = model.metrics
+    trained = model if isinstance(model, PoseModel) else None
+    metrics = trained and trained.metrics
     groups = model.latent_space.groups[1:]
     owned = np.bincount(model.attention_mask.argmax(axis=0), minlength=len(groups))
     return {
         "name": model.name,
-        "version": FORMAT_VERSION,
+        "version": trained and FORMAT_VERSION,
         "fingerprint": model.fingerprint,
         "vertices": model.n_vertices,
         "faces": len(model.faces),
@@ -178,7 +184,7 @@ def describe(model: PoseModel) -> dict[str, Any]:
         "reconstruction": metrics and {name: getattr(metrics, name) for name in _ERRORS},
         "acap": metrics and {"mean": metrics.acap_mean, "max": metrics.acap_max},
         "masks": metrics and {name: getattr(metrics, name) for name in _MASKS},
-        "predictor": _describe_predictor(model),
+        "predictor": trained and _describe_predictor(trained),
         "near_exclusion": model.near_exclusion,
         **rules_json(model),
         "up_axis": "xyz"[model.up_axis],

@@ -34,6 +34,7 @@ from lcollision_core.model_file import Section
 from tests.app.support import Lcollision
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube
 from tests.core.shapes import random_rotation
+from tests.rigged_shapes import rigged_body, write_gltf
 
 TRAINING = ("--domains", "2", "--domain-codes", "3", "--seed", "1", "--licence", "CC0-1.0")
 
@@ -120,6 +121,22 @@ def test_info_in_words_names_domains_and_errors(lcollision: Lcollision, tube: Pa
     assert "vertex error 0." in result.stdout
     assert "poses left out" in result.stdout
     assert " 2  part 2  (" in result.stdout
+
+
+def test_info_of_a_character_names_its_parts_and_nothing_trained(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    file = write_gltf(rigged_body(), tmp_path / "hero.glb")
+    report = json.loads(lcollision("info", file, "--json").stdout)
+    assert {"Torso", "Left forearm"} <= {domain["name"] for domain in report["domains"]}
+    codes = sum(domain["codes"] for domain in report["domains"])
+    assert report["latent_size"] == codes + 6
+    trained = ("version", "reconstruction", "acap", "masks", "predictor")
+    assert [report[field] for field in trained] == [None] * len(trained)
+    assert report["rules"]["rest_exclusion"] == 0.02
+    words = lcollision("info", file).stdout
+    assert "posed by the joints of hero.glb" in words
+    assert "predictor" not in words
 
 
 def test_figure_shows_each_domain_in_its_colour(
