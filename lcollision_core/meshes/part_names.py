@@ -17,6 +17,7 @@ _SIDES = {
 _PREFIXES = frozenset(
     ("mixamorig", "bip", "bip01", "bip001", "biped", "valvebiped", "bind", "cc", "base", "def")
     + ("org", "mch", "jnt", "joint", "jt", "skel", "rig", "c", "b", "j", "sec", "adj", "end")
+    + ("bone", "node")
 )
 """Words that say nothing of the part."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.meshes.part_names import part_labels, part_names
+from lcollision_core.meshes.part_names import joint_labels, part_labels, part_names
 
 
 @pytest.mark.parametrize(
@@ -81,3 +81,9 @@ def test_labels_are_printable_whatever_the_names() -> None:
     joints = np.arange(4, dtype=np.int32)[:, None]
     labels = part_labels(names, np.full(4, -1), joints, np.ones((4, 1)))
     assert labels.tolist() == ["Part", "Part", "Part", "日本"]
+
+
+def test_bones_that_have_numbers_alone_keep_them() -> None:
+    names = ["Bone", "Bone.001", "Bone.002", "tail_bone_01", "tail_bone_02"]
+    labels = joint_labels(names, np.array([-1, 0, 1, 2, 3]))
+    assert labels == ("Bone", "Bone.001", "Bone.002", "Tail", "Tail")
