@@ -260,9 +260,9 @@ class PoseDocument(LiveEditing):
             changed.emit()
         self._tell_modified()
 
-    def open_model(self, name_or_path: str | Path) -> None:
-        """Read a model, or the file of a rigged character, in the long worker and load it."""
-        work = partial(jobs.open_model, name_or_path)
+    def open_model(self, name_or_path: str | Path, up: int | None = None) -> None:
+        """Read a model, or a rigged character with an up axis, in the long worker and load it."""
+        work = partial(jobs.open_model, name_or_path, up=up)
         self._bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
 
     def look_into(

@@ -153,7 +153,7 @@ class FileActions(QObject):
         self.settings["last_folder"] = str(path.resolve().parent)
 
     def turn_upright(self) -> None:
-        """Turn the model by the next axis, in its file, and open it again.
+        """Turn the body by the next axis and open it again; a model is changed in its file.
 
         Raises
         ------
@@ -172,8 +172,11 @@ class FileActions(QObject):
         if not self.may_lose_changes():
             return
         axis = (document.model.up_axis + 1) % 3
-        change_model(file, lambda model: model.turned_upright(axis))
-        document.open_model(file)
+        if document.model.is_trained:
+            change_model(file, lambda model: model.turned_upright(axis))
+            document.open_model(file)
+        else:
+            document.open_model(file, axis)
 
     def open_path(self, path: Path) -> None:
         """Open a file as what its extension says: poses, a model, a character, or a mesh.

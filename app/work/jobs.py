@@ -113,12 +113,14 @@ class ExportStyle:
     fps: float = 30.0
 
 
-def open_model(name_or_path: str | Path, _: Progress, cancel: CancelToken) -> OpenedModel:
+def open_model(
+    name_or_path: str | Path, _: Progress, cancel: CancelToken, up: int | None = None
+) -> OpenedModel:
     """Read a model and use it once, so that nothing is left to compile before the first frame."""
     from lcollision_core.model import find_model, open_body
 
     path = find_model(name_or_path).absolute()
-    model = open_body(path)
+    model = open_body(path, up)
     cancel.raise_if_cancelled()
     warm_up(model)
     return OpenedModel(model, str(path))

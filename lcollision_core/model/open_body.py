@@ -11,13 +11,14 @@ from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.model.rig_model import RigModel
 
 
-def open_body(name_or_path: str | os.PathLike[str]) -> PosableBody:
+def open_body(name_or_path: str | os.PathLike[str], up: int | None = None) -> PosableBody:
     """Read a body that can take poses.
 
     Parameters
     ----------
     name_or_path : a model's file, the name of a bundled or user model, or the file of a rigged
         character
+    up : the up axis, 0, 1 or 2, of a character whose file is wrong about it
 
     Raises
     ------
@@ -26,5 +27,5 @@ def open_body(name_or_path: str | os.PathLike[str]) -> PosableBody:
     LCollisionError : the character has no rig.
     """
     if Path(name_or_path).suffix.lower() in CHARACTER_SUFFIXES:
-        return RigModel.of(read_character(name_or_path))
+        return RigModel.of(read_character(name_or_path, up))
     return PoseModel.load(name_or_path)

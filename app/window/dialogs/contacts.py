@@ -149,12 +149,11 @@ class ContactsDialog(QDialog):
         self.propose.clicked.connect(self._document.propose_pairs)
         self.ignored.itemChanged.connect(self._on_edited)
         held = QWidget()
-        title = hbox(labelled("Ignored pairs", "title"), None, self.counts["ignored"])
+        title = hbox(labelled("Ignored pairs", "title"), None, self.counts["ignored"], self.propose)
         choice = hbox(self.first, labelled("and", "caption"), self.second, self.add)
         for box in (self.first, self.second):
             choice.setStretchFactor(box, 1)
-        listed = hbox(self.ignored, vbox(self.propose, None))
-        held.setLayout(vbox(title, listed, choice, spacing=CLOSE))
+        held.setLayout(vbox(title, self.ignored, choice, spacing=CLOSE))
         return held
 
     def _field(self, name: str) -> NumberBox:
@@ -247,7 +246,7 @@ class ContactsDialog(QDialog):
     def _on_proposed(self, proposals: tuple[ProposedPair, ...]) -> None:
         """List pairs of groups that touch in nearly every pose, for the user to tick."""
         for proposal in proposals:
-            share = f"in contact in {100 * proposal.share:.0f} % of the poses"
+            share = f"{100 * proposal.share:.0f} % of the poses"
             self._list(proposal.groups).setText(f"{' and '.join(proposal.groups)}: {share}")
         if not proposals:
             self.total.setText("No two groups touch in nearly every pose.")

@@ -66,6 +66,16 @@ def test_a_dropped_character_is_posed_by_its_joints_in_degrees(
     assert str(arm_file) in window.settings["recent_files"]
 
 
+def test_a_character_is_turned_upright_without_changing_its_file(
+    qtbot: QtBot, window: MainWindow, arm_file: Path
+) -> None:
+    before, content = dropped(qtbot, window, arm_file).up_axis, arm_file.read_bytes()
+    with qtbot.waitSignal(window.document.opened, timeout=PATIENCE):
+        window.actions_by_key["upright"].trigger()
+    assert window.document.model.up_axis == (before + 1) % 3
+    assert arm_file.read_bytes() == content
+
+
 def test_a_character_without_predictor_lacks_nothing(
     qtbot: QtBot, window: MainWindow, arm_file: Path
 ) -> None:

@@ -141,8 +141,7 @@ def test_groups_that_always_touch_are_proposed_with_their_share(
     expected = propose_ignored(body.detector, body.decode(body.training_latent), body.groups)
     assert proposed.args[0] == expected
     assert [dialog.ignored.item(row).text() for row in range(dialog.ignored.count())] == [
-        f"{pair.groups[0]} and {pair.groups[1]}: in contact in {100 * pair.share:.0f} % of the "
-        "poses"
+        f"{pair.groups[0]} and {pair.groups[1]}: {100 * pair.share:.0f} % of the poses"
         for pair in expected
     ]
     assert dialog.rules() == body.rules
