@@ -359,12 +359,10 @@ class _Source:
         mesh = self.patch.description["meshes"][node["mesh"]]
         n_targets = max(len(primitive.get("targets", ())) for primitive in mesh["primitives"])
         for primitive in mesh["primitives"]:
-            # Lines and points: all primitives have the same targets.
-            count = self.patch.description["accessors"][primitive["attributes"]["POSITION"]][
-                "count"
-            ]
-            while len(primitive.setdefault("targets", [])) < n_targets:
-                zeros = np.zeros((count, 3), dtype=np.float32)
+            position = primitive["attributes"].get("POSITION")
+            # Lines and points: all primitives that show something have the same targets.
+            while position is not None and len(primitive.setdefault("targets", [])) < n_targets:
+                zeros = np.zeros((self.patch.description["accessors"][position]["count"], 3))
                 primitive["targets"].append({"POSITION": self._vectors(zeros, has_bounds=True)})
         for owner in (mesh, node):
             if owner is mesh or "weights" in owner:
@@ -386,7 +384,7 @@ class _Source:
                 shaping.add(int(parents[node]))
 
         def shows_pose(animation: dict[str, Any]) -> bool:
-            targets = [channel["target"] for channel in animation["channels"]]
+            targets = [channel["target"] for channel in animation.get("channels", ())]
             # What has no node is a pointer to anything, by an extension.
             return all("node" in target and target["node"] not in shaping for target in targets)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.json_values import parse_json
+from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes.formats.gltf_document import chunks, resource, whole
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 
@@ -46,6 +46,7 @@ class GltfPatch:
     def __init__(self, data: bytes, path: Path) -> None:
         text, blob = chunks(data.removeprefix(b"\xef\xbb\xbf"))
         self.description: dict[str, Any] = parse_json(text)
+        _require_structure(self.description)
         self._binary = bytearray()
         starts = []
         for number, buffer in enumerate(self.description.get("buffers", [])):
@@ -70,7 +71,7 @@ class GltfPatch:
 
     def _embed(self, image: dict[str, Any], path: Path) -> None:
         uri = image.get("uri")
-        if uri is None or uri.startswith("data:"):
+        if not isinstance(uri, str) or uri.startswith("data:"):
             return
         try:
             content = resource(uri, path, MAX_FILE_BYTES - len(self._binary))
@@ -144,3 +145,52 @@ class GltfPatch:
                 bytes(self._binary),
             )
         )
+
+
+_STRUCTURE: dict[str, dict[str, Any]] = {
+    "buffers": {},
+    "bufferViews": {},
+    "accessors": {},
+    "images": {},
+    "skins": {},
+    "scenes": {"nodes": int},
+    "nodes": {"children": int, "weights": float},
+    "meshes": {"weights": float, "primitives": {"targets": {}}},
+    "animations": {"channels": {}},
+}
+"""Lists that are changed, with what their objects' own lists hold: objects, or numbers."""
+
+
+def _require_structure(description: dict[str, Any]) -> None:
+    """Refuse lists that hold anything else: what reads the file passes over some that are changed.
+
+    Raises
+    ------
+    MeshFileError : one does.
+    """
+    _require_lists(description, _STRUCTURE, "the file")
+    whole(
+        description.get("scene", 0), "the scene", 0, max(len(description.get("scenes", ())) - 1, 0)
+    )
+    for number, mesh in enumerate(description.get("meshes", ())):
+        for primitive in mesh.get("primitives", ()):
+            if not isinstance(primitive.get("attributes"), dict):
+                raise MeshFileError.must_be(f"the attributes of mesh {number}", "an object", "none")
+    for number, animation in enumerate(description.get("animations", ())):
+        for channel in animation.get("channels", ()):
+            if not isinstance(channel.get("target"), dict):
+                raise MeshFileError.must_be(f"a target of animation {number}", "an object", "none")
+
+
+def _require_lists(held: dict[str, Any], lists: dict[str, Any], where: str) -> None:
+    for name, kind in lists.items():
+        if name not in held:
+            continue
+        what, items = f"{name} of {where}", held[name]
+        is_objects = isinstance(kind, dict)
+        types = (dict,) if is_objects else (int, float) if kind is float else (int,)
+        if not isinstance(items, list) or not all(type(item) in types for item in items):
+            expected = "a list of objects" if is_objects else "a list of numbers"
+            raise MeshFileError.must_be(what, expected, quoted(items))
+        for number, item in enumerate(items if is_objects else ()):
+            _require_lists(item, kind, f"{name} {number}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -335,3 +336,28 @@ def test_a_source_that_changed_is_refused(character: Character, tmp_path: Path) 
     other.write(Path(character.source))
     with pytest.raises(MeshFileError, match="is not the file that the character was read from"):
         write_character(tmp_path / "posed.glb", character, vertices, "mesh")
+
+
+@pytest.mark.parametrize(
+    ("places", "value", "sentence"),
+    [
+        (("nodes", 7, "children"), "", "children of nodes 7 must be a list of numbers, got ''"),
+        (("animations", 2, "channels", 0, "target"), None, "a target of animation 2 must be an"),
+        (("bufferViews", 0, "buffer"), 7, "the buffer of buffer view 0 must be a whole number"),
+    ],
+)
+def test_damage_that_reading_passes_over_is_one_sentence(
+    tmp_path: Path, places: tuple[str | int, ...], value: object, sentence: str
+) -> None:
+    builder = figure()
+    character = read_character(builder.write(tmp_path / "figure.glb"))
+    held: Any = builder.description
+    for place in places[:-1]:
+        held = held[place]
+    held[places[-1]] = value
+    builder.write(tmp_path / "figure.glb")
+    for form in (CharacterForm.MESH, CharacterForm.MORPH):
+        with pytest.raises(MeshFileError, match=r"figure\.glb cannot be read: ") as caught:
+            write_character(tmp_path / "posed.glb", character, character.rest_vertices, form)
+        assert sentence in str(caught.value)
+    assert not (tmp_path / "posed.glb").exists()
