@@ -41,7 +41,7 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
     with one_sentence(path):
         mesh = join_parts(scene)
         rest = mesh.posed(scene.rest)[0]
-        rig, notes = _rig(scene, mesh)
+        rig, notes = _rig(scene, mesh, rest)
 
     def sample(clip: str, fps: float | None) -> ClipFrames:
         with one_sentence(path):
@@ -103,7 +103,9 @@ def _axis(up: int | str) -> int:
     raise ShapeError.must_be("up", "0, 1, 2, 'x', 'y' or 'z'", repr(up))
 
 
-def _rig(scene: Scene, mesh: JoinedMesh) -> tuple[Rig | None, tuple[str, ...]]:
+def _rig(
+    scene: Scene, mesh: JoinedMesh, rest_vertices: FloatArray
+) -> tuple[Rig | None, tuple[str, ...]]:
     """Return the skeleton of what is skinned, and notes."""
     in_skins = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
     if not in_skins:
@@ -127,6 +129,11 @@ def _rig(scene: Scene, mesh: JoinedMesh) -> tuple[Rig | None, tuple[str, ...]]:
     placed = rest[mesh.bones] @ mesh.bind
     points = mesh.morphed(tuple(weights[0] for weights in scene.rest.weights))
     turns = placed[mesh.bone_of]
+    at_rest = np.einsum("vijk,vk->vij", turns[..., :3, :3], points) + turns[..., :3, 3]
+    notes: tuple[str, ...] = ()
+    if mesh.dual.any():
+        at_rest[mesh.dual > 0.0] = rest_vertices[mesh.dual > 0.0, None]
+        notes = ("its skin is blended by dual quaternions, in poses by its joints linearly",)
     return Rig(
         unique_names([scene.node_names[node] or f"node {node}" for node in order]),
         np.array([_parent_joint(scene, node, joint) for node in order], dtype=np.int64),
@@ -134,8 +141,8 @@ def _rig(scene: Scene, mesh: JoinedMesh) -> tuple[Rig | None, tuple[str, ...]]:
         np.array(order, dtype=np.int64),
         joint_of_bone[mesh.bone_of].astype(np.int32),
         mesh.weights,
-        np.einsum("vijk,vk->vij", turns[..., :3, :3], points) + turns[..., :3, 3],
-    ), ()
+        at_rest,
+    ), notes
 
 
 def _is_regular(transform: FloatArray) -> bool:

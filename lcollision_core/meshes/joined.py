@@ -12,6 +12,7 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH
 from lcollision_core.meshes.degenerate import degenerate_faces
+from lcollision_core.meshes.dual_quaternions import blend_dual_quaternions
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
 from lcollision_core.meshes.formats.scene import MAX_FRAME_NUMBERS, Part, Scene, ScenePoses
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -45,6 +46,7 @@ class JoinedMesh:
     weights : (V, I) float64 array >= 0, each row sums to 1
     points : (V, 3) float64 array, in the coordinates of each vertex's part
     is_skinned : (V,) bool array
+    dual : (V,) float64 array, the share that dual quaternions have of the blend
     morphs : what adds to `points`
     groups : named meshes and materials, at most `MAX_GROUPS`
     notes : sentences on what was changed
@@ -58,6 +60,7 @@ class JoinedMesh:
     weights: FloatArray
     points: FloatArray
     is_skinned: npt.NDArray[np.bool_]
+    dual: FloatArray
     morphs: tuple[_Morphs, ...]
     groups: tuple[FaceGroup, ...]
     notes: tuple[str, ...]
@@ -104,6 +107,7 @@ class JoinedMesh:
             with np.errstate(over="ignore", invalid="ignore"):
                 turns = poses.transforms[pose, self.bones] @ self.bind
                 blended = (blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
+                blended = self._with_dual_quaternions(blended, turns)
                 points = self.morphed(tuple(weights[pose] for weights in poses.weights))
                 result[pose] = np.einsum("vij,vj->vi", blended[:, :, :3], points)
                 result[pose] += blended[:, :, 3]
@@ -111,6 +115,16 @@ class JoinedMesh:
         if not np.isfinite(result).all():
             raise MeshFileError("a pose of its nodes has coordinates that are not finite")
         return result
+
+    def _with_dual_quaternions(self, blended: FloatArray, turns: FloatArray) -> FloatArray:
+        """Replace the share of (V, 3, 4) linear blends that is not linear."""
+        rows = np.flatnonzero(self.dual)
+        if not len(rows):
+            return blended
+        other = blend_dual_quaternions(turns, self.bone_of[rows], self.weights[rows])[:, :3]
+        share = self.dual[rows, None, None]
+        blended[rows] = (1.0 - share) * blended[rows] + share * other
+        return blended
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,9 +186,13 @@ def join_parts(scene: Scene) -> JoinedMesh:
     bones, bind, bone_of, weights = _common_bones(parts)
     points = np.concatenate([part.points for part in parts])
     morph_of = _morph_numbers(parts)
+    dual = np.concatenate(
+        [np.zeros(len(part.points)) if part.dual is None else part.dual for part in parts]
+    )
     # -0.0 becomes 0.0: equal numbers, equal bits.
+    places = np.column_stack([points, dual]) + 0.0
     keys = np.concatenate(
-        [(points + 0.0).view(np.int64), bone_of, weights.view(np.int64), morph_of], axis=1
+        [places.view(np.int64), bone_of, weights.view(np.int64), morph_of], axis=1
     )
     kept, joined = _first_of_equal(keys)
     faces = np.concatenate([joined[part.faces + first_vertex[i]] for i, part in enumerate(parts)])
@@ -196,6 +214,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
         weights[kept],
         points[kept],
         is_skinned[kept],
+        dual[kept],
         tuple(morphs),
         (),
         (),

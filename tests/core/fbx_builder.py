@@ -80,7 +80,14 @@ def _moved(y: float) -> np.ndarray:
     return matrix
 
 
-def arm_fbx(path: Path, *, up: int = 1, metres: float = 0.01, is_long: bool = True) -> Path:
+def arm_fbx(
+    path: Path,
+    *,
+    up: int = 1,
+    metres: float = 0.01,
+    is_long: bool = True,
+    skinning: str = "Linear",
+) -> Path:
     """Write a tube in a scene of two bones, with a blend shape and the clip "wave".
 
     Parameters
@@ -89,6 +96,7 @@ def arm_fbx(path: Path, *, up: int = 1, metres: float = 0.01, is_long: bool = Tr
     up : 0, 1 or 2
     metres : the unit
     is_long : whether the file says that the clip lasts as long as its curves, else that it is empty
+    skinning : Linear, Rigid, DualQuaternion or Blend, of the upper vertices more
     """
     vertices, faces = tube()
     corners = faces.copy()
@@ -101,6 +109,10 @@ def arm_fbx(path: Path, *, up: int = 1, metres: float = 0.01, is_long: bool = Tr
     }
     changed = np.flatnonzero(vertices[:, 1] > 1.2)
     offsets = np.tile([0.0, 0.1, 0.3], (len(changed), 1))
+    shares_of_dual = ""
+    if skinning == "Blend":
+        rows = np.arange(len(vertices))
+        shares_of_dual = f"Indexes: {_numbers(rows)}\n        BlendWeights: {_numbers(upper)}"
     objects = f"""
     Geometry: 100, "Geometry::Tube", "Mesh" {{
         Vertices: {_numbers(vertices.astype(float))}
@@ -145,7 +157,10 @@ def arm_fbx(path: Path, *, up: int = 1, metres: float = 0.01, is_long: bool = Tr
         }}
     }}
     Material: 300, "Material::Skin", "" {{ }}
-    Deformer: 400, "Deformer::", "Skin" {{ }}
+    Deformer: 400, "Deformer::", "Skin" {{
+        SkinningType: "{skinning}"
+        {shares_of_dual}
+    }}
     Deformer: 403, "Deformer::", "BlendShape" {{ }}
     Deformer: 404, "SubDeformer::Longer", "BlendShapeChannel" {{
         DeformPercent: 50
@@ -168,6 +183,7 @@ def arm_fbx(path: Path, *, up: int = 1, metres: float = 0.01, is_long: bool = Tr
         (510, 201, "Lcl Rotation", "XYZ", (10.0, 0.0, -30.0), (-50.0, 40.0, 60.0)),
         (520, 202, "Lcl Translation", "XYZ", (0.0, 1.5, 0.0), (0.5, 1.75, -0.25)),
         (530, 404, "DeformPercent", None, (0.0,), (100.0,)),
+        (540, 202, "Lcl Rotation", "XYZ", (0.0, 0.0, 0.0), (20.0, 110.0, -40.0)),
     )
     for first, target, name, axes, start, end in curves:
         objects += f'\n    AnimationCurveNode: {first}, "AnimCurveNode::", "" {{ }}'

@@ -49,8 +49,7 @@ def read_scene(file: BinaryIO) -> Scene:
     """Read what the file shows.
 
     Vertices are the file's control points, in its order of nodes. A clip's own frames are those of
-    the file's frame rate. Skins are blended linearly, and where the file asks for dual quaternions
-    the notes say so.
+    the file's frame rate.
 
     Raises
     ------
@@ -189,8 +188,6 @@ def _part(held: dict[str, Any], node: int, transforms: FloatArray, notes: list[s
         bones, bind, bone_of = bones[1:], bind[1:], np.maximum(bone_of - 1, 0)
     if int(held["skins"]) > 1:
         notes.append("of the several skins of a mesh only the first was read")
-    if not held.get("is_linear", True):
-        notes.append("a skin of dual quaternions is blended linearly")
     if is_mirrored(transforms[bones] @ bind, bone_of, weights):
         faces = faces[:, [0, 2, 1]]
     return Part(
@@ -206,6 +203,7 @@ def _part(held: dict[str, Any], node: int, transforms: FloatArray, notes: list[s
         weights,
         is_skinned="shares" in held,
         morphs=_morphs(held, len(points)),
+        dual=held.get("dual"),
     )
 
 

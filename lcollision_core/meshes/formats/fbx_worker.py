@@ -133,7 +133,9 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
     skins = list(_items(mesh.skin_deformers))
     part["skins"] = np.array(len(skins))
     for skin in skins[:1]:
-        part["is_linear"] = np.array(int(skin.skinning_method) <= 1)
+        if skin.skinning_method != ufbx.SkinningMethod.LINEAR or skin.num_dq_weights:
+            # Numbers of the first weight and of weights, and the share of dual quaternions.
+            part["dual"] = np.clip(_array(skin.vertices, np.float64, 3)[:, 2], 0.0, 1.0)
         clusters = [
             (bone, cluster)
             for cluster in _items(skin.clusters)

@@ -57,6 +57,8 @@ class Part:
     is_skinned : whether the bones are joints of a skin
     morphs : (M, W, 3) float32 array, what each morph target adds
     is_single : whether the file holds the points as float32
+    dual : (W,) float64 array, the share in [0, 1] that dual quaternions have of the blend; None
+        where it is linear, as above
     """
 
     mesh: str
@@ -72,6 +74,7 @@ class Part:
     is_skinned: bool
     morphs: npt.NDArray[np.float32]
     is_single: bool = False
+    dual: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

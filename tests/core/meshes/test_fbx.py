@@ -17,8 +17,9 @@ from tests.core.gltf_builder import tube
 pytest.importorskip("ufbx")
 
 
-def test_frames_agree_with_ufbx(tmp_path: Path) -> None:
-    path = arm_fbx(tmp_path / "arm.fbx")
+@pytest.mark.parametrize("skinning", ["Linear", "Rigid", "DualQuaternion", "Blend"])
+def test_frames_agree_with_ufbx(tmp_path: Path, skinning: str) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx", skinning=skinning)
     character = read_character(path)
     height = float(np.ptp(character.rest_vertices[:, 1]))
     rest = ufbx_frames(path, None, [0.0])[0]
@@ -28,6 +29,22 @@ def test_frames_agree_with_ufbx(tmp_path: Path) -> None:
     expected = ufbx_frames(path, 0, frames.times.tolist())
     assert np.abs(frames.vertices[:, character.joined] - expected).max() < 1e-6 * height
     assert np.abs(expected[-1] - expected[0]).max() > 0.3 * height
+
+
+def test_dual_quaternions_are_not_linear_and_the_notes_say_what_the_rig_does(
+    tmp_path: Path,
+) -> None:
+    linear, dual = (
+        read_character(arm_fbx(tmp_path / "arm.fbx", skinning=skinning))
+        for skinning in ("Linear", "DualQuaternion")
+    )
+    last = [character.sample("wave", 1.0).vertices[-1] for character in (linear, dual)]
+    assert np.abs(last[0] - last[1]).max() > 0.05
+    assert any("dual quaternions" in note for note in dual.notes)
+    assert not any("dual quaternions" in note for note in linear.notes)
+    assert dual.rig is not None
+    at_rest = np.einsum("vi,vij->vj", dual.rig.weights, dual.rig.points)
+    assert np.abs(at_rest - dual.rest_vertices).max() < 1e-12
 
 
 def test_a_clip_without_a_span_is_as_long_as_its_curves(tmp_path: Path) -> None:
