@@ -96,15 +96,23 @@ def excluding_rules(
         return set().union(*(faces_of[vertex] for vertex in reached))
 
     near, of_rest = rules["near_exclusion"] * size, rules["rest_exclusion"]
-    at_rest: set[tuple[int, int]] = set()
-    for pair in touching_at_rest if of_rest is not None else ():
-        a, b = ({face} if of_rest == 0.0 else around(face, of_rest * size) for face in pair)
-        at_rest |= {(one, two) for one in a for two in b} | {(two, one) for one in a for two in b}
+    touched: dict[int, set[int]] = {}
+    for a, b in touching_at_rest if of_rest is not None else ():
+        touched.setdefault(a, set()).add(b)
+        touched.setdefault(b, set()).add(a)
+
+    def is_of_rest(a: int, b: int) -> bool:
+        """Whether a face near a touches one near b at rest."""
+        if not touched:
+            return False
+        by_a, by_b = ({f} if of_rest == 0.0 else around(f, of_rest * size) for f in (a, b))
+        return any(touched.get(face, set()) & by_b for face in by_a)
+
     excluded = {}
     for (a, b), depth in pairs.items():
         if near > 0.0 and b in around(a, near):
             excluded[a, b] = "near"
-        elif (a, b) in at_rest:
+        elif is_of_rest(a, b):
             excluded[a, b] = "rest"
         elif any(
             (a in groups[one] and b in groups[two]) or (b in groups[one] and a in groups[two])
