@@ -75,9 +75,9 @@ def test_version_is_that_of_the_package() -> None:
     [
         (["nonsense"], "No such command 'nonsense'; see lcollision --help"),
         (["chek"], "No such command 'chek'"),
-        (["missing.obj"], "missing.obj is not there; name a file of poses, a mesh or a model"),
-        (["edit", "missing.obj"], "missing.obj is not there; name a file of poses, a mesh or a"),
-        ([str(Path(__file__).parent)], "is a folder; name a file of poses, a mesh or a model, or"),
+        (["missing.obj"], "missing.obj is not there; name a file of poses, a character, a mesh"),
+        (["edit", "missing.obj"], "missing.obj is not there; name a file of poses, a character"),
+        ([str(Path(__file__).parent)], "is a folder; name a file of poses, a character, a mesh"),
         (["--model"], "Option '--model' requires an argument"),
         (["--bogus"], "No such option: --bogus; see lcollision --help"),
         (["check"], "Missing argument 'MESH...'; see lcollision check --help"),

@@ -370,7 +370,7 @@ def test_a_predictor_that_comes_in_mid_drag_lets_it_go_on(
     settle(qtbot, solid)
     assert solid.frame is not None
     assert solid.frame.prediction is None
-    solid._on_predictor(model)
+    solid._on_prepared(model)
     assert solid.dragging
     solid.end_drag()
     latent = solid.latent

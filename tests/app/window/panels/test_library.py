@@ -382,14 +382,15 @@ def test_the_context_menu_has_the_menu_s_own_actions(qtbot: QtBot, window: MainW
     assert library.chosen.name == "bend 2"
     at_training = opened_at(place_of(window, "bend 2"))
     assert at_training == [
-        *("load", "blend", "add", "keep", "import_poses", "export_poses", "find_pose")
+        *("load", "blend", "add", "keep", "import_poses", "export_poses", "export_motion"),
+        "find_pose",
     ]
     document.add_pose_to_library("mine")
     library.choose_own("mine")
     document.set_code(0, 0.5)
     assert opened_at(place_of(window, "mine")) == [
         *("load", "blend", "rename", "tags", "duplicate", "remove", "keep", "update"),
-        *("import_poses", "export_poses", "export_library", "find_pose"),
+        *("import_poses", "export_poses", "export_motion", "export_library", "find_pose"),
     ]
     empty = library.list.viewport().rect().bottomRight() - QPoint(3, 3)
     assert opened_at(empty) == [*("keep", "update", "import_poses", "export_library", "find_pose")]
