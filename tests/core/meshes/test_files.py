@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 from lcollision_core.errors import MeshFileError
@@ -84,6 +84,8 @@ def test_any_float64_survives_text_formats_bit_for_bit(
     tmp_path: Path, numbers: list[tuple[float]]
 ) -> None:
     vertices = np.resize(np.array(numbers), (max(3, len(numbers)), 3))
+    # Of nothing but subnormal numbers a mesh is coarser than its edges, and refused.
+    assume(np.abs(vertices).max() > np.finfo(np.float64).tiny)
     for suffix in (".obj", ".off", ".ply"):
         write_mesh(tmp_path / f"m{suffix}", vertices, np.array([[0, 1, 2]]))
         assert read_mesh(tmp_path / f"m{suffix}").vertices.tobytes() == vertices.tobytes()
