@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,14 @@ def crossing_pairs(vertices: Array, faces: npt.NDArray[np.int64]) -> set[tuple[i
     corners = vertices[faces]
     middle = corners.mean(axis=1)
     radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
-    near = cKDTree(middle).query_pairs(2.0 * radius.max(), output_type="ndarray")
+    # The larger of two faces that touch has the other's middle within twice its own radius.
+    reached = cKDTree(middle).query_ball_point(middle, 2.0 * radius)
+    larger = np.repeat(np.arange(len(faces)), [len(others) for others in reached])
+    near = np.stack([larger, np.concatenate(reached).astype(np.int64)], axis=1)
+    order = np.lexsort((np.arange(len(faces)), radius))
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(faces))
+    near = np.sort(near[rank[near[:, 1]] < rank[near[:, 0]]], axis=1)
     apart = np.linalg.norm(middle[near[:, 0]] - middle[near[:, 1]], axis=1)
     near = near[apart <= radius[near].sum(axis=1)]
     shared = (faces[near[:, 0], :, None] == faces[near[:, 1], None, :]).any(axis=(1, 2))
@@ -51,77 +57,93 @@ def crossing_pairs(vertices: Array, faces: npt.NDArray[np.int64]) -> set[tuple[i
     return {(int(a), int(b)) for a, b in near[found]}
 
 
-def excluding_rules(
-    pairs: Mapping[tuple[int, int], float],
-    touching_at_rest: Iterable[tuple[int, int]],
-    rest: Array,
-    faces: npt.NDArray[np.int64],
-    rules: Mapping[str, Any],
-    groups: Mapping[str, set[int]],
-) -> dict[tuple[int, int], str]:
-    """Return the first rule that excludes each pair of a pose; those that count are left out.
+class IndependentRules:
+    """Contact rules, applied pair by pair; what is found about a face is kept for later poses.
 
     Parameters
     ----------
-    pairs : colliding faces with their depths, in the unit of `rest`
-    touching_at_rest : pairs of faces of the rest pose
+    rest, faces : of the rest pose
+    touching_at_rest : pairs of its faces
     rules : as in JSON
     groups : faces by name
     """
-    size = float(np.ptp(rest[np.unique(faces)], axis=0).max())
-    neighbours: dict[int, set[int]] = {}
-    for a, b, c in faces.tolist():
-        for i, j in ((a, b), (b, c), (c, a)):
-            neighbours.setdefault(i, set()).add(j)
-            neighbours.setdefault(j, set()).add(i)
-    faces_of: dict[int, set[int]] = {}
-    for face, corners in enumerate(faces.tolist()):
-        for corner in corners:
-            faces_of.setdefault(corner, set()).add(face)
 
-    @cache
-    def around(face: int, radius: float) -> set[int]:
+    def __init__(
+        self,
+        rest: Array,
+        faces: npt.NDArray[np.int64],
+        touching_at_rest: Iterable[tuple[int, int]],
+        rules: Mapping[str, Any],
+        groups: Mapping[str, set[int]],
+    ) -> None:
+        self._rest, self._corners, self._groups = rest, faces.tolist(), groups
+        size = float(np.ptp(rest[np.unique(faces)], axis=0).max())
+        self._near, self._tolerated = (
+            rules["near_exclusion"] * size,
+            rules["tolerated_depth"] * size,
+        )
+        self._ignored = rules["ignored"]
+        self._of_rest = None if rules["rest_exclusion"] is None else rules["rest_exclusion"] * size
+        self._neighbours: dict[int, set[int]] = {}
+        self._faces_of: dict[int, set[int]] = {}
+        for face, (a, b, c) in enumerate(self._corners):
+            for i, j in ((a, b), (b, c), (c, a)):
+                self._neighbours.setdefault(i, set()).add(j)
+                self._neighbours.setdefault(j, set()).add(i)
+                self._faces_of.setdefault(i, set()).add(face)
+        self._touched: dict[int, set[int]] = {}
+        for a, b in touching_at_rest:
+            self._touched.setdefault(a, set()).add(b)
+            self._touched.setdefault(b, set()).add(a)
+        self._around: dict[tuple[int, float], set[int]] = {}
+
+    def excluding(self, pairs: Mapping[tuple[int, int], float]) -> dict[tuple[int, int], str]:
+        """Return the first rule that excludes each pair; those that count are left out.
+
+        Parameters
+        ----------
+        pairs : colliding faces of a pose with their depths, in the unit of the rest pose
+        """
+        ruled = {pair: self._rule(*pair, depth) for pair, depth in pairs.items()}
+        return {pair: rule for pair, rule in ruled.items() if rule is not None}
+
+    def _rule(self, a: int, b: int, depth: float) -> str | None:
+        if self._near > 0.0 and b in self._faces_around(a, self._near):
+            return "near"
+        if self._of_rest is not None and self._is_of_rest(a, b, self._of_rest):
+            return "rest"
+        for one, two in self._ignored:
+            first, second = self._groups[one], self._groups[two]
+            if (a in first and b in second) or (b in first and a in second):
+                return "ignored"
+        return "tolerated" if depth <= self._tolerated else None
+
+    def _is_of_rest(self, a: int, b: int, radius: float) -> bool:
+        """Whether a face near a touches one near b at rest."""
+        by_b = self._faces_around(b, radius)
+        return any(self._touched.get(face, set()) & by_b for face in self._faces_around(a, radius))
+
+    def _faces_around(self, face: int, radius: float) -> set[int]:
         """Faces with a corner at most so far from one of this face, along edges, by Dijkstra."""
+        if radius == 0.0:
+            return {face}
+        known = self._around.get((face, radius))
+        if known is not None:
+            return known
         reached: set[int] = set()
-        waiting = [(0.0, corner) for corner in faces[face].tolist()]
+        waiting = [(0.0, corner) for corner in self._corners[face]]
         while waiting:
             length, vertex = heapq.heappop(waiting)
             if vertex in reached:
                 continue
             reached.add(vertex)
-            for other in neighbours[vertex] - reached:
-                further = length + float(np.linalg.norm(rest[vertex] - rest[other]))
+            for other in self._neighbours[vertex] - reached:
+                further = length + float(np.linalg.norm(self._rest[vertex] - self._rest[other]))
                 if further <= radius:
                     heapq.heappush(waiting, (further, other))
-        return set().union(*(faces_of[vertex] for vertex in reached))
-
-    near, of_rest = rules["near_exclusion"] * size, rules["rest_exclusion"]
-    touched: dict[int, set[int]] = {}
-    for a, b in touching_at_rest if of_rest is not None else ():
-        touched.setdefault(a, set()).add(b)
-        touched.setdefault(b, set()).add(a)
-
-    def is_of_rest(a: int, b: int) -> bool:
-        """Whether a face near a touches one near b at rest."""
-        if not touched:
-            return False
-        by_a, by_b = ({f} if of_rest == 0.0 else around(f, of_rest * size) for f in (a, b))
-        return any(touched.get(face, set()) & by_b for face in by_a)
-
-    excluded = {}
-    for (a, b), depth in pairs.items():
-        if near > 0.0 and b in around(a, near):
-            excluded[a, b] = "near"
-        elif is_of_rest(a, b):
-            excluded[a, b] = "rest"
-        elif any(
-            (a in groups[one] and b in groups[two]) or (b in groups[one] and a in groups[two])
-            for one, two in rules["ignored"]
-        ):
-            excluded[a, b] = "ignored"
-        elif depth <= rules["tolerated_depth"] * size:
-            excluded[a, b] = "tolerated"
-    return excluded
+        found = set().union(*(self._faces_of[vertex] for vertex in reached))
+        self._around[face, radius] = found
+        return found
 
 
 def _pierces(start: Array, stop: Array, triangle: Array) -> npt.NDArray[np.bool_]:

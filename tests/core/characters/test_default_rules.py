@@ -14,7 +14,7 @@ from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.rules import near_pairs_estimate
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import grid
-from tests.independent_check import crossing_pairs, excluding_rules
+from tests.independent_check import IndependentRules, crossing_pairs
 from tests.rigged_shapes import rigged_body, rigged_tube
 
 
@@ -85,7 +85,5 @@ def test_real_characters_are_free_at_rest_by_an_independent_reading(
     assert not found.colliding
     assert found.excluded.total > 0.9 * len(crossing)
     some = crossing[:: max(1, len(crossing) // 50)]
-    excluded = excluding_rules(
-        dict.fromkeys(some, 1.0), some, rest, faces, rules.to_json(), groups={}
-    )
-    assert set(excluded) == set(some)
+    applied = IndependentRules(rest, faces, some, rules.to_json(), groups={})
+    assert set(applied.excluding(dict.fromkeys(some, 1.0))) == set(some)

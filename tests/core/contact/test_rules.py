@@ -21,7 +21,7 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import FaceGroup, Topology
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import Mesh, grid, join, soup
-from tests.independent_check import excluding_rules
+from tests.independent_check import IndependentRules
 
 RULES = ("near", "rest", "ignored", "tolerated")
 
@@ -43,9 +43,9 @@ def check_by_the_text(
     for group in groups:
         named.setdefault(group.name, set()).update(group.faces.tolist())
     depth_of = dict(zip(map(tuple, colliding.pairs.tolist()), colliding.depth, strict=True))
-    excluded = excluding_rules(
-        depth_of, map(tuple, at_rest.tolist()), rest.vertices, rest.faces, rules.to_json(), named
-    )
+    touching = map(tuple, at_rest.tolist())
+    applied = IndependentRules(rest.vertices, rest.faces, touching, rules.to_json(), named)
+    excluded = applied.excluding(depth_of)
 
     found = detector.detect(pose)
     assert list(map(tuple, found.pairs.tolist())) == [p for p in depth_of if p not in excluded]
