@@ -355,7 +355,7 @@ class _Source:
         return stored
 
     def _weigh_morph(self, node: dict[str, Any]) -> None:
-        """Give the newest morph target of a node's mesh its weight, and its name if others have."""
+        """Give the newest morph target of a node's mesh its weight, and a name if all have one."""
         mesh = self.patch.description["meshes"][node["mesh"]]
         n_targets = max(len(primitive.get("targets", ())) for primitive in mesh["primitives"])
         for primitive in mesh["primitives"]:
@@ -368,10 +368,11 @@ class _Source:
             if owner is mesh or "weights" in owner:
                 given = list(owner.get("weights", ()))[: n_targets - 1]
                 owner["weights"] = given + [0.0] * (n_targets - 1 - len(given)) + [1.0]
-        extras = mesh.get("extras")
-        names = extras.get("targetNames") if isinstance(extras, dict) else None
-        if isinstance(names, list) and len(names) == n_targets - 1:
-            names.append("pose")
+        extras = mesh.setdefault("extras", {}) if n_targets == 1 else mesh.get("extras")
+        if isinstance(extras, dict):
+            names = extras.get("targetNames", [])
+            if isinstance(names, list) and len(names) == n_targets - 1:
+                extras["targetNames"] = [*names, "pose"]
 
     def drop_clips(self) -> list[str]:
         """Remove the animations that move what shapes the character, and return their names."""

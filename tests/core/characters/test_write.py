@@ -192,6 +192,7 @@ def test_a_morph_target_of_weight_0_is_the_source(character: Character, tmp_path
     description, binary = described(path)
     for mesh in description["meshes"]:
         assert mesh.pop("weights") == [1.0]
+        assert mesh.pop("extras") == {"targetNames": ["pose"]}
     builder = GltfBuilder()
     builder.description, builder.blob = description, binary
     again = read_character(builder.write(back))
