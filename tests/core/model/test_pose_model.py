@@ -164,8 +164,9 @@ def test_latent_space_names_every_code_and_straddles_zero(model: PoseModel) -> N
     assert space.groups[1].full_name(2) == f"{model.domain_names[0]}, motion 3"
     assert (space.low < 0).all()
     assert (space.high > 0).all()
-    assert (model.training_latent >= space.low / 1.2).all()
-    assert (model.training_latent <= space.high / 1.2).all()
+    # Divided by 1.2, the box's ends may round to within its own training codes.
+    assert (1.2 * model.training_latent >= space.low).all()
+    assert (1.2 * model.training_latent <= space.high).all()
     sampled = _box(model, 2000)
     assert (sampled >= space.low).all()
     assert (sampled <= space.high).all()
