@@ -38,6 +38,7 @@ def propose_ignored(
     groups: Sequence[FaceGroup],
     least_share: float = NEARLY_ALWAYS,
     *,
+    counted_only: bool = False,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> tuple[ProposedPair, ...]:
@@ -53,6 +54,8 @@ def propose_ignored(
     poses : (N, V, 3) array, N > 0
     groups : components, materials, meshes or body parts; of equal ones the first is proposed
     least_share : of the poses, above 0
+    counted_only : whether excluded pairs do not count here either, so that what is proposed is what
+        the rules still call a collision in nearly every pose
 
     Returns
     -------
@@ -79,7 +82,7 @@ def propose_ignored(
             cancel.raise_if_cancelled()
         found = detector.detect(pose)
         excluded = found.excluded_pairs[found.excluded_rule != NEAR]
-        pairs = np.concatenate([found.pairs, excluded])
+        pairs = found.pairs if counted_only else np.concatenate([found.pairs, excluded])
         one_way = (member[pairs[:, 0]].T @ member[pairs[:, 1]]).toarray() > 0
         in_contact += one_way | one_way.T
         progress(done + 1, len(vertices))

@@ -1,0 +1,9 @@
+"""From files of a character or a body in many poses to a trained model, in one resumable run."""
+
+from lcollision_core.learning.card import LearnedCard, card_of
+from lcollision_core.learning.effort import EFFORTS, Effort, Quality
+from lcollision_core.learning.estimate import estimated_seconds
+from lcollision_core.learning.request import LearningRequest
+from lcollision_core.learning.run import learn_model
+from lcollision_core.learning.status import STAGES, LearningStatus, Stage
+from lcollision_core.learning.work_folder import WorkFolder, WorkState, WorkStatus, list_work

@@ -1,0 +1,286 @@
+"""One run from files to a trained model, which goes on however it was stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.learning.card import LearnedCard, card_of
+from lcollision_core.learning.contacts import with_proposed_rules
+from lcollision_core.learning.effort import EFFORTS, Effort, Quality
+from lcollision_core.learning.estimate import estimated_seconds
+from lcollision_core.learning.request import LearningRequest
+from lcollision_core.learning.sources import gather_poses
+from lcollision_core.learning.status import STAGES, LearningStatus, Pace, Stage, StatusCallback
+from lcollision_core.learning.work_folder import WorkFolder, WorkState, WorkStatus
+from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
+from lcollision_core.model import PoseModel, save_trained
+
+if TYPE_CHECKING:
+    from lcollision_core.embedding.run import TrainingStatus
+    from lcollision_core.labels import LabelStatus
+    from lcollision_core.predictor import PredictorStatus
+
+_SECONDS_BETWEEN_NOTES = 0.5
+"""Between two notes of the status in the work folder."""
+
+_GATHERED = 0.9
+"""Fraction of the stage of the poses after which their contact rules are proposed."""
+
+
+def learn_model(
+    work: WorkFolder,
+    progress: StatusCallback = no_progress,
+    cancel: CancelToken | None = None,
+) -> LearnedCard:
+    """Do what the request of a work folder asks for, or what is left of it.
+
+    The work folder says at any time how far the run is. At the end it keeps that alone.
+
+    Parameters
+    ----------
+    work : prepared with a request
+    progress : called with each `LearningStatus`
+    cancel : polled often; what is done so far stays in the work folder
+
+    Returns
+    -------
+    card : of the model, which is at `card.model`
+
+    Raises
+    ------
+    ModelFileError : there is a model of that name that did not come of this request, or another
+        process is at it.
+    LCollisionError : the files cannot be learned from, or the disk is full; the sentence says what
+        is needed, and is kept as the status.
+    CancelledError : `cancel` was set.
+    """
+    token = cancel or CancelToken()
+    with work.held():
+        return _Learner(work, progress, token).run()
+
+
+class _Learner:
+    """One call of `learn_model`."""
+
+    def __init__(self, work: WorkFolder, progress: StatusCallback, cancel: CancelToken) -> None:
+        self._work, self._cancel = work, cancel
+        self._request = work.request
+        self._effort: Effort = EFFORTS[Quality(self._request.quality)]
+        self._show = progress
+        self._pace = Pace(self._tell)
+        spent = work.status.seconds
+        self._before = {str(stage): float(spent.get(stage, 0.0)) for stage in STAGES}
+        self._stage, self._began = Stage.POSES, time.monotonic()
+        self._noted = -np.inf
+
+    def run(self) -> LearnedCard:
+        work = self._work
+        if (made := self._model_made()) is None:
+            try:
+                path = self._make()
+            except CancelledError:
+                self._leave(WorkState.STOPPED)
+                raise
+            except LCollisionError as error:
+                self._leave(WorkState.FAILED, str(error))
+                raise
+            made = PoseModel.load(path), path
+        model, path = made
+        card = card_of(model, str(path))
+        work.tell(
+            WorkStatus(
+                WorkState.DONE,
+                Stage.PREDICTOR,
+                1.0,
+                1.0,
+                0.0,
+                seconds=card.seconds,
+                model=str(path),
+            )
+        )
+        work.keep_only_status()
+        return card
+
+    def _model_made(self) -> tuple[PoseModel, Path] | None:
+        """Return the model that an earlier process made of this request, if it came so far."""
+        path = self._work.destination
+        if not path.exists():
+            return None
+        model = PoseModel.load(path)
+        if model.card.provenance.get("request") != _plain(self._request):
+            raise ModelFileError(
+                f"there is a model {self._work.name!r} already",
+                "choose another name",
+                where=path,
+            )
+        return model, path
+
+    def _make(self) -> Path:
+        """Go through the stages, each of which goes on where it was left."""
+        work = self._work
+        poses = self._poses()
+        self._pace.expect(
+            estimated_seconds(poses.topology.n_vertices, len(poses), Quality(self._request.quality))
+        )
+        model = self._embedding(poses)
+        return self._predictor(model, work)
+
+    def _poses(self) -> PoseSet:
+        self._enter(Stage.POSES)
+        path, request = self._work.poses, self._request
+        if path.exists():
+            return read_pose_set(path)
+        gathered = gather_poses(
+            [Path(source) for source in request.sources],
+            by_rig=request.by_rig,
+            n_wanted=self._effort.n_poses,
+            clip=request.clip,
+            fps=request.fps,
+            up=request.up,
+            seed=request.seed,
+            progress=lambda done, total: self._at(_GATHERED * done / max(total, 1)),
+            cancel=self._cancel,
+        )
+        if request.scale != 1.0:
+            gathered = gathered.scaled(request.scale)
+        poses = with_proposed_rules(
+            gathered,
+            request,
+            lambda done, total: self._at(_GATHERED + (1.0 - _GATHERED) * done / max(total, 1)),
+            self._cancel,
+        )
+        write_pose_set(path, poses)
+        return poses
+
+    def _embedding(self, poses: PoseSet) -> PoseModel:
+        from lcollision_core.embedding.training import train_embedding
+
+        self._enter(Stage.LATENT_SPACE)
+        path, request = self._work.embedding, self._request
+        if path.exists():
+            return PoseModel.load(path)
+        checkpoint = self._work.checkpoint(Stage.LATENT_SPACE)
+
+        def told(status: TrainingStatus) -> None:
+            error = status.both_error or status.level1_error
+            facts = [] if error is None else [f"error {100.0 * error:.2f} %"]
+            self._at(status.done / status.total, facts)
+
+        trained = train_embedding(
+            poses,
+            self._effort.embedding,
+            checkpoint=checkpoint,
+            progress=told,
+            cancel=self._cancel,
+            seed=request.seed,
+        )
+        model = PoseModel.from_training(
+            self._work.name,
+            trained,
+            poses,
+            ", ".join(Path(source).name for source in request.sources),
+            request.licence,
+            {
+                "program": f"lcollision {version('lcollision')}",
+                "command": "new",
+                "request": _plain(request),
+                "poses_sha256": hashlib.sha256(
+                    np.ascontiguousarray(poses.vertices).tobytes()
+                ).hexdigest(),
+            },
+        )
+        model.save(path)
+        checkpoint.unlink(missing_ok=True)
+        return model
+
+    def _predictor(self, model: PoseModel, work: WorkFolder) -> Path:
+        from lcollision_core.labels import LabelStore, label_poses
+        from lcollision_core.predictor import train_predictor
+        from lcollision_core.resolve import find_free_poses
+
+        effort, seed = self._effort, self._request.seed
+        self._enter(Stage.LABELS)
+
+        def told_rows(status: LabelStatus) -> None:
+            share = status.colliding_share
+            facts = [] if share is None else [f"{100.0 * share:.0f} % of the samples collide"]
+            self._at(status.done / status.total, facts)
+
+        label_poses(
+            model.labeller(),
+            work.labels,
+            effort.n_samples,
+            seed=seed,
+            progress=told_rows,
+            cancel=self._cancel,
+        )
+        self._enter(Stage.PREDICTOR)
+        store = LabelStore.open(work.labels)
+
+        def told_epochs(status: PredictorStatus) -> None:
+            # Labelling patches takes about as long as the passes over them.
+            done = 0.5 + 0.5 * status.done / status.total
+            done = done if status.preparing is None else 0.5 * status.preparing
+            accuracy = status.held_out_accuracy
+            self._at(done, [] if accuracy is None else [f"{100.0 * accuracy:.1f} % accuracy"])
+
+        trained = train_predictor(
+            store.load(effort.n_samples),
+            model.embedding,
+            effort.predictor,
+            store=store.identity,
+            groups=model.groups,
+            checkpoint=work.checkpoint(Stage.PREDICTOR),
+            progress=told_epochs,
+            cancel=self._cancel,
+            seed=seed,
+        )
+        free = find_free_poses(model.embedding, model.exact_check())
+        finished = model.with_predictor(trained).with_free_poses(free)
+        provenance = {**finished.card.provenance, "seconds": self._seconds()}
+        finished = finished.with_card(replace(finished.card, provenance=provenance))
+        return save_trained(work.destination, None, finished)
+
+    def _enter(self, stage: Stage) -> None:
+        self._cancel.raise_if_cancelled()
+        self._before = self._seconds()
+        self._stage, self._began = stage, time.monotonic()
+        self._at(0.0)
+
+    def _seconds(self) -> dict[str, float]:
+        """Return the seconds spent in each stage, by this process and those before."""
+        now = time.monotonic() - self._began
+        return self._before | {str(self._stage): self._before[self._stage] + now}
+
+    def _at(self, stage_done: float, facts: Sequence[str] = ()) -> None:
+        self._pace.tell(self._stage, stage_done, facts)
+
+    def _tell(self, status: LearningStatus) -> None:
+        self._show(status)
+        now = time.monotonic()
+        if now - self._noted > _SECONDS_BETWEEN_NOTES:
+            self._noted = now
+            self._work.tell(WorkStatus.of_progress(status, self._seconds()))
+
+    def _leave(self, state: WorkState, sentence: str = "") -> None:
+        """Say what has become of the run, unless the disk has no space even for that."""
+        last = replace(self._work.status, seconds=self._seconds(), seconds_left=None)
+        with suppress(MeshFileError):
+            self._work.tell(replace(last, state=state, sentence=sentence))
+
+
+def _plain(request: LearningRequest) -> object:
+    """Return a request as it comes back from a file, where tuples are lists."""
+    return json.loads(json.dumps(request.to_json()))

@@ -1,0 +1,94 @@
+"""How far a run of learning is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Stage(StrEnum):
+    """One stage of learning a model."""
+
+    POSES = "poses"
+    LATENT_SPACE = "latent space"
+    LABELS = "labels"
+    PREDICTOR = "predictor"
+
+
+STAGES = tuple(Stage)
+"""In their order."""
+
+_LEAST_SECONDS = 5.0
+"""Of a run, before its pace says more than the estimate."""
+
+_FIRST = 2
+"""Reports of a stage that tell where it begins, not how fast it is."""
+
+
+@dataclass(frozen=True)
+class LearningStatus:
+    """Progress of a run.
+
+    Attributes
+    ----------
+    stage : that is under way
+    stage_done : fraction of it, from 0 to 1
+    done : fraction of all stages by their estimated time, from 0 to 1
+    seconds_left : of all stages, at the pace of this run
+    facts : beside it, as "error 0.31 %"
+    """
+
+    stage: Stage
+    stage_done: float
+    done: float
+    seconds_left: float
+    facts: tuple[str, ...] = ()
+
+
+StatusCallback = Callable[[LearningStatus], None]
+
+
+class Pace:
+    """Turns the progress of single stages into that of the run, and measures its pace.
+
+    Parameters
+    ----------
+    progress : called with each status
+    """
+
+    def __init__(self, progress: StatusCallback) -> None:
+        self._progress = progress
+        self._expected: Mapping[Stage, float] = dict.fromkeys(STAGES, 1.0)
+        self._began = time.monotonic()
+        self._stage, self._n_told = Stage.POSES, 0
+        self._behind = self._skipped = 0.0
+
+    def expect(self, seconds: Mapping[Stage, float]) -> None:
+        """Take the estimated seconds of each stage, once they are known; the pace begins anew."""
+        self._expected = seconds
+        self._began = time.monotonic()
+        self._behind = self._skipped = self._seconds_behind(self._stage, 1.0)
+
+    def tell(self, stage: Stage, stage_done: float, facts: Sequence[str] = ()) -> None:
+        """Report a fraction of a stage.
+
+        What is done at once when a stage begins was done by an earlier process.
+        """
+        if stage is not self._stage:
+            self._stage, self._n_told = stage, 0
+        behind, total = self._seconds_behind(stage, stage_done), sum(self._expected.values())
+        if self._n_told < _FIRST:
+            self._skipped += behind - self._behind
+        self._n_told += 1
+        self._behind = behind
+        seconds, worked = time.monotonic() - self._began, behind - self._skipped
+        pace = seconds / worked if seconds > _LEAST_SECONDS and worked > 0.0 else 1.0
+        left = (total - behind) * pace
+        self._progress(LearningStatus(stage, stage_done, behind / total, left, tuple(facts)))
+
+    def _seconds_behind(self, stage: Stage, stage_done: float) -> float:
+        """Return the estimated seconds of what is done."""
+        before = sum(self._expected[one] for one in STAGES[: STAGES.index(stage)])
+        return before + stage_done * self._expected[stage]

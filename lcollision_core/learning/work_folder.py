@@ -1,0 +1,248 @@
+"""The folder of a run of learning: what it works on, how far it is, and what goes on after a kill.
+
+It stands beside the model that the run is to make, and any process can look into it: the one that
+learns, the window that shows how far that is, and a later window.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.json_values import from_json, parse_json
+from lcollision_core.learning.request import LearningRequest
+from lcollision_core.learning.status import LearningStatus, Stage
+from lcollision_core.meshes import atomic_write, locked
+from lcollision_core.model import user_models_folder
+from lcollision_core.model.model_store import MODEL_SUFFIX
+from lcollision_core.regular_files import read_regular
+
+_VERSION = 1
+_MOST_BYTES = 1_000_000
+_SUFFIX = ".work"
+
+
+class WorkState(StrEnum):
+    """What has become of a run, as its process last said."""
+
+    RUNNING = "running"
+    STOPPED = "stopped"
+    FAILED = "failed"
+    DONE = "done"
+
+
+@dataclass(frozen=True)
+class WorkStatus:
+    """How far a run is.
+
+    Attributes
+    ----------
+    state : a `WorkState`; a run that is "running" and that no process holds was killed
+    stage : a `Stage`
+    stage_done, done : fractions of the stage and of all of them
+    seconds_left : at the pace of the run; None where it does not run
+    facts : of the stage, in words
+    sentence : why it failed
+    seconds : spent in each stage so far, by name
+    model : the file that came of it, once it is done
+    """
+
+    state: str
+    stage: str = Stage.POSES
+    stage_done: float = 0.0
+    done: float = 0.0
+    seconds_left: float | None = None
+    facts: tuple[str, ...] = ()
+    sentence: str = ""
+    seconds: Mapping[str, Any] = field(default_factory=dict)
+    model: str = ""
+
+    @classmethod
+    def of_progress(cls, status: LearningStatus, seconds: Mapping[str, float]) -> WorkStatus:
+        """Return the status of a run that is under way."""
+        return cls(
+            WorkState.RUNNING,
+            status.stage,
+            status.stage_done,
+            status.done,
+            status.seconds_left,
+            status.facts,
+            seconds=dict(seconds),
+        )
+
+
+class WorkFolder:
+    """The folder of one run.
+
+    Parameters
+    ----------
+    destination : the model file that the run is to make
+
+    Attributes
+    ----------
+    destination : as given
+    path : the folder, which may not exist
+    """
+
+    def __init__(self, destination: Path) -> None:
+        self.destination = destination
+        self.path = destination.with_name(destination.name + _SUFFIX)
+
+    @classmethod
+    def at(cls, path: Path) -> WorkFolder:
+        """Return the work folder of this path."""
+        return cls(path.with_name(path.name.removesuffix(_SUFFIX)))
+
+    @property
+    def name(self) -> str:
+        """Of the model that it is to be."""
+        return self.destination.stem
+
+    @property
+    def poses(self) -> Path:
+        """The poses to learn from, once they are gathered."""
+        return self.path / "poses.npz"
+
+    @property
+    def embedding(self) -> Path:
+        """The model with its latent space, and no predictor yet."""
+        return self.path / f"embedding{MODEL_SUFFIX}"
+
+    @property
+    def labels(self) -> Path:
+        """The store of labelled samples."""
+        return self.path / "labels"
+
+    @property
+    def log(self) -> Path:
+        """What the process that learns in the background writes on its errors."""
+        return self.path / "log.txt"
+
+    def checkpoint(self, stage: Stage) -> Path:
+        """Return the checkpoint of a stage's training."""
+        return self.path / f"{stage.replace(' ', '-')}.checkpoint"
+
+    def prepare(self, request: LearningRequest) -> None:
+        """Make the folder for a request, or go on with the one that is there.
+
+        Raises
+        ------
+        ModelFileError : the folder is of another request.
+        MeshFileError : it cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise MeshFileError.because(
+                self.path, "cannot be made", error, "choose another place for the model"
+            ) from error
+        if (self.path / "request.json").exists():
+            if self.request != request:
+                raise ModelFileError(
+                    f"a model {self.name!r} is being learned from other files or options",
+                    f"choose another name, or remove {self.path}",
+                )
+            return
+        self._write("request.json", request.to_json())
+
+    @property
+    def request(self) -> LearningRequest:
+        """What the run is to do.
+
+        Raises
+        ------
+        ModelFileError : it is damaged or missing.
+        """
+        path = self.path / "request.json"
+        try:
+            return LearningRequest.of_json(self._read(path))
+        except (OSError, ValueError, LCollisionError) as error:
+            raise ModelFileError.unreadable(path, error, f"remove {self.path}") from error
+
+    @property
+    def status(self) -> WorkStatus:
+        """How far the run is; a damaged or missing file says that it has not begun."""
+        try:
+            return from_json(WorkStatus, self._read(self.path / "status.json"), "status")
+        except (OSError, ValueError, LCollisionError):
+            return WorkStatus(WorkState.STOPPED)
+
+    def tell(self, status: WorkStatus) -> None:
+        """Write how far the run is, whole or not at all.
+
+        Raises
+        ------
+        MeshFileError : the disk is full, or the folder gone.
+        """
+        self._write("status.json", asdict(status))
+
+    @contextmanager
+    def held(self, wait: float = 5.0) -> Iterator[None]:
+        """Keep other processes from running the same, for as long as this one lives.
+
+        Raises
+        ------
+        ModelFileError : another process runs it.
+        """
+        try:
+            lock = locked(self.path / "run", wait)
+            lock.__enter__()
+        except MeshFileError as error:
+            if not self.path.is_dir():
+                raise
+            raise ModelFileError(
+                f"a model {self.name!r} is being learned by another process",
+                "wait for it, or stop it first",
+            ) from error
+        try:
+            yield
+        finally:
+            lock.__exit__(None, None, None)
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a process is at it."""
+        if not self.path.is_dir():
+            return False
+        try:
+            with self.held(wait=0.0):
+                return False
+        except (ModelFileError, MeshFileError):
+            return True
+
+    def remove(self) -> None:
+        """Remove all of it; the model that came of it stays."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    def keep_only_status(self) -> None:
+        """Remove what the run worked on, and keep what it says of itself."""
+        for entry in self.path.iterdir():
+            if entry.is_dir():
+                shutil.rmtree(entry, ignore_errors=True)
+            elif entry.name not in ("request.json", "status.json") and entry.name[0] != ".":
+                entry.unlink(missing_ok=True)
+
+    def _read(self, path: Path) -> Any:
+        values = parse_json(read_regular(path, _MOST_BYTES))
+        version = values.get("version", _VERSION) if isinstance(values, dict) else _VERSION
+        if version != _VERSION:
+            raise ModelFileError.too_new(path, version, _VERSION)
+        return values
+
+    def _write(self, name: str, values: Mapping[str, Any]) -> None:
+        content = json.dumps({"version": _VERSION, **values}, indent=1)
+        with atomic_write(self.path / name) as file:
+            file.write(content.encode())
+
+
+def list_work() -> tuple[WorkFolder, ...]:
+    """Return the runs whose models are to be in the user's own folder, by name."""
+    found = user_models_folder().glob(f"*{MODEL_SUFFIX}{_SUFFIX}")
+    return tuple(WorkFolder.at(path) for path in sorted(found) if path.is_dir())
