@@ -84,7 +84,7 @@ def progress_bar(task: str) -> Iterator[Progress]:
 
 @contextmanager
 def status_bar(
-    task: str, told_of: Callable[[Any], Told], *, rows: bool = False
+    task: str, told_of: Callable[[Any], Told], *, rows: bool = False, estimates: bool = True
 ) -> Iterator[Callable[[Any], None]]:
     """Give a callback that draws a bar on a terminal, and in a pipe tells now and then.
 
@@ -93,9 +93,11 @@ def status_bar(
     task : what is done, until a status says otherwise
     told_of : what the bar shows of a status, with which the callback is called
     rows : show the counts done and in all, not the percentage and the time left
+    estimates : whether the bar estimates the time left, where the facts do not tell it
     """
     if sys.stderr.isatty():
-        with _bar(task, *(("count",) if rows else ("share", "time"))) as show:
+        amounts = ("count",) if rows else ("share", "time") if estimates else ("share",)
+        with _bar(task, *amounts) as show:
             yield lambda status: show(*told_of(status))
         return
     last = time.monotonic()

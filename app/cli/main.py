@@ -23,6 +23,7 @@ from app.cli import (
     label,
     mirror,
     models,
+    new,
     poses,
     resolve,
     train,
@@ -101,6 +102,7 @@ app = typer.Typer(
 )
 for command in (
     edit.edit,
+    new.new,
     *(models.models, models.info, models.domains, models.upright),
     check.check,
     *(poses.encode, poses.decode, poses.sample),

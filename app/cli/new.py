@@ -1,0 +1,158 @@
+"""``lcollision new``: from files of a character or of a body's poses to a model, in one command."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from app.cli.console import JsonOption, note, print_json, status_bar, tell
+from app.cli.contact_options import (
+    IgnoreOption,
+    NearExclusionOption,
+    RestExclusionOption,
+    ToleratedDepthOption,
+    note_rules,
+)
+from app.cli.inputs import Axis
+from app.cli.interrupt import cancel_on_interrupt
+from app.wording import duration_text
+from lcollision_core.errors import CancelledError
+
+if TYPE_CHECKING:
+    from app.cli.console import Told
+    from lcollision_core.learning import LearnedCard, LearningStatus
+
+
+def new(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            readable=False,
+            help="Files of one character (GLB, glTF, VRM, FBX), folders of meshes, point caches "
+            "beside their mesh, .npz files.",
+        ),
+    ],
+    output: Annotated[
+        str,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="NAME",
+            help="The model's name, which stores it with yours, or a .safetensors file.",
+        ),
+    ],
+    quality: Annotated[
+        Literal["quick", "good", "best"], typer.Option(help="How much time is spent.")
+    ] = "good",
+    by_rig: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=10_000,
+            metavar="N",
+            help="Poses drawn by the rig. Default: as many as the clips lack.",
+        ),
+    ] = None,
+    clip: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The animation to take. Default: all.")
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(metavar="X", help="Frames a second. Default: the keys.")
+    ] = None,
+    up: Annotated[
+        Axis | None, typer.Option(help="The axis that is up. Default: what the files say.")
+    ] = None,
+    scale: Annotated[
+        float, typer.Option(metavar="S", help="Brings the files into the model's unit.")
+    ] = 1.0,
+    near_exclusion: NearExclusionOption = None,
+    rest_exclusion: RestExclusionOption = None,
+    ignore: IgnoreOption = None,
+    tolerated_depth: ToleratedDepthOption = None,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal models.")] = 0,
+    licence: Annotated[str, typer.Option(help="Under which the model may be used.")] = "unknown",
+    as_json: JsonOption = False,
+) -> None:
+    """Make a model of a character or of a body's poses: poses, latent space, labels, predictor.
+
+    The contact rules are proposed from the poses unless options give them. However it is stopped,
+    the same command goes on where it was.
+    """
+    from lcollision_core.learning import LearningRequest, WorkFolder, learn_model
+    from lcollision_core.model import PoseModel, model_destination
+
+    request = LearningRequest(
+        tuple(str(source.absolute()) for source in sources),
+        quality,
+        by_rig,
+        clip,
+        fps,
+        None if up is None else "xyz".index(up),
+        scale,
+        near_exclusion,
+        rest_exclusion,
+        tolerated_depth,
+        None if ignore is None else tuple(ignore),
+        seed,
+        licence,
+    )
+    work = WorkFolder(model_destination(output))
+    work.prepare(request)
+    bar = status_bar("reading files", told_of_learning, estimates=False)
+    try:
+        with cancel_on_interrupt() as cancel, bar as progress:
+            card = learn_model(work, progress, cancel)
+    except CancelledError:
+        note(f"stopped; run the same command again to go on from {work.path}")
+        raise
+    work.remove()
+    model = PoseModel.load(card.model)
+    picture = Path(card.model).with_suffix(".png")
+    from app.view.masks_figure import draw_masks
+
+    draw_masks(model, picture)
+    note_rules(model)
+    if as_json:
+        print_json(asdict(card) | {"picture": str(picture), "rules": model.rules.to_json()})
+        return
+    _print(card)
+    tell(f"  its parts are drawn in {picture}")
+    tell(f"  `lcollision edit --model {card.name}` opens it")
+
+
+def _print(card: LearnedCard) -> None:
+    """Print the card of a model."""
+    tell(
+        f"{card.name}: {card.vertices} vertices, {card.parts} body parts, learned from "
+        f"{card.poses} poses in {duration_text(sum(card.seconds.values()))}"
+    )
+    tell(
+        f"  poses come back to {100.0 * card.error_mean:.2f} % of the body size, at most "
+        f"{100.0 * card.error_max:.2f} %"
+    )
+    rates = (
+        (f"{100.0 * rate:.1f} %" if rate is not None else "an unknown share") + what
+        for rate, what in (
+            (card.false_positive_rate, " of the free poses are called colliding"),
+            (card.false_negative_rate, " of the colliding ones free"),
+        )
+    )
+    tell(
+        f"  {100.0 * card.accuracy:.1f} % of unseen samples are classified correctly (majority "
+        f"baseline: {100.0 * card.majority_rate:.1f} %): {', '.join(rates)}"
+    )
+    tell(
+        f"  {100.0 * card.colliding_share:.1f} % of its {card.samples} samples collide; "
+        + ", ".join(f"{stage} {duration_text(spent)}" for stage, spent in card.seconds.items())
+    )
+
+
+def told_of_learning(status: LearningStatus) -> Told:
+    """Put the stage, how far it is, and the time left into words."""
+    stage = f"{status.stage} {100.0 * status.stage_done:.0f} %"
+    left = f"about {duration_text(status.seconds_left)} left"
+    return status.done, 1.0, stage, [left, *status.facts]
