@@ -35,6 +35,12 @@ if TYPE_CHECKING:
 _SECONDS_BETWEEN_NOTES = 0.5
 """Between two notes of the status in the work folder."""
 
+_VERTICES, _POSES = 10_000, 100
+"""Of a character, until its files are read."""
+
+_PATCHES = 0.3
+"""Fraction of the predictor's stage that labelling its patches takes."""
+
 _GATHERED = 0.9
 """Fraction of the stage of the poses after which their contact rules are proposed."""
 
@@ -79,7 +85,8 @@ class _Learner:
         self._request = work.request
         self._effort: Effort = EFFORTS[Quality(self._request.quality)]
         self._show = progress
-        self._pace = Pace(self._tell)
+        quality = Quality(self._request.quality)
+        self._pace = Pace(self._tell, estimated_seconds(_VERTICES, _POSES, quality))
         spent = work.status.seconds
         self._before = {str(stage): float(spent.get(stage, 0.0)) for stage in STAGES}
         self._stage, self._began = Stage.POSES, time.monotonic()
@@ -230,9 +237,10 @@ class _Learner:
         store = LabelStore.open(work.labels)
 
         def told_epochs(status: PredictorStatus) -> None:
-            # Labelling patches takes about as long as the passes over them.
-            done = 0.5 + 0.5 * status.done / status.total
-            done = done if status.preparing is None else 0.5 * status.preparing
+            if status.preparing is not None:
+                done = _PATCHES * status.preparing
+            else:
+                done = _PATCHES + (1.0 - _PATCHES) * status.done / status.total
             accuracy = status.held_out_accuracy
             self._at(done, [] if accuracy is None else [f"{100.0 * accuracy:.1f} % accuracy"])
 

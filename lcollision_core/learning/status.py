@@ -56,17 +56,17 @@ class Pace:
     Parameters
     ----------
     progress : called with each status
+    expected : estimated seconds of each stage
     """
 
-    def __init__(self, progress: StatusCallback) -> None:
-        self._progress = progress
-        self._expected: Mapping[Stage, float] = dict.fromkeys(STAGES, 1.0)
+    def __init__(self, progress: StatusCallback, expected: Mapping[Stage, float]) -> None:
+        self._progress, self._expected = progress, expected
         self._began = time.monotonic()
         self._stage, self._n_told = Stage.POSES, 0
-        self._behind = self._skipped = 0.0
+        self._behind = self._skipped = self._shown = 0.0
 
     def expect(self, seconds: Mapping[Stage, float]) -> None:
-        """Take the estimated seconds of each stage, once they are known; the pace begins anew."""
+        """Take better estimates once the poses are known; the pace begins anew."""
         self._expected = seconds
         self._began = time.monotonic()
         self._behind = self._skipped = self._seconds_behind(self._stage, 1.0)
@@ -86,7 +86,9 @@ class Pace:
         seconds, worked = time.monotonic() - self._began, behind - self._skipped
         pace = seconds / worked if seconds > _LEAST_SECONDS and worked > 0.0 else 1.0
         left = (total - behind) * pace
-        self._progress(LearningStatus(stage, stage_done, behind / total, left, tuple(facts)))
+        # Better estimates never take back what was shown.
+        self._shown = max(self._shown, behind / total)
+        self._progress(LearningStatus(stage, stage_done, self._shown, left, tuple(facts)))
 
     def _seconds_behind(self, stage: Stage, stage_done: float) -> float:
         """Return the estimated seconds of what is done."""

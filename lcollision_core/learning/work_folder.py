@@ -21,12 +21,11 @@ from lcollision_core.learning.request import LearningRequest
 from lcollision_core.learning.status import LearningStatus, Stage
 from lcollision_core.meshes import atomic_write, locked
 from lcollision_core.model import user_models_folder
-from lcollision_core.model.model_store import MODEL_SUFFIX
+from lcollision_core.model.model_store import MODEL_SUFFIX, WORK_SUFFIX, work_path
 from lcollision_core.regular_files import read_regular
 
 _VERSION = 1
 _MOST_BYTES = 1_000_000
-_SUFFIX = ".work"
 
 
 class WorkState(StrEnum):
@@ -93,12 +92,12 @@ class WorkFolder:
 
     def __init__(self, destination: Path) -> None:
         self.destination = destination
-        self.path = destination.with_name(destination.name + _SUFFIX)
+        self.path = work_path(destination)
 
     @classmethod
     def at(cls, path: Path) -> WorkFolder:
         """Return the work folder of this path."""
-        return cls(path.with_name(path.name.removesuffix(_SUFFIX)))
+        return cls(path.with_name(path.name.removesuffix(WORK_SUFFIX)))
 
     @property
     def name(self) -> str:
@@ -244,5 +243,5 @@ class WorkFolder:
 
 def list_work() -> tuple[WorkFolder, ...]:
     """Return the runs whose models are to be in the user's own folder, by name."""
-    found = user_models_folder().glob(f"*{MODEL_SUFFIX}{_SUFFIX}")
+    found = user_models_folder().glob(f"*{MODEL_SUFFIX}{WORK_SUFFIX}")
     return tuple(WorkFolder.at(path) for path in sorted(found) if path.is_dir())

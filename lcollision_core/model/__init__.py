@@ -46,6 +46,7 @@ from lcollision_core.model.source_file import (
     SourceFile,
     WrittenPose,
     offered_forms,
+    own_source,
     source_for,
     write_pose,
     write_sequence,

@@ -13,6 +13,9 @@ from lcollision_core.meshes import has_known_suffix
 
 MODEL_SUFFIX = ".safetensors"
 
+WORK_SUFFIX = ".work"
+"""What the folder of an unfinished model adds to its file's name."""
+
 
 @dataclass(frozen=True)
 class ListedModel:
@@ -70,12 +73,13 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
                 return model.path
         if not has_known_suffix(path):
             destination = user_models_folder() / f"{path}{MODEL_SUFFIX}"
-    if destination.name and checkpoint_path(destination).is_file():
-        raise ModelFileError(
-            "is not finished",
-            f"run its command again, which goes on from {checkpoint_path(destination)}",
-            where=f"the training of {str(path)!r}",
-        )
+    for unfinished in (checkpoint_path(destination), work_path(destination)):
+        if destination.name and unfinished.exists():
+            raise ModelFileError(
+                "is not finished",
+                f"run its command again, which goes on from {unfinished}",
+                where=f"the training of {str(path)!r}",
+            )
     if len(path.parts) == 1:
         names = ", ".join(model.name for model in listed) or "none yet"
         close = get_close_matches(path.name, [model.name for model in listed], 1)
@@ -89,6 +93,11 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
 def checkpoint_path(destination: Path) -> Path:
     """Return the file that a training to a destination goes on from."""
     return destination.with_name(destination.name + ".checkpoint")
+
+
+def work_path(destination: Path) -> Path:
+    """Return the folder in which a model is learned from files: see `learning.WorkFolder`."""
+    return destination.with_name(destination.name + WORK_SUFFIX)
 
 
 def model_destination(name_or_path: str | os.PathLike[str]) -> Path:

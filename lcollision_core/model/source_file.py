@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from lcollision_core.meshes import (
     atomic_files,
     body_size,
     file_stems,
+    mesh_files,
     read_mesh,
 )
 from lcollision_core.meshes.formats.obj_rewrite import rewrite_obj
@@ -339,7 +340,8 @@ def source_for(
     ----------
     suffix : of the output
     body : of the poses
-    like : the file, if the user names one; else a character's own where that offers the suffix
+    like : the file, if the user names one; else the one that the body came from, see
+        `own_source`, where that offers the suffix
 
     Raises
     ------
@@ -347,12 +349,32 @@ def source_for(
     """
     if like is not None:
         return SourceFile(like, body)
-    if isinstance(body, RigModel):
-        own = body.character.source
-        suffixes = {form.suffix for form in offered_forms(own, has_rig=True)}
+    own = own_source(body)
+    if own is not None:
+        suffixes = {form.suffix for form in offered_forms(own, has_rig=isinstance(body, RigModel))}
         if suffix.lower() in suffixes or suffix.lower() == own.suffix.lower() == ".vrm":
             return SourceFile(own, body)
     return None
+
+
+def own_source(body: PosableBody) -> Path | None:
+    """Return the user's file that a body came from and whose form exports can keep, if it is there.
+
+    That is a character's file, and of a model that was learned from files in one run the first of
+    them, of a folder its first mesh.
+    """
+    if isinstance(body, RigModel):
+        return body.character.source
+    request = body.card.provenance.get("request")
+    sources = request.get("sources") if isinstance(request, Mapping) else None
+    first = sources[0] if isinstance(sources, Sequence) and sources else None
+    if not isinstance(first, str) or request.get("scale", 1.0) != 1.0:
+        return None
+    path = Path(first)
+    if path.is_dir():
+        path = next(iter(mesh_files(path)[0]), path)
+    kept = {suffix for form in EXPORT_FORMS for suffix in form.of_sources}
+    return path if path.suffix.lower() in kept and path.is_file() else None
 
 
 def write_pose(

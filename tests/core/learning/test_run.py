@@ -1,0 +1,209 @@
+"""From a pose set to a trained model in one run, which goes on however it is stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.learning import (
+    EFFORTS,
+    STAGES,
+    Effort,
+    LearningRequest,
+    LearningStatus,
+    Quality,
+    WorkFolder,
+    WorkState,
+    learn_model,
+)
+from lcollision_core.meshes import PoseSet, write_pose_set
+from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.predictor import PRESETS
+
+SMALL = Effort(
+    16,
+    EmbeddingConfig(
+        n_domains=2, n_domain_codes=3, level1_epochs=10, level2_epochs=4, held_out_stride=0
+    ),
+    256,
+    replace(PRESETS["default"], epochs=2),
+)
+
+
+@pytest.fixture(autouse=True)
+def _small_effort(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EFFORTS, Quality.QUICK, SMALL)
+
+
+@pytest.fixture
+def request_for_tube(tmp_path: Path, tube_poses: PoseSet) -> LearningRequest:
+    file = tmp_path / "tube.npz"
+    write_pose_set(file, tube_poses)
+    return LearningRequest((str(file),), Quality.QUICK)
+
+
+def work_in(folder: Path, request: LearningRequest, name: str = "tube") -> WorkFolder:
+    work = WorkFolder(folder / f"{name}.safetensors")
+    work.prepare(request)
+    return work
+
+
+def numbers_of(path: str) -> tuple[str, bytes]:
+    """Return what tells the latent space and the predictor of a model."""
+    model = PoseModel.load(path)
+    return model.fingerprint, model.predict(model.training_latent).collision_logit.tobytes()
+
+
+def test_a_run_ends_with_a_model_that_resolves(
+    tmp_path: Path, request_for_tube: LearningRequest
+) -> None:
+    work = work_in(tmp_path, request_for_tube)
+    told: list[LearningStatus] = []
+    card = learn_model(work, told.append)
+    model = PoseModel.load(card.model)
+    assert card.model == str(tmp_path / "tube.safetensors")
+    assert (card.vertices, card.poses, card.parts, card.samples) == (model.n_vertices, 16, 2, 256)
+    assert model.domain_names == ("left thigh", "left shin")
+    assert card.accuracy == model.predictor_record.metrics.accuracy
+    assert 0.0 < card.error_mean < 0.2
+    assert {status.stage for status in told} == set(STAGES)
+    assert all(np.diff([status.done for status in told]) >= 0.0)
+    assert told[0].done < 0.1
+    assert told[-1].done > 0.99
+    assert all(seconds > 0.0 for seconds in card.seconds.values())
+    # The status stays for a window that looks later, and nothing large.
+    assert work.status.state == WorkState.DONE
+    assert work.status.model == card.model
+    assert not work.poses.exists()
+    assert not work.labels.exists()
+    collides = sample_poses(model, 1, 0, colliding=True)
+    assert model.resolve(collides[0]).exactly_free
+
+
+def test_a_run_that_is_cancelled_anywhere_goes_on_to_the_same_model(
+    tmp_path: Path, request_for_tube: LearningRequest
+) -> None:
+    told: list[LearningStatus] = []
+    whole = learn_model(work_in(tmp_path, request_for_tube, "whole"), told.append)
+    work = work_in(tmp_path, request_for_tube, "parts")
+    stops = np.linspace(0, len(told) - 2, 10).round().astype(int).tolist()
+    for stop in stops:
+        token, seen = CancelToken(), []
+
+        def cancel(status: LearningStatus, token: CancelToken = token, seen: list = seen) -> None:  # type: ignore[type-arg]
+            seen.append(status)
+            if status.done >= told[stop].done:  # noqa: B023 - called before the next
+                token.cancel()
+
+        with pytest.raises(CancelledError):
+            learn_model(work, cancel, token)
+        assert work.status.state == WorkState.STOPPED
+        assert not work.is_held
+        assert work.status.done <= told[stop].done + 0.3
+    parts = learn_model(work)
+    assert numbers_of(parts.model) == numbers_of(whole.model)
+    assert parts.error_mean == whole.error_mean
+
+
+_KILLED = """
+import sys
+from pathlib import Path
+from tests.core.learning.test_run import SMALL
+from lcollision_core.learning import EFFORTS, Quality, WorkFolder, learn_model
+EFFORTS[Quality.QUICK] = SMALL
+learn_model(WorkFolder(Path(sys.argv[1])))
+"""
+
+
+def test_a_run_that_is_killed_goes_on_to_the_same_model(
+    tmp_path: Path, request_for_tube: LearningRequest
+) -> None:
+    whole = learn_model(work_in(tmp_path, request_for_tube, "whole"))
+    work = work_in(tmp_path, request_for_tube, "killed")
+    for stage in STAGES[1:]:
+        process = subprocess.Popen([sys.executable, "-c", _KILLED, work.destination])
+        give_up = time.monotonic() + 60.0
+        while work.status.stage != stage and process.poll() is None:
+            assert time.monotonic() < give_up, f"{stage} has not begun"
+            time.sleep(0.01)
+        assert process.poll() is None, "it ended before it was killed"
+        assert work.is_held
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        # A killed process cannot say so: nobody holds what is said to run.
+        assert work.status.state == WorkState.RUNNING
+        assert not work.is_held
+    killed = learn_model(work)
+    assert numbers_of(killed.model) == numbers_of(whole.model)
+
+
+def test_a_finished_run_is_not_done_again(
+    tmp_path: Path, request_for_tube: LearningRequest
+) -> None:
+    first = learn_model(work_in(tmp_path, request_for_tube))
+    stamp = Path(first.model).stat().st_mtime_ns
+    again = learn_model(work_in(tmp_path, request_for_tube))
+    assert again == first
+    assert Path(first.model).stat().st_mtime_ns == stamp
+
+
+def test_what_another_request_made_or_makes_is_not_touched(
+    tmp_path: Path, request_for_tube: LearningRequest
+) -> None:
+    other = replace(request_for_tube, seed=1)
+    work_in(tmp_path, request_for_tube)
+    with pytest.raises(ModelFileError, match=r"being learned from other files or options"):
+        work_in(tmp_path, other)
+    learn_model(work_in(tmp_path, request_for_tube))
+    WorkFolder(tmp_path / "tube.safetensors").remove()
+    before = (tmp_path / "tube.safetensors").read_bytes()
+    with pytest.raises(ModelFileError, match=r"there is a model 'tube' already"):
+        learn_model(work_in(tmp_path, other))
+    assert (tmp_path / "tube.safetensors").read_bytes() == before
+
+
+def test_two_processes_do_not_learn_the_same(
+    tmp_path: Path, request_for_tube: LearningRequest
+) -> None:
+    work = work_in(tmp_path, request_for_tube)
+    with work.held():
+        assert work.is_held
+        with (
+            pytest.raises(ModelFileError, match="being learned by another process"),
+            work.held(wait=0.0),
+        ):
+            pass
+    assert not work.is_held
+
+
+def test_what_cannot_be_learned_from_is_said_and_kept(tmp_path: Path) -> None:
+    work = work_in(tmp_path, LearningRequest((str(tmp_path / "none.npz"),), Quality.QUICK))
+    with pytest.raises(MeshFileError, match="does not exist"):
+        learn_model(work)
+    assert work.status.state == WorkState.FAILED
+    assert "does not exist" in work.status.sentence
+
+
+def test_damaged_status_and_request(tmp_path: Path, request_for_tube: LearningRequest) -> None:
+    work = work_in(tmp_path, request_for_tube)
+    assert work.request == request_for_tube
+    (work.path / "status.json").write_text("{")
+    assert work.status.state == WorkState.STOPPED
+    (work.path / "request.json").write_text('{"version": 99}')
+    with pytest.raises(ModelFileError, match="format version 99"):
+        _ = work.request
+    with pytest.raises(LCollisionError, match="quality must be quick, good, best, got better"):
+        LearningRequest(("a",), "better")
+    with pytest.raises(LCollisionError, match="no files"):
+        LearningRequest(())
