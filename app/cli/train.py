@@ -35,6 +35,7 @@ from lcollision_core.jobs import CancelToken
 if TYPE_CHECKING:
     from app.cli.console import Told
     from lcollision_core.embedding.run import TrainingStatus
+    from lcollision_core.meshes import PoseSet
     from lcollision_core.predictor import PredictorStatus
 
 app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
@@ -113,7 +114,7 @@ def embedding(
             poses, config, checkpoint=checkpoint, progress=progress, cancel=cancel, seed=seed
         )
     model = PoseModel.from_training(
-        destination.stem, trained, poses, source, licence, _provenance(poses.vertices, seed)
+        destination.stem, trained, poses, source, licence, _provenance(poses, seed)
     )
     written = save_trained(destination, before, model)
     note_if_beside(written, destination)
@@ -225,18 +226,19 @@ def _resumable(
         raise
 
 
-def _provenance(vertices: Any, seed: int) -> dict[str, Any]:
+def _provenance(poses: PoseSet, seed: int) -> dict[str, Any]:
     import hashlib
     from importlib.metadata import version
 
     import numpy as np
 
-    digest = hashlib.sha256(np.ascontiguousarray(vertices).tobytes()).hexdigest()
+    digest = hashlib.sha256(np.ascontiguousarray(poses.vertices).tobytes()).hexdigest()
     return {
         "program": f"lcollision {version('lcollision')}",
         "command": "train embedding",
         "seed": seed,
         "poses_sha256": digest,
+        **({"poses": dict(poses.provenance)} if poses.provenance else {}),
     }
 
 

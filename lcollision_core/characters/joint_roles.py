@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 
 from lcollision_core.characters.character import Rig
+from lcollision_core.meshes.part_names import part_names
 from lcollision_core.meshes.topology import FloatArray
 
 _BENT = np.radians(6.0)
@@ -21,27 +22,33 @@ _SHORT = 1e-6
 
 
 class Role(Enum):
-    """What a joint is in a body; values are patterns of its name's letters, the first counts."""
+    """What a joint is in a body; values are patterns of its name in small letters and digits.
+
+    The first that is found counts. What has none and belongs to the head is of its face.
+    """
 
     TWIST = "twist|roll(?!er)"
-    THUMB = "thumb"
-    FINGER = "finger|index|middle|(?<!sp)(?<!st)ring|pinky|pinkie|little|metacarpal"
-    TOE = "toe|ball"
+    PALM = "palm|carpal"
+    THUMB = "thumb|^bip[0-9]*[lr]finger0"
+    FINGER = "finger|index|middle|(?<!sp)(?<!st)ring|pinky|pinkie|little"
+    TOE = "toe|(?<!eye)ball"
     FOOT = "foot|ankle"
     HAND = "hand|wrist"
-    FOREARM = "forearm|lowerarm|loarm|elbow"
+    FOREARM = "forearm|lowerarm|lowarm|loarm|armlower|elbow"
     SHOULDER = "shoulder|clavicle|collar"
-    UPPER_ARM = "arm(?!atu|or)"
-    THIGH = "thigh|upleg|upperleg"
+    UPPER_ARM = "arm(?!atu|or)|shldr"
+    THIGH = "thigh|upleg|upperleg|legupper"
     SHIN = "shin|calf|knee|leg"
     NECK = "neck"
-    HEAD = "head|skull"
+    HEAD = "(?<!fore)head|skull"
     SPINE = "spine|chest|torso|waist|abdomen|belly"
     OTHER = ""
+    FACE = "$^"
 
 
 _LIMITS: dict[Role, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     Role.TWIST: ((0, 0), (-60, 60), (0, 0)),
+    Role.PALM: ((-20, 20), (0, 0), (-15, 15)),
     Role.THUMB: ((-30, 60), (-20, 20), (-30, 30)),
     Role.FINGER: ((-20, 95), (0, 0), (-15, 15)),
     Role.TOE: ((-45, 45), (0, 0), (0, 0)),
@@ -56,6 +63,7 @@ _LIMITS: dict[Role, tuple[tuple[float, float], tuple[float, float], tuple[float,
     Role.HEAD: ((-40, 40), (-60, 60), (-35, 35)),
     Role.SPINE: ((-25, 40), (-35, 35), (-30, 30)),
     Role.OTHER: ((-75, 75), (-75, 75), (-75, 75)),
+    Role.FACE: ((-75, 75), (-75, 75), (-75, 75)),
 }
 """Degrees of bend, twist and sideways turn from the rest pose. They are wider than a person's, as
 rest poses differ, and a hinge hardly bends backwards."""
@@ -65,15 +73,28 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
     """Tell what each of the rig's joints is.
 
     A forearm is one only below an arm, and a shin below a thigh, so that limits of hinges are not
-    given to what merely sounds like one.
+    given to what merely sounds like one. Where a rig names both halves of a limb, a joint that is
+    called like the bone that it hangs on is a piece of it, and twists.
     """
+    plain = [
+        re.sub("[^a-z0-9]", "", re.split("[:|]", name)[-1].lower()) for name in rig.joint_names
+    ]
+    named = [next(role for role in Role if re.search(role.value, name)) for name in plain]
+    halves = {Role.FOREARM: Role.UPPER_ARM, Role.SHIN: Role.THIGH}
+    halves |= {above: below for below, above in halves.items()}
+    of_face = [part == "Head" for part in part_names(rig.joint_names)]
     roles: list[Role] = []
-    above = {Role.FOREARM: Role.UPPER_ARM, Role.SHIN: Role.THIGH}
-    for name, parent in zip(rig.joint_names, rig.parents, strict=True):
-        letters = re.sub("[^a-z]", "", re.split("[:|]", name)[-1].lower())
-        role = next(role for role in Role if re.search(role.value, letters))
-        if role in above and (parent < 0 or roles[parent] is not above[role]):
+    for joint, (role, parent) in enumerate(zip(named, rig.parents, strict=True)):
+        above = parent
+        while above >= 0 and roles[above] is Role.TWIST:
+            above = rig.parents[above]
+        bone = roles[above] if above >= 0 else None
+        if role in halves and role is bone and halves[role] in named:
+            role = Role.TWIST
+        elif role in (Role.FOREARM, Role.SHIN) and bone is not halves[role]:
             role = Role.OTHER
+        elif role is Role.OTHER and of_face[joint]:
+            role = Role.FACE
         roles.append(role)
     return tuple(roles)
 

@@ -1,30 +1,97 @@
-"""Several files of one body as one set of poses."""
+"""The poses that a body is learned from, of all the files that have some."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lcollision_core.characters import CHARACTER_SUFFIXES, is_rigged, read_character
+from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import PoseSet, concatenated, read_pose_set
+from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
+from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
+
+ENOUGH_POSES = 100
+"""Poses from which on a rigged character is not posed by its rig unless that is asked for."""
 
 
 def gather_poses(
-    paths: Sequence[Path],
+    paths: Sequence[str | os.PathLike[str]],
     *,
     by_rig: int | None = None,
-    n_wanted: int = 100,
+    n_wanted: int = ENOUGH_POSES,
     clip: str | None = None,
     fps: float | None = None,
     up: int | None = None,
     seed: int = 0,
+    thin: bool = True,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> PoseSet:
-    """Read all poses of some files of one body."""
-    del by_rig, n_wanted, seed
-    poses = concatenated(
-        [read_pose_set(path, progress, cancel, clip=clip, fps=fps) for path in paths]
+    """Read the poses of one body from several sources, and let its rig make more.
+
+    Pose 0 is the rest pose of the first rigged file, wherever it is named, else that of the first
+    source.
+
+    Parameters
+    ----------
+    paths : files of characters, point caches, folders of meshes, pose sets, all of one topology
+    by_rig : how many poses the rig is to make, 0 for none; None for as many as are missing to
+        `n_wanted`
+    n_wanted : poses of a rigged character
+    clip, fps : of animations, as for `read_pose_set`
+    up : 0, 1 or 2 where the files are wrong about the axis that is up
+    seed : of the poses by the rig
+    thin : leave out near-duplicates among what the files have: see `thinned`
+    progress : called with (steps done, all steps); a source is as many steps as the rig's poses
+    cancel : polled between poses
+
+    Raises
+    ------
+    MeshFileError, PoseSetError : as of `read_pose_set`, for one of the sources.
+    PoseSetError : the sources are not of one topology.
+    LCollisionError : poses by the rig are asked for, and no source has a rig.
+    CancelledError : `cancel` was set.
+    """
+    if not paths:
+        raise LCollisionError("there is nothing to read poses from", "name a file or a folder")
+    files = [Path(path) for path in paths]
+    rigged = next(
+        (file for file in files if file.suffix.lower() in CHARACTER_SUFFIXES and is_rigged(file)),
+        None,
     )
+    if by_rig and rigged is None:
+        raise LCollisionError(
+            "has no joints to pose it by",
+            "name a rigged character among the files, or leave out poses by the rig",
+            where=", ".join(map(str, files)),
+        )
+    if rigged is not None:
+        files.sort(key=lambda file: file != rigged)
+    character = None if rigged is None else read_character(rigged, up)
+    n_steps = len(files) + (character is not None and by_rig != 0)
+
+    def part(number: int) -> Progress:
+        return lambda done, total: progress(number * total + done, n_steps * total)
+
+    found = []
+    for number, file in enumerate(files):
+        is_still = character is not None and file == rigged and not character.clips
+        if character is not None and is_still and clip is None and (by_rig != 0 or len(files) > 1):
+            found.append(rest_pose_set(character))
+        else:
+            found.append(read_pose_set(file, part(number), cancel, clip=clip, fps=fps))
+    poses = concatenated(found)
+    if thin:
+        poses = thinned(poses, cancel=cancel)
+    if character is not None and by_rig is None:
+        by_rig = max(0, n_wanted - len(poses)) if character.rig is not None else 0
+    if character is not None and by_rig:
+        if len(found) > 1:
+            # Its names have those of their files.
+            poses = replace(poses, source=None)
+        made = poses_by_rig(RigModel.of(character), by_rig, seed, part(len(files)), cancel)
+        poses = replace(concatenated([poses, made]), source=files[0])
     return poses if up is None else replace(poses, up_axis=up)

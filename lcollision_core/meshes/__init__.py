@@ -32,6 +32,7 @@ from lcollision_core.meshes.pose_set import (
     write_pose_set,
 )
 from lcollision_core.meshes.precision import as_stored, can_hold
+from lcollision_core.meshes.thinning import thinned
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.units import body_size, front_direction, up_axis
 from lcollision_core.meshes.upright import UpGuess, guess_up

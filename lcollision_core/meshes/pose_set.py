@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from lcollision_core.meshes.stored_rules import (
     RULE_ARRAYS,
     groups_from_arrays,
     groups_to_arrays,
+    provenance_from_arrays,
     rules_from_arrays,
     rules_to_arrays,
     texts_of,
@@ -46,6 +48,7 @@ FORMAT_VERSION = 1
 _MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
 _EXTRA_ARRAYS = (
     *("format_version", "names", "notes", "near_exclusion", "up_axis", "vertex_labels"),
+    "provenance",
     *RULE_ARRAYS,
 )
 _MAX_TEXT_LENGTH = 500
@@ -70,6 +73,7 @@ class PoseSet:
     groups : named groups of faces, of which the rules may ignore pairs
     up_axis : 0, 1 or 2 for x, y or z; None if it is to be guessed
     vertex_labels : (V,) array of printable strings, the body part of each vertex, if known
+    provenance : how the poses were made, JSON values by name
 
     Raises
     ------
@@ -85,6 +89,7 @@ class PoseSet:
     groups: tuple[FaceGroup, ...] = ()
     up_axis: int | None = None
     vertex_labels: npt.NDArray[np.str_] | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         shape = self.vertices.shape
@@ -211,17 +216,27 @@ def read_pose_set(
     pose_set = collect_poses(Path(path), refuse, progress, cancel, clip, fps).pose_set
     if pose_set is None:
         raise MeshFileError("holds no poses", "name another folder or file", where=path)
-    flat = degenerate_faces(pose_set.topology, pose_set.vertices[0])
+    require_usable_reference(pose_set)
+    return pose_set
+
+
+def require_usable_reference(poses: PoseSet) -> None:
+    """Refuse a set of which a face of the reference has no area.
+
+    Raises
+    ------
+    PoseSetError : the sentence names the set's source.
+    """
+    flat = degenerate_faces(poses.topology, poses.vertices[0])
     if len(flat):
         face = int(flat[0])
         raise PoseSetError(
-            f"cannot be used: {len(flat)} faces of the reference, pose 0 ({pose_set.names[0]}), "
+            f"cannot be used: {len(flat)} faces of the reference, pose 0 ({poses.names[0]}), "
             f"have no area, the first is face {face} between vertices "
-            f"{pose_set.faces[face].tolist()}",
+            f"{poses.faces[face].tolist()}",
             "remove them from all poses",
-            where=path,
+            where=poses.source,
         )
-    return pose_set
 
 
 @dataclass(frozen=True, eq=False)
@@ -467,6 +482,7 @@ def _collect_npz(
         extras = {"names": names} | _extras_of(arrays, vertices.shape)
         rules = rules_from_arrays(arrays, extras.pop("near_exclusion", 0.0))
         groups = groups_from_arrays(arrays, topology.n_faces)
+        extras["provenance"] = provenance_from_arrays(arrays)
         pose_set = PoseSet(vertices, topology, source=path, rules=rules, groups=groups, **extras)
     except LCollisionError as error:
         report(MeshFileError.because(path, "cannot be read as a pose set", error))
@@ -568,5 +584,7 @@ def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
         arrays["up_axis"] = np.array(pose_set.up_axis)
     if pose_set.vertex_labels is not None:
         arrays["vertex_labels"] = pose_set.vertex_labels
+    if pose_set.provenance:
+        arrays["provenance"] = np.array(json.dumps(dict(pose_set.provenance), allow_nan=False))
     with atomic_write(path) as file:
         write_npz(file, arrays)

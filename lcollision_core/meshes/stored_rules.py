@@ -26,6 +26,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 RULE_ARRAYS = ("rules", "group_names", "group_runs", "group_ends")
 
 _MAX_RULES_LENGTH = 2_000_000
+_MAX_PROVENANCE_LENGTH = 2_000_000
 
 
 def rules_to_arrays(rules: ContactRules) -> dict[str, npt.NDArray[Any]]:
@@ -109,3 +110,25 @@ def texts_of(value: npt.NDArray[np.str_], name: str, most: int) -> tuple[str, ..
         raise MeshFileError("holds a character that does not exist", where=name)
     # A lone surrogate, from an undecodable file name, cannot be printed.
     return tuple(text[:most].encode(errors="replace").decode() for text in native.tolist())
+
+
+def provenance_from_arrays(arrays: Arrays) -> dict[str, Any]:
+    """Return how the poses of a file were made, JSON values by name; empty where it does not say.
+
+    Raises
+    ------
+    MeshFileError : it is damaged.
+    """
+    stored = arrays.get("provenance")
+    if stored is None:
+        return {}
+    if stored.shape != () or stored.dtype.kind != "U":
+        raise MeshFileError.must_be("provenance", "one string", f"{stored.dtype} {stored.shape}")
+    (text,) = texts_of(stored.reshape(1), "provenance", _MAX_PROVENANCE_LENGTH)
+    try:
+        values = parse_json(text.encode())
+    except ValueError as error:
+        raise MeshFileError.because("provenance", "is damaged", error) from error
+    if not isinstance(values, dict):
+        raise MeshFileError.must_be("provenance", "JSON values by name", type(values).__name__)
+    return values

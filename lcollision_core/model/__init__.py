@@ -1,5 +1,6 @@
 """A trained body: reads one file and offers everything that a front end needs."""
 
+from lcollision_core.model.by_rig import poses_by_rig, rest_pose_set
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.encode import encode_mesh, read_model_mesh, with_detail
 from lcollision_core.model.encoded_pose import EncodedPose
