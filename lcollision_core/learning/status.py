@@ -20,8 +20,8 @@ class Stage(StrEnum):
 STAGES = tuple(Stage)
 """In their order."""
 
-_LEAST_SECONDS = 5.0
-"""Of a run, before its pace says more than the estimate."""
+_TRUSTED_SECONDS = 30.0
+"""Of estimated work, as much as which the estimate counts beside the pace of the run."""
 
 _FIRST = 2
 """Reports of a stage that tell where it begins, not how fast it is."""
@@ -84,7 +84,7 @@ class Pace:
         self._n_told += 1
         self._behind = behind
         seconds, worked = time.monotonic() - self._began, behind - self._skipped
-        pace = seconds / worked if seconds > _LEAST_SECONDS and worked > 0.0 else 1.0
+        pace = (_TRUSTED_SECONDS + seconds) / (_TRUSTED_SECONDS + max(worked, 0.0))
         left = (total - behind) * pace
         # Better estimates never take back what was shown.
         self._shown = max(self._shown, behind / total)
