@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
@@ -30,6 +29,8 @@ if TYPE_CHECKING:
 
 _MOST_POSES_ASKED = 50
 """Poses in which groups are looked at for contact, evenly spaced."""
+
+_MOST_BY_RIG = 10_000
 
 _LISTED = 5
 """Most proposed pairs of groups that are named."""
@@ -165,7 +166,8 @@ def make(
         typer.Argument(
             metavar="KIND|FILE...",
             help="body, body-swing or body-jump; or files of one character with animations (GLB, "
-            "glTF, VRM, FBX), point caches (PC2, MDD) beside their mesh, folders of meshes.",
+            "glTF, VRM, FBX), point caches (PC2, MDD) beside their mesh, folders of meshes, pose "
+            "sets.",
         ),
     ],
     output: Annotated[
@@ -177,8 +179,25 @@ def make(
             "--vertices", min=500, max=12000, metavar="N", help="Vertices of the built-in body."
         ),
     ] = None,
+    by_rig: Annotated[
+        int | None,
+        typer.Option(
+            "--by-rig",
+            min=1,
+            max=_MOST_BY_RIG,
+            metavar="N",
+            help="Let the rig of a character make N random poses within human limits, free of "
+            "collisions where it can; near-duplicates of what else the files hold are left out.",
+        ),
+    ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, metavar="S", help="0 gives the authored poses, others vary them.")
+        int,
+        typer.Option(
+            min=0,
+            metavar="S",
+            help="Of the built-in body 0 gives the authored poses, others vary them; of --by-rig "
+            "equal seeds give equal poses.",
+        ),
     ] = 0,
     clip: Annotated[
         str | None,
@@ -195,7 +214,7 @@ def make(
         typer.Option(help="The axis that is up. Default: what the files say, else a guess."),
     ] = None,
 ) -> None:
-    """Make a pose set of the built-in body, or of the frames of a character's animations."""
+    """Make a pose set of the built-in body, or of a character's animations and its rig."""
     from lcollision_core.errors import MeshFileError
     from lcollision_core.meshes import require_writable, write_pose_set
 
@@ -204,17 +223,20 @@ def make(
     require_writable(output)
     kind = _BODIES.get(sources[0])
     if kind is not None:
-        _require_only_body(sources, clip=clip, fps=fps, up=up)
+        _require_only_body(sources, clip=clip, fps=fps, up=up, by_rig=by_rig)
         from lcollision_core.meshes.body import make_body
 
         with progress_bar("Posing the body") as progress:
             poses = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)
     else:
-        if n_vertices is not None or seed:
+        if n_vertices is not None:
+            raise LCollisionError("--vertices is for the built-in body", "leave it out")
+        if seed and by_rig is None:
             raise LCollisionError(
-                "--vertices and --seed are for the built-in body", "leave them out"
+                "--seed is for the built-in body and for poses by the rig",
+                "leave it out, or add --by-rig N",
             )
-        poses = _read_all([Path(source) for source in sources], clip, fps, up)
+        poses = _gathered(sources, clip, fps, up, by_rig, seed)
     write_pose_set(output, poses)
     note(f"wrote {len(poses)} poses of {poses.topology.n_vertices} vertices to {output}")
 
@@ -224,23 +246,37 @@ def _require_only_body(sources: list[str], **options: object) -> None:
         raise LCollisionError(
             f"{sources[0]} is made alone", "name nothing else", got=", ".join(sources)
         )
-    given = [f"--{name}" for name, value in options.items() if value is not None]
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
     if given:
         raise LCollisionError(f"{given[0]} is for files, not for {sources[0]}", "leave it out")
 
 
-def _read_all(paths: list[Path], clip: str | None, fps: float | None, up: Axis | None) -> PoseSet:
-    from lcollision_core.meshes import concatenated, read_pose_set
+def _gathered(
+    sources: list[str],
+    clip: str | None,
+    fps: float | None,
+    up: Axis | None,
+    by_rig: int | None,
+    seed: int,
+) -> PoseSet:
+    from lcollision_core.learning import gather_poses
 
-    found = []
-    for path in paths:
-        with progress_bar(f"Reading {path.name}") as progress:
-            found.append(read_pose_set(path, progress, clip=clip, fps=fps))
-    poses = concatenated(found)
+    with progress_bar("Reading poses" if by_rig is None else "Posing the character") as progress:
+        poses = gather_poses(
+            sources,
+            by_rig=by_rig or 0,
+            clip=clip,
+            fps=fps,
+            up=None if up is None else "xyz".index(up),
+            seed=seed,
+            thin=by_rig is not None,
+            progress=progress,
+        )
     for remark in poses.notes:
         note(remark)
-    if up is not None:
-        return replace(poses, up_axis="xyz".index(up))
+    if by_rig is not None:
+        made = poses.provenance["sources"][-1]["by_rig"]
+        note(f"{made['free']} of {counted(made['drawn'], 'pose')} by the rig are free")
     if not (guess := poses.up).is_sure:
         note(f"{up_sentence(guess)}; --up x|y|z says otherwise")
     return poses

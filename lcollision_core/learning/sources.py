@@ -16,6 +16,9 @@ from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
 ENOUGH_POSES = 100
 """Poses from which on a rigged character is not posed by its rig unless that is asked for."""
 
+_STEPS = 100
+"""Of the progress of each source."""
+
 
 def gather_poses(
     paths: Sequence[str | os.PathLike[str]],
@@ -45,7 +48,7 @@ def gather_poses(
     up : 0, 1 or 2 where the files are wrong about the axis that is up
     seed : of the poses by the rig
     thin : leave out near-duplicates among what the files have: see `thinned`
-    progress : called with (steps done, all steps); a source is as many steps as the rig's poses
+    progress : called with (steps done, all steps), as many for a source as for the rig's poses
     cancel : polled between poses
 
     Raises
@@ -58,10 +61,7 @@ def gather_poses(
     if not paths:
         raise LCollisionError("there is nothing to read poses from", "name a file or a folder")
     files = [Path(path) for path in paths]
-    rigged = next(
-        (file for file in files if file.suffix.lower() in CHARACTER_SUFFIXES and is_rigged(file)),
-        None,
-    )
+    rigged = next(filter(_has_rig, files), None)
     if by_rig and rigged is None:
         raise LCollisionError(
             "has no joints to pose it by",
@@ -74,7 +74,9 @@ def gather_poses(
     n_steps = len(files) + (character is not None and by_rig != 0)
 
     def part(number: int) -> Progress:
-        return lambda done, total: progress(number * total + done, n_steps * total)
+        return lambda done, total: progress(
+            number * _STEPS + _STEPS * done // total, n_steps * _STEPS
+        )
 
     found = []
     for number, file in enumerate(files):
@@ -95,3 +97,8 @@ def gather_poses(
         made = poses_by_rig(RigModel.of(character), by_rig, seed, part(len(files)), cancel)
         poses = replace(concatenated([poses, made]), source=files[0])
     return poses if up is None else replace(poses, up_axis=up)
+
+
+def _has_rig(path: Path) -> bool:
+    """Whether it is a file of a rigged character; what is missing is refused when it is read."""
+    return path.suffix.lower() in CHARACTER_SUFFIXES and path.is_file() and is_rigged(path)

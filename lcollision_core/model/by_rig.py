@@ -57,10 +57,10 @@ _CURL_SPREAD = 0.15
 _SIZES = (0.4, 1.0)
 """Least and most by which the turns of a pose are scaled."""
 
-_DRAWS = (1.0, 1.0, 1.0, 0.75, 0.5)
+_DRAWS = (1.0, 1.0, 0.75, 0.5)
 """How often a pose that collides is drawn, and by what its turns are scaled then."""
 
-_FULL = 3
+_FULL = 2
 """Of these draws, those that are not scaled down; of a pose that is never free, one of them is
 kept, as else the poses of a character that nearly always collides would all be near to rest."""
 
@@ -120,11 +120,12 @@ def poses_by_rig(
             progress(n_poses - len(waiting) + n_free, n_poses)
         chosen[waiting] = number
         waiting = waiting[colliding]
-    for number, pose in enumerate(waiting):
-        vertices = body.decode(tried[:_FULL, pose]).astype(np.float32)
-        found = body.detector.detect_batch(vertices, cancel=cancel)
-        chosen[pose] = found.vertex_energy.sum(axis=1).argmin()
-        progress(n_poses - len(waiting) + number + 1, n_poses)
+    for start in range(0, len(waiting), _AT_ONCE // _FULL):
+        some = waiting[start : start + _AT_ONCE // _FULL]
+        vertices = body.decode(tried[:_FULL, some].reshape(-1, body.latent_size)).astype(np.float32)
+        energy = body.detector.detect_batch(vertices, cancel=cancel).vertex_energy.sum(axis=1)
+        chosen[some] = energy.reshape(_FULL, -1).argmin(axis=0)
+        progress(n_poses - len(waiting) + start + len(some), n_poses)
     codes = tried[chosen, np.arange(n_poses)]
     provenance = {
         "seed": seed,
@@ -228,7 +229,10 @@ class _Draws:
 
     @cached_property
     def limits(self) -> FloatArray:
-        """(J, 3, 2) radians of bend, twist and turn sideways, in the joints' own axes."""
+        """(J, 3, 2) radians of bend, twist and turn sideways, in the joints' own axes.
+
+        They are within those of drags; 0 where a joint has no code.
+        """
         space = self.space
         limits = np.radians(np.array([_HUMAN[role] for role in space.roles], dtype=np.float64))
         left = np.cross(space.up, space.front)
@@ -244,7 +248,11 @@ class _Draws:
             out = np.sign(space.origins[joint] @ left - middle) * (left @ way)
             if out + space.up @ way < 0.0:
                 limits[joint, 2] = -limits[joint, 2, ::-1]
-        return limits
+        reached = np.zeros_like(limits)
+        place = space.joint_of_code[ROOT_CODES:], space.axis_of_code[ROOT_CODES:]
+        low, high = space.low[ROOT_CODES:, None], space.high[ROOT_CODES:, None]
+        reached[place] = np.clip(limits[place], low, high)
+        return reached
 
     @property
     def limits_in_degrees(self) -> dict[str, Any]:

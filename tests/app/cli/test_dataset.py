@@ -185,7 +185,9 @@ def test_a_set_whose_up_axis_is_not_sure_asks_for_it(
     [
         (["body", "--clip", "wave"], "--clip is for files, not for body"),
         (["body", "body-jump"], "body is made alone, got body, body-jump"),
-        (["arm.glb", "--seed", "1"], "--vertices and --seed are for the built-in body"),
+        (["body", "--by-rig", "5"], "--by-rig is for files, not for body"),
+        (["arm.glb", "--vertices", "600"], "--vertices is for the built-in body"),
+        (["arm.glb", "--seed", "1"], "--seed is for the built-in body and for poses by the rig"),
         (["arm.glb", "--clip", "run"], "arm.glb cannot be read: it has no clip 'run'"),
         (["none.glb"], "none.glb does not exist"),
         (["arm.glb", "other.glb"], "has another number of vertices than the set"),
