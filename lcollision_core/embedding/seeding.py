@@ -244,8 +244,12 @@ def principal_components(rows: npt.NDArray[np.floating], n_wanted: int) -> Float
 
     The sign of each is fixed: its largest entry is positive.
     """
-    _, _, right = np.linalg.svd(np.asarray(rows, dtype=np.float64), full_matrices=False)
-    leading = right[:n_wanted]
+    values = np.asarray(rows, dtype=np.float64)
+    n_found = min(n_wanted, *values.shape)
+    # Poses are few: the eigenvectors of their (N, N) products give the directions. Orthonormal
+    # columns come out of the last step even where the rows span fewer.
+    mixtures = np.linalg.eigh(values @ values.T)[1][:, ::-1][:, :n_found]
+    leading = np.linalg.qr(values.T @ mixtures)[0].T
     strongest = leading[np.arange(len(leading)), np.abs(leading).argmax(axis=1)]
     oriented: FloatArray = leading * np.where(strongest < 0.0, -1.0, 1.0)[:, None]
     return oriented
