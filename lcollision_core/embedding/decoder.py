@@ -6,6 +6,7 @@ vertices of its domain only, so a pose costs one pass over a few megabytes of fl
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -95,16 +96,20 @@ class FeatureDecoder:
 
     def tangents(self, latent: npt.NDArray[Any]) -> FloatArray:
         """Differentiate the features of one (D,) latent: (D, V, 9) float64 array."""
+        return np.concatenate(list(self.tangent_groups(latent)))
+
+    def tangent_groups(self, latent: npt.NDArray[Any]) -> Iterator[FloatArray]:
+        """Yield the rows of `tangents` group by group, which need not be in memory together."""
         row = self._checked(np.asarray(latent)[None])[0]
-        tangents = np.zeros((self.latent_size, *self.offset.shape))
         start = 0
         for group in self.groups:
             stop = start + len(group.weights)
             slope = 1.0 - np.tanh(row[start:stop] @ group.weights) ** 2
             by_code = (group.weights * slope).reshape(stop - start, -1, N_FEATURES)
-            tangents[start:stop, group.support] = by_code * self.scale
+            tangents = np.zeros((stop - start, *self.offset.shape))
+            tangents[:, group.support] = by_code * self.scale
+            yield tangents
             start = stop
-        return tangents
 
     def pull_back(self, latent: npt.NDArray[Any], by_features: npt.NDArray[Any]) -> FloatArray:
         """Turn derivatives by one pose's features, (n, V, 9), into those by its codes, (n, D).

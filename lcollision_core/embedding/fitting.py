@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,7 +15,7 @@ from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray
 
 MAX_STEPS = 20
-"""The fit ends earlier when a step gains under 2 %."""
+"""Jacobians computed at most; the fit ends earlier when a step with a new one gains under 2 %."""
 
 PRIOR_SHARE = 2.5e-3
 """Cost of a code at one training deviation, relative to the mean squared vertex distance so far.
@@ -22,6 +23,9 @@ It determines what the vertices do not, and vanishes for a mesh that the decoder
 whose code is thus recovered."""
 
 _SETTLED = 0.02
+_WORTH_REUSE = 0.1
+"""Decoding costs a thirtieth of a Jacobian, so steps go on with the same one while they gain this
+much of the cost."""
 _HALVINGS = 5
 
 
@@ -35,8 +39,8 @@ class Decoder(Protocol):
     def features(self, latent: npt.NDArray[Any]) -> FloatArray:
         """(B, D) to (B, V, 9)."""
 
-    def tangents(self, latent: npt.NDArray[Any]) -> FloatArray:
-        """(D,) to (D, V, 9)."""
+    def tangent_groups(self, latent: npt.NDArray[Any]) -> Iterator[FloatArray]:
+        """(D,) to arrays of (m, V, 9), D rows in all."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,7 @@ def fit_latent(
     cancel: CancelToken | None = None,
     *,
     in_place: bool = False,
+    n_threads: int | None = None,
 ) -> LatentFit:
     """Fit code and rigid motion together to a mesh.
 
@@ -98,6 +103,7 @@ def fit_latent(
     deviation : (D,) array > 0, of the training codes
     cancel : polled before each step
     in_place : the mesh stays where it is, and the codes alone are fitted
+    n_threads : threads to compute a Jacobian on, one for each core by default
 
     Returns
     -------
@@ -122,36 +128,47 @@ def fit_latent(
         misfit = float((residual**2).sum() / n_vertices)
         return _Candidate(code, rotation, translation, decoded, residual, misfit)
 
+    def jacobian_at(one: _Candidate) -> FloatArray:
+        features = decoder.features(one.latent[None])[0]
+        jacobian = np.empty((n_codes + (0 if in_place else 6), n_vertices, 3))
+        start = 0
+        for tangents in decoder.tangent_groups(one.latent):
+            moved = codec.decode_jvp(features, tangents, n_threads)
+            jacobian[start : start + len(moved)] = moved[:, picked]
+            start += len(moved)
+        if not in_place:
+            # The mesh is free to turn and shift after the pose, so only what no small rigid
+            # motion could undo counts.
+            jacobian[n_codes : n_codes + 3] = np.eye(3)[:, None]
+            centred = one.decoded - one.decoded.mean(axis=0)
+            jacobian[n_codes + 3 :] = np.cross(np.eye(3)[:, None], centred)
+        return jacobian.reshape(len(jacobian), -1)
+
     best = at(np.asarray(guess))
     for _ in range(MAX_STEPS):
         if cancel is not None:
             cancel.raise_if_cancelled()
-        stiffness = PRIOR_SHARE * best.misfit * inverse_variance
-        features = decoder.features(best.latent[None])[0]
-        moved = codec.decode_jvp(features, decoder.tangents(best.latent))[:, picked]
-        jacobian = moved.reshape(n_codes, -1).T
-        if not in_place:
-            # The mesh is free to turn and shift after the pose, so only what no small rigid
-            # motion could undo counts.
-            rigid = np.empty((n_vertices, 3, 6))
-            rigid[:, :, :3] = np.eye(3)
-            centred = best.decoded - best.decoded.mean(axis=0)
-            rigid[:, :, 3:] = np.cross(np.eye(3), centred[:, None]).swapaxes(1, 2)
-            jacobian = np.concatenate([jacobian, rigid.reshape(3 * n_vertices, 6)], axis=1)
-        normal = jacobian.T @ jacobian / n_vertices
-        slope = jacobian.T @ best.residual.ravel() / n_vertices
-        slope[:n_codes] += stiffness * best.latent
-        normal[np.arange(n_codes), np.arange(n_codes)] += stiffness
-        # A mesh on a line leaves a turn open.
-        normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal)
-        step = np.linalg.solve(normal, slope)[:n_codes]
-        halved = (at(best.latent - 0.5**power * step) for power in range(_HALVINGS))
-        start_cost = best.cost(stiffness)
-        better = next((one for one in halved if one.cost(stiffness) < start_cost), None)
-        if better is None:
-            break
-        best = better
-        if 1.0 - best.cost(stiffness) / start_cost < _SETTLED:
+        jacobian = jacobian_at(best)
+        gram = jacobian @ jacobian.T / n_vertices
+        first_gain, gain = None, 1.0
+        while gain > _WORTH_REUSE:
+            stiffness = PRIOR_SHARE * best.misfit * inverse_variance
+            slope = jacobian @ best.residual.ravel() / n_vertices
+            slope[:n_codes] += stiffness * best.latent
+            normal = gram.copy()
+            normal[np.arange(n_codes), np.arange(n_codes)] += stiffness
+            # A mesh on a line leaves a turn open.
+            normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal)
+            step = np.linalg.solve(normal, slope)[:n_codes]
+            halved = (at(best.latent - 0.5**power * step) for power in range(_HALVINGS))
+            start_cost = best.cost(stiffness)
+            better = next((one for one in halved if one.cost(stiffness) < start_cost), None)
+            gain = 0.0
+            if better is not None:
+                gain = 1.0 - better.cost(stiffness) / start_cost
+                best = better
+            first_gain = gain if first_gain is None else first_gain
+        if first_gain < _SETTLED:
             break
     distances = np.linalg.norm(best.residual, axis=1)
     mean_error, max_error = float(distances.mean()), float(distances.max())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,9 +108,9 @@ class LinearDecoder:
         )
         return combined
 
-    def tangents(self, latent: npt.NDArray[Any]) -> FloatArray:  # noqa: ARG002
-        """Return the (m, V, 9) derivatives, the same everywhere."""
-        return self.basis
+    def tangent_groups(self, latent: npt.NDArray[Any]) -> Iterator[FloatArray]:  # noqa: ARG002
+        """Yield the (m, V, 9) derivatives, the same everywhere."""
+        yield self.basis
 
 
 def feature_pca(

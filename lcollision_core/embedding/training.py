@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,20 +16,20 @@ from lcollision_core.embedding.autoencoders import build_decoder
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.checkpoint import Checkpoint, run_key
 from lcollision_core.embedding.config import EmbeddingConfig
-from lcollision_core.embedding.fitting import Decoder, fit_latent
+from lcollision_core.embedding.fitting import Decoder, LatentFit, fit_latent
 from lcollision_core.embedding.latent_box import LatentBox
 from lcollision_core.embedding.masks import judge_masks
 from lcollision_core.embedding.metrics import EmbeddingMetrics, feature_pca, vertex_distances
 from lcollision_core.embedding.run import Run, StatusCallback
 from lcollision_core.errors import PoseSetError
-from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.jobs import CancelToken, available_cores, no_progress
 from lcollision_core.meshes.alignment import align_rigid
 from lcollision_core.meshes.pose_set import PoseSet
 from lcollision_core.meshes.precision import can_hold
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import body_size
 
-_RUN_VERSION = 1
+_RUN_VERSION = 2
 """Raised when training changes, so that no checkpoint is resumed with other rules."""
 
 
@@ -196,13 +197,23 @@ class _Trainer:
         def save() -> dict[str, npt.NDArray[Any]]:
             return {"latent": latent.copy(), "errors": errors.copy()}
 
-        for index in self._run.steps(
-            model, "codes", len(poses), load, save, part=part, unit="poses"
-        ):
+        def fit(index: int) -> LatentFit:
             target = self._vertices[poses[index]]
-            fit = fit_latent(decoder, self._codec, target, latent[index], deviation)
-            latent[index] = fit.latent
-            errors[index] = fit.mean_error, fit.max_error
+            return fit_latent(decoder, self._codec, target, latent[index], deviation, n_threads=1)
+
+        steps = self._run.steps(model, "codes", len(poses), load, save, part=part, unit="poses")
+        # One pose a thread, so that a pose gets the same bits on any number of them.
+        pool = ThreadPoolExecutor(available_cores())
+        fits: Iterator[LatentFit] | None = None
+        try:
+            for index in steps:
+                if fits is None:
+                    fits = pool.map(fit, range(index, len(poses)))
+                found = next(fits)
+                latent[index] = found.latent
+                errors[index] = found.mean_error, found.max_error
+        finally:
+            pool.shutdown(cancel_futures=True)
         return latent, errors
 
     def _measure_held_out(self) -> dict[str, Any]:
