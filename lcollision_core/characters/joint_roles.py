@@ -32,7 +32,7 @@ class Role(Enum):
     THUMB = "thumb|^bip[0-9]*[lr]finger0"
     FINGER = "finger|index|middle|(?<!sp)(?<!st)ring|pinky|pinkie|little"
     TOE = "toe|(?<!eye)ball"
-    FOOT = "foot|ankle"
+    FOOT = "foot|ankle|paw|hoof"
     HAND = "hand|wrist"
     FOREARM = "forearm|lowerarm|lowarm|loarm|armlower|elbow"
     SHOULDER = "shoulder|clavicle|collar"
@@ -130,13 +130,36 @@ def bone_directions(rig: Rig, origins: FloatArray) -> FloatArray:
     return directions
 
 
-def front_of(roles: tuple[Role, ...], directions: FloatArray, up: FloatArray) -> FloatArray | None:
-    """Return the horizontal unit vector along which the feet point; None without feet."""
+def front_of(
+    roles: tuple[Role, ...], origins: FloatArray, directions: FloatArray, up: FloatArray
+) -> FloatArray | None:
+    """Return the horizontal unit vector along which a body faces; None if its joints do not tell.
+
+    That is where its feet point, and of a body that lies more than it stands, as an animal's with
+    hooves, where its head is from its middle.
+
+    Parameters
+    ----------
+    roles : of J joints
+    origins : (J, 3), where they are at rest
+    directions : (J, 3), their bones' at rest
+    up : (3,) unit vector
+    """
+
+    def level(way: FloatArray) -> FloatArray:
+        flat: FloatArray = way - (way @ up) * up
+        return flat
+
     feet = [joint for joint, role in enumerate(roles) if role is Role.FOOT]
-    way: FloatArray = directions[feet].sum(axis=0)
-    way -= (way @ up) * up
+    way = level(directions[feet].sum(axis=0))
     length = float(np.linalg.norm(way))
-    return way / length if length > 0.5 * len(feet) * (1 - _PARALLEL) and feet else None
+    if feet and length > 0.5 * len(feet) * (1 - _PARALLEL):
+        return way / length
+    if Role.HEAD not in roles:
+        return None
+    way = origins[roles.index(Role.HEAD)] - origins.mean(axis=0)
+    length = float(np.linalg.norm(level(way)))
+    return level(way) / length if length > abs(way @ up) else None
 
 
 def joint_axes(

@@ -144,7 +144,7 @@ class RigPoseSpace:
     def _set_axes(self, rig: Rig, up: FloatArray) -> None:
         self.roles = roles = joint_roles.joint_roles(rig)
         directions = joint_roles.bone_directions(rig, rig.rest[:, :3, 3])
-        front = joint_roles.front_of(roles, directions, up)
+        front = joint_roles.front_of(roles, self.origins, directions, up)
         if front is None:
             upwards = int(np.abs(up).argmax())
             front = front_direction(self.rest_vertices * up[upwards], upwards) * up[upwards]

@@ -32,18 +32,24 @@ _FACE = frozenset(
 """Words that are too short to be sought inside others."""
 
 _PAIRED = (
-    (r"toe|ball|foot|feet|ankle|heel|tarsal|hallux", "foot"),
+    (r"toe|ball|foot|feet|ankle|heel|tarsal|hallux|paw|hoof|hooves|pastern|fetlock", "foot"),
     (_HAND, "hand"),
     (r"forearm|lowerarm|lowarm|armlower|elbow|ulna|forearmbend", "forearm"),
     (r"upperarm|uparm|armupper|bicep|humerus|shldr", "upper arm"),
     (r"shoulder|clavicle|collar|scapula", "shoulder"),
     (r"upleg|upperleg|legupper|thigh|femur", "thigh"),
-    (r"lowerleg|lowleg|leglower|calf|shin|knee|tibia", "shin"),
+    (r"lowerleg|lowleg|leglower|calf|shin|knee|tibia|cannon|(?<!s)hock", "shin"),
 )
 """Parts of which a body has two, by a pattern that a name without blanks contains."""
 
 _PAIRED_WORDS = {"arm": ("upper arm", "forearm"), "leg": ("shin", "thigh")}
 """A word that is a part of a limb where the rig names the other part, else the limb."""
+
+_ENDS = {
+    **dict.fromkeys(("front", "fore"), "front"),
+    **dict.fromkeys(("hind", "rear", "back"), "hind"),
+}
+"""Which legs of an animal with four, by a word."""
 
 _SINGLE = (
     (r"head|skull", "Head"),
@@ -63,12 +69,17 @@ def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
     ----------
     names : of all joints of a rig, as of Mixamo, Blender, VRM, Unreal, Biped or Daz
     """
-    plain = [_part(*_words(name)) for name in names]
+    words = [_words(name) for name in names]
+    plain = [_part(*one) for one in words]
     present = set(plain)
-    return tuple(
-        part if part is not None else _limb(*_words(name), present)
-        for name, part in zip(names, plain, strict=True)
-    )
+    parts = [
+        part if part is not None else _limb(*one, present)
+        for one, part in zip(words, plain, strict=True)
+    ]
+    legs = [_with_end(part, *one) for one, part in zip(words, parts, strict=True)]
+    # One alone is a helper, as at the front of a thigh.
+    has_four_legs = len({leg for leg, part in zip(legs, parts, strict=True) if leg != part}) > 1
+    return tuple(legs if has_four_legs else parts)
 
 
 def joint_labels(names: Sequence[str], parents: npt.NDArray[np.int64]) -> tuple[str, ...]:
@@ -161,6 +172,17 @@ def _limb(side: str, words: tuple[str, ...], present: set[str | None]) -> str | 
         if side and word in words:
             return f"{side} {part}" if f"{side} {other}" in present else f"{side} {word}"
     return None
+
+
+def _with_end(part: str | None, side: str, words: tuple[str, ...]) -> str | None:
+    """Return "Left front thigh" for a "Left thigh" whose joint's name says so."""
+    ends = [
+        _ENDS[word]
+        for word, after in zip(words, (*words, "")[1:], strict=True)
+        if word in _ENDS and (word, after) != ("fore", "arm")
+    ]
+    paired = part is not None and side and part.startswith(f"{side} ")
+    return f"{side} {ends[0]} {part.removeprefix(f'{side} ')}" if part and paired and ends else part
 
 
 def _spelled_out(name: str) -> str:

@@ -278,6 +278,15 @@ def test_hinges_bend_one_way_and_forward_is_where_the_toes_point() -> None:
     np.testing.assert_allclose(upright[place("Head"), :3, 3], rig.rest[place("Head"), :3, 3])
 
 
+def test_an_animal_faces_where_its_head_is() -> None:
+    tube = rigged_tube()
+    rig = replace(rig_of(tube), joint_names=("pelvis", "neck", "head"))
+    lying = replace(tube, rig=rig, up=np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(RigPoseSpace(lying).front, [0.0, 1.0, 0.0], atol=1e-12)
+    # One that stands has its head above.
+    assert abs(RigPoseSpace(replace(lying, up=tube.up)).front @ tube.up) < 1e-12
+
+
 @pytest.mark.parametrize(
     ("chain", "roles"),
     [

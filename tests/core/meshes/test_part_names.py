@@ -54,6 +54,22 @@ def test_biped_names_have_blanks() -> None:
     )  # fmt: skip
 
 
+def test_the_legs_of_an_animal_with_four_are_apart() -> None:
+    ends = ["thigh.L", "shin.L", "foot.L"]
+    names = [*(f"front_{end}" for end in ends), *ends, "spine"]
+    assert part_names(names) == (
+        "Left front thigh", "Left front shin", "Left front foot",
+        "Left thigh", "Left shin", "Left foot", "Torso",
+    )  # fmt: skip
+    names = ["HindUpLeg_Right", "RearKnee_Right", "Fore_Paw_R", "FrontHoof_L"]
+    assert part_names(names) == (
+        "Right hind thigh", "Right hind shin", "Right front foot", "Left front foot"
+    )  # fmt: skip
+    # A forearm is none of them, nor is a helper at the front of a thigh.
+    names = ["L Fore Arm", "R Fore Arm", "thigh_front_helper.L", "thigh.L"]
+    assert part_names(names) == ("Left forearm", "Right forearm", "Left thigh", "Left thigh")
+
+
 def test_an_arm_is_the_upper_one_only_where_there_is_a_forearm() -> None:
     assert part_names(["arm.L", "leg.L"]) == ("Left arm", "Left leg")
     assert part_names(["LeftArm", "LeftForeArm", "LeftLeg", "LeftUpLeg"]) == (
