@@ -101,27 +101,16 @@ class RuleOptions:
         rules = replace(rules, **chosen)
         if not self.ignore:
             return rules, groups
-        _, parts, components = groups_by_kind(groups, topology, vertex_labels)
-        others = (*parts, *components)
-        known = {group.name for group in (*groups, *others)}
+        from lcollision_core.meshes import groups_by_kind
+
+        held = {group.name for group in groups}
+        kinds = groups_by_kind(groups, topology, vertex_labels).values()
+        others = tuple(group for kind in kinds for group in kind if group.name not in held)
+        known = held | {group.name for group in others}
         pairs = tuple(_pair(entry, known) for entry in self.ignore)
         named = {name for pair in pairs for name in pair}
         groups = (*groups, *(group for group in others if group.name in named))
         return replace(rules, ignored=tuple(dict.fromkeys((*rules.ignored, *pairs)))), groups
-
-
-def groups_by_kind(
-    groups: tuple[FaceGroup, ...],
-    topology: Topology,
-    vertex_labels: npt.NDArray[np.str_] | None = None,
-) -> tuple[tuple[FaceGroup, ...], ...]:
-    """Return the groups of a mesh, and its body parts and components of other names."""
-    from lcollision_core.meshes import component_groups, part_groups
-
-    held = {group.name for group in groups}
-    parts = () if vertex_labels is None else part_groups(topology, vertex_labels)
-    others = (parts, component_groups(topology))
-    return groups, *(tuple(group for group in kind if group.name not in held) for kind in others)
 
 
 def _pair(entry: str, known: set[str]) -> tuple[str, str]:
@@ -154,6 +143,8 @@ _LISTED = 8
 
 def note_rules(body: PosableBody) -> None:
     """Report the pairs of faces that the figures leave out, and how many that is at rest."""
+    if body.rules_are_chosen:
+        note(f"the contact rules of {body.name} are those that you chose in the window")
     if not body.rules.exclude_nothing:
         note(rules_sentence(body.rules, excluded_at_rest(body)))
 

@@ -14,7 +14,6 @@ from app.cli.contact_options import (
     RestExclusionOption,
     RuleOptions,
     ToleratedDepthOption,
-    groups_by_kind,
     rules_sentence,
 )
 from app.cli.inputs import Axis, PoseSetArgument, up_sentence
@@ -57,10 +56,9 @@ def check(
     Exits with 1 when the set cannot be trained on as it is: a pose is unusable, or a face of
     the first has no area.
     """
-    from lcollision_core.contact import CollisionDetector, RuleCounts, propose_ignored
+    from lcollision_core.contact import CollisionDetector, RuleCounts, propose_by_kind
     from lcollision_core.errors import MeshFileError, ShapeError
-    from lcollision_core.meshes import degenerate_faces, inspect_pose_set
-    from lcollision_core.meshes.face_groups import MAX_GROUPS
+    from lcollision_core.meshes import degenerate_faces, groups_by_kind, inspect_pose_set
 
     with progress_bar("Reading poses") as progress:
         inspection = inspect_pose_set(path, progress)
@@ -80,11 +78,9 @@ def check(
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
     asked = poses.vertices[:: -(-len(poses) // _MOST_POSES_ASKED)]
-    proposed = [
-        pair
-        for kind in groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
-        for pair in propose_ignored(detector, asked, kind[:MAX_GROUPS])
-    ]
+    kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
+    found_by_kind = propose_by_kind(detector, asked, kinds)
+    proposed = [pair for kind in found_by_kind.values() for pair in kind]
     guess = poses.up
     report: dict[str, Any] = {
         "poses": inspection.n_found,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,8 @@ from scipy import sparse
 from lcollision_core.contact.detector import CollisionDetector
 from lcollision_core.contact.kernels import NEAR
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes.face_groups import FaceGroup, require_groups
+from lcollision_core.meshes.contact_rules import STRICT
+from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, require_groups
 
 NEARLY_ALWAYS = 0.95
 """Share of the poses from which contact says nothing about a pose."""
@@ -38,7 +39,6 @@ def propose_ignored(
     groups: Sequence[FaceGroup],
     least_share: float = NEARLY_ALWAYS,
     *,
-    counted_only: bool = False,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> tuple[ProposedPair, ...]:
@@ -54,8 +54,6 @@ def propose_ignored(
     poses : (N, V, 3) array, N > 0
     groups : components, materials, meshes or body parts; of equal ones the first is proposed
     least_share : of the poses, above 0
-    counted_only : whether excluded pairs do not count here either, so that what is proposed is what
-        the rules still call a collision in nearly every pose
 
     Returns
     -------
@@ -66,16 +64,35 @@ def propose_ignored(
     ShapeError : the poses or the groups do not fit the detector.
     CancelledError : `cancel` was set.
     """
-    n_faces = detector.topology.n_faces
-    require_groups(detector.rules, (*groups, *detector.groups), n_faces)
-    by_faces: dict[bytes, FaceGroup] = {}
-    for group in groups:
-        by_faces.setdefault(group.faces.tobytes(), group)
-    distinct = list(by_faces.values())
-    if len(distinct) < 2:
-        return ()
-    member = _members(distinct, n_faces)
-    in_contact = np.zeros(2 * (len(distinct),), dtype=np.int64)
+    kinds = {"": groups}
+    return propose_by_kind(detector, poses, kinds, least_share, progress=progress, cancel=cancel)[
+        ""
+    ]
+
+
+def propose_by_kind(
+    detector: CollisionDetector,
+    poses: npt.ArrayLike,
+    kinds: Mapping[str, Sequence[FaceGroup]],
+    least_share: float = NEARLY_ALWAYS,
+    *,
+    counted_only: bool = False,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> dict[str, tuple[ProposedPair, ...]]:
+    """Find such pairs among groups of one kind, for each kind by itself: see `propose_ignored`.
+
+    Pairs of groups of two kinds, as of a mesh and a body part, say nothing that those of one kind
+    do not.
+
+    Parameters
+    ----------
+    kinds : groups by kind, of which the first `MAX_GROUPS` are looked at: see `groups_by_kind`
+    counted_only : whether excluded pairs do not count here either, so that what is proposed is what
+        the rules still call a collision in nearly every pose
+    detector, poses, least_share, progress, cancel : as there
+    """
+    tallies = {kind: _Tally(groups[:MAX_GROUPS], detector) for kind, groups in kinds.items()}
     vertices = np.asarray(poses)
     for done, pose in enumerate(vertices):
         if cancel is not None:
@@ -83,22 +100,47 @@ def propose_ignored(
         found = detector.detect(pose)
         excluded = found.excluded_pairs[found.excluded_rule != NEAR]
         pairs = found.pairs if counted_only else np.concatenate([found.pairs, excluded])
-        one_way = (member[pairs[:, 0]].T @ member[pairs[:, 1]]).toarray() > 0
-        in_contact += one_way | one_way.T
+        for tally in tallies.values():
+            tally.add(pairs)
         progress(done + 1, len(vertices))
-    overlap = (member.T @ member).toarray() > 0
-    share = np.where(overlap, 0.0, in_contact / len(vertices))
-    first, second = np.nonzero(np.triu(share >= least_share, k=1))
-    order = np.argsort(-share[first, second], kind="stable")
-    return tuple(
-        ProposedPair((distinct[a].name, distinct[b].name), float(share[a, b]))
-        for a, b in zip(first[order], second[order], strict=True)
-    )
+    return {kind: tally.proposals(least_share) for kind, tally in tallies.items()}
+
+
+class _Tally:
+    """Counts the poses in which groups are in contact; of equal groups the first stands for all."""
+
+    def __init__(self, groups: Sequence[FaceGroup], detector: CollisionDetector) -> None:
+        n_faces = detector.topology.n_faces
+        require_groups(STRICT, groups, n_faces)
+        by_faces: dict[bytes, FaceGroup] = {}
+        for group in groups:
+            by_faces.setdefault(group.faces.tobytes(), group)
+        self._groups = list(by_faces.values())
+        self._member = _members(self._groups, n_faces)
+        self._in_contact = np.zeros(2 * (len(self._groups),), dtype=np.int64)
+        self._n_poses = 0
+
+    def add(self, pairs: npt.NDArray[np.integer]) -> None:
+        """Count a pose with (P, 2) pairs of faces in contact."""
+        first, second = self._member[pairs[:, 0]], self._member[pairs[:, 1]]
+        one_way = (first.T @ second).toarray() > 0
+        self._in_contact += one_way | one_way.T
+        self._n_poses += 1
+
+    def proposals(self, least_share: float) -> tuple[ProposedPair, ...]:
+        overlap = (self._member.T @ self._member).toarray() > 0
+        share = np.where(overlap, 0.0, self._in_contact / max(1, self._n_poses))
+        first, second = np.nonzero(np.triu(share >= least_share, k=1))
+        order = np.argsort(-share[first, second], kind="stable")
+        return tuple(
+            ProposedPair((self._groups[a].name, self._groups[b].name), float(share[a, b]))
+            for a, b in zip(first[order], second[order], strict=True)
+        )
 
 
 def _members(groups: Sequence[FaceGroup], n_faces: int) -> sparse.csr_matrix:
     """Return (F, G) ones where a face is of a group."""
-    faces = np.concatenate([group.faces for group in groups])
+    faces = np.concatenate([np.empty(0, dtype=np.int64), *(group.faces for group in groups)])
     of_group = np.repeat(np.arange(len(groups)), [len(group.faces) for group in groups])
     ones = np.ones(len(faces), dtype=np.int32)
     return sparse.csr_matrix((ones, (faces, of_group)), shape=(n_faces, len(groups)))

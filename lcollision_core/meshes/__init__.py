@@ -14,7 +14,13 @@ from lcollision_core.meshes.audit import audit_mesh, inspect_pose_set
 from lcollision_core.meshes.concatenation import concatenated
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts
 from lcollision_core.meshes.degenerate import degenerate_faces
-from lcollision_core.meshes.face_groups import FaceGroup, component_groups, part_groups
+from lcollision_core.meshes.face_groups import (
+    GROUP_KINDS,
+    FaceGroup,
+    component_groups,
+    groups_by_kind,
+    part_groups,
+)
 from lcollision_core.meshes.file_names import file_stem, file_stems, has_known_suffix
 from lcollision_core.meshes.files import (
     READABLE_SUFFIXES,

@@ -16,6 +16,9 @@ from lcollision_core.meshes.topology import Topology
 MAX_GROUPS = 1000
 """The most groups that are kept of one mesh."""
 
+GROUP_KINDS = ("meshes and materials", "body parts", "components")
+"""What groups of faces are, from those that the file names to those that are found."""
+
 
 @dataclass(frozen=True, eq=False)
 class FaceGroup:
@@ -56,6 +59,31 @@ def part_groups(topology: Topology, vertex_labels: npt.NDArray[np.str_]) -> tupl
     return tuple(
         FaceGroup(str(name), np.flatnonzero(of_face == name)) for name in np.unique(of_face)
     )
+
+
+def groups_by_kind(
+    groups: Sequence[FaceGroup],
+    topology: Topology,
+    vertex_labels: npt.NDArray[np.str_] | None = None,
+) -> dict[str, tuple[FaceGroup, ...]]:
+    """Return the groups of a mesh, and its body parts and components of other names, by kind.
+
+    Parameters
+    ----------
+    groups : that the mesh has; body parts and components among them are listed as such
+    vertex_labels : (V,) names of body parts, where they are known
+
+    Returns
+    -------
+    groups by each of `GROUP_KINDS`
+    """
+    parts = () if vertex_labels is None else part_groups(topology, vertex_labels)
+    computed = (parts, component_groups(topology))
+    known = {(group.name, group.faces.tobytes()) for kind in computed for group in kind}
+    own = tuple(group for group in groups if (group.name, group.faces.tobytes()) not in known)
+    taken = {group.name for group in own}
+    others = (tuple(group for group in kind if group.name not in taken) for kind in computed)
+    return dict(zip(GROUP_KINDS, (own, *others), strict=True))
 
 
 def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: int) -> None:

@@ -16,7 +16,13 @@ from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import FaceGroup, RigidTransform, Topology, front_direction
+from lcollision_core.meshes import (
+    FaceGroup,
+    RigidTransform,
+    Topology,
+    front_direction,
+    groups_by_kind,
+)
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect, code_names
 from lcollision_core.model.encoded_pose import EncodedPose
@@ -58,7 +64,13 @@ class PosableBody(ABC):
     ----------
     name, card, topology : as given
     reference, attention_mask, training_latent : as given, read-only
+    notes : sentences on what was changed on reading
+    frame_rate : of the poses that the body came with, in frames a second; None if they are no
+        motion's
     """
+
+    notes: tuple[str, ...] = ()
+    frame_rate: float | None = None
 
     def __init__(
         self,
@@ -369,13 +381,20 @@ class PosableBody(ABC):
     def with_rules(self, rules: ContactRules) -> Self:
         """Return the same model with other contact rules, which are checked by being applied.
 
+        They may ignore pairs of any groups of `groups_by_kind`.
+
         Raises
         ------
         ShapeError : an ignored group is unknown, or too many pairs are excluded.
         ModelFileError : a predictor depends on the rules that there are.
         """
-        detector = CollisionDetector(self.topology, self.reference, rules, self.groups)
-        other = self.with_card(replace(self.card, rules=rules))
+        wanted = {name for pair in rules.ignored for name in pair}
+        wanted -= {group.name for group in self.groups}
+        kinds = self.groups_by_kind.values() if wanted else ()
+        added = (group for kind in kinds for group in kind if group.name in wanted)
+        groups = (*self.groups, *added)
+        detector = CollisionDetector(self.topology, self.reference, rules, groups)
+        other = self.with_card(replace(self.card, rules=rules, groups=groups))
         for cached in ("pose_mirror", "resolver", "free_latent"):
             other.__dict__.pop(cached, None)
         other.__dict__["detector"] = detector
@@ -487,9 +506,28 @@ class PosableBody(ABC):
         return self.card.rules
 
     @property
+    def own_rules(self) -> ContactRules:
+        """The rules that the body's file says, or that a character starts with."""
+        return self.rules
+
+    @property
+    def rules_are_chosen(self) -> bool:
+        """Whether the user has chosen other rules for it, which its file does not keep."""
+        return self.rules != self.own_rules
+
+    @property
     def groups(self) -> tuple[FaceGroup, ...]:
         """Named groups of faces, of which the rules may ignore pairs."""
         return self.card.groups
+
+    @cached_property
+    def groups_by_kind(self) -> dict[str, tuple[FaceGroup, ...]]:
+        """All groups that rules may ignore pairs of, by each of `GROUP_KINDS`."""
+        return groups_by_kind(self.groups, self.topology, self._vertex_labels())
+
+    def _vertex_labels(self) -> npt.NDArray[np.str_] | None:
+        """Return the (V,) names of body parts that groups are called after, None if unknown."""
+        return None
 
     @property
     def near_exclusion(self) -> float:

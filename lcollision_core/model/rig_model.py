@@ -17,7 +17,7 @@ from lcollision_core.characters.rig_space import ROOT_CODES
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import RigidTransform, part_groups
+from lcollision_core.meshes import ContactRules, RigidTransform, part_groups
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect
 from lcollision_core.model.colours import domain_colours
@@ -39,8 +39,8 @@ FloatArray = npt.NDArray[np.float64]
 REST = "rest"
 """The name of the rest pose."""
 
-_FRAMES_A_SECOND, _MOST_FRAMES = 10.0, 300
-"""Frames of the clips that are taken as poses: enough to know what the character does."""
+_MOST_FRAMES = 300
+"""Of the clips, that are taken as poses."""
 
 _SAME = 1e-5
 """Normalised: what is alike to so much is the same rig."""
@@ -67,7 +67,13 @@ class RigModel(PosableBody):
     Attributes
     ----------
     character : as given
+    own_card : the card that its file makes, whatever was chosen instead
+    notes : sentences on what was changed on reading, and on what else is not as in the file
+    frame_rate : of the poses that are frames of its clips, in frames a second
     """
+
+    frame_rate = 10.0
+    """Enough to know what the character does."""
 
     def __init__(
         self, character: Character, space: RigPoseSpace, card: ModelCard, poses: FloatArray
@@ -81,6 +87,7 @@ class RigModel(PosableBody):
             poses,
         )
         self.character, self._space = character, space
+        self.own_card, self.notes = card, character.notes
 
     @classmethod
     def of(cls, character: Character, parts: Sequence[str] | None = None) -> RigModel:
@@ -97,7 +104,7 @@ class RigModel(PosableBody):
         """
         names, frames = [REST], []
         for clip in character.clips if character.rig is not None else ():
-            found = character.sample(clip, _FRAMES_A_SECOND)
+            found = character.sample(clip, cls.frame_rate)
             if found.transforms is not None:
                 names += found.names
                 frames.append(found.transforms)
@@ -122,6 +129,17 @@ class RigModel(PosableBody):
             groups=(*character.groups, *part_groups(character.topology, joint_parts(space.rig))),
         )
         return cls(character, space, card, poses)
+
+    def noted(self, sentence: str) -> RigModel:
+        """Return the same body with a further note."""
+        other = self.with_card(self.card)
+        other.notes = (*self.notes, sentence)
+        return other
+
+    @property
+    def own_rules(self) -> ContactRules:
+        """The rules that the character starts with, which its file does not hold."""
+        return self.own_card.rules
 
     @property
     def pose_space(self) -> RigPoseSpace:
@@ -151,6 +169,9 @@ class RigModel(PosableBody):
         arrays["codes"] = np.stack([space.joint_of_code, space.axis_of_code])
         names = {"joints": rig.joint_names, "parts": space.part_names}
         return digest_of(json.dumps(names), arrays)[:16]
+
+    def _vertex_labels(self) -> npt.NDArray[np.str_]:
+        return joint_parts(self.space.rig)
 
     @property
     def is_trained(self) -> bool:

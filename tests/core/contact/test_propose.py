@@ -9,11 +9,19 @@ from lcollision_core.contact import (
     CollisionDetector,
     ContactRules,
     ProposedPair,
+    propose_by_kind,
     propose_ignored,
 )
 from lcollision_core.errors import CancelledError, ShapeError
 from lcollision_core.jobs import CancelToken
-from lcollision_core.meshes import FaceGroup, component_groups, part_groups
+from lcollision_core.meshes import (
+    GROUP_KINDS,
+    FaceGroup,
+    component_groups,
+    groups_by_kind,
+    part_groups,
+)
+from lcollision_core.meshes.face_groups import MAX_GROUPS
 from tests.core.shapes import Mesh, soup, strip
 
 FLOOR = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
@@ -92,3 +100,34 @@ def test_bad_groups_are_refused_and_cancelling_is_heard() -> None:
     cancel.cancel()
     with pytest.raises(CancelledError):
         propose_ignored(detector(), poses(), GROUPS, cancel=cancel)
+
+
+def test_groups_are_told_apart_by_kind_also_where_the_mesh_lists_them() -> None:
+    labels = np.array(["left"] * 3 + ["right"] * 6)
+    parts, components = part_groups(MESH.topology, labels), component_groups(MESH.topology)
+    # A mesh of the name of a part stands for itself.
+    mesh = FaceGroup("left", np.array([2]))
+    kinds = groups_by_kind((mesh, parts[1], components[0]), MESH.topology, labels)
+    names = {kind: [group.name for group in groups] for kind, groups in kinds.items()}
+    assert names == dict(
+        zip(GROUP_KINDS, [["left"], ["right"], [g.name for g in components]], strict=True)
+    )
+    assert groups_by_kind((), MESH.topology)["body parts"] == ()
+
+
+def test_proposals_of_each_kind_are_those_of_it_alone() -> None:
+    kinds = {"meshes": GROUPS, "components": component_groups(MESH.topology), "none": ()}
+    steps: list[tuple[int, int]] = []
+    found = propose_by_kind(
+        detector(), poses(), kinds, 0.8, progress=lambda *step: steps.append(step)
+    )
+    alone = {kind: propose_ignored(detector(), poses(), kinds[kind], 0.8) for kind in kinds}
+    assert found == alone
+    assert [len(pairs) for pairs in found.values()] == [2, 2, 0]
+    assert steps[-1] == (10, 10)
+
+
+def test_of_very_many_groups_the_first_are_looked_at() -> None:
+    many = (*GROUPS, *(FaceGroup(f"copy {n}", np.array([n % 3])) for n in range(MAX_GROUPS)))
+    found = propose_by_kind(detector(), poses(), {"meshes": many})
+    assert found["meshes"] == (ProposedPair(("floor", "post"), 1.0),)
