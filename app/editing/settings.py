@@ -52,6 +52,7 @@ SETTINGS: dict[str, Setting] = {
     "resolve_metric": Setting("eye", choices=("eye", "latent")),
     "resolve_time_budget": Setting(20.0, 0.1, 3600.0),
     "export_form": Setting("joints", choices=("joints", "mesh", "morph", "obj", "mesh-alone")),
+    "motion_form": Setting("clip", choices=("clip", "pc2", "mdd")),
     "export_rate": Setting(30, 1, 240),
     "export_axes": Setting("model", choices=("model", "y-up", "blender", "maya", "unreal")),
     "export_scale": Setting(1.0, 1e-6, 1e6),

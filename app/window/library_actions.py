@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 LIBRARY_MENU = "&Library"
 
-_CACHES = {"PC2": ".pc2", "MDD": ".mdd"}
-
 
 class LibraryActions(QObject):
     """The actions of the menu Library, which is also the browser's context menu.
@@ -204,12 +202,14 @@ class LibraryActions(QObject):
         )
 
     def _export_motion(self) -> None:
-        form = MotionDialog(self._files.settings, self._window)
+        model, poses = self._document.model, self._panel.chosen_poses
+        of_clips = set(model.pose_names[1:])
+        rate = model.frame_rate if any(pose.name in of_clips for pose in poses) else None
+        form = MotionDialog(self._files.settings, self._window, model, rate)
         accepted = form.exec() == QDialog.DialogCode.Accepted
-        style = form.export_style
+        kinds, style = form.kinds, form.export_style
         form.deleteLater()
-        poses = self._panel.chosen_poses
-        path = self._files.ask_save("Export motion", poses[0].name, _CACHES) if accepted else None
+        path = self._files.ask_save("Export motion", poses[0].name, kinds) if accepted else None
         if path is not None:
             self._document.export_motion(path, poses, style)
 

@@ -31,6 +31,7 @@ MESH = "mesh-alone"
 
 _MESHES = {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
 _FOLLOWS = "As OBJ, PLY or STL: faces and positions alone."
+_STAY = "Axes and unit stay as in that file."
 
 
 class ExportDialog(Form):
@@ -77,8 +78,9 @@ class ExportDialog(Form):
         form = self._forms.get(self.form.currentData())
         if form is not None:
             return {form.suffix.removeprefix(".").upper(): form.suffix}
-        # As GLB a character has forms of its own.
-        return {k: s for k, s in _MESHES.items() if s != ".glb" or self._character is None}
+        # As GLB some characters have forms of their own.
+        taken = {form.suffix for form in self._forms.values()}
+        return {kind: suffix for kind, suffix in _MESHES.items() if suffix not in taken}
 
     @property
     def export_style(self) -> ExportStyle:
@@ -135,36 +137,87 @@ class ExportDialog(Form):
         has_axes = form is None or form.has_axes
         self.axes.setEnabled(has_axes)
         self._scale.setEnabled(has_axes)
-        mesh = _FOLLOWS if self._character is not None else _GLB
+        mesh = _GLB if ".glb" in self.kinds.values() else _FOLLOWS
+        if self._character is not None and not self._forms:
+            suffix = self._character.suffix.removeprefix(".").upper()
+            mesh = f"{suffix} files aren't written: this is the pose as a plain mesh, without "
+            mesh += f"joints and textures. {_GLB}"
         self.explain(self._about, mesh if form is None else form.explanation)
         meaning = self._meanings[self.axes.currentData()]
-        self.explain(self._meaning, meaning if has_axes else "Axes and unit stay as in that file.")
+        self.explain(self._meaning, meaning if has_axes else _STAY)
 
 
 class MotionDialog(Form):
-    """Asks for the frame rate, the axes and the unit of poses to write as frames."""
+    """Asks for the form, the frame rate, the axes and the unit of poses to write as frames.
 
-    def __init__(self, settings: Settings, parent: QWidget) -> None:
-        from lcollision_core.model import EXPORT_SCALES
+    Parameters
+    ----------
+    settings, parent : see `Form`
+    model : of the poses; those of a character may go into its own file
+    rate : frames a second that the poses came from, None if they are no motion's
+
+    Attributes
+    ----------
+    form, rate, axes : fields
+    """
+
+    def __init__(
+        self, settings: Settings, parent: QWidget, model: PosableBody, rate: float | None = None
+    ) -> None:
+        from lcollision_core.model import EXPORT_SCALES, RigModel, offered_forms
 
         super().__init__("Export motion", "Choose file…", settings, parent)
-        tip = "One pose is one frame"
-        self._rate = self.add_number("export_rate", "Frames per second", tip=tip)
+        self._meanings = _meanings(model)
+        source = model.character.source if isinstance(model, RigModel) else None
+        offered = offered_forms(source, has_rig=source is not None)
+        self._forms = {form.key: form for form in offered if form.is_sequence}
+        names = {key: form.label for key, form in self._forms.items()}
+        self.form = self.add_choice("motion_form", "Form", names, "What is written")
+        if self._settings["motion_form"] not in names:
+            # What is not offered now stays remembered.
+            del self._readers["motion_form"]
+        self.rate = self.add_number("export_rate", "Frames per second", tip="One pose is one frame")
+        if rate is not None:
+            self.rate.setValue(round(rate))
+            self._readers["export_rate"] = self._remembered_rate
+            self.add_note(f"At {rate:g}, poses of a clip last as long as the clip.")
+        self._own_rate = rate
         self.axes, self._scale = _add_frame(self)
-        self.add_note(
-            "A point cache holds positions alone: keep it beside your mesh, whose vertex order it "
-            "has. Each frame is checked."
-        )
+        self._about, self._meaning = self.add_note(""), self.add_note("")
         self.axes.currentIndexChanged.connect(
             lambda: self._scale.setValue(EXPORT_SCALES[self.axes.currentData()])
         )
+        for choice in (self.form, self.axes):
+            choice.currentIndexChanged.connect(self._explain)
+        self._explain()
+
+    @property
+    def kinds(self) -> dict[str, str]:
+        """The file format of the chosen form, extension by name."""
+        suffix = self._forms[self.form.currentData()].suffix
+        return {suffix.removeprefix(".").upper(): suffix}
 
     @property
     def export_style(self) -> ExportStyle:
         """What the fields say."""
         return ExportStyle(
-            self.axes.currentData(), self._scale.value(), fps=float(self._rate.value())
+            self.axes.currentData(), self._scale.value(), fps=float(self.rate.value())
         )
+
+    def _remembered_rate(self) -> int:
+        """Return the rate for poses of no motion, which that of a clip does not change."""
+        is_own = self._own_rate is not None and self.rate.value() == round(self._own_rate)
+        return int(self._settings["export_rate"] if is_own else self.rate.value())
+
+    @Slot()
+    def _explain(self) -> None:
+        form = self._forms[self.form.currentData()]
+        for field in (self.axes, self._scale):
+            field.setEnabled(form.has_axes)
+        order = " It has the vertex order of your mesh: keep it beside that." * form.has_axes
+        self.explain(self._about, f"{form.explanation}{order} Each frame is checked.")
+        meaning = self._meanings[self.axes.currentData()]
+        self.explain(self._meaning, meaning if form.has_axes else _STAY)
 
 
 def _add_frame(form: Form) -> tuple[QComboBox, NumberBox]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.settings import SETTINGS
 from app.view.theme import DARK, LIGHT, apply_theme
-from app.window.dialogs.export import EXPORT_NAMES, MESH, ExportDialog
+from app.window.dialogs.export import EXPORT_NAMES, MESH, ExportDialog, MotionDialog
 from app.window.dialogs.forms import Form
 from app.window.main_window import MainWindow
 from lcollision_core.characters import read_character
@@ -169,14 +170,91 @@ def test_a_model_keeps_the_form_of_a_file_that_is_named(
     assert (tmp_path / "out.obj").read_text().startswith("# mine\n")
 
 
+def chooser(change: Callable[[MotionDialog], None], path: Path, timers: list[QTimer]) -> QTimer:
+    """Return what changes the form of a motion's export and accepts it, with a file."""
+    accept = named(path, timers)
+
+    def fill(dialog: QDialog) -> None:
+        assert isinstance(dialog, MotionDialog)
+        change(dialog)
+        take_picture(dialog, f"export_motion_{path.suffix[1:]}")
+        accept(dialog)
+
+    return answer(fill)
+
+
+def test_poses_of_a_clip_go_back_into_the_character_s_file_and_last_as_long(
+    qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path
+) -> None:
+    path = tmp_path / "wave.glb"
+    timers: list[QTimer] = []
+    poses = window.library.list
+    for row in range(1, poses.count()):
+        poses.item(row).setSelected(True)
+
+    def look(dialog: MotionDialog) -> None:
+        keys = [dialog.form.itemData(row) for row in range(dialog.form.count())]
+        assert keys == ["clip", "pc2", "mdd"]
+        assert dialog.kinds == {"GLB": ".glb"}
+        assert (dialog.rate.value(), dialog.axes.isEnabled()) == (10, False)
+
+    timers.append(chooser(look, path, timers))
+    with qtbot.waitSignal(window.document.message, timeout=PATIENCE) as told:
+        window.actions_by_key["export_motion"].trigger()
+    assert told.args[0].startswith("Exported wave.glb: ")
+    (clip,) = arm_model.character.clips
+    before = arm_model.character.sample(clip, arm_model.frame_rate)
+    after = read_character(path).sample("poses", None)
+    np.testing.assert_allclose(after.times, before.times, atol=1e-6)
+    np.testing.assert_allclose(after.vertices, before.vertices, atol=1e-4 * arm_model.body_size)
+    # The rate of the clip is no choice to be remembered.
+    assert window.settings["export_rate"] == SETTINGS["export_rate"].default
+    assert window.settings["motion_form"] == "clip"
+
+
 def test_selected_poses_are_the_frames_of_a_point_cache(
     qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path
 ) -> None:
     path = tmp_path / "wave.pc2"
     timers: list[QTimer] = []
     window.library.list.selectAll()
-    timers.append(answer(named(path, timers)))
+
+    def change(dialog: MotionDialog) -> None:
+        dialog.form.setCurrentIndex(dialog.form.findData("pc2"))
+        assert dialog.axes.isEnabled()
+        dialog.rate.setValue(25)
+
+    timers.append(chooser(change, path, timers))
     with qtbot.waitSignal(window.document.message, timeout=PATIENCE):
         window.actions_by_key["export_motion"].trigger()
     cache = read_point_cache(path)
     assert len(cache.frames) == len(arm_model.pose_names)
+    assert window.settings["export_rate"] == 25
+
+
+def test_poses_of_no_motion_keep_the_rate_and_form_that_were_chosen(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    window.settings["export_rate"] = 12
+    form = MotionDialog(window.settings, window, window.document.model)
+    qtbot.addWidget(form)
+    assert [form.form.itemData(row) for row in range(form.form.count())] == ["pc2", "mdd"]
+    assert form.rate.value() == 12
+    form.accept()
+    # A model has no clip to choose, which says nothing of the next character.
+    assert window.settings["motion_form"] == "clip"
+
+
+def test_a_character_whose_format_is_not_written_is_given_as_a_mesh_and_that_is_said(
+    qtbot: QtBot, window: MainWindow, arm_model: RigModel
+) -> None:
+    character = replace(arm_model.character, source=Path("arm.fbx"))
+    form = ExportDialog(window.settings, window, RigModel.of(character))
+    qtbot.addWidget(form)
+    assert form.form.currentData() == MESH
+    assert not form.form.isEnabled()
+    assert form.kinds == {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
+    assert form._about.text().startswith("FBX files aren't written: this is the pose as a plain")
+    motion = MotionDialog(window.settings, window, RigModel.of(character))
+    qtbot.addWidget(motion)
+    assert motion.form.findData("clip") < 0
