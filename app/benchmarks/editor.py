@@ -14,6 +14,8 @@ drag_event_ms : in a solid drag of 60 events a second, from one until a picture 
 drag_lag_ms : by how much what a picture shows is older than the newest event, 95th percentile
 idle_cpu : fraction of one core while nothing happens, once the library's pictures are drawn
 start_seconds : from the command to a window that shows the pose, with warm caches
+open_seconds : from dropping a character on a window that shows `body`, where nothing is to do, to
+    one that shows it dragged, with warm caches; None for models
 memory_mb : the most that the process held at once
 actions : random actions done after that
 exceptions : that they raised, in the window or in a thread behind it
@@ -35,9 +37,13 @@ from pathlib import Path
 
 from app.benchmarks.timing import Row
 from app.window.editor import why_no_window
+from lcollision_core.characters import CHARACTER_SUFFIXES
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.model import find_model
+
+START, DROP = -1, -2
+"""In the place of a number of actions."""
 
 _STARTS = 3
 """Runs for each model: the first fills the caches, the last is the one that is measured."""
@@ -74,14 +80,21 @@ def time_editor(
     for index, model in enumerate(models):
         for start in range(_STARTS):
             is_last = start == _STARTS - 1
-            answer = _run(find_model(model), n_actions if is_last else -1)
+            answer = _run(find_model(model), n_actions if is_last else START)
             progress(index * _STARTS + start + 1, len(models) * _STARTS)
-        rows.append(answer)
+        is_character = find_model(model).suffix.lower() in CHARACTER_SUFFIXES
+        dropped = _run(find_model(model), DROP)["open_seconds"] if is_character else None
+        rows.append(answer | {"open_seconds": dropped})
     return rows
 
 
 def _run(model: Path, n_actions: int) -> Row:
-    """Run one editor with separate settings, log, sessions and library; -1 only starts it."""
+    """Run one editor with separate settings, log, sessions and library.
+
+    Parameters
+    ----------
+    n_actions : random actions; `START` only starts it, `DROP` times a drop
+    """
     with tempfile.TemporaryDirectory() as folder:
         environment = {
             **os.environ,

@@ -20,6 +20,7 @@ import rich  # noqa: F401 - what the command would have loaded by then, as the n
 import typer  # noqa: F401
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Slot
 
+from app.benchmarks.editor import DROP
 from app.benchmarks.timing import median_seconds
 from app.editing.document import PoseDocument
 from app.editing.settings import Settings
@@ -30,6 +31,7 @@ from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
+from lcollision_core.posing import Grip
 
 _EVENTS = 60
 _BURST_EVENTS, _BURST_SECONDS = 250, 2.0
@@ -149,10 +151,7 @@ class Session(QObject):
         document.set_solid(True)
         document.load_pose(document.training_pose(0))
         self.settle()
-        assert document.frame is not None
-        outwards = np.linalg.norm(model.reference - model.reference.mean(axis=0), axis=1)
-        grip = document.grip_at(int(outwards.argmax()))
-        home = grip.position(document.frame.vertices)
+        grip, home = self._outermost()
         side, up = np.delete(np.eye(3), model.up_axis, axis=0)[0], np.eye(3)[model.up_axis]
         moved: list[float] = []
         targets: list[npt.NDArray[np.float64]] = []
@@ -179,6 +178,31 @@ class Session(QObject):
             moved[last] - moved[shown] for last, (_, shown) in zip(newest, pictures, strict=True)
         ]
         return waits, lags
+
+    def drop(self, path: Path) -> float:
+        """Drop a character on the window; return the seconds until that shows it dragged."""
+        document = self._document
+        start = time.perf_counter()
+        self._window.files.open_dropped([path])
+        self.wait_for(lambda: Path(document.model_file) == path and self.is_shown())
+        grip, home = self._outermost()
+        target = home + _DRAG_RADIUS * document.model.body_size * np.eye(3)[document.model.up_axis]
+        document.begin_drag(grip, "Drag")
+        document.drag_to(target)
+        self.wait_for(lambda: self._shows(target))
+        seconds = time.perf_counter() - start
+        document.end_drag()
+        self.settle()
+        return seconds
+
+    def _outermost(self) -> tuple[Grip, npt.NDArray[np.float64]]:
+        """Return the outermost patch of the reference, and where it is in the pose shown."""
+        document = self._document
+        assert document.frame is not None
+        reference = document.model.reference
+        outwards = np.linalg.norm(reference - reference.mean(axis=0), axis=1)
+        grip = document.grip_at(int(outwards.argmax()))
+        return grip, grip.position(document.frame.vertices)
 
     def _shows(self, target: npt.NDArray[np.float64]) -> bool:
         return bool(self._pictures) and self._pictures[-1][1] == target.tobytes()
@@ -402,10 +426,13 @@ def show_first_pose(window: MainWindow, model: str) -> None:
 
 
 def run(model: str, n_actions: int, started: float) -> None:
-    """Open the editor, measure unless `n_actions` is below 0, and print one line of JSON.
+    """Open the editor, do what is asked for, and print one line of JSON.
 
     Parameters
     ----------
+    model : its file
+    n_actions : random actions after measuring, `START` for neither, or `DROP` to begin with the
+        bundled body and drop the model's file on it
     started : when the command was given, in seconds since 1970
     """
     settings = Settings()
@@ -413,7 +440,7 @@ def run(model: str, n_actions: int, started: float) -> None:
     _application = make_application(settings)
     window = MainWindow(PoseDocument(), settings)
     try:
-        show_first_pose(window, model)
+        show_first_pose(window, "body" if n_actions == DROP else model)
     except LCollisionError as error:
         window.close_unasked()
         sys.exit(str(error))
@@ -425,6 +452,8 @@ def run(model: str, n_actions: int, started: float) -> None:
     else:
         # What is compiled for the first prediction is kept for the next start.
         session.settle()
+    if n_actions == DROP:
+        answer["open_seconds"] = session.drop(Path(model).absolute())
     # Nothing is to be asked about, nor kept.
     window.document.mark_saved()
     window.close()
