@@ -96,6 +96,8 @@ def info(
         tell(f"  {_predictor_sentence(report)}")
     else:
         tell(f"  posed by the joints of {report['source']}, without training")
+    for remark in model.notes:
+        tell(f"  {remark}")
     if not model.rules.exclude_nothing:
         tell(f"  {rules_sentence(model.rules, report['excluded_at_rest'])}")
     _print_domains(report)

@@ -76,7 +76,7 @@ class PoseDocument(LiveEditing):
     of_other_model : OtherModelError, where a file of poses needs another model that is known
     recovered : Path, the poses file that `recover` has put in
     contacts_counted : ContactsAtRest
-    pairs_proposed : tuple of ProposedPair
+    pairs_proposed : dict of tuples of ProposedPair, by kind of group
     """
 
     model_changed = Signal()
@@ -512,7 +512,7 @@ class PoseDocument(LiveEditing):
 
     def _on_model(self, opened: jobs.OpenedModel) -> None:
         self._put_in(opened)
-        self.message.emit(f"Opened {opened.model.name}")
+        self.message.emit("; ".join((f"Opened {opened.model.name}", *opened.model.notes)))
         self.opened.emit(Path(opened.file))
 
     def _on_poses(self, read: jobs.ReadPoses | OtherModelError) -> None:

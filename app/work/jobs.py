@@ -117,11 +117,16 @@ def open_model(
     name_or_path: str | Path, _: Progress, cancel: CancelToken, up: int | None = None
 ) -> OpenedModel:
     """Read a model and use it once, so that nothing is left to compile before the first frame."""
-    from lcollision_core.model import find_model, open_body
+    from lcollision_core.model import RigModel, find_model, open_body, remember_file
 
     path = find_model(name_or_path).absolute()
     model = open_body(path, up)
     cancel.raise_if_cancelled()
+    if isinstance(model, RigModel):
+        try:
+            remember_file(model, path)
+        except ModelFileError as error:
+            model = model.noted(error.headline)
     warm_up(model)
     return OpenedModel(model, str(path))
 
@@ -134,6 +139,7 @@ def warm_up(model: PosableBody) -> None:
     latent.flags.writeable = False
     evaluator.verdict(evaluator.frame(latent, 0))
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
+    _ = model.groups_by_kind
 
 
 def _drag_once(model: PosableBody) -> None:
@@ -183,7 +189,8 @@ def read_poses(
     try:
         held = read_pose_file(path, model)
     except OtherModelError as error:
-        if error.model is None:
+        # One that was opened for them is not the one that it was.
+        if error.model is None or opened is not None:
             raise
         return error
     cancel.raise_if_cancelled()
@@ -336,14 +343,16 @@ def contacts_at_rest(model: PosableBody, _: Progress, __: CancelToken) -> Contac
 
 def propose_pairs(
     model: PosableBody, progress: Progress, cancel: CancelToken
-) -> tuple[ProposedPair, ...]:
-    """Propose groups to ignore, by some of the poses that the body came with."""
-    from lcollision_core.contact import propose_ignored
+) -> dict[str, tuple[ProposedPair, ...]]:
+    """Propose groups to ignore, by kind, by some of the poses that the body came with."""
+    from lcollision_core.contact import propose_by_kind
 
     count = len(model.training_latent)
     chosen = np.unique(np.linspace(0, count - 1, _MOST_PROPOSING).round().astype(int))
     poses = model.decode(model.training_latent[chosen])
-    return propose_ignored(model.detector, poses, model.groups, progress=progress, cancel=cancel)
+    return propose_by_kind(
+        model.detector, poses, model.groups_by_kind, progress=progress, cancel=cancel
+    )
 
 
 def change_rules(
@@ -351,9 +360,10 @@ def change_rules(
 ) -> OpenedModel:
     """Apply other contact rules to a model, and write them into its file.
 
-    Those of a character, or of a bundled model, change in the window alone.
+    Those of a character are remembered beside its file; of a bundled model they change in the
+    window alone.
     """
-    from lcollision_core.model import PoseModel, change_model
+    from lcollision_core.model import PoseModel, RigModel, change_model, remember_choices
 
     changed = model.with_rules(rules)
     if isinstance(model, PoseModel) and not is_bundled(model_file):
@@ -363,6 +373,8 @@ def change_rules(
             return held.with_rules(rules)
 
         change_model(model_file, change)
+    if isinstance(changed, RigModel):
+        remember_choices(changed)
     return OpenedModel(changed, model_file)
 
 
@@ -379,13 +391,21 @@ def edit_parts(
 ) -> OpenedModel:
     """Write a model's parts into its file, as that is now, or into a copy of the user's own.
 
-    Those of a character, whose file is not ours, change in the window alone.
+    Those of a character, whose file is not ours, are remembered beside it.
     """
     from lcollision_core.meshes import locked
-    from lcollision_core.model import PoseModel, change_model, model_destination
+    from lcollision_core.model import (
+        PoseModel,
+        RigModel,
+        change_model,
+        model_destination,
+        remember_choices,
+    )
 
     if not isinstance(model, PoseModel):
         changed = model.edit_domains(edits.names, edits.colours, edits.order)
+        if isinstance(changed, RigModel):
+            remember_choices(changed)
         return OpenedModel(changed, model_file)
 
     def change(held: PoseModel) -> PoseModel:

@@ -6,13 +6,14 @@ import os
 from pathlib import Path
 
 from lcollision_core.characters import CHARACTER_SUFFIXES, read_character
+from lcollision_core.model.known_characters import with_remembered
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.model.rig_model import RigModel
 
 
 def open_body(name_or_path: str | os.PathLike[str], up: int | None = None) -> PosableBody:
-    """Read a body that can take poses.
+    """Read a body that can take poses; a character with what the user has chosen for it.
 
     Parameters
     ----------
@@ -27,5 +28,5 @@ def open_body(name_or_path: str | os.PathLike[str], up: int | None = None) -> Po
     LCollisionError : the character has no rig.
     """
     if Path(name_or_path).suffix.lower() in CHARACTER_SUFFIXES:
-        return RigModel.of(read_character(name_or_path, up))
+        return with_remembered(RigModel.of(read_character(name_or_path, up)))
     return PoseModel.load(name_or_path)

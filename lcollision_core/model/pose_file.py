@@ -16,6 +16,7 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes import RigidTransform, atomic_write
+from lcollision_core.model.known_characters import find_character
 from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry, pose_bytes
 from lcollision_core.model.model_store import ListedModel, user_models_folder
@@ -294,10 +295,13 @@ def _other_model(
     fingerprint, name = (
         str(owner.get(key))[:MAX_POSE_NAME_LENGTH] for key in ("fingerprint", "name")
     )
-    listed = find_latent_space(fingerprint, name)
+    listed, character = find_latent_space(fingerprint, name), find_character(fingerprint)
     if listed is not None:
         what = f"holds poses of the model {listed.name!r}, not of {model.name!r}"
         next_step = f"use them with {listed.name!r}"
+    elif character is not None:
+        what = f"holds poses of the character {character.name!r}, not of {model.name!r}"
+        next_step = f"use them with {character.path}"
     elif name == model.name:
         what = (
             f"holds poses of another model called {name!r} too, which is not among the models here"
@@ -309,7 +313,7 @@ def _other_model(
             f"the models here"
         )
         next_step = f"copy its file to {user_models_folder()}, or name it"
-    return OtherModelError(what, next_step, where=path, model=listed)
+    return OtherModelError(what, next_step, where=path, model=listed or character)
 
 
 def to_json(pose: NamedPose) -> dict[str, Any]:

@@ -85,7 +85,7 @@ class BodyPartsDialog(QDialog):
             else "The changes are saved in the model's file. Undo does not revert them."
         )
         if not model.is_trained:
-            note = "The changes last while the character is open: its file stays as it is."
+            note = "The changes are remembered for this character: its file stays as it is."
         self.copy_name = QLineEdit(self._free_name())
         self.copy_name.setAccessibleName("Name of the copy")
         copy_row = QWidget()

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Qt, Slot
+from PySide6.QtCore import QSize, Qt, Slot
 from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
     QDialog,
     QDialogButtonBox,
     QLabel,
-    QListWidget,
-    QListWidgetItem,
     QPushButton,
+    QTreeWidget,
+    QTreeWidgetItem,
     QVBoxLayout,
     QWidget,
 )
@@ -23,14 +23,15 @@ from app.view.shading import UNCOUNTED_FACE
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.number_box import NumberBox
 from app.window.widgets import dialog_vbox, hbox, labelled, vbox
-from app.wording import counted
+from app.wording import counted, with_capital
+from lcollision_core.errors import ShapeError
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.work.jobs import ContactsAtRest
     from lcollision_core.contact import ContactRules, ProposedPair
 
-_WIDTH, _BORDER = 420, WIDE + 4
+_WIDTH, _BORDER = 400, WIDE + 4
 _COUNTING = "Counting pairs at rest…"
 _PERCENT = 100.0
 _MOST = {"near": 50.0, "rest": 50.0, "tolerated": 10.0}
@@ -39,7 +40,10 @@ _MOST = {"near": 50.0, "rest": 50.0, "tolerated": 10.0}
 _DEFAULT_REST = 2.0
 """Per cent that a rest exclusion begins with."""
 
-_LIST_HEIGHT = 84
+_LIST_HEIGHT = 112
+_ROW = QSize(0, 20)
+_OTHERS = "other pairs"
+_TINT = "Crosses in the pose shown, but isn't counted"
 _PAIR = Qt.ItemDataRole.UserRole
 _CHECKED, _UNCHECKED = Qt.CheckState.Checked, Qt.CheckState.Unchecked
 
@@ -56,11 +60,11 @@ class ContactsDialog(QDialog):
     ----------
     near, rest, tolerated : fields, in per cent of the body size
     at_rest : whether there is a rest exclusion
-    ignored : pairs of groups, ticked where they are ignored
+    ignored : pairs of groups by kind of group, ticked where they are ignored
     first, second, add, propose : what adds to these
-    apply : the button
+    apply, restore : buttons; the latter brings back the rules that a character starts with
     total : says how many pairs count at rest
-    locked : says why nothing can be changed, where that is so
+    kept : says where changes are kept, or why nothing can be changed
     counts : labels of the counts by rule, as the fields of `RuleCounts` are called
     """
 
@@ -78,9 +82,9 @@ class ContactsDialog(QDialog):
         for label in self.counts.values():
             label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         self.total = self._note(_COUNTING)
-        self._tint = QLabel(with_swatch("On the body: crosses, but isn't counted", UNCOUNTED_FACE))
+        self._tint = QLabel(with_swatch(_TINT, UNCOUNTED_FACE))
         self._tint.setObjectName("caption")
-        self.locked = labelled("", "caption", wraps=True)
+        self.kept = labelled("", "caption", wraps=True)
         self._lay_out()
         self.at_rest.toggled.connect(self._on_edited)
         for field in (self.near, self.rest, self.tolerated):
@@ -96,7 +100,11 @@ class ContactsDialog(QDialog):
         self.apply = buttons.addButton("Apply", QDialogButtonBox.ButtonRole.ApplyRole)
         self.apply.setToolTip("Check the pose, drag and resolve by these rules from now on")
         self.apply.clicked.connect(self._apply)
-        buttons.button(QDialogButtonBox.StandardButton.Close).setAutoDefault(False)
+        self.restore = buttons.addButton("Defaults", QDialogButtonBox.ButtonRole.ResetRole)
+        self.restore.setToolTip("Go back to the rules that the character starts with")
+        self.restore.clicked.connect(self._restore)
+        for button in (self.restore, buttons.button(QDialogButtonBox.StandardButton.Close)):
+            button.setAutoDefault(False)
         buttons.rejected.connect(self.reject)
         near, tolerated = (labelled(text, "title") for text in ("Skin folds", "Tolerated depth"))
         page = dialog_vbox(
@@ -113,7 +121,7 @@ class ContactsDialog(QDialog):
             self._ignored_part(),
             self.total,
             self._tint,
-            self.locked,
+            self.kept,
             buttons,
         )
         page.setSpacing(NORMAL)
@@ -132,7 +140,10 @@ class ContactsDialog(QDialog):
 
     def _ignored_part(self) -> QWidget:
         """Return the list of ignored pairs, with what adds to it and takes from it."""
-        self.ignored = QListWidget()
+        self.ignored = QTreeWidget()
+        self.ignored.setHeaderHidden(True)
+        self.ignored.setUniformRowHeights(True)
+        self.ignored.setIndentation(NORMAL + TIGHT)
         self.ignored.setAccessibleName("Ignored pairs")
         self.ignored.setFixedHeight(_LIST_HEIGHT)
         self.first, self.second = QComboBox(), QComboBox()
@@ -142,7 +153,9 @@ class ContactsDialog(QDialog):
             box.setToolTip("Meshes, materials and body parts of the file")
         self.add, self.propose = QPushButton("Ignore"), QPushButton("Propose")
         self.add.setToolTip("Don't count any contact between these two")
-        self.propose.setToolTip("List the groups that touch in nearly every pose, to be ticked")
+        self.propose.setToolTip(
+            "List the groups that touch in nearly every pose: tick pairs, or a whole kind"
+        )
         for button in (self.add, self.propose):
             button.setAutoDefault(False)
         self.add.clicked.connect(self._add_pair)
@@ -172,9 +185,21 @@ class ContactsDialog(QDialog):
         return ContactRules(
             _length(self.near, held.near_exclusion),
             _length(self.rest, held.rest_exclusion) if self.at_rest.isChecked() else None,
-            tuple(item.data(_PAIR) for item in self._items if item.checkState() is _CHECKED),
+            tuple(item.data(0, _PAIR) for item in self._items if item.checkState(0) is _CHECKED),
             _length(self.tolerated, held.tolerated_depth),
         )
+
+    def _where_kept(self) -> str:
+        """Say where changes are kept, or why there can be none; empty where they are in a file."""
+        model = self._document.model
+        if model.has_predictor:
+            return (
+                f"“{model.name}” has a predictor that was trained by these rules: train a model "
+                "by other rules to change them."
+            )
+        if not model.is_trained:
+            return "What you apply is remembered for this character: its file stays as it is."
+        return ""
 
     @Slot()
     def _on_model(self) -> None:
@@ -188,17 +213,17 @@ class ContactsDialog(QDialog):
         self.ignored.clear()
         for pair in rules.ignored:
             self._list(pair, _CHECKED)
+        self._name_kinds()
         names = list(dict.fromkeys(group.name for group in model.groups))
         for box in (self.first, self.second):
             box.clear()
             box.addItems(names)
         self.second.setCurrentIndex(min(1, len(names) - 1))
-        self.locked.setText(
-            f"“{model.name}” has a predictor that was trained by these rules: train a model by "
-            "other rules to change them."
-        )
-        self.locked.setMinimumHeight(self.locked.heightForWidth(_WIDTH - 2 * _BORDER))
-        self.locked.setVisible(model.has_predictor)
+        kept = self._where_kept()
+        self.kept.setText(kept)
+        self.kept.setMinimumHeight(self.kept.heightForWidth(_WIDTH - 2 * _BORDER))
+        self.kept.setVisible(bool(kept))
+        self.restore.setVisible(not model.is_trained)
         for label in self.counts.values():
             label.setText("…")
         self.total.setText(_COUNTING)
@@ -218,19 +243,27 @@ class ContactsDialog(QDialog):
 
     @Slot()
     def _on_edited(self) -> None:
-        can_change = not self._document.model.has_predictor
+        model = self._document.model
+        can_change = not model.has_predictor
         always: tuple[QWidget, ...] = (self.near, self.at_rest, self.tolerated, self.ignored)
         for widget in always:
             widget.setEnabled(can_change)
         self.rest.setEnabled(can_change and self.at_rest.isChecked())
         several = can_change and self.first.count() > 1
-        for choice in (self.first, self.second, self.add, self.propose):
+        for choice in (self.first, self.second, self.add):
             choice.setEnabled(several)
-        self.apply.setEnabled(
-            can_change
-            and not self._document.changing_rules
-            and self.rules() != self._document.model.rules
-        )
+        free = can_change and not self._document.changing_rules
+        self.propose.setEnabled(can_change)
+        self.restore.setEnabled(free and model.rules_are_chosen)
+        self.apply.setEnabled(free and self._differ())
+
+    def _differ(self) -> bool:
+        """Whether the fields say other rules than apply, and ones that there can be."""
+        try:
+            return self.rules() != self._document.model.rules
+        except ShapeError as error:
+            self.total.setText(with_capital(str(error)))
+            return False
 
     @Slot()
     def _apply(self) -> None:
@@ -238,35 +271,71 @@ class ContactsDialog(QDialog):
         self._on_edited()
 
     @Slot()
+    def _restore(self) -> None:
+        self._document.set_rules(self._document.model.own_rules)
+        self._on_edited()
+
+    @Slot()
     def _add_pair(self) -> None:
-        pair = self.first.currentText(), self.second.currentText()
-        self._list(pair).setCheckState(_CHECKED)
+        item = self._list((self.first.currentText(), self.second.currentText()))
+        item.setCheckState(0, _CHECKED)
+        self._name_kinds()
+        self.ignored.scrollToItem(item)
 
     @Slot(object)
-    def _on_proposed(self, proposals: tuple[ProposedPair, ...]) -> None:
+    def _on_proposed(self, proposals: dict[str, tuple[ProposedPair, ...]]) -> None:
         """List pairs of groups that touch in nearly every pose, for the user to tick."""
-        for proposal in proposals:
-            share = f"{100 * proposal.share:.0f} % of the poses"
-            self._list(proposal.groups).setText(f"{' and '.join(proposal.groups)}: {share}")
-        if not proposals:
+        for pair in (pair for kind in proposals.values() for pair in kind):
+            share = f"{100 * pair.share:.0f} % of the poses"
+            self._list(pair.groups).setText(0, f"{' and '.join(pair.groups)}: {share}")
+        self._name_kinds()
+        if not any(proposals.values()):
             self.total.setText("No two groups touch in nearly every pose.")
 
-    def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QListWidgetItem:
+    def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QTreeWidgetItem:
         """Return the item of a pair, which is listed now if it was not."""
         for item in self._items:
-            if set(item.data(_PAIR)) == set(pair):
+            if set(item.data(0, _PAIR)) == set(pair):
                 return item
-        item = QListWidgetItem(" and ".join(pair))
-        item.setData(_PAIR, pair)
+        kind = self._kind(pair)
+        # One that is made in its parent takes part in the parent's tick.
+        item = QTreeWidgetItem(kind, [" and ".join(pair)])
+        item.setData(0, _PAIR, pair)
         item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
-        item.setCheckState(state)
-        item.setToolTip("Ticked: contacts between these two are not counted")
-        self.ignored.addItem(item)
+        item.setCheckState(0, state)
+        item.setSizeHint(0, _ROW)
+        item.setToolTip(0, "Ticked: contacts between these two are not counted")
         return item
 
+    def _kind(self, pair: tuple[str, str]) -> QTreeWidgetItem:
+        """Return the item under which the pairs of a kind of group are listed."""
+        kinds = self._document.model.groups_by_kind
+        names = {kind: {group.name for group in groups} for kind, groups in kinds.items()}
+        name = next((kind for kind, known in names.items() if set(pair) <= known), _OTHERS)
+        for kind in self._kinds:
+            if kind.data(0, _PAIR) == name:
+                return kind
+        kind = QTreeWidgetItem(self.ignored)
+        kind.setData(0, _PAIR, name)
+        tick = Qt.ItemFlag.ItemIsUserCheckable | Qt.ItemFlag.ItemIsAutoTristate
+        kind.setFlags(kind.flags() | tick)
+        kind.setSizeHint(0, _ROW)
+        kind.setToolTip(0, "Ticked: none of these pairs is counted")
+        return kind
+
+    def _name_kinds(self) -> None:
+        """Say of each kind how many pairs it has; the only one is open."""
+        for kind in self._kinds:
+            kind.setText(0, f"{with_capital(kind.data(0, _PAIR))} ({kind.childCount()})")
+            kind.setExpanded(kind.isExpanded() or len(self._kinds) == 1)
+
     @property
-    def _items(self) -> list[QListWidgetItem]:
-        return [self.ignored.item(row) for row in range(self.ignored.count())]
+    def _kinds(self) -> list[QTreeWidgetItem]:
+        return [self.ignored.topLevelItem(row) for row in range(self.ignored.topLevelItemCount())]
+
+    @property
+    def _items(self) -> list[QTreeWidgetItem]:
+        return [kind.child(row) for kind in self._kinds for row in range(kind.childCount())]
 
 
 def _length(field: NumberBox, held: float | None) -> float:

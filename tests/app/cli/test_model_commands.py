@@ -21,13 +21,23 @@ from typer.testing import CliRunner
 from app.cli.main import app
 from lcollision_core.bundled import bundled_file
 from lcollision_core.embedding.config import EmbeddingConfig
-from lcollision_core.meshes import PoseSet, locked, read_mesh, write_mesh, write_pose_set
+from lcollision_core.meshes import (
+    ContactRules,
+    PoseSet,
+    locked,
+    read_mesh,
+    write_mesh,
+    write_pose_set,
+)
 from lcollision_core.model import (
     NamedPose,
     PoseModel,
+    RigModel,
     change_model,
     checkpoint_path,
+    open_body,
     read_poses,
+    remember_choices,
     write_poses,
 )
 from lcollision_core.model_file import Section
@@ -137,6 +147,26 @@ def test_info_of_a_character_names_its_parts_and_nothing_trained(
     words = lcollision("info", file).stdout
     assert "posed by the joints of hero.glb" in words
     assert "predictor" not in words
+
+
+def test_commands_apply_the_rules_that_were_chosen_for_a_character_and_say_so(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    file = write_gltf(rigged_body(), tmp_path / "hero.glb")
+    body = open_body(file)
+    assert isinstance(body, RigModel)
+    remember_choices(body.with_rules(ContactRules(tolerated_depth=0.5)))
+    words = lcollision("info", file).stdout
+    assert "its contact rules are those that you chose for it in the window" in words
+    assert "not counted are pairs not deeper than 0.5" in words
+    assert json.loads(lcollision("info", file, "--json").stdout)["rules"]["tolerated_depth"] == 0.5
+    sampled = lcollision("sample", file, "-n", "1", "-o", tmp_path / "poses.json")
+    assert sampled.exit_code == 0
+    chosen = "the contact rules of hero are those that you chose in the window"
+    assert (
+        chosen
+        in lcollision("mirror", file, tmp_path / "poses.json", "-o", tmp_path / "m.json").stderr
+    )
 
 
 def test_figure_shows_each_domain_in_its_colour(

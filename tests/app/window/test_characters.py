@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
@@ -18,9 +19,10 @@ from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
 from app.work.jobs import ExportStyle
-from lcollision_core.model import RigModel, open_body
+from lcollision_core.model import NamedPose, PoseModel, RigModel, open_body, write_poses
 from tests.app.windows import PATIENCE, answer, close_window, drop, rest, settings_in
 from tests.core.gltf_builder import arm
+from tests.rigged_shapes import rigged_body, write_gltf
 
 
 @pytest.fixture
@@ -205,3 +207,51 @@ def test_the_editor_starts_with_a_character_or_without_a_damaged_one(
     for number, handler in handlers.items():
         signal.signal(number, handler)
     close_window(window)
+
+
+def test_what_was_changed_on_reading_is_told_once(
+    qtbot: QtBot, window: MainWindow, arm_file: Path
+) -> None:
+    told: list[str] = []
+    window.document.message.connect(told.append)
+    model = dropped(qtbot, window, arm_file)
+    assert told == ["; ".join(["Opened arm", *model.notes])]
+
+
+def test_poses_of_a_character_bring_it_back_over_another_body(
+    qtbot: QtBot, window: MainWindow, arm_file: Path, tmp_path: Path, editor_model: PoseModel
+) -> None:
+    model, document = dropped(qtbot, window, arm_file), window.document
+    poses = tmp_path / "poses.json"
+    write_poses(poses, model, [NamedPose("bent", model.training_latent[2])])
+    document.set_model(editor_model)
+    asked: list[str] = []
+
+    def accept(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        asked.append(dialog.text())
+        next(b for b in dialog.buttons() if b.text().startswith("Open")).click()
+
+    timer = answer(accept)
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        drop(window, poses)
+    timer.stop()
+    assert asked == ["poses.json holds poses of the model “arm”."]
+    assert document.model.fingerprint == model.fingerprint
+    assert Path(document.model_file) == arm_file
+    np.testing.assert_allclose(document.latent, model.training_latent[2])
+
+
+def test_poses_of_a_character_whose_file_is_another_s_by_now_are_refused(
+    qtbot: QtBot, window: MainWindow, arm_file: Path, tmp_path: Path, editor_model: PoseModel
+) -> None:
+    model, document = dropped(qtbot, window, arm_file), window.document
+    poses = tmp_path / "poses.json"
+    write_poses(poses, model, [NamedPose("rest", model.training_latent[0])])
+    document.set_model(editor_model)
+    write_gltf(rigged_body(), arm_file)
+    with qtbot.waitSignal(document.failed, timeout=PATIENCE):
+        document.open_poses(poses, arm_file)
+    assert document.model is editor_model
+    for dialog in window.findChildren(FailureDialog):
+        dialog.close()

@@ -15,11 +15,12 @@ from app.view.shading import Shading
 from app.window.dialogs.contacts import ContactsDialog
 from app.window.main_window import MainWindow
 from app.work.jobs import contacts_at_rest
-from lcollision_core.contact import propose_ignored
+from lcollision_core.contact import propose_by_kind
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes import ContactRules
-from lcollision_core.model import PoseModel, RigModel
+from lcollision_core.model import PoseModel, RigModel, open_body
 from tests.app.windows import PATIENCE, rest, take_picture
+from tests.core.gltf_builder import arm
 from tests.rigged_shapes import rigged_body
 
 LEFT = Qt.MouseButton.LeftButton
@@ -97,8 +98,9 @@ def test_pairs_of_groups_are_ignored_and_counted_again(
     QTest.mouseClick(dialog.apply, LEFT)
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
     assert document.model.rules.ignored == ((names[0], names[1]),)
-    (item,) = dialog.ignored.findItems(names[0], Qt.MatchFlag.MatchContains)
-    item.setCheckState(Qt.CheckState.Unchecked)
+    (kind,) = dialog._kinds
+    assert kind.isExpanded()
+    kind.child(0).setCheckState(0, Qt.CheckState.Unchecked)
     QTest.mouseClick(dialog.apply, LEFT)
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
     assert document.model.rules == ContactRules()
@@ -109,8 +111,8 @@ def test_rules_that_a_predictor_was_trained_by_stay(qtbot: QtBot, window: MainWi
     dialog = dialog_of(qtbot, window)
     fields = (dialog.near, dialog.at_rest, dialog.rest, dialog.tolerated, dialog.add, dialog.apply)
     assert [field.isEnabled() for field in fields] == [False] * len(fields)
-    assert dialog.locked.isVisible()
-    assert window.document.model.name in dialog.locked.text()
+    assert dialog.kept.isVisible()
+    assert window.document.model.name in dialog.kept.text()
     dialog.close()
 
 
@@ -132,20 +134,63 @@ def test_rules_of_a_model_without_predictor_are_kept_in_its_file(
     dialog.close()
 
 
-def test_groups_that_always_touch_are_proposed_with_their_share(
+def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     qtbot: QtBot, window: MainWindow, body: RigModel
 ) -> None:
     document, dialog = window.document, dialog_of(qtbot, window)
     with qtbot.waitSignal(document.pairs_proposed, timeout=PATIENCE) as proposed:
         QTest.mouseClick(dialog.propose, LEFT)
-    expected = propose_ignored(body.detector, body.decode(body.training_latent), body.groups)
+    poses = body.decode(body.training_latent)
+    expected = propose_by_kind(body.detector, poses, body.groups_by_kind)
     assert proposed.args[0] == expected
-    assert [dialog.ignored.item(row).text() for row in range(dialog.ignored.count())] == [
+    shown = {kind.text(0): kind for kind in dialog._kinds}
+    assert list(shown) == [
+        f"{kind.capitalize()} ({len(pairs)})" for kind, pairs in expected.items() if pairs
+    ]
+    texts = [item.text(0) for item in dialog._items]
+    assert texts == [
         f"{pair.groups[0]} and {pair.groups[1]}: {100 * pair.share:.0f} % of the poses"
-        for pair in expected
+        for pairs in expected.values()
+        for pair in pairs
     ]
     assert dialog.rules() == body.rules
-    dialog.ignored.item(0).setCheckState(Qt.CheckState.Checked)
-    assert dialog.rules().ignored == (expected[0].groups,)
-    assert dialog.apply.isEnabled()
+    components = next(kind for text, kind in shown.items() if text.startswith("Components"))
+    components.setCheckState(0, Qt.CheckState.Checked)
+    ignored = tuple(pair.groups for pair in expected["components"])
+    assert dialog.rules().ignored == ignored
+    take_picture(dialog, "contacts_proposed")
+    # The components are no groups of the file.
+    QTest.mouseClick(dialog.apply, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert document.model.rules.ignored == ignored
+    assert contacts_at_rest(document.model, no_progress, CancelToken()).excluded.ignored > 0
+    dialog.close()
+
+
+def test_rules_are_remembered_and_go_back_to_the_defaults(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document, path = window.document, arm().write(tmp_path / "arm.glb")
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        document.open_model(path)
+    own = document.model.rules
+    dialog = dialog_of(qtbot, window)
+    assert "remembered for this character" in dialog.kept.text()
+    assert not dialog.restore.isEnabled()
+    dialog.tolerated.setValue(1.5)
+    QTest.mouseClick(dialog.apply, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert open_body(path).rules == document.model.rules != own
+    told = []
+    document.message.connect(told.append)
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        document.open_model(path)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert document.model.rules.tolerated_depth == 0.015
+    (sentence,) = told
+    assert sentence.endswith("; its contact rules are those that you chose for it in the window")
+    QTest.mouseClick(dialog.restore, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert document.model.rules == own == open_body(path).rules
+    assert (dialog.tolerated.value(), dialog.restore.isEnabled()) == (0.0, False)
     dialog.close()

@@ -1,0 +1,169 @@
+"""What is remembered of characters, whose files are not changed: where they are, what was chosen.
+
+One JSON file for each rig, in the user's data folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.json_values import from_json, parse_json, quoted
+from lcollision_core.meshes import ContactRules, locked
+from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.model.model_store import ListedModel
+from lcollision_core.model.rig_model import RigModel
+from lcollision_core.regular_files import read_regular
+
+_FORMAT, _VERSION = "lcollision-character", 1
+_MAX_BYTES = 10_000_000
+_PARTS = ("domain_names", "domain_colours", "domain_order")
+
+
+@dataclass(frozen=True)
+class KnownCharacter:
+    """What is remembered of a rig; of what was not chosen, None.
+
+    Attributes
+    ----------
+    file : where it was last opened from
+    rules, domain_names, domain_colours, domain_order : see `ModelCard`
+    """
+
+    file: str
+    rules: ContactRules | None = None
+    domain_names: tuple[str, ...] | None = None
+    domain_colours: tuple[str, ...] | None = None
+    domain_order: tuple[int, ...] | None = None
+
+
+def user_characters_folder() -> Path:
+    """Return the folder of what is remembered of characters, which may not exist yet."""
+    from platformdirs import user_data_path
+
+    return user_data_path("lcollision", appauthor=False) / "characters"
+
+
+def known_character(fingerprint: str) -> KnownCharacter | None:
+    """Return what is remembered of a rig, None for nothing.
+
+    Parameters
+    ----------
+    fingerprint : of the rig: see `RigModel.fingerprint`
+
+    Raises
+    ------
+    ModelFileError : its file is damaged, of a later version, or cannot be read.
+    """
+    path = _path(fingerprint)
+    try:
+        document = parse_json(read_regular(path, _MAX_BYTES))
+        if not isinstance(document, dict) or document.get("format") != _FORMAT:
+            raise ValueError("it holds something else")
+        version = document.get("format_version")
+        if isinstance(version, int) and version > _VERSION:
+            raise ModelFileError.too_new(path, quoted(version), _VERSION)
+        return from_json(KnownCharacter, document, "the character")
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise ModelFileError.unreadable(path, error, "remove it, and choose again") from error
+
+
+def find_character(fingerprint: str) -> ListedModel | None:
+    """Return the file that a rig was last opened from, None if it is gone or unknown.
+
+    Parameters
+    ----------
+    fingerprint : of the rig, as a file of poses says it
+    """
+    if not re.fullmatch("[0-9a-f]{16}", fingerprint):
+        return None
+    try:
+        known = known_character(fingerprint)
+    except ModelFileError:
+        # Opening the character says so.
+        return None
+    if known is None or not Path(known.file).is_file():
+        return None
+    return ListedModel(Path(known.file).stem, Path(known.file), bundled=False)
+
+
+def with_remembered(model: RigModel) -> RigModel:
+    """Return a character with the rules and body parts that the user chose for it.
+
+    Its notes say so, or why what is remembered does not apply.
+    """
+    try:
+        known = known_character(model.fingerprint)
+        if known is None:
+            return model
+        chosen = {name: getattr(known, name) for name in _PARTS}
+        chosen = {name: value for name, value in chosen.items() if value is not None}
+        changed = model.with_card(replace(model.card, **chosen)) if chosen else model
+        if known.rules is None:
+            return changed
+        return changed.with_rules(known.rules).noted(
+            "its contact rules are those that you chose for it in the window"
+        )
+    except LCollisionError as error:
+        return model.noted(f"what you chose for it in the window is left out: {error.headline}")
+
+
+def remember_file(model: RigModel, file: str | os.PathLike[str]) -> None:
+    """Keep where a character is, for files of poses that belong to it.
+
+    Parameters
+    ----------
+    file : that it was opened from
+
+    Raises
+    ------
+    ModelFileError : it cannot be kept.
+    """
+    known = known_character(model.fingerprint)
+    now = replace(known or KnownCharacter(""), file=str(Path(file).absolute()))
+    if now != known:
+        _write(model, now)
+
+
+def remember_choices(model: RigModel) -> None:
+    """Keep what the rules and body parts of a character differ in from those of its file.
+
+    Raises
+    ------
+    ModelFileError : it cannot be kept.
+    """
+    known = known_character(model.fingerprint) or KnownCharacter(str(model.character.source))
+    own, card = model.own_card, model.card
+    chosen = {name: getattr(card, name) for name in ("rules", *_PARTS)}
+    changed = {
+        name: None if getattr(own, name) == chosen[name] else chosen[name] for name in chosen
+    }
+    _write(model, replace(known, **changed))
+
+
+def _write(model: RigModel, known: KnownCharacter) -> None:
+    document: dict[str, Any] = {"format": _FORMAT, "format_version": _VERSION, "file": known.file}
+    if known.rules is not None:
+        document["rules"] = known.rules.to_json()
+    held = {name: getattr(known, name) for name in _PARTS}
+    document |= {name: value for name, value in held.items() if value is not None}
+    path = _path(model.fingerprint)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with locked(path), atomic_write(path) as file:
+            file.write(json.dumps(document, indent=1).encode() + b"\n")
+    except (OSError, MeshFileError) as error:
+        raise ModelFileError.because(
+            f"what is remembered of {model.name}", "cannot be kept", error, "make room, try again"
+        ) from error
+
+
+def _path(fingerprint: str) -> Path:
+    return user_characters_folder() / f"{fingerprint}.json"
