@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import note
-from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -101,44 +100,16 @@ class RuleOptions:
         rules = replace(rules, **chosen)
         if not self.ignore:
             return rules, groups
-        from lcollision_core.meshes import groups_by_kind
+        from lcollision_core.meshes import groups_by_kind, named_pair
 
         held = {group.name for group in groups}
         kinds = groups_by_kind(groups, topology, vertex_labels).values()
         others = tuple(group for kind in kinds for group in kind if group.name not in held)
         known = held | {group.name for group in others}
-        pairs = tuple(_pair(entry, known) for entry in self.ignore)
+        pairs = tuple(named_pair(entry, known) for entry in self.ignore)
         named = {name for pair in pairs for name in pair}
         groups = (*groups, *(group for group in others if group.name in named))
         return replace(rules, ignored=tuple(dict.fromkeys((*rules.ignored, *pairs)))), groups
-
-
-def _pair(entry: str, known: set[str]) -> tuple[str, str]:
-    """Split A:B where both are names; names may hold colons."""
-    splits = [
-        (entry[:at].strip(), entry[at + 1 :].strip())
-        for at, character in enumerate(entry)
-        if character == ":"
-    ]
-    for one, other in splits:
-        if one in known and other in known:
-            return one, other
-    listed = ", ".join(sorted(known)[:_LISTED]) + (" ..." if len(known) > _LISTED else "")
-    if not splits:
-        raise LCollisionError(
-            "is not A:B with the names of two groups of faces",
-            f"name two of {listed}",
-            where=f"--ignore {entry!r}",
-        )
-    unknown = next(name for name in splits[0] if name not in known)
-    raise LCollisionError(
-        f"names {unknown!r}, which is no group of faces of this mesh",
-        f"name two of {listed}",
-        where=f"--ignore {entry!r}",
-    )
-
-
-_LISTED = 8
 
 
 def note_rules(body: PosableBody) -> None:

@@ -19,7 +19,7 @@ from app.cli.contact_options import (
 from app.cli.inputs import Axis
 from app.cli.interrupt import cancel_on_interrupt
 from app.wording import duration_text
-from lcollision_core.errors import CancelledError
+from lcollision_core.errors import CancelledError, LCollisionError
 
 if TYPE_CHECKING:
     from app.cli.console import Told
@@ -108,6 +108,10 @@ def new(
             card = learn_model(work, progress, cancel)
     except CancelledError:
         note(f"stopped; run the same command again to go on from {work.path}")
+        raise
+    except LCollisionError:
+        if not work.poses.exists() and not work.is_held:
+            work.remove()
         raise
     work.remove()
     model = PoseModel.load(card.model)

@@ -33,43 +33,6 @@ class ProposedPair:
     share: float
 
 
-def propose_ignored(
-    detector: CollisionDetector,
-    poses: npt.ArrayLike,
-    groups: Sequence[FaceGroup],
-    least_share: float = NEARLY_ALWAYS,
-    *,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
-) -> tuple[ProposedPair, ...]:
-    """Find the pairs of groups that are in contact in nearly every pose.
-
-    As the set-up assistants of robot arms do, which never test two links that always touch. Pairs
-    of faces that the detector's rules exclude count too, as a group may be ignored instead, except
-    for those near along the surface. Groups that have faces in common are not proposed.
-
-    Parameters
-    ----------
-    detector : of the poses
-    poses : (N, V, 3) array, N > 0
-    groups : components, materials, meshes or body parts; of equal ones the first is proposed
-    least_share : of the poses, above 0
-
-    Returns
-    -------
-    proposals : the most frequent first
-
-    Raises
-    ------
-    ShapeError : the poses or the groups do not fit the detector.
-    CancelledError : `cancel` was set.
-    """
-    kinds = {"": groups}
-    return propose_by_kind(detector, poses, kinds, least_share, progress=progress, cancel=cancel)[
-        ""
-    ]
-
-
 def propose_by_kind(
     detector: CollisionDetector,
     poses: npt.ArrayLike,
@@ -80,17 +43,33 @@ def propose_by_kind(
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> dict[str, tuple[ProposedPair, ...]]:
-    """Find such pairs among groups of one kind, for each kind by itself: see `propose_ignored`.
+    """Find the pairs of groups that are in contact in nearly every pose, for each kind by itself.
 
-    Pairs of groups of two kinds, as of a mesh and a body part, say nothing that those of one kind
-    do not.
+    As the set-up assistants of robot arms do, which never test two links that always touch. Pairs
+    of faces that the detector's rules exclude count too, as a group may be ignored instead, except
+    for those near along the surface. Groups that have faces in common are not proposed, nor are
+    groups of two kinds, as of a mesh and a body part, which say nothing that those of one do not.
 
     Parameters
     ----------
-    kinds : groups by kind, of which the first `MAX_GROUPS` are looked at: see `groups_by_kind`
+    detector : of the poses
+    poses : (N, V, 3) array, N > 0
+    kinds : groups by kind, see `groups_by_kind`, of which the first `MAX_GROUPS` are looked at; of
+        equal ones the first is proposed
+    least_share : of the poses, above 0
     counted_only : whether excluded pairs do not count here either, so that what is proposed is what
         the rules still call a collision in nearly every pose
-    detector, poses, least_share, progress, cancel : as there
+    progress : called with (poses looked at, poses in all)
+    cancel : polled between poses
+
+    Returns
+    -------
+    proposals : by kind, the most frequent first
+
+    Raises
+    ------
+    ShapeError : the poses or the groups do not fit the detector.
+    CancelledError : `cancel` was set.
     """
     tallies = {kind: _Tally(groups[:MAX_GROUPS], detector) for kind, groups in kinds.items()}
     vertices = np.asarray(poses)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector, ContactRules, propose_ignored
-from lcollision_core.errors import LCollisionError
+from lcollision_core.contact import CollisionDetector, ContactRules, propose_by_kind
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.learning.request import LearningRequest
-from lcollision_core.meshes import FaceGroup, PoseSet, component_groups, part_groups
+from lcollision_core.meshes import PoseSet, groups_by_kind, named_pair
 
 _NEAR_EXCLUSIONS = (0.0, 0.02, 0.05, 0.1)
 """Normalised lengths that are tried on poses without a rig, the shortest first."""
@@ -57,25 +56,32 @@ def with_proposed_rules(
     elif not rules.near_exclusion:
         near = _near_exclusion(poses, rules, chosen)
         rules = replace(rules, near_exclusion=near)
-    groups = {group.name: group for group in poses.groups}
-    named = _named_groups(poses, groups)
-    pairs = dict.fromkeys(rules.ignored)
+    kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
+    named = {group.name: group for kind in kinds.values() for group in kind}
+    named |= {group.name: group for group in poses.groups}
     if request.ignored is None:
         detector = CollisionDetector(poses.topology, poses.vertices[0], rules, poses.groups)
-        components = component_groups(poses.topology)
-        kind = components if len(components) > 1 else tuple(named.values())
-        found = propose_ignored(
-            detector, asked, kind, counted_only=True, progress=progress, cancel=cancel
+        *_, parts, components = kinds
+        asked_kind = components if len(kinds[components]) > 1 else parts
+        found = propose_by_kind(
+            detector,
+            asked,
+            {asked_kind: kinds[asked_kind]},
+            counted_only=True,
+            progress=progress,
+            cancel=cancel,
         )
-        pairs |= dict.fromkeys(pair.groups for pair in found)
+        new = [pair.groups for pair in found[asked_kind]]
     else:
-        pairs |= dict.fromkeys(_pair(entry, named) for entry in request.ignored)
-    used = {name: named[name] for pair in pairs for name in pair if name not in groups}
-    rules = replace(rules, ignored=tuple(pairs))
-    return replace(poses, rules=rules, groups=(*poses.groups, *used.values()))
+        new = [named_pair(entry, named) for entry in request.ignored]
+    ignored = tuple(dict.fromkeys((*rules.ignored, *new)))
+    held = {group.name for group in poses.groups}
+    used = dict.fromkeys(name for pair in ignored for name in pair if name not in held)
+    groups = (*poses.groups, *(named[name] for name in used))
+    return replace(poses, rules=replace(rules, ignored=ignored), groups=groups)
 
 
-def _near_exclusion(poses: PoseSet, rules: ContactRules, chosen: np.ndarray) -> float:
+def _near_exclusion(poses: PoseSet, rules: ContactRules, chosen: npt.NDArray[np.intp]) -> float:
     """Return the shortest near exclusion by which few poses collide."""
     shares: dict[float, float] = {}
     for near in _NEAR_EXCLUSIONS:
@@ -87,24 +93,3 @@ def _near_exclusion(poses: PoseSet, rules: ContactRules, chosen: np.ndarray) -> 
             return near
     best = min(shares.values())
     return next(near for near, share in shares.items() if share <= best + _FEW)
-
-
-def _named_groups(poses: PoseSet, groups: Mapping[str, FaceGroup]) -> dict[str, FaceGroup]:
-    """Return the groups of the files, and the body parts and components of other names."""
-    labels = poses.vertex_labels
-    parts = () if labels is None else part_groups(poses.topology, labels)
-    others = {group.name: group for group in (*parts, *component_groups(poses.topology))}
-    return others | dict(groups)
-
-
-def _pair(entry: str, named: Mapping[str, FaceGroup]) -> tuple[str, str]:
-    for at in (place for place, letter in enumerate(entry) if letter == ":"):
-        pair = entry[:at].strip(), entry[at + 1 :].strip()
-        if all(name in named for name in pair):
-            return pair
-    listed = ", ".join(sorted(named)[:8]) + (" ..." if len(named) > 8 else "")
-    raise LCollisionError(
-        "is not A:B with the names of two groups of faces of this mesh",
-        f"name two of {listed}",
-        where=f"--ignore {entry!r}",
-    )

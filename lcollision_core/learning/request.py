@@ -60,8 +60,9 @@ class LearningRequest:
             )
 
     def to_json(self) -> dict[str, Any]:
-        """Return the JSON values of `of_json`."""
-        return asdict(self)
+        """Return the JSON values of `of_json`, lists as they come back from a file."""
+        values = asdict(self) | {"sources": list(self.sources)}
+        return values if self.ignored is None else values | {"ignored": list(self.ignored)}
 
     @classmethod
     def of_json(cls, values: Mapping[str, Any]) -> LearningRequest:

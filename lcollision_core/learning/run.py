@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -14,13 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.learning.card import LearnedCard, card_of
 from lcollision_core.learning.contacts import with_proposed_rules
 from lcollision_core.learning.effort import EFFORTS, Effort, Quality
 from lcollision_core.learning.estimate import estimated_seconds
-from lcollision_core.learning.request import LearningRequest
 from lcollision_core.learning.sources import gather_poses
 from lcollision_core.learning.status import STAGES, LearningStatus, Pace, Stage, StatusCallback
 from lcollision_core.learning.work_folder import WorkFolder, WorkState, WorkStatus
@@ -94,7 +92,9 @@ class _Learner:
 
     def run(self) -> LearnedCard:
         work = self._work
-        if (made := self._model_made()) is None:
+        # An earlier process may have come so far, and been killed then.
+        path = work.destination
+        if work.made(self._request) is None:
             try:
                 path = self._make()
             except CancelledError:
@@ -103,9 +103,7 @@ class _Learner:
             except LCollisionError as error:
                 self._leave(WorkState.FAILED, str(error))
                 raise
-            made = PoseModel.load(path), path
-        model, path = made
-        card = card_of(model, str(path))
+        card = card_of(PoseModel.load(path), str(path))
         work.tell(
             WorkStatus(
                 WorkState.DONE,
@@ -119,20 +117,6 @@ class _Learner:
         )
         work.keep_only_status()
         return card
-
-    def _model_made(self) -> tuple[PoseModel, Path] | None:
-        """Return the model that an earlier process made of this request, if it came so far."""
-        path = self._work.destination
-        if not path.exists():
-            return None
-        model = PoseModel.load(path)
-        if model.card.provenance.get("request") != _plain(self._request):
-            raise ModelFileError(
-                f"there is a model {self._work.name!r} already",
-                "choose another name",
-                where=path,
-            )
-        return model, path
 
     def _make(self) -> Path:
         """Go through the stages, each of which goes on where it was left."""
@@ -200,9 +184,10 @@ class _Learner:
             ", ".join(Path(source).name for source in request.sources),
             request.licence,
             {
+                **poses.provenance,
                 "program": f"lcollision {version('lcollision')}",
                 "command": "new",
-                "request": _plain(request),
+                "request": request.to_json(),
                 "poses_sha256": hashlib.sha256(
                     np.ascontiguousarray(poses.vertices).tobytes()
                 ).hexdigest(),
@@ -287,8 +272,3 @@ class _Learner:
         last = replace(self._work.status, seconds=self._seconds(), seconds_left=None)
         with suppress(MeshFileError):
             self._work.tell(replace(last, state=state, sentence=sentence))
-
-
-def _plain(request: LearningRequest) -> object:
-    """Return a request as it comes back from a file, where tuples are lists."""
-    return json.loads(json.dumps(request.to_json()))

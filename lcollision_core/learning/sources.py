@@ -12,6 +12,7 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
 from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
+from lcollision_core.model.known_characters import with_remembered
 
 ENOUGH_POSES = 100
 """Poses from which on a rigged character is not posed by its rig unless that is asked for."""
@@ -36,7 +37,7 @@ def gather_poses(
     """Read the poses of one body from several sources, and let its rig make more.
 
     Pose 0 is the rest pose of the first rigged file, wherever it is named, else that of the first
-    source.
+    source. The contact rules of a rigged file are those by which its rig is posed.
 
     Parameters
     ----------
@@ -71,6 +72,9 @@ def gather_poses(
     if rigged is not None:
         files.sort(key=lambda file: file != rigged)
     character = None if rigged is None else read_character(rigged, up)
+    body = None
+    if character is not None and character.rig is not None:
+        body = with_remembered(RigModel.of(character))
     n_steps = len(files) + (character is not None and by_rig != 0)
 
     def part(number: int) -> Progress:
@@ -88,14 +92,17 @@ def gather_poses(
     poses = concatenated(found)
     if thin:
         poses = thinned(poses, cancel=cancel)
-    if character is not None and by_rig is None:
-        by_rig = max(0, n_wanted - len(poses)) if character.rig is not None else 0
-    if character is not None and by_rig:
+    if by_rig is None:
+        by_rig = 0 if body is None else max(0, n_wanted - len(poses))
+    if body is not None and by_rig:
         if len(found) > 1:
             # Its names have those of their files.
             poses = replace(poses, source=None)
-        made = poses_by_rig(RigModel.of(character), by_rig, seed, part(len(files)), cancel)
+        made = poses_by_rig(body, by_rig, seed, part(len(files)), cancel)
         poses = replace(concatenated([poses, made]), source=files[0])
+    if body is not None:
+        # As of the character that is posed by its rig, so that verdicts agree.
+        poses = replace(poses, rules=body.rules, groups=body.groups)
     return poses if up is None else replace(poses, up_axis=up)
 
 

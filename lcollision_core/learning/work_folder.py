@@ -20,7 +20,7 @@ from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.learning.request import LearningRequest
 from lcollision_core.learning.status import LearningStatus, Stage
 from lcollision_core.meshes import atomic_write, locked
-from lcollision_core.model import user_models_folder
+from lcollision_core.model import PoseModel, user_models_folder
 from lcollision_core.model.model_store import MODEL_SUFFIX, WORK_SUFFIX, work_path
 from lcollision_core.regular_files import read_regular
 
@@ -133,23 +133,42 @@ class WorkFolder:
 
         Raises
         ------
-        ModelFileError : the folder is of another request.
+        ModelFileError : there is a model of that name, or another is being learned.
         MeshFileError : it cannot be written.
         """
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise MeshFileError.because(
-                self.path, "cannot be made", error, "choose another place for the model"
-            ) from error
-        if (self.path / "request.json").exists():
+        self.made(request)
+        if self.path.is_dir() and (self.is_held or self.poses.exists()):
             if self.request != request:
                 raise ModelFileError(
                     f"a model {self.name!r} is being learned from other files or options",
                     f"choose another name, or remove {self.path}",
                 )
             return
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise MeshFileError.because(
+                self.path, "cannot be made", error, "choose another place for the model"
+            ) from error
         self._write("request.json", request.to_json())
+
+    def made(self, request: LearningRequest) -> PoseModel | None:
+        """Return the model that came of a request, None if there is none of that name.
+
+        Raises
+        ------
+        ModelFileError : there is a model of that name that did not come of it.
+        """
+        if not self.destination.exists():
+            return None
+        model = PoseModel.load(self.destination)
+        if model.card.provenance.get("request") != request.to_json():
+            raise ModelFileError(
+                f"there is a model {self.name!r} already",
+                "choose another name, or remove it",
+                where=self.destination,
+            )
+        return model
 
     @property
     def request(self) -> LearningRequest:

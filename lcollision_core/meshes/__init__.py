@@ -19,6 +19,7 @@ from lcollision_core.meshes.face_groups import (
     FaceGroup,
     component_groups,
     groups_by_kind,
+    named_pair,
     part_groups,
 )
 from lcollision_core.meshes.file_names import file_stem, file_stems, has_known_suffix

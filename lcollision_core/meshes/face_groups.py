@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import ShapeError
+from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH, ContactRules
 from lcollision_core.meshes.topology import Topology
 
@@ -18,6 +18,10 @@ MAX_GROUPS = 1000
 
 GROUP_KINDS = ("meshes and materials", "body parts", "components")
 """What groups of faces are, from those that the file names to those that are found."""
+
+
+_LISTED = 8
+"""Names that a refusal lists."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +88,31 @@ def groups_by_kind(
     taken = {group.name for group in own}
     others = (tuple(group for group in kind if group.name not in taken) for kind in computed)
     return dict(zip(GROUP_KINDS, (own, *others), strict=True))
+
+
+def named_pair(entry: str, names: Collection[str]) -> tuple[str, str]:
+    """Split "A:B", as people write a pair of groups, where both are names; names may hold colons.
+
+    Raises
+    ------
+    LCollisionError : it is not two of the names.
+    """
+    splits = [
+        (entry[:at].strip(), entry[at + 1 :].strip())
+        for at, character in enumerate(entry)
+        if character == ":"
+    ]
+    for one, other in splits:
+        if one in names and other in names:
+            return one, other
+    listed = ", ".join(sorted(names)[:_LISTED]) + (" ..." if len(names) > _LISTED else "")
+    where, next_step = f"--ignore {entry!r}", f"name two of {listed}"
+    if not splits:
+        what = "is not A:B with the names of two groups of faces"
+        raise LCollisionError(what, next_step, where=where)
+    unknown = next(name for name in splits[0] if name not in names)
+    what = f"names {unknown!r}, which is no group of faces of this mesh"
+    raise LCollisionError(what, next_step, where=where)
 
 
 def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: int) -> None:

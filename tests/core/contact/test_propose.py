@@ -10,7 +10,6 @@ from lcollision_core.contact import (
     ContactRules,
     ProposedPair,
     propose_by_kind,
-    propose_ignored,
 )
 from lcollision_core.errors import CancelledError, ShapeError
 from lcollision_core.jobs import CancelToken
@@ -46,18 +45,33 @@ def detector(rules: ContactRules | None = None) -> CollisionDetector:
     return CollisionDetector(MESH.topology, MESH.vertices, rules or ContactRules(), GROUPS)
 
 
+def proposed(
+    detector: CollisionDetector, poses: np.ndarray, groups: tuple[FaceGroup, ...], *share: float
+) -> tuple[ProposedPair, ...]:
+    """Return what is proposed among groups of one kind."""
+    return propose_by_kind(detector, poses, {"all": groups}, *share)["all"]
+
+
 def test_contacts_are_proposed_with_their_share() -> None:
     always = ProposedPair(("floor", "post"), 1.0)
     often = ProposedPair(("floor", "blade"), 0.8)
-    assert propose_ignored(detector(), poses(), GROUPS) == (always,)
-    assert propose_ignored(detector(), poses(), GROUPS, 0.8) == (always, often)
-    assert propose_ignored(detector(), poses(), GROUPS, 0.81) == (always,)
+    assert proposed(detector(), poses(), GROUPS) == (always,)
+    assert proposed(detector(), poses(), GROUPS, 0.8) == (always, often)
+    assert proposed(detector(), poses(), GROUPS, 0.81) == (always,)
 
 
 def test_what_is_excluded_at_rest_or_ignored_is_in_contact_too() -> None:
     for rules in (ContactRules(rest_exclusion=0.0), ContactRules(ignored=(("post", "floor"),))):
-        found = propose_ignored(detector(rules), poses(), GROUPS)
+        found = proposed(detector(rules), poses(), GROUPS)
         assert [proposal.groups for proposal in found] == [("floor", "post")]
+
+
+def test_of_what_counts_alone_nothing_excluded_is_proposed() -> None:
+    groups = {"all": GROUPS}
+    strict = propose_by_kind(detector(), poses(), groups, counted_only=True)["all"]
+    assert [proposal.groups for proposal in strict] == [("floor", "post")]
+    rules = ContactRules(rest_exclusion=0.0)
+    assert propose_by_kind(detector(rules), poses(), groups, counted_only=True) == {"all": ()}
 
 
 def test_folds_of_the_skin_are_no_contact() -> None:
@@ -68,15 +82,15 @@ def test_folds_of_the_skin_are_no_contact() -> None:
     groups = (FaceGroup("start", np.array([0, 1])), FaceGroup("end", np.arange(10, 16)))
     for near, n_found in ((0.0, 1), (2.0, 0)):
         bent = CollisionDetector(straight.topology, straight.vertices, ContactRules(near))
-        assert len(propose_ignored(bent, loop.vertices[None], groups)) == n_found
+        assert len(proposed(bent, loop.vertices[None], groups)) == n_found
 
 
 def test_groups_that_overlap_or_are_equal_are_not_proposed() -> None:
     everything = FaceGroup("mesh", np.array([0, 1, 2]))
     again = FaceGroup("post's material", np.array([2]))
-    found = propose_ignored(detector(), poses(), (everything, *GROUPS, again))
+    found = proposed(detector(), poses(), (everything, *GROUPS, again))
     assert [proposal.groups for proposal in found] == [("floor", "post")]
-    assert propose_ignored(detector(), poses(), (everything,)) == ()
+    assert proposed(detector(), poses(), (everything,)) == ()
 
 
 def test_components_and_parts_are_groups() -> None:
@@ -95,11 +109,11 @@ def test_components_and_parts_are_groups() -> None:
 
 def test_bad_groups_are_refused_and_cancelling_is_heard() -> None:
     with pytest.raises(ShapeError, match="the group 'far' must be of faces from 0 to 2, got 3"):
-        propose_ignored(detector(), poses(), (*GROUPS, FaceGroup("far", np.array([3]))))
+        proposed(detector(), poses(), (*GROUPS, FaceGroup("far", np.array([3]))))
     cancel = CancelToken()
     cancel.cancel()
     with pytest.raises(CancelledError):
-        propose_ignored(detector(), poses(), GROUPS, cancel=cancel)
+        propose_by_kind(detector(), poses(), {"all": GROUPS}, cancel=cancel)
 
 
 def test_groups_are_told_apart_by_kind_also_where_the_mesh_lists_them() -> None:
@@ -121,7 +135,7 @@ def test_proposals_of_each_kind_are_those_of_it_alone() -> None:
     found = propose_by_kind(
         detector(), poses(), kinds, 0.8, progress=lambda *step: steps.append(step)
     )
-    alone = {kind: propose_ignored(detector(), poses(), kinds[kind], 0.8) for kind in kinds}
+    alone = {kind: proposed(detector(), poses(), kinds[kind], 0.8) for kind in kinds}
     assert found == alone
     assert [len(pairs) for pairs in found.values()] == [2, 2, 0]
     assert steps[-1] == (10, 10)

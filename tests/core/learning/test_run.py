@@ -23,6 +23,7 @@ from lcollision_core.learning import (
     LearningRequest,
     LearningStatus,
     Quality,
+    Stage,
     WorkFolder,
     WorkState,
     learn_model,
@@ -162,14 +163,24 @@ def test_what_another_request_made_or_makes_is_not_touched(
     tmp_path: Path, request_for_tube: LearningRequest
 ) -> None:
     other = replace(request_for_tube, seed=1)
-    work_in(tmp_path, request_for_tube)
+    work = work_in(tmp_path, other)
+    # What has not begun gives way.
+    assert work_in(tmp_path, request_for_tube).request == request_for_tube
+    token = CancelToken()
+
+    def cancel_later(status: LearningStatus) -> None:
+        if status.stage == Stage.LATENT_SPACE:
+            token.cancel()
+
+    with pytest.raises(CancelledError):
+        learn_model(work, cancel_later, token)
     with pytest.raises(ModelFileError, match=r"being learned from other files or options"):
         work_in(tmp_path, other)
     learn_model(work_in(tmp_path, request_for_tube))
     WorkFolder(tmp_path / "tube.safetensors").remove()
     before = (tmp_path / "tube.safetensors").read_bytes()
     with pytest.raises(ModelFileError, match=r"there is a model 'tube' already"):
-        learn_model(work_in(tmp_path, other))
+        work_in(tmp_path, other)
     assert (tmp_path / "tube.safetensors").read_bytes() == before
 
 

@@ -1,0 +1,113 @@
+"""``lcollision new``: from files to a model in one command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pygltflib import GLTF2
+
+from lcollision_core.learning import EFFORTS, Quality
+from lcollision_core.meshes import read_mesh, write_pose_set
+from lcollision_core.model import PoseModel, open_body, own_source, read_poses
+from tests.app.support import Lcollision
+from tests.bending_tube import bending_tube
+from tests.core.learning.test_run import SMALL
+from tests.rigged_shapes import rigged_body, write_gltf
+
+
+@pytest.fixture(autouse=True)
+def _small_effort(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EFFORTS, Quality.QUICK, SMALL)
+
+
+@pytest.fixture
+def tube(tmp_path: Path) -> Path:
+    path = tmp_path / "tube.npz"
+    write_pose_set(path, bending_tube(labelled=True))
+    return path
+
+
+def test_a_pose_set_becomes_a_model_with_a_card_and_a_picture(
+    tube: Path, tmp_path: Path, lcollision: Lcollision
+) -> None:
+    model = tmp_path / "bent.safetensors"
+    result = lcollision("new", tube, "-o", model, "--quality", "quick", "--json")
+    assert result.exit_code == 0, result.stderr
+    card = json.loads(result.stdout)
+    assert (card["vertices"], card["poses"], card["samples"]) == (210, 16, 256)
+    assert card["model"] == str(model)
+    assert Path(card["picture"]).read_bytes().startswith(b"\x89PNG")
+    assert card["rules"] == PoseModel.load(model).rules.to_json()
+    # Nothing is left beside it.
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "bent.png",
+        "bent.safetensors",
+        "tube.npz",
+    ]
+    again = lcollision("new", tube, "-o", model, "--quality", "quick")
+    assert again.exit_code == 0
+    assert "bent: 210 vertices, 2 body parts, learned from 16 poses" in again.stdout
+
+
+def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
+    tmp_path: Path, lcollision: Lcollision
+) -> None:
+    file = write_gltf(rigged_body(), tmp_path / "figure.glb")
+    arguments = ("--quality", "quick", "--by-rig", "20", "--ignore", "Head:Torso")
+    result = lcollision("new", file, "-o", "hero", *arguments)
+    assert result.exit_code == 0, result.stderr
+    model = PoseModel.load("hero")
+    assert model.pose_names[0] == "rest"
+    assert sum("rig" in name for name in model.pose_names) == 20
+    assert model.rules.ignored == (("Head", "Torso"),)
+    # Beside that it is posed by the rules by which its rig is.
+    assert replace(model.rules, ignored=()) == open_body(file).rules
+    assert model.card.provenance["by_rig"]["drawn"] == 20
+    assert own_source(model) == file
+    sampled, posed = tmp_path / "poses.json", tmp_path / "posed.glb"
+    assert lcollision("sample", "hero", "-n", 1, "-o", sampled).exit_code == 0
+    written = lcollision("decode", "hero", sampled, "-o", posed)
+    assert written.exit_code == 0, written.stderr
+    expected = model.decode(read_poses(sampled, model)[0].latent)
+    held = read_mesh(posed, topology=model.topology)
+    assert np.allclose(held.vertices, expected, atol=1e-5 * model.body_size)
+    # The character's own file: its joints are still nodes of it, its mesh has the name it had.
+    assert {"Body", "LeftForeArm"} <= {node.name for node in GLTF2().load(posed).nodes}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("{folder}/none.glb",), "none.glb"),
+        (("{tube}", "--by-rig", "5"), "has no joints to pose it by"),
+        (("{tube}", "--ignore", "nose"), "--ignore 'nose' is not A:B"),
+        (("{tube}", "-o", "{folder}/tube.obj"), "a model is a .safetensors file"),
+    ],
+)
+def test_what_cannot_be_learned_from_is_one_sentence(
+    arguments: tuple[str, ...], sentence: str, tube: Path, tmp_path: Path, lcollision: Lcollision
+) -> None:
+    given = [one.format(folder=tmp_path, tube=tube) for one in arguments]
+    output = () if "-o" in given else ("-o", tmp_path / "m.safetensors")
+    result = lcollision("new", *given, *output, "--quality", "quick")
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not list(tmp_path.glob("m.safetensors*"))
+
+
+def test_a_model_that_is_there_is_not_replaced(
+    tube: Path, tmp_path: Path, lcollision: Lcollision
+) -> None:
+    held = tmp_path / "held.safetensors"
+    assert lcollision("new", tube, "-o", held, "--quality", "quick").exit_code == 0
+    before = held.read_bytes()
+    result = lcollision("new", tube, "-o", held, "--quality", "quick", "--seed", "1")
+    assert result.exit_code == 2
+    assert "there is a model 'held' already" in result.stderr
+    assert held.read_bytes() == before
+    assert not (tmp_path / "held.safetensors.work").exists()

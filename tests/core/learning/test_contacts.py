@@ -1,0 +1,73 @@
+"""Contact rules that are proposed from the poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.errors import LCollisionError
+from lcollision_core.learning import LearningRequest
+from lcollision_core.learning.contacts import with_proposed_rules
+from lcollision_core.meshes import ContactRules, PoseSet, Topology
+from tests.bending_tube import (
+    LENGTH_IN_FILES,
+    PLACE_IN_FILES,
+    bending_tube,
+    bent_tube,
+    tube_topology,
+)
+
+REQUEST = LearningRequest(("tube.npz",))
+
+
+def colliding_share(poses: PoseSet) -> float:
+    detector = CollisionDetector(poses.topology, poses.vertices[0], poses.rules, poses.groups)
+    return float(np.mean(detector.are_colliding(poses.vertices)))
+
+
+def two_tubes() -> PoseSet:
+    """Return poses of a tube that bends beside a second one that always stands in it."""
+    poses, topology = bending_tube(12, most=0.6), tube_topology()
+    post = bent_tube(0.0, 0.0) * [0.4, 0.15, 0.4] + [0.05, 0.02, 0.0]
+    still = np.repeat(post[None] * LENGTH_IN_FILES + PLACE_IN_FILES, len(poses), axis=0)
+    both = np.concatenate([poses.vertices, still], axis=1)
+    n_vertices = topology.n_vertices
+    faces = np.concatenate([topology.faces, topology.faces + n_vertices])
+    return PoseSet(both, Topology(faces, 2 * n_vertices), poses.names)
+
+
+def test_poses_that_are_free_keep_the_strict_rule() -> None:
+    poses = bending_tube(12, most=0.6)
+    assert colliding_share(poses) == 0.0
+    assert with_proposed_rules(poses, REQUEST).rules == ContactRules()
+
+
+def test_folds_of_most_poses_are_not_counted() -> None:
+    # The inside of the bend is shorter than the tube is thick.
+    vertices = np.stack([bent_tube(0.0, angle) for angle in (0.0, *np.linspace(3.7, 4.4, 9))])
+    names = tuple(f"bend {pose}" for pose in range(len(vertices)))
+    poses = PoseSet(vertices, tube_topology(), names)
+    assert colliding_share(poses) > 0.5
+    proposed = with_proposed_rules(poses, REQUEST)
+    assert proposed.rules.near_exclusion in (0.02, 0.05, 0.1)
+    assert colliding_share(proposed) < colliding_share(poses)
+    fixed = with_proposed_rules(poses, replace(REQUEST, near_exclusion=0.0))
+    assert fixed.rules == ContactRules()
+
+
+def test_components_that_always_collide_are_ignored_unless_the_request_says_which() -> None:
+    poses = two_tubes()
+    assert colliding_share(poses) == 1.0
+    proposed = with_proposed_rules(poses, REQUEST)
+    assert proposed.rules.ignored == (("component 1", "component 2"),)
+    assert {group.name for group in proposed.groups} == {"component 1", "component 2"}
+    assert colliding_share(proposed) == 0.0
+    none = with_proposed_rules(poses, replace(REQUEST, ignored=(), near_exclusion=0.0))
+    assert none.rules.ignored == ()
+    named = replace(REQUEST, ignored=("component 2:component 1",))
+    assert with_proposed_rules(poses, named).rules.ignored == (("component 2", "component 1"),)
+    with pytest.raises(LCollisionError, match=r"names 'hat', which is no group"):
+        with_proposed_rules(poses, replace(REQUEST, ignored=("hat:component 1",)))
