@@ -72,9 +72,9 @@ rest poses differ, and a hinge hardly bends backwards."""
 def joint_roles(rig: Rig) -> tuple[Role, ...]:
     """Tell what each of the rig's joints is.
 
-    A forearm is one only below an arm, and a shin below a thigh, so that limits of hinges are not
-    given to what merely sounds like one. Where a rig names both halves of a limb, a joint that is
-    called like the bone that it hangs on is a piece of it, and twists.
+    A forearm is one only below an arm, a shin below a thigh, and a finger below a hand, so that
+    limits of hinges are not given to what merely sounds like one. Where a rig names both halves of
+    a limb, a joint that is called like the bone that it hangs on is a piece of it, and twists.
     """
     plain = [
         re.sub("[^a-z0-9]", "", re.split("[:|]", name)[-1].lower()) for name in rig.joint_names
@@ -84,15 +84,19 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
     halves |= {above: below for below, above in halves.items()}
     of_face = [part == "Head" for part in part_names(rig.joint_names)]
     roles: list[Role] = []
+    in_hand: list[bool] = []
     for joint, (role, parent) in enumerate(zip(named, rig.parents, strict=True)):
+        in_hand.append(role is Role.HAND or bool(parent >= 0 and in_hand[parent]))
         above = parent
         while above >= 0 and roles[above] is Role.TWIST:
             above = rig.parents[above]
         bone = roles[above] if above >= 0 else None
         if role in halves and role is bone and halves[role] in named:
             role = Role.TWIST
-        elif role in (Role.FOREARM, Role.SHIN) and bone is not halves[role]:
-            role = Role.OTHER
+        elif role in (Role.FOREARM, Role.SHIN):
+            role = role if bone is halves[role] else Role.OTHER
+        elif role in (Role.PALM, Role.THUMB, Role.FINGER):
+            role = role if in_hand[joint] else Role.OTHER
         elif role is Role.OTHER and of_face[joint]:
             role = Role.FACE
         roles.append(role)

@@ -62,19 +62,21 @@ def gather_poses(
     if not paths:
         raise LCollisionError("there is nothing to read poses from", "name a file or a folder")
     files = [Path(path) for path in paths]
-    rigged = next(filter(_has_rig, files), None)
+    characters = {file: read_character(file, up) for file in files if _has_rig(file)}
+    rigged = next(iter(characters), None)
     if by_rig and rigged is None:
         raise LCollisionError(
             "has no joints to pose it by",
             "name a rigged character among the files, or leave out poses by the rig",
             where=", ".join(map(str, files)),
         )
-    if rigged is not None:
-        files.sort(key=lambda file: file != rigged)
-    character = None if rigged is None else read_character(rigged, up)
+    files.sort(key=lambda file: file != rigged)
+    character = None if rigged is None else characters[rigged]
     body = None
     if character is not None and character.rig is not None:
         body = with_remembered(RigModel.of(character))
+    # Alone, without animation, a character is no pose set.
+    with_still = len(files) > 1 or (by_rig != 0 and clip is None)
     n_steps = len(files) + (character is not None and by_rig != 0)
 
     def part(number: int) -> Progress:
@@ -84,9 +86,8 @@ def gather_poses(
 
     found = []
     for number, file in enumerate(files):
-        is_still = character is not None and file == rigged and not character.clips
-        if character is not None and is_still and clip is None and (by_rig != 0 or len(files) > 1):
-            found.append(rest_pose_set(character))
+        if with_still and file in characters and not characters[file].clips:
+            found.append(rest_pose_set(characters[file]))
         else:
             found.append(read_pose_set(file, part(number), cancel, clip=clip, fps=fps))
     poses = concatenated(found)

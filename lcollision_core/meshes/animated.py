@@ -97,7 +97,7 @@ def _read_clips(
         if not scene.clips:
             raise MeshFileError(
                 "it holds no animation, so it is one mesh, not a pose set",
-                "name its folder, or export it with its animation",
+                "name its folder, export it with its animation, or let its rig pose it",
             )
         mesh = join_parts(scene)
         frames, names = [mesh.posed(scene.rest)], ["rest"]

@@ -63,13 +63,17 @@ def _kept(poses: PoseSet, tolerance: float, cancel: CancelToken | None) -> list[
     size = body_size(poses.vertices[0], poses.topology)
     points = poses.vertices[:, chosen].astype(np.float64) / size
     points -= points.mean(axis=1, keepdims=True)
+    # No motion changes the distance of two vertices, and where they move by a and b it changes by
+    # at most a + b, so that half the squared changes of disjoint pairs are a lower bound.
+    half = len(chosen) // 2
+    spans = np.linalg.norm(points[:, :half] - points[:, half : 2 * half], axis=2)
     kept: list[int] = []
-    compared = np.empty_like(points)
     for pose, vertices in enumerate(points):
         if cancel is not None:
             cancel.raise_if_cancelled()
-        if (_squared_distances(compared[: len(kept)], vertices) >= tolerance**2).all():
-            compared[len(kept)] = vertices
+        least = ((spans[kept] - spans[pose]) ** 2).sum(axis=1) / (2 * len(chosen))
+        near = np.array(kept, dtype=np.int64)[least < tolerance**2]
+        if (_squared_distances(points[near], vertices) >= tolerance**2).all():
             kept.append(pose)
     return kept
 

@@ -19,6 +19,7 @@ from lcollision_core.meshes import (
 from lcollision_core.meshes.formats.point_cache import write_point_cache
 from tests.app.support import Lcollision
 from tests.core.gltf_builder import arm, rotation, tube
+from tests.rigged_shapes import rigged_body, write_gltf
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
@@ -216,3 +217,26 @@ def test_options_and_files_that_do_not_fit_get_one_sentence(
     assert result.exit_code == 2
     assert sentence in result.stderr
     assert not Path("out.npz").exists()
+
+
+def test_a_rig_makes_the_poses_of_a_set(lcollision: Lcollision, tmp_path: Path) -> None:
+    file = write_gltf(rigged_body(), tmp_path / "still.gltf")
+    first, again, other = (tmp_path / name for name in ("one.npz", "two.npz", "three.npz"))
+    result = lcollision("dataset", "make", file, "--by-rig", 6, "--seed", 2, "-o", first)
+    assert result.exit_code == 0
+    poses = read_pose_set(first)
+    assert len(poses) == 7
+    made = poses.provenance["sources"][1]["by_rig"]
+    assert f"{made['free']} of 6 poses by the rig are free" in result.stderr
+    assert f"wrote 7 poses of {poses.topology.n_vertices} vertices" in result.stderr
+    lcollision("dataset", "make", file, "--by-rig", 6, "--seed", 2, "-o", again)
+    assert again.read_bytes() == first.read_bytes()
+    lcollision("dataset", "make", file, "--by-rig", 6, "-o", other)
+    assert not np.array_equal(read_pose_set(other).vertices, poses.vertices)
+    # What has no animation is no pose set by itself.
+    result = lcollision("dataset", "make", file, "-o", tmp_path / "none.npz")
+    assert result.exit_code == 2
+    assert "it holds no animation" in result.stderr
+    result = lcollision("dataset", "make", first, "--by-rig", 6, "-o", tmp_path / "none.npz")
+    assert result.exit_code == 2
+    assert "one.npz has no joints to pose it by" in result.stderr

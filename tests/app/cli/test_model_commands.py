@@ -52,7 +52,7 @@ TRAINING = ("--domains", "2", "--domain-codes", "3", "--seed", "1", "--licence",
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("dataset") / "bends.npz"
-    write_pose_set(path, bending_tube())
+    write_pose_set(path, replace(bending_tube(), provenance={"by_rig": {"seed": 7}}))
     return path
 
 
@@ -122,6 +122,7 @@ def test_info_prints_what_scripts_read(lcollision: Lcollision, tube: Path) -> No
     assert report["masks"]["connected_share"] > 0.95
     assert 1 <= report["masks"]["domains_per_vertex"] <= 2
     assert report["provenance"]["seed"] == 1
+    assert report["provenance"]["poses"] == {"by_rig": {"seed": 7}}
 
 
 def test_info_in_words_names_domains_and_errors(lcollision: Lcollision, tube: Path) -> None:

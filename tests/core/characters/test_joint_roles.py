@@ -119,4 +119,6 @@ def test_faces_and_palms_are_neither_toes_nor_fingers_nor_unknown() -> None:
     assert list(head.values()) == [Role.HEAD, *[Role.FACE] * 5, Role.OTHER]
     hand = roles_of(chain("hand_l", "index_metacarpal_l", "index_01_l"))
     assert tuple(hand.values()) == (Role.HAND, Role.PALM, Role.FINGER)
-    assert roles_of("DEF-palm.01.L") == {"DEF-palm.01.L": Role.PALM}
+    assert roles_of(chain("DEF-hand.L", "DEF-palm.01.L"))["DEF-palm.01.L"] is Role.PALM
+    sausage = roles_of(chain("Bottom", "Middle", "Top"))
+    assert set(sausage.values()) == {Role.OTHER}

@@ -19,6 +19,7 @@ from tests.bending_tube import (
     bent_tube,
     tube_topology,
 )
+from tests.core.shapes import strip
 
 REQUEST = LearningRequest(("tube.npz",))
 
@@ -46,14 +47,16 @@ def test_poses_that_are_free_keep_the_strict_rule() -> None:
 
 
 def test_folds_of_most_poses_are_not_counted() -> None:
-    # The inside of the bend is shorter than the tube is thick.
-    vertices = np.stack([bent_tube(0.0, angle) for angle in (0.0, *np.linspace(3.7, 4.4, 9))])
-    names = tuple(f"bend {pose}" for pose in range(len(vertices)))
-    poses = PoseSet(vertices, tube_topology(), names)
+    # A long strip that crosses itself in a small loop in all poses but the first.
+    loop = [[0, 0], [2, 0], [4, 0], [4, 2], [3, 3], [1.5, 1.5], [0, -1]]
+    path = [*([x, 0] for x in range(-45, 0)), *loop, *([0, -y] for y in range(2, 50))]
+    rest, folded = strip([[x, 0] for x in range(len(path))]), strip(path)
+    vertices = np.stack([rest.vertices, *[folded.vertices] * 4])
+    poses = PoseSet(vertices, rest.topology, tuple("abcde"))
     assert colliding_share(poses) > 0.5
     proposed = with_proposed_rules(poses, REQUEST)
-    assert proposed.rules.near_exclusion in (0.02, 0.05, 0.1)
-    assert colliding_share(proposed) < colliding_share(poses)
+    assert proposed.rules.near_exclusion == 0.1
+    assert colliding_share(proposed) == 0.0
     fixed = with_proposed_rules(poses, replace(REQUEST, near_exclusion=0.0))
     assert fixed.rules == ContactRules()
 

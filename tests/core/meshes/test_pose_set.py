@@ -270,6 +270,7 @@ def test_npz_round_trip_keeps_everything(tmp_path: Path, dtype: type[np.floating
         rules=ContactRules(0.025),
         up_axis=1,
         vertex_labels=np.array(["head", "left arm", "left arm", "leg"]),
+        provenance={"by_rig": {"seed": 3, "limits_degrees": {"größer": [[-5.0, 150.0]]}}},
     )
     path = tmp_path / "set.npz"
     write_pose_set(path, pose_set)
@@ -279,7 +280,7 @@ def test_npz_round_trip_keeps_everything(tmp_path: Path, dtype: type[np.floating
     assert np.array_equal(again.vertices, pose_set.vertices)
     assert again.topology == pose_set.topology
     assert again.source == path
-    for name in ("names", "notes", "near_exclusion", "up_axis"):
+    for name in ("names", "notes", "near_exclusion", "up_axis", "provenance"):
         assert getattr(again, name) == getattr(pose_set, name)
     assert again.vertex_labels is not None
     assert again.vertex_labels.tolist() == ["head", "left arm", "left arm", "leg"]
@@ -312,6 +313,9 @@ def test_rules_and_groups_come_back(tmp_path: Path) -> None:
         ({"rules": np.array('{"tolerated_depth": -1}')}, "tolerated depth must be 0 or more"),
         ({"rules": np.array('{"ignored": [["a", "b"]]}')}, "the group 'a' is unknown"),
         ({"rules": np.array(3)}, "rules must be one string"),
+        ({"provenance": np.array("{")}, "provenance is damaged"),
+        ({"provenance": np.array("[1]")}, "provenance must be JSON values by name"),
+        ({"provenance": np.array([1.0])}, "provenance must be one string"),
         ({"group_names": np.array(["a"])}, "group_runs must be a list of whole numbers"),
         ({"group_runs": np.array([0, 99])}, "are not runs that ascend"),
         ({"group_runs": np.array([2, 1])}, "are not runs that ascend"),
@@ -321,7 +325,7 @@ def test_rules_and_groups_come_back(tmp_path: Path) -> None:
         ({"group_names": np.array([1])}, "group_names must be at most"),
     ],
 )
-def test_damaged_rules_and_groups_are_refused(
+def test_damaged_rules_groups_and_provenance_are_refused(
     tmp_path: Path, changes: dict[str, Any], sentence: str
 ) -> None:
     sound = {"vertices": _poses(2), "faces": FACES}
