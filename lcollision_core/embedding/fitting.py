@@ -24,8 +24,8 @@ whose code is thus recovered."""
 
 _SETTLED = 0.02
 _WORTH_REUSE = 0.1
-"""Decoding costs a thirtieth of a Jacobian, so steps go on with the same one while they gain this
-much of the cost."""
+"""Decoding costs far less than a Jacobian, so steps go on with the same one while they gain this
+share of the cost."""
 _HALVINGS = 5
 
 
@@ -90,8 +90,8 @@ def fit_latent(
     """Fit code and rigid motion together to a mesh.
 
     Minimises the mean squared vertex distance over all rigid motions of the mesh, by damped
-    Gauss-Newton from a guess, where each step weighs the distance d² that it starts from against
-    `PRIOR_SHARE` d² Σ (z / deviation)².
+    Gauss-Newton from a guess, several steps with one Jacobian, where each step weighs the distance
+    d² that it starts from against `PRIOR_SHARE` d² Σ (z / deviation)².
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def fit_latent(
         uses count
     guess : (D,) array, where to start
     deviation : (D,) array > 0, of the training codes
-    cancel : polled before each step
+    cancel : polled before each Jacobian
     in_place : the mesh stays where it is, and the codes alone are fitted
     n_threads : threads to compute a Jacobian on, one for each core by default
 
@@ -150,8 +150,8 @@ def fit_latent(
             cancel.raise_if_cancelled()
         jacobian = jacobian_at(best)
         gram = jacobian @ jacobian.T / n_vertices
-        first_gain, gain = None, 1.0
-        while gain > _WORTH_REUSE:
+        gains: list[float] = []
+        while not gains or gains[-1] > _WORTH_REUSE:
             stiffness = PRIOR_SHARE * best.misfit * inverse_variance
             slope = jacobian @ best.residual.ravel() / n_vertices
             slope[:n_codes] += stiffness * best.latent
@@ -163,12 +163,12 @@ def fit_latent(
             halved = (at(best.latent - 0.5**power * step) for power in range(_HALVINGS))
             start_cost = best.cost(stiffness)
             better = next((one for one in halved if one.cost(stiffness) < start_cost), None)
-            gain = 0.0
-            if better is not None:
-                gain = 1.0 - better.cost(stiffness) / start_cost
+            if better is None:
+                gains.append(0.0)
+            else:
+                gains.append(1.0 - better.cost(stiffness) / start_cost)
                 best = better
-            first_gain = gain if first_gain is None else first_gain
-        if first_gain < _SETTLED:
+        if gains[0] < _SETTLED:
             break
     distances = np.linalg.norm(best.residual, axis=1)
     mean_error, max_error = float(distances.mean()), float(distances.max())

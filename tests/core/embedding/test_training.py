@@ -19,6 +19,7 @@ from lcollision_core.embedding import (
     judge_masks,
     train_embedding,
 )
+from lcollision_core.embedding.fitting import fit_latent
 from lcollision_core.embedding.metrics import vertex_distances
 from lcollision_core.errors import (
     CancelledError,
@@ -117,6 +118,14 @@ def test_tube_is_rebuilt_and_split_where_it_bends() -> None:
     assert (owner[22:] == 0).all()
     assert (owner[11:14] == 1).all()
     assert (owner[:3] == 2).all()
+
+
+def test_level_2_may_stay_as_its_principal_components() -> None:
+    config = replace(SMALL, level1_epochs=40, level2_epochs=0, held_out_stride=0)
+    metrics = train_embedding(tube_poses(), config).metrics
+    assert metrics is not None
+    assert metrics.mean < 0.002
+    assert metrics.mean < metrics.guess_mean < metrics.level1_mean
 
 
 def test_metrics_are_those_of_the_embedding() -> None:
@@ -254,6 +263,31 @@ def test_encode_gives_the_code_of_a_moved_mesh_back() -> None:
         still = embedding.encode(decoded)
         # Float32 codes and a fit that stops at 2 % gain leave this much between the two.
         assert np.abs(fit.latent - still.latent).max() < 1e-3 * np.abs(still.latent).max()
+
+
+def test_fit_has_the_same_bits_on_any_number_of_threads_and_few_jacobians(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    embedding, poses = trained_tube(), tube_poses()
+    codec, decoder = embedding.codec, embedding.decoder
+    vertices = poses.vertices[1] / np.ptp(poses.vertices[0], axis=0).max()
+    calls = []
+    differentiate = codec.decode_jvp
+
+    def counted(*arguments: object) -> object:
+        calls.append(arguments)
+        return differentiate(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(codec, "decode_jvp", counted)
+    guess, deviation = np.zeros(embedding.latent_size), embedding.latent_deviation
+    fits = [
+        fit_latent(decoder, codec, vertices, guess, deviation, n_threads=n_threads)
+        for n_threads in (1, 2)
+    ]
+    assert np.array_equal(fits[0].latent, fits[1].latent)
+    assert fits[0].mean_error < 0.005
+    n_jacobians = len(calls) / 2 / len(embedding.group_sizes)
+    assert 1 < n_jacobians <= 5
 
 
 def test_encode_improves_on_the_guess() -> None:
