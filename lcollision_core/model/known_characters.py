@@ -142,7 +142,7 @@ def remember_choices(model: RigModel) -> None:
     known = known_character(model.fingerprint) or KnownCharacter(str(model.character.source))
     own, card = model.own_card, model.card
     chosen = {name: getattr(card, name) for name in ("rules", *_PARTS)}
-    changed = {
+    changed: dict[str, Any] = {
         name: None if getattr(own, name) == chosen[name] else chosen[name] for name in chosen
     }
     _write(model, replace(known, **changed))

@@ -43,8 +43,13 @@ _DEFAULT_REST = 2.0
 _LIST_HEIGHT = 112
 _ROW = QSize(0, 20)
 _OTHERS = "other pairs"
+_MEANINGS = {
+    "meshes and materials": "As the file has them",
+    "body parts": "Such as an upper arm and its forearm, which cross at the elbow",
+    "components": "Pieces of the surface that hang together, such as shells and buttons",
+    _OTHERS: "Groups of two kinds",
+}
 _TINT = "Crosses in the pose shown, but isn't counted"
-_PAIR = Qt.ItemDataRole.UserRole
 _CHECKED, _UNCHECKED = Qt.CheckState.Checked, Qt.CheckState.Unchecked
 
 
@@ -141,6 +146,8 @@ class ContactsDialog(QDialog):
     def _ignored_part(self) -> QWidget:
         """Return the list of ignored pairs, with what adds to it and takes from it."""
         self.ignored = QTreeWidget()
+        self._pairs: dict[tuple[str, str], QTreeWidgetItem] = {}
+        self._kinds: dict[str, QTreeWidgetItem] = {}
         self.ignored.setHeaderHidden(True)
         self.ignored.setUniformRowHeights(True)
         self.ignored.setIndentation(NORMAL + TIGHT)
@@ -185,7 +192,7 @@ class ContactsDialog(QDialog):
         return ContactRules(
             _length(self.near, held.near_exclusion),
             _length(self.rest, held.rest_exclusion) if self.at_rest.isChecked() else None,
-            tuple(item.data(0, _PAIR) for item in self._items if item.checkState(0) is _CHECKED),
+            tuple(pair for pair, item in self._pairs.items() if item.checkState(0) is _CHECKED),
             _length(self.tolerated, held.tolerated_depth),
         )
 
@@ -210,6 +217,8 @@ class ContactsDialog(QDialog):
         rest = rules.rest_exclusion
         self.rest.setValue(_DEFAULT_REST if rest is None else _PERCENT * rest)
         self.tolerated.setValue(_PERCENT * rules.tolerated_depth)
+        self._pairs.clear()
+        self._kinds.clear()
         self.ignored.clear()
         for pair in rules.ignored:
             self._list(pair, _CHECKED)
@@ -294,13 +303,12 @@ class ContactsDialog(QDialog):
 
     def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QTreeWidgetItem:
         """Return the item of a pair, which is listed now if it was not."""
-        for item in self._items:
-            if set(item.data(0, _PAIR)) == set(pair):
-                return item
+        for known in (pair, pair[::-1]):
+            if known in self._pairs:
+                return self._pairs[known]
         kind = self._kind(pair)
         # One that is made in its parent takes part in the parent's tick.
-        item = QTreeWidgetItem(kind, [" and ".join(pair)])
-        item.setData(0, _PAIR, pair)
+        item = self._pairs[pair] = QTreeWidgetItem(kind, [" and ".join(pair)])
         item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
         item.setCheckState(0, state)
         item.setSizeHint(0, _ROW)
@@ -312,30 +320,23 @@ class ContactsDialog(QDialog):
         kinds = self._document.model.groups_by_kind
         names = {kind: {group.name for group in groups} for kind, groups in kinds.items()}
         name = next((kind for kind, known in names.items() if set(pair) <= known), _OTHERS)
-        for kind in self._kinds:
-            if kind.data(0, _PAIR) == name:
-                return kind
-        kind = QTreeWidgetItem(self.ignored)
-        kind.setData(0, _PAIR, name)
+        if name in self._kinds:
+            return self._kinds[name]
+        order = [*kinds, _OTHERS]
+        place = sum(order.index(known) < order.index(name) for known in self._kinds)
+        kind = self._kinds[name] = QTreeWidgetItem()
+        self.ignored.insertTopLevelItem(place, kind)
         tick = Qt.ItemFlag.ItemIsUserCheckable | Qt.ItemFlag.ItemIsAutoTristate
         kind.setFlags(kind.flags() | tick)
         kind.setSizeHint(0, _ROW)
-        kind.setToolTip(0, "Ticked: none of these pairs is counted")
+        kind.setToolTip(0, f"{_MEANINGS[name]}. Ticked: none of these pairs is counted")
         return kind
 
     def _name_kinds(self) -> None:
-        """Say of each kind how many pairs it has; the only one is open."""
-        for kind in self._kinds:
-            kind.setText(0, f"{with_capital(kind.data(0, _PAIR))} ({kind.childCount()})")
-            kind.setExpanded(kind.isExpanded() or len(self._kinds) == 1)
-
-    @property
-    def _kinds(self) -> list[QTreeWidgetItem]:
-        return [self.ignored.topLevelItem(row) for row in range(self.ignored.topLevelItemCount())]
-
-    @property
-    def _items(self) -> list[QTreeWidgetItem]:
-        return [kind.child(row) for kind in self._kinds for row in range(kind.childCount())]
+        """Say of each kind how many pairs it has; one alone is open, several are seen at once."""
+        for name, kind in self._kinds.items():
+            kind.setText(0, f"{with_capital(name)} ({kind.childCount()})")
+            kind.setExpanded(len(self._kinds) == 1)
 
 
 def _length(field: NumberBox, held: float | None) -> float:

@@ -98,7 +98,7 @@ def test_pairs_of_groups_are_ignored_and_counted_again(
     QTest.mouseClick(dialog.apply, LEFT)
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
     assert document.model.rules.ignored == ((names[0], names[1]),)
-    (kind,) = dialog._kinds
+    (kind,) = dialog._kinds.values()
     assert kind.isExpanded()
     kind.child(0).setCheckState(0, Qt.CheckState.Unchecked)
     QTest.mouseClick(dialog.apply, LEFT)
@@ -143,17 +143,19 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     poses = body.decode(body.training_latent)
     expected = propose_by_kind(body.detector, poses, body.groups_by_kind)
     assert proposed.args[0] == expected
-    shown = {kind.text(0): kind for kind in dialog._kinds}
+    kinds = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
+    shown = {kind.text(0): kind for kind in kinds}
     assert list(shown) == [
         f"{kind.capitalize()} ({len(pairs)})" for kind, pairs in expected.items() if pairs
     ]
-    texts = [item.text(0) for item in dialog._items]
+    texts = [kind.child(row).text(0) for kind in kinds for row in range(kind.childCount())]
     assert texts == [
         f"{pair.groups[0]} and {pair.groups[1]}: {100 * pair.share:.0f} % of the poses"
         for pairs in expected.values()
         for pair in pairs
     ]
     assert dialog.rules() == body.rules
+    assert not any(kind.isExpanded() for kind in kinds)
     components = next(kind for text, kind in shown.items() if text.startswith("Components"))
     components.setCheckState(0, Qt.CheckState.Checked)
     ignored = tuple(pair.groups for pair in expected["components"])
