@@ -86,7 +86,8 @@ def joint_labels(names: Sequence[str], parents: npt.NDArray[np.int64]) -> tuple[
     """Name the body part of each joint.
 
     A joint whose name does not tell is part of what its parents are, and if they do not tell
-    either, has its own name.
+    either, has its own name. Where that makes one part of all, as of a snake's "seg.01" and
+    "seg.02", each keeps its number.
 
     Parameters
     ----------
@@ -103,6 +104,8 @@ def joint_labels(names: Sequence[str], parents: npt.NDArray[np.int64]) -> tuple[
         inherits = own[joint] is None and parent >= 0 and known[parent]
         labels.append(own[joint] or (labels[parent] if inherits else _spelled_out(name)))
         known.append(own[joint] is not None or inherits)
+    if len(set(labels)) == 1 and not any(known):
+        labels = [_printable(name) for name in names]
     return tuple(labels)
 
 
@@ -188,6 +191,10 @@ def _with_end(part: str | None, side: str, words: tuple[str, ...]) -> str | None
 def _spelled_out(name: str) -> str:
     """Return a name as people write it: "tail_02.L" is "Left tail"."""
     side, words = _words(name)
-    text = " ".join([side, *words]).strip() or " ".join(name.split())
-    printable = "".join(letter for letter in text if letter.isprintable()).strip() or "Part"
-    return printable[:1].upper() + printable[1:].lower() if side else printable.capitalize()
+    printable = _printable(" ".join([side, *words]).strip() or name)
+    return printable[:1].upper() + printable[1:].lower() if side else printable
+
+
+def _printable(name: str) -> str:
+    text = "".join(filter(str.isprintable, " ".join(name.split())))
+    return (text.strip() or "Part").capitalize()

@@ -103,3 +103,10 @@ def test_bones_that_have_numbers_alone_keep_them() -> None:
     names = ["Bone", "Bone.001", "Bone.002", "tail_bone_01", "tail_bone_02"]
     labels = joint_labels(names, np.array([-1, 0, 1, 2, 3]))
     assert labels == ("Bone", "Bone.001", "Bone.002", "Tail", "Tail")
+
+
+def test_a_body_of_one_name_is_many_parts() -> None:
+    parents = np.array([-1, 0, 1])
+    assert joint_labels(["seg.01", "seg.02", "seg.03"], parents) == ("Seg.01", "Seg.02", "Seg.03")
+    assert joint_labels(["tail_01", "tail_02", "fin"], parents) == ("Tail", "Tail", "Fin")
+    assert joint_labels(["LeftHand", "LeftHandIndex1", "x"], parents) == ("Left hand",) * 3
