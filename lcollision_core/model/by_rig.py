@@ -121,11 +121,12 @@ def poses_by_rig(
         chosen[waiting] = number
         waiting = waiting[colliding]
     for start in range(0, len(waiting), _AT_ONCE // _FULL):
-        some = waiting[start : start + _AT_ONCE // _FULL]
-        vertices = body.decode(tried[:_FULL, some].reshape(-1, body.latent_size)).astype(np.float32)
+        poses = waiting[start : start + _AT_ONCE // _FULL]
+        codes = tried[:_FULL, poses].reshape(-1, body.latent_size)
+        vertices = body.decode(codes).astype(np.float32)
         energy = body.detector.detect_batch(vertices, cancel=cancel).vertex_energy.sum(axis=1)
-        chosen[some] = energy.reshape(_FULL, -1).argmin(axis=0)
-        progress(n_poses - len(waiting) + start + len(some), n_poses)
+        chosen[poses] = energy.reshape(_FULL, -1).argmin(axis=0)
+        progress(n_poses - len(waiting) + start + len(poses), n_poses)
     codes = tried[chosen, np.arange(n_poses)]
     provenance = {
         "seed": seed,
@@ -225,7 +226,8 @@ class _Draws:
 
     @property
     def _limb_of_code(self) -> npt.NDArray[np.int64]:
-        return self._limb[self.space.joint_of_code]
+        limbs: npt.NDArray[np.int64] = self._limb[self.space.joint_of_code]
+        return limbs
 
     @cached_property
     def limits(self) -> FloatArray:

@@ -366,9 +366,11 @@ def own_source(body: PosableBody) -> Path | None:
     if isinstance(body, RigModel):
         return body.character.source
     request = body.card.provenance.get("request")
-    sources = request.get("sources") if isinstance(request, Mapping) else None
+    if not isinstance(request, Mapping) or request.get("scale", 1.0) != 1.0:
+        return None
+    sources = request.get("sources")
     first = sources[0] if isinstance(sources, Sequence) and sources else None
-    if not isinstance(first, str) or request.get("scale", 1.0) != 1.0:
+    if not isinstance(first, str):
         return None
     path = Path(first)
     if path.is_dir():
