@@ -64,12 +64,6 @@ def gather_poses(
     files = [Path(path) for path in paths]
     characters = {file: read_character(file, up) for file in files if _has_rig(file)}
     rigged = next(iter(characters), None)
-    if by_rig and rigged is None:
-        raise LCollisionError(
-            "has no joints to pose it by",
-            "name a rigged character among the files, or leave out poses by the rig",
-            where=", ".join(map(str, files)),
-        )
     files.sort(key=lambda file: file != rigged)
     character = None if rigged is None else characters[rigged]
     body = None
@@ -90,6 +84,12 @@ def gather_poses(
             found.append(rest_pose_set(characters[file]))
         else:
             found.append(read_pose_set(file, part(number), cancel, clip=clip, fps=fps))
+    if by_rig and rigged is None:
+        raise LCollisionError(
+            "has no joints to pose it by",
+            "name a rigged character among the files, or leave out poses by the rig",
+            where=", ".join(map(str, files)),
+        )
     poses = concatenated(found)
     if thin:
         poses = thinned(poses, cancel=cancel)

@@ -108,8 +108,9 @@ def test_what_has_no_rig_is_read_as_it_is(moving: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_gathered_gets_a_sentence(moving: Path, tmp_path: Path) -> None:
     with pytest.raises(LCollisionError, match="nothing to read"):
         gather_poses([])
-    with pytest.raises(MeshFileError, match=r"none\.glb does not exist"):
-        gather_poses([tmp_path / "none.glb"])
+    for by_rig in (None, 5):
+        with pytest.raises(MeshFileError, match=r"none\.glb does not exist"):
+            gather_poses([tmp_path / "none.glb"], by_rig=by_rig)
     with pytest.raises(MeshFileError, match="no clip 'run'"):
         gather_poses([moving], clip="run")
     other = write_gltf(rigged_tube(frames=True), tmp_path / "other.gltf")
