@@ -121,12 +121,13 @@ def poses_by_rig(
         chosen[waiting] = number
         waiting = waiting[colliding]
     for start in range(0, len(waiting), _AT_ONCE // _FULL):
-        poses = waiting[start : start + _AT_ONCE // _FULL]
-        codes = tried[:_FULL, poses].reshape(-1, body.latent_size)
-        vertices = body.decode(codes).astype(np.float32)
+        group = waiting[start : start + _AT_ONCE // _FULL]
+        vertices = body.decode(tried[:_FULL, group].reshape(-1, body.latent_size)).astype(
+            np.float32
+        )
         energy = body.detector.detect_batch(vertices, cancel=cancel).vertex_energy.sum(axis=1)
-        chosen[poses] = energy.reshape(_FULL, -1).argmin(axis=0)
-        progress(n_poses - len(waiting) + start + len(poses), n_poses)
+        chosen[group] = energy.reshape(_FULL, -1).argmin(axis=0)
+        progress(n_poses - len(waiting) + start + len(group), n_poses)
     codes = tried[chosen, np.arange(n_poses)]
     provenance = {
         "seed": seed,
