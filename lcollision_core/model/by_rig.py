@@ -12,10 +12,11 @@ import numpy.typing as npt
 from lcollision_core.characters import Character, RigPoseSpace, joint_parts
 from lcollision_core.characters.joint_roles import Role
 from lcollision_core.characters.rig_space import ROOT_CODES
-from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.errors import LCollisionError, PoseSetError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import ContactRules, PoseSet
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
+from lcollision_core.meshes.npz import MAX_ITEMS
 from lcollision_core.meshes.pose_set import require_usable_reference
 from lcollision_core.model.rig_model import REST, RigModel
 
@@ -98,11 +99,18 @@ def poses_by_rig(
     Raises
     ------
     ShapeError : n_poses is below 1.
-    PoseSetError : a face of the rest pose has no area.
+    PoseSetError : a face of the rest pose has no area, or the poses are too many.
     CancelledError : `cancel` was set.
     """
     if n_poses < 1:
         raise ShapeError.must_be("the number of poses by the rig", "1 or more", n_poses)
+    n_items = n_poses * body.n_vertices * 3
+    if n_items > MAX_ITEMS:
+        raise PoseSetError(
+            f"would have {n_items} coordinates, at most {MAX_ITEMS} can be read",
+            "ask for fewer poses",
+            where=body.character.source,
+        )
     rest, draws = rest_pose_set(body.character), _Draws(body.space)
     generator = np.random.default_rng(seed)
     extents = draws.extents(n_poses, generator)

@@ -175,6 +175,8 @@ def test_unknown_joints_turn_modestly() -> None:
 def test_what_cannot_be_posed_gets_a_sentence(body: RigModel) -> None:
     with pytest.raises(ShapeError, match="1 or more"):
         poses_by_rig(body, 0)
+    with pytest.raises(PoseSetError, match=r"would have .* coordinates"):
+        poses_by_rig(body, 10**7)
     cancel = CancelToken()
     cancel.cancel()
     with pytest.raises(CancelledError):
