@@ -139,8 +139,8 @@ def front_of(
 ) -> FloatArray | None:
     """Return the horizontal unit vector along which a body faces; None if its joints do not tell.
 
-    That is where its feet point, and of a body that lies more than it stands, as an animal's with
-    hooves, where its head is from its middle.
+    Where its feet point; of a body that lies more than it stands, as an animal's whose hooves point
+    down, along its spine to its head.
 
     Parameters
     ----------
@@ -154,16 +154,15 @@ def front_of(
         flat: FloatArray = way - (way @ up) * up
         return flat
 
+    if Role.HEAD in roles and Role.SPINE in roles:
+        way = origins[roles.index(Role.HEAD)] - origins[roles.index(Role.SPINE)]
+        length = float(np.linalg.norm(level(way)))
+        if length > abs(way @ up):
+            return level(way) / length
     feet = [joint for joint, role in enumerate(roles) if role is Role.FOOT]
     way = level(directions[feet].sum(axis=0))
     length = float(np.linalg.norm(way))
-    if feet and length > 0.5 * len(feet) * (1 - _PARALLEL):
-        return way / length
-    if Role.HEAD not in roles:
-        return None
-    way = origins[roles.index(Role.HEAD)] - origins.mean(axis=0)
-    length = float(np.linalg.norm(level(way)))
-    return level(way) / length if length > abs(way @ up) else None
+    return way / length if length > 0.5 * len(feet) * (1 - _PARALLEL) and feet else None
 
 
 def joint_axes(
