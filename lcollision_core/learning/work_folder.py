@@ -226,8 +226,8 @@ class WorkFolder:
 
     @property
     def is_held(self) -> bool:
-        """Whether a process is at it."""
-        if not self.path.is_dir():
+        """Whether a process is at it; asked without a write, also on a full disk."""
+        if not (self.path / ".run.lock").exists():
             return False
         try:
             with self.held(wait=0.0):
