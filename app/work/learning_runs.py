@@ -1,0 +1,270 @@
+"""The models that are being learned: each run is a folder that another process works on."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, QProcess, QProcessEnvironment, QTimer, Signal, Slot
+
+import app
+from app.work.learner import DISCARD, STOP, WANTED
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    from lcollision_core.learning import LearningRequest, WorkFolder, WorkStatus
+
+LEARNER = (sys.executable, "-m", "app.work.learner")
+
+POLL_MILLISECONDS = 1000
+
+_SECONDS_TO_BEGIN = 120.0
+"""After which a process that has shown nothing is taken to have failed."""
+
+_LEAST_FREE_BYTES = 100_000_000
+"""On a disk with less, that is why a process has gone."""
+
+_GONE = "it ended unexpectedly, as when the computer is switched off; it goes on where it was"
+_FULL = "the disk is full: {0:.0f} MB are left at {1}; free some space, then continue"
+
+
+class RunPhase(StrEnum):
+    """What a run is doing."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    STOPPING = "stopping"
+    STOPPED = "stopped"
+    FAILED = "failed"
+    KILLED = "killed"
+    DONE = "done"
+
+
+@dataclass(frozen=True)
+class LearningRun:
+    """One run, as it was at the last look.
+
+    Attributes
+    ----------
+    path : its work folder
+    name : of the model
+    phase : see `RunPhase`; a run that waits begins when no other runs
+    status : what its process last said
+    sentence : why it failed or is gone, "" else
+    """
+
+    path: Path
+    name: str
+    phase: RunPhase
+    status: WorkStatus
+    sentence: str = ""
+
+    @property
+    def is_active(self) -> bool:
+        """Whether a process is at it, or soon will be."""
+        return self.phase in (RunPhase.WAITING, RunPhase.RUNNING, RunPhase.STOPPING)
+
+    @property
+    def work(self) -> WorkFolder:
+        """Its work folder."""
+        from lcollision_core.learning import WorkFolder
+
+        return WorkFolder.at(self.path)
+
+
+class LearningRuns(QObject):
+    """Looks at the user's runs again and again, and starts, stops and continues them.
+
+    One runs at a time, in a process that outlives the window; others wait.
+
+    Parameters
+    ----------
+    parent : of the object
+    command : the program that learns, and its arguments before the work folder
+
+    Signals
+    -------
+    changed : `runs` are others, or further
+
+    Attributes
+    ----------
+    runs : by name
+    """
+
+    changed = Signal()
+
+    def __init__(self, parent: QObject, command: tuple[str, ...] = LEARNER) -> None:
+        super().__init__(parent)
+        self._command = command
+        self.runs: tuple[LearningRun, ...] = ()
+        self._starting: tuple[Path, float] | None = None
+        self._timer = QTimer(self, interval=POLL_MILLISECONDS)
+        self._timer.timeout.connect(self.look)
+
+    def begin(self) -> None:
+        """Look now, and from now on."""
+        self._timer.start()
+        self.look()
+
+    def close(self) -> None:
+        """Look no more; what runs goes on."""
+        self._timer.stop()
+
+    def run_of(self, path: Path | None) -> LearningRun | None:
+        """Return the run of a work folder; None if it is gone."""
+        return next((run for run in self.runs if run.path == path), None)
+
+    def start(self, request: LearningRequest, name: str) -> Path:
+        """Begin to learn a model, as soon as no other is learned.
+
+        Parameters
+        ----------
+        request : what from, and how
+        name : of the model
+
+        Returns
+        -------
+        path : of the work folder
+
+        Raises
+        ------
+        LCollisionError : there is a model or a run of that name, or the folder cannot be made.
+        """
+        from lcollision_core.learning import WorkFolder
+        from lcollision_core.model import model_destination
+
+        destination = model_destination(name)
+        if destination.exists():
+            raise LCollisionError(f"there is a model {name!r} already", "choose another name")
+        work = WorkFolder(destination)
+        work.prepare(request)
+        self.resume(work.path)
+        return work.path
+
+    def resume(self, path: Path) -> None:
+        """Go on with a run where it was left.
+
+        Raises
+        ------
+        LCollisionError : its folder cannot be written to.
+        """
+        try:
+            (path / STOP).unlink(missing_ok=True)
+            (path / WANTED).touch()
+        except OSError as error:
+            raise LCollisionError.unwritable(path, error, "free some space there") from error
+        self.look()
+
+    def stop(self, path: Path, discard: bool = False) -> None:
+        """Stop a run, whoever started it; it can go on later unless it is discarded.
+
+        Raises
+        ------
+        LCollisionError : its folder cannot be written to.
+        """
+        run = self.run_of(path)
+        try:
+            (path / WANTED).unlink(missing_ok=True)
+            if self._is_starting(path) or (run is not None and run.work.is_held):
+                (path / STOP).write_text(DISCARD if discard else "", encoding="utf-8")
+            elif discard and run is not None:
+                run.work.remove()
+        except OSError as error:
+            raise LCollisionError.unwritable(path, error, "free some space there") from error
+        self.look()
+
+    @Slot()
+    def look(self) -> None:
+        """See how far all runs are, and begin one that waits."""
+        from lcollision_core.learning import list_work
+
+        runs = tuple(self._looked_at(work) for work in list_work() if not self._is_gone(work))
+        self._forget_what_has_begun(runs)
+        idle = not any(run.phase in (RunPhase.RUNNING, RunPhase.STOPPING) for run in runs)
+        waiting = [run for run in runs if run.phase is RunPhase.WAITING]
+        if idle and waiting and self._starting is None:
+            self._launch(waiting[0].work)
+        if runs != self.runs:
+            self.runs = runs
+            self.changed.emit()
+
+    def _looked_at(self, work: WorkFolder) -> LearningRun:
+        # In this order: a run that begins or ends meanwhile is seen as it was before.
+        is_wanted, stops, is_held = (work.path / WANTED).exists(), _is_to_stop(work), work.is_held
+        status = work.status
+        if is_held or (stops and self._is_starting(work.path)):
+            phase = RunPhase.STOPPING if stops else RunPhase.RUNNING
+        elif is_wanted:
+            phase = RunPhase.WAITING
+        elif status.state == RunPhase.RUNNING:
+            phase = RunPhase.KILLED
+        else:
+            phase = RunPhase(status.state)
+        sentence = status.sentence if phase is RunPhase.FAILED else ""
+        if phase is RunPhase.KILLED:
+            free = shutil.disk_usage(work.path.parent).free
+            is_full = free < _LEAST_FREE_BYTES
+            sentence = _FULL.format(free / 1e6, work.path.parent) if is_full else _GONE
+        return LearningRun(work.path, work.name, phase, status, sentence)
+
+    def _is_gone(self, work: WorkFolder) -> bool:
+        """Remove a run that was discarded, once no process is at it."""
+        if not _is_to_stop(work, DISCARD) or work.is_held or self._is_starting(work.path):
+            return False
+        work.remove()
+        return True
+
+    def _is_starting(self, path: Path) -> bool:
+        return self._starting is not None and self._starting[0] == path
+
+    def _forget_what_has_begun(self, runs: tuple[LearningRun, ...]) -> None:
+        """See whether the process that was started is at work, or has ended without a sign."""
+        if self._starting is None:
+            return
+        path, give_up = self._starting
+        run = next((held for held in runs if held.path == path), None)
+        is_late = time.monotonic() > give_up
+        if is_late:
+            with suppress(OSError):
+                (path / WANTED).unlink(missing_ok=True)
+        has_begun = run is None or run.work.is_held or not (path / WANTED).exists()
+        if is_late or (has_begun and not (path / STOP).exists()):
+            self._starting = None
+
+    def _launch(self, work: WorkFolder) -> None:
+        """Start the process, which belongs to no window."""
+        process = QProcess()
+        program, *arguments = self._command
+        process.setProgram(program)
+        process.setArguments([*arguments, str(work.path)])
+        process.setStandardInputFile(QProcess.nullDevice())
+        for redirect in (process.setStandardOutputFile, process.setStandardErrorFile):
+            redirect(str(work.log), QProcess.OpenModeFlag.Append)
+        process.setProcessEnvironment(_environment())
+        self._starting = work.path, time.monotonic() + _SECONDS_TO_BEGIN
+        process.startDetached()
+
+
+def _is_to_stop(work: WorkFolder, how: str = "") -> bool:
+    """Whether a window has asked for a run to stop, and in this way."""
+    try:
+        return how in (work.path / STOP).read_text(encoding="utf-8")
+    except OSError:
+        return False
+
+
+def _environment() -> QProcessEnvironment:
+    """Return this process's environment, in which a checkout of the program is found too."""
+    environment = QProcessEnvironment.systemEnvironment()
+    root = Path(app.__file__).parents[1]
+    if root.name != "site-packages":
+        known = environment.value("PYTHONPATH")
+        environment.insert("PYTHONPATH", os.pathsep.join(filter(None, (str(root), known))))
+    return environment

@@ -1,0 +1,48 @@
+"""``python -m tests.app.quick_learner WORK_FOLDER``: the learner, with efforts of some seconds."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from dataclasses import replace
+
+from app.work import learner
+from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.learning import EFFORTS, Effort, run
+from lcollision_core.predictor import PRESETS
+
+EFFORTS.update(
+    dict.fromkeys(
+        EFFORTS,
+        Effort(
+            16,
+            EmbeddingConfig(
+                n_domains=2, n_domain_codes=3, level1_epochs=10, level2_epochs=5, held_out_stride=0
+            ),
+            256,
+            replace(PRESETS["paper"], epochs=2, average_passes=0.0),
+        ),
+    )
+)
+
+
+# On a busy machine the tests would wait for what gives way to all others.
+learner._NICENESS = 1
+
+
+def slow_down() -> None:
+    """Let each progress take long, so that a test can come in between."""
+    seconds = float(os.environ.get("SECONDS_PER_STEP", "0"))
+    tell = run.Pace.tell
+
+    def slowly(*arguments: object) -> None:
+        tell(*arguments)  # type: ignore[arg-type]
+        time.sleep(seconds)
+
+    run.Pace.tell = slowly  # type: ignore[method-assign]
+
+
+if __name__ == "__main__":
+    slow_down()
+    sys.exit(learner.main(sys.argv[1:]))

@@ -1,0 +1,194 @@
+"""Runs in processes of their own: begun, followed, stopped, killed, continued, discarded."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import QObject
+from pytestqt.qtbot import QtBot
+
+from app.work import learning_runs
+from app.work.learner import WANTED
+from app.work.learning_runs import LearningRun, LearningRuns, RunPhase
+from lcollision_core.errors import LCollisionError
+from lcollision_core.learning import LearningRequest, WorkFolder, WorkState, WorkStatus
+from lcollision_core.meshes import locked, write_pose_set
+from lcollision_core.model import PoseModel, model_destination
+from tests.bending_tube import bending_tube
+
+QUICK = (sys.executable, "-m", "tests.app.quick_learner")
+PATIENCE = 60_000
+
+
+@pytest.fixture
+def tube_file(tmp_path: Path) -> Path:
+    path = tmp_path / "tube poses.npz"
+    write_pose_set(path, bending_tube())
+    return path
+
+
+@pytest.fixture
+def runs(qtbot: QtBot, monkeypatch: pytest.MonkeyPatch) -> Iterator[LearningRuns]:  # noqa: ARG001
+    monkeypatch.setattr(learning_runs, "POLL_MILLISECONDS", 50)
+    monkeypatch.setenv("SECONDS_PER_STEP", "0.05")
+    parent = QObject()
+    held = LearningRuns(parent, QUICK)
+    held.begin()
+    yield held
+    for run in held.runs:
+        held.stop(run.path, discard=True)
+    qtbot.waitUntil(lambda: not held.runs, timeout=PATIENCE)
+    held.close()
+
+
+def begin(qtbot: QtBot, runs: LearningRuns, file: Path, name: str = "hero") -> Path:
+    path = runs.start(LearningRequest((str(file),), "quick"), name)
+    wait_for(qtbot, runs, path, lambda run: run.phase is RunPhase.RUNNING)
+    return path
+
+
+def wait_for(qtbot: QtBot, runs: LearningRuns, path: Path, is_so: object) -> LearningRun:
+    def looks() -> bool:
+        run = runs.run_of(path)
+        return run is not None and callable(is_so) and bool(is_so(run))
+
+    qtbot.waitUntil(looks, timeout=PATIENCE)
+    run = runs.run_of(path)
+    assert run is not None
+    return run
+
+
+def process_of(path: Path) -> int:
+    """Return the number of the process that learns in a folder."""
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (entry / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if os.fsencode(path) in words and b"tests.app.quick_learner" in words:
+            return int(entry.name)
+    raise AssertionError(f"no process learns in {path}")
+
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="looks for the process in /proc")
+
+
+@linux
+def test_killed_in_the_middle_a_run_says_so_and_goes_on_to_its_end(
+    qtbot: QtBot, runs: LearningRuns, tube_file: Path
+) -> None:
+    path = begin(qtbot, runs, tube_file)
+    wait_for(qtbot, runs, path, lambda run: run.status.stage != "poses")
+    number = process_of(path)
+    assert os.getpriority(os.PRIO_PROCESS, number) >= 1
+    assert os.getsid(number) != os.getsid(0)
+    os.kill(number, signal.SIGKILL)
+    killed = wait_for(qtbot, runs, path, lambda run: not run.is_active)
+    assert killed.phase is RunPhase.KILLED
+    assert "ended unexpectedly" in killed.sentence
+    runs.resume(path)
+    done = wait_for(qtbot, runs, path, lambda run: not run.is_active)
+    assert done.phase is RunPhase.DONE, done.work.log.read_text()
+    assert Path(done.status.model) == model_destination("hero")
+    assert PoseModel.load(done.status.model).has_predictor
+
+
+@linux
+def test_a_run_is_stopped_from_another_window_and_one_waits_for_another(
+    qtbot: QtBot, runs: LearningRuns, tube_file: Path
+) -> None:
+    first = begin(qtbot, runs, tube_file)
+    second = runs.start(LearningRequest((str(tube_file),), "good"), "villain")
+    assert wait_for(qtbot, runs, second, lambda _: True).phase is RunPhase.WAITING
+    later = LearningRuns(runs)
+    later.look()
+    assert [(run.name, run.phase) for run in later.runs] == [
+        ("hero", RunPhase.RUNNING),
+        ("villain", RunPhase.WAITING),
+    ]
+    later.stop(first)
+    stopped = wait_for(qtbot, runs, first, lambda run: not run.is_active)
+    assert stopped.phase is RunPhase.STOPPED
+    wait_for(qtbot, runs, second, lambda run: run.phase is RunPhase.RUNNING)
+    os.kill(process_of(second), signal.SIGTERM)
+    wait_for(qtbot, runs, second, lambda run: run.phase is RunPhase.STOPPED)
+    runs.stop(first, discard=True)
+    assert not first.exists()
+    runs.resume(second)
+    wait_for(qtbot, runs, second, lambda run: run.phase is RunPhase.RUNNING)
+    runs.stop(second, discard=True)
+    qtbot.waitUntil(lambda: not second.exists(), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not runs.runs, timeout=PATIENCE)
+
+
+def test_what_cannot_be_learned_from_is_said_in_one_sentence(
+    qtbot: QtBot, runs: LearningRuns, tmp_path: Path
+) -> None:
+    broken = tmp_path / "broken.npz"
+    broken.write_bytes(b"no poses")
+    path = runs.start(LearningRequest((str(broken),), "quick"), "hero")
+    failed = wait_for(qtbot, runs, path, lambda run: run.phase is RunPhase.FAILED)
+    assert "broken.npz" in failed.sentence
+    assert "\n" not in failed.sentence
+    assert "Traceback" in failed.work.log.read_text()
+
+
+def folder_of(name: str, state: WorkState) -> WorkFolder:
+    work = WorkFolder(model_destination(name))
+    work.prepare(LearningRequest(("/nowhere.npz",)))
+    work.tell(WorkStatus(state, "labels", 0.5, 0.6, 100.0))
+    return work
+
+
+def test_a_process_that_went_as_the_disk_filled_up_is_explained_by_that(
+    runs: LearningRuns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = folder_of("hero", WorkState.RUNNING)
+    with locked(work.path / "run"):
+        runs.look()
+        assert [run.phase for run in runs.runs] == [RunPhase.RUNNING]
+    monkeypatch.setattr(learning_runs, "_LEAST_FREE_BYTES", 1 << 62)
+    runs.look()
+    (run,) = runs.runs
+    assert run.phase is RunPhase.KILLED
+    assert run.sentence.startswith("the disk is full: ")
+
+
+def test_a_program_that_never_begins_does_not_wait_for_ever(
+    qtbot: QtBot, runs: LearningRuns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learning_runs, "_SECONDS_TO_BEGIN", 0.2)
+    monkeypatch.setattr(runs, "_command", (sys.executable, "-c", "pass"))
+    path = runs.start(LearningRequest(("/nowhere.npz",)), "hero")
+    run = wait_for(qtbot, runs, path, lambda run: not run.is_active)
+    assert run.phase is RunPhase.STOPPED
+    assert not (path / WANTED).exists()
+
+
+def test_names_that_are_taken_are_refused(runs: LearningRuns, editor_model: PoseModel) -> None:
+    editor_model.save(model_destination("hero"))
+    with pytest.raises(LCollisionError, match="there is a model 'hero' already"):
+        runs.start(LearningRequest(("/nowhere.npz",)), "hero")
+    folder_of("villain", WorkState.STOPPED)
+    with pytest.raises(LCollisionError, match="being learned from other files"):
+        runs.start(LearningRequest(("/elsewhere.npz",)), "villain")
+
+
+def test_the_learner_refuses_a_folder_without_a_request(tmp_path: Path) -> None:
+    work = WorkFolder(tmp_path / "hero.safetensors")
+    work.path.mkdir()
+    began = time.monotonic()
+    result = subprocess.run(
+        [*learning_runs.LEARNER, work.path], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 2, result.stderr
+    assert time.monotonic() - began < 60.0
+    assert work.status.state == WorkState.FAILED
+    assert "request.json" in work.status.sentence
