@@ -111,3 +111,26 @@ def with_capital(text: str) -> str:
     """Begin with a capital, unless the first word is a file's name or a number."""
     word = text.partition(" ")[0]
     return text[:1].upper() + text[1:] if word.isalpha() else text
+
+
+def duration_text(seconds: float) -> str:
+    """Write a time to wait as in "about 25 minutes", no finer than it can be known."""
+    minutes = seconds / 60.0
+    if minutes < 0.75:
+        return "less than a minute"
+    if minutes < 1.5:
+        return "about 1 minute"
+    step = 1 if minutes < 20 else 5
+    whole = step * round(minutes / step)
+    if whole < 60:
+        return f"about {whole} minutes"
+    hours, rest = divmod(whole, 60)
+    return f"about {hours} h {rest} min" if rest else f"about {hours} h"
+
+
+def spent_text(seconds: float) -> str:
+    """Write a time that has passed as in "40 s", "4 min" or "1 h 5 min"."""
+    if seconds < 60.0:
+        return f"{seconds:.0f} s"
+    hours, minutes = divmod(round(seconds / 60.0), 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"

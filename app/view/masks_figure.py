@@ -21,6 +21,19 @@ _LEGEND_COLUMN, _LEGEND_ROW = 425, 52
 _MARGIN = 50
 
 
+def parts_image(model: PosableBody, width: int, height: int) -> Image.Image:
+    """Draw the same two sides as `draw_masks`, without names, on nothing.
+
+    Parameters
+    ----------
+    width, height : of both together, in pixels
+    """
+    picture = Image.new("RGBA", (width, height))
+    renderer = PoseRenderer(model, width // 2, height, LIGHT, transparent=True)
+    _paste_sides(picture, renderer, model, width // 2, height)
+    return picture
+
+
 def draw_masks(model: PosableBody, path: str | os.PathLike[str]) -> None:
     """Draw the reference from two sides, each domain in its colour, stronger where it owns more.
 
@@ -37,8 +50,6 @@ def draw_masks(model: PosableBody, path: str | os.PathLike[str]) -> None:
     -----
     After figure 2 of Tan et al. 2021.
     """
-    from lcollision_core.meshes.normals import vertex_normals
-
     names, colours = model.domain_names, model.domain_colours
     n_columns = min((2 * _VIEW_WIDTH - 2 * _MARGIN) // _LEGEND_COLUMN, len(names))
     n_rows = -(-len(names) // n_columns)
@@ -46,16 +57,9 @@ def draw_masks(model: PosableBody, path: str | os.PathLike[str]) -> None:
     picture = Image.new("RGB", (2 * _VIEW_WIDTH, height), "white")
 
     renderer = PoseRenderer(model, _VIEW_WIDTH, _VIEW_HEIGHT, LIGHT)
-    scene, vertices = renderer.scene, model.reference.astype(np.float32)
-    scene.show_floor(False)
-    scene.set_plain_background("#ffffff")
-    normals = vertex_normals(vertices, model.faces)
-    scene.show(vertices, normals, mask_colours(model.attention_mask, colours))
-    for index, side in enumerate(("Front", "Back")):
-        aspect = _VIEW_WIDTH / _VIEW_HEIGHT
-        scene.view = preset_view(side, vertices, model.up_axis, model.front, aspect)
-        picture.paste(renderer.drawn(), (index * _VIEW_WIDTH, 0))
-    renderer.close()
+    renderer.scene.show_floor(False)
+    renderer.scene.set_plain_background("#ffffff")
+    _paste_sides(picture, renderer, model, _VIEW_WIDTH, _VIEW_HEIGHT)
 
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(size=26)
@@ -69,3 +73,18 @@ def draw_masks(model: PosableBody, path: str | os.PathLike[str]) -> None:
         draw.rectangle((x, y, x + 60, y + 30), outline="#c8c8cd")
         draw.text((x + 76, y + 15), name, fill="#282c34", font=font, anchor="lm")
     save_png(picture, path)
+
+
+def _paste_sides(
+    picture: Image.Image, renderer: PoseRenderer, model: PosableBody, width: int, height: int
+) -> None:
+    """Draw the front and the back of the reference beside each other, and close the renderer."""
+    from lcollision_core.meshes.normals import vertex_normals
+
+    scene, vertices = renderer.scene, model.reference.astype(np.float32)
+    normals = vertex_normals(vertices, model.faces)
+    scene.show(vertices, normals, mask_colours(model.attention_mask, model.domain_colours))
+    for index, side in enumerate(("Front", "Back")):
+        scene.view = preset_view(side, vertices, model.up_axis, model.front, width / height)
+        picture.paste(renderer.drawn(), (index * width, 0))
+    renderer.close()

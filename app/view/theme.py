@@ -106,6 +106,7 @@ def _style_sheet(theme: Theme) -> str:
     text = bundled_file("editor.qss").read_text(encoding="utf-8")
     return Template(text).substitute(
         asdict(theme),
+        tick=bundled_file("icons", f"tick-{theme.name}.svg").as_posix(),
         hover=mixed(theme.card, theme.accent, 0.10).name(),
         pressed=mixed(theme.card, theme.accent, 0.22).name(),
         faded=mixed(theme.text, theme.window, 0.55).name(),

@@ -39,6 +39,15 @@ ACTIONS: dict[str, Spec] = {
     "new": Spec("&New pose", "Ctrl+N", "Start again from the first pose of the body", "new"),
     "open": Spec("&Open…", "Ctrl+O", "Open poses, a character, a mesh or a model", "open"),
     "open_model": Spec("Open &model…", "Ctrl+Shift+O", "Open a character or a model"),
+    "new_model": Spec(
+        "New mo&del…", "Ctrl+Shift+N", "Learn a model from a character or a body in many poses"
+    ),
+    "learn_character": Spec(
+        "Learn t&his character…",
+        "Ctrl+Alt+N",
+        "Give this character body parts of its own and an instant estimate",
+    ),
+    "learning": Spec("Learnin&g…", "Ctrl+Alt+P", "How far the models are that are being learned"),
     "save": Spec("&Save", "Ctrl+S", "Save the pose to its file", "save"),
     "save_as": Spec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
     "import": Spec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),

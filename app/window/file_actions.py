@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QObject, Qt, Slot
+from PySide6.QtCore import QObject, Qt, Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 POSES_SUFFIX = ".json"
 MODEL_SUFFIX = ".safetensors"
 """As in `lcollision_core.model`, which takes too long to import before the window is there."""
+
+LEARNED_FROM = (".npz", ".pc2", ".mdd")
+"""Files of poses of one body: nothing to open, but to learn a model from."""
 
 _VIDEOS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png"}
 
@@ -79,6 +82,10 @@ class FileActions(QObject):
 
     Whatever a user can fix is raised as `LCollisionError`, for the window to show.
 
+    Signals
+    -------
+    learning_wanted : tuple of Path, folders of meshes and other files that models are learned from
+
     Parameters
     ----------
     window : that dialogs belong to
@@ -93,6 +100,8 @@ class FileActions(QObject):
     acts : callables by the actions' keys
     recent_menu, models_menu : list what can be opened by a click
     """
+
+    learning_wanted = Signal(object)
 
     def __init__(
         self,
@@ -181,7 +190,7 @@ class FileActions(QObject):
     def open_path(self, path: Path) -> None:
         """Open a file as what its extension says: poses, a model, a character, or a mesh.
 
-        A file without a rig is a mesh.
+        A file without a rig is a mesh. Folders and sets of poses lead to a new model.
 
         Raises
         ------
@@ -189,11 +198,13 @@ class FileActions(QObject):
         """
         self._dropped = None
         suffix = path.suffix.lower()
+        if is_learned_from(path):
+            self.learning_wanted.emit((path,))
+            return
         if not path.is_file():
             self.settings.forget_file(str(path.resolve()))
-            kind = "it is a folder" if path.is_dir() else "there is no such file"
             raise LCollisionError(
-                f"Couldn't open {path}: {kind}",
+                f"Couldn't open {path}: there is no such file",
                 "choose a file of poses, a character, a mesh or a model",
             )
         document, meshes = self._document, (*_mesh_suffixes(), *_character_suffixes())
@@ -233,6 +244,9 @@ class FileActions(QObject):
         ------
         LCollisionError : as for `open_path`.
         """
+        if all(map(is_learned_from, paths)):
+            self.learning_wanted.emit(tuple(paths))
+            return
         known = (POSES_SUFFIX, MODEL_SUFFIX, *_mesh_suffixes(), *_character_suffixes())
         path = next((held for held in paths if held.suffix.lower() in known), paths[0])
         self.open_path(path)
@@ -448,6 +462,11 @@ class FileActions(QObject):
         if path is not None:
             self.settings["last_folder"] = str(path.resolve().parent)
         return path
+
+
+def is_learned_from(path: Path) -> bool:
+    """Whether a path is a folder, or a file of poses of one body, to learn a model from."""
+    return path.is_dir() or (path.suffix.lower() in LEARNED_FROM and path.is_file())
 
 
 def _unused(folder: Path, name: str, suffix: str) -> Path:

@@ -32,6 +32,7 @@ from app.window.dialogs.help import show_about, show_shortcuts
 from app.window.drag_actions import DragActions
 from app.window.edit_actions import EditActions
 from app.window.file_actions import FileActions
+from app.window.learning_actions import LearningActions
 from app.window.library_actions import LibraryActions
 from app.window.menus import fill_menus, make_bar
 from app.window.panels.collision import CollisionPanel
@@ -107,7 +108,9 @@ class MainWindow(QMainWindow):
         self.sliders = SlidersPanel(document)
         self.randomise = RandomiseCard(document, act["randomise"], settings["randomise_amount"])
         self.sliders.add_card(self.randomise)
-        self.collision = CollisionPanel(document, act["resolve"], act["resolve_options"])
+        self.collision = CollisionPanel(
+            document, act["resolve"], act["resolve_options"], act["learn_character"]
+        )
         self.library = LibraryPanel(document, act["keep"], act["update"], act["add"])
         self.docks = {
             "sliders": self._dock("sliders", "Sliders", self.sliders),
@@ -115,6 +118,9 @@ class MainWindow(QMainWindow):
             "library": self._dock("library", "Poses", self.library),
         }
         self.files = FileActions(self, document, settings, self.viewport, self.attempt)
+        self._status = StatusBar()
+        self.setStatusBar(self._status)
+        self.learning = LearningActions(self, document, self.files, self._status, act, self.attempt)
         self._edits = EditActions(
             self, document, settings, self.sliders, self.randomise, self.viewport.pictures, act
         )
@@ -147,6 +153,7 @@ class MainWindow(QMainWindow):
             "log": open_log_file,
             "about": lambda: show_about(document.model if document.has_model else None, self),
             **self.files.acts,
+            **self.learning.acts,
             **self._edits.acts,
             **ContactActions(self, document, self.viewport).acts,
             **drags.acts,
@@ -164,8 +171,6 @@ class MainWindow(QMainWindow):
             self.attempt,
         )
         WindowShortcuts(self)
-        self._status = StatusBar()
-        self.setStatusBar(self._status)
         self._preparing = Preparing(self)
         self._connect()
         self._restore()
@@ -270,6 +275,7 @@ class MainWindow(QMainWindow):
         self.settings["window_layout"] = self.saveState(_LAYOUT_VERSION)
         self.settings["randomise_amount"] = self.randomise.amount.value() / 100
         self._preparing.close()
+        self.learning.close()
         # The window is hidden while long work ends.
         for held in (self, *self.findChildren(QWidget)):
             if held.isWindow():

@@ -15,6 +15,7 @@ SEPARATOR = ""
 MENUS: dict[str, tuple[str, ...]] = {
     "&File": (
         *("new", "open", "open_model", "models", "recent", SEPARATOR),
+        *("new_model", "learn_character", "learning", SEPARATOR),
         *("save", "save_as", SEPARATOR),
         *("import", "export", SEPARATOR),
         *("screenshot", "turntable", SEPARATOR, "quit"),

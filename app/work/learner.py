@@ -11,7 +11,8 @@ import signal
 import sys
 import threading
 import traceback
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,7 +33,9 @@ _NICENESS = 10
 _BELOW_NORMAL_PRIORITY_CLASS = 0x4000
 _SECONDS_BETWEEN_LOOKS = 0.25
 _BUG = "the program has failed ({0}: {1}); continue, or see the log file in {2}"
-_NO_MEMORY = "there is not enough memory; close other programs and continue, or learn a lighter mesh"
+_NO_MEMORY = (
+    "there is not enough memory; close other programs and continue, or learn a lighter mesh"
+)
 _FULL_OR_GONE = "{0}; free some space on the disk of {1}, then continue"
 
 
@@ -58,11 +61,9 @@ def main(arguments: list[str]) -> int:
     work, cancel = WorkFolder.at(Path(arguments[0])), CancelToken()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: cancel.cancel())
-    ended = threading.Event()
-    looking = threading.Thread(target=_obey, args=(work, cancel, ended), daemon=True)
-    looking.start()
     try:
-        learn_model(work, lambda _: _begun(work), cancel)
+        with obeying(work, cancel):
+            learn_model(work, lambda _: _begun(work), cancel)
     except CancelledError:
         return 130
     except LCollisionError as error:
@@ -81,11 +82,27 @@ def main(arguments: list[str]) -> int:
         traceback.print_exc()
         _tell_failure(work, _BUG.format(type(error).__name__, error, work.path))
         return 3
+    return 0
+
+
+@contextmanager
+def obeying(work: WorkFolder, cancel: CancelToken) -> Iterator[None]:
+    """Cancel the work once a window asks for its end; afterwards what asked is taken away.
+
+    Parameters
+    ----------
+    work : that is worked on inside the block
+    cancel : of that work
+    """
+    ended = threading.Event()
+    looking = threading.Thread(target=_obey, args=(work, cancel, ended), daemon=True)
+    looking.start()
+    try:
+        yield
     finally:
         ended.set()
         looking.join()
         _leave(work)
-    return 0
 
 
 def _give_way() -> None:

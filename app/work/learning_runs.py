@@ -7,7 +7,7 @@ import shutil
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from lcollision_core.learning import LearningRequest, WorkFolder, WorkStatus
 
 LEARNER = (sys.executable, "-m", "app.work.learner")
+"""The program that learns, and its arguments before the work folder."""
 
 POLL_MILLISECONDS = 1000
 
@@ -32,6 +33,7 @@ _LEAST_FREE_BYTES = 100_000_000
 """On a disk with less, that is why a process has gone."""
 
 _GONE = "it ended unexpectedly, as when the computer is switched off; it goes on where it was"
+_NOT_BEGUN = "its process doesn't begin; continue to try again, or see {0}"
 _FULL = "the disk is full: {0:.0f} MB are left at {1}; free some space, then continue"
 
 
@@ -84,11 +86,6 @@ class LearningRuns(QObject):
 
     One runs at a time, in a process that outlives the window; others wait.
 
-    Parameters
-    ----------
-    parent : of the object
-    command : the program that learns, and its arguments before the work folder
-
     Signals
     -------
     changed : `runs` are others, or further
@@ -100,9 +97,8 @@ class LearningRuns(QObject):
 
     changed = Signal()
 
-    def __init__(self, parent: QObject, command: tuple[str, ...] = LEARNER) -> None:
+    def __init__(self, parent: QObject) -> None:
         super().__init__(parent)
-        self._command = command
         self.runs: tuple[LearningRun, ...] = ()
         self._starting: tuple[Path, float] | None = None
         self._timer = QTimer(self, interval=POLL_MILLISECONDS)
@@ -226,22 +222,23 @@ class LearningRuns(QObject):
 
     def _forget_what_has_begun(self, runs: tuple[LearningRun, ...]) -> None:
         """See whether the process that was started is at work, or has ended without a sign."""
+        from lcollision_core.learning import WorkFolder
+
         if self._starting is None:
             return
         path, give_up = self._starting
         run = next((held for held in runs if held.path == path), None)
-        is_late = time.monotonic() > give_up
-        if is_late:
-            with suppress(OSError):
-                (path / WANTED).unlink(missing_ok=True)
         has_begun = run is None or run.work.is_held or not (path / WANTED).exists()
-        if is_late or (has_begun and not (path / STOP).exists()):
+        if has_begun and not (path / STOP).exists():
             self._starting = None
+        elif time.monotonic() > give_up:
+            self._starting = None
+            _tell_not_begun(WorkFolder.at(path))
 
     def _launch(self, work: WorkFolder) -> None:
         """Start the process, which belongs to no window."""
         process = QProcess()
-        program, *arguments = self._command
+        program, *arguments = LEARNER
         process.setProgram(program)
         process.setArguments([*arguments, str(work.path)])
         process.setStandardInputFile(QProcess.nullDevice())
@@ -249,7 +246,21 @@ class LearningRuns(QObject):
             redirect(str(work.log), QProcess.OpenModeFlag.Append)
         process.setProcessEnvironment(_environment())
         self._starting = work.path, time.monotonic() + _SECONDS_TO_BEGIN
-        process.startDetached()
+        has_started, _ = process.startDetached()
+        if not has_started:
+            self._starting = None
+            _tell_not_begun(work)
+
+
+def _tell_not_begun(work: WorkFolder) -> None:
+    """Say of a run that its process shows nothing."""
+    from lcollision_core.learning import WorkState
+
+    with suppress(OSError, LCollisionError):
+        sentence = _NOT_BEGUN.format(work.log)
+        work.tell(replace(work.status, state=WorkState.FAILED, sentence=sentence))
+        for name in (WANTED, STOP):
+            (work.path / name).unlink(missing_ok=True)
 
 
 def _is_to_stop(work: WorkFolder, how: str = "") -> bool:

@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import NORMAL, ROW_HEIGHT
+from app.window.dialogs.names import NO_FILE_NAME
 from app.window.widgets import dialog_vbox, hbox, labelled, swatch, vbox
 from app.work.jobs import PartEdits
 from lcollision_core.errors import ModelFileError
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 _DOMAIN, _COLOUR = Qt.ItemDataRole.UserRole, Qt.ItemDataRole.UserRole + 1
 _SWATCH = 16
-_NO_FILE_NAME = frozenset('/\\:*?"<>|.')
 
 
 class BodyPartsDialog(QDialog):
@@ -172,7 +172,7 @@ class BodyPartsDialog(QDialog):
 
     def _why_not(self, edits: PartEdits) -> str:
         name = edits.copy_name
-        if name is not None and (not name or len(name) > 60 or _NO_FILE_NAME & set(name)):
+        if name is not None and (not name or len(name) > 60 or NO_FILE_NAME & set(name)):
             return "The copy needs a name of up to 60 letters, without a dot or a slash."
         if name is not None and name in self._taken:
             return f"There is a model “{name}” already; choose another name for the copy."

@@ -10,6 +10,9 @@ from PySide6.QtWidgets import QDialog, QInputDialog, QLabel, QLineEdit, QVBoxLay
 from app.window.widgets import labelled
 from app.wording import heading, menu_text
 
+NO_FILE_NAME = frozenset('/\\:*?"<>|.')
+"""Letters that the name of a model cannot have."""
+
 _WIDTH = 400
 """Least width, so that no title is cut."""
 
@@ -89,3 +92,18 @@ def ask_for_name(
     accepted = dialog.exec() == QDialog.DialogCode.Accepted
     dialog.deleteLater()
     return dialog.name if accepted else None
+
+
+def why_no_model_name(name: str) -> str:
+    """Say in a sentence why a new model of the user's cannot have a name, "" if it can."""
+    from lcollision_core.learning import list_work
+    from lcollision_core.meshes import file_stem
+    from lcollision_core.model import list_models
+
+    if not name or len(name) > 60 or NO_FILE_NAME & set(name) or file_stem(name) != name:
+        return "A model needs a name of up to 60 letters, without a dot or a slash."
+    if name.casefold() in {model.name.casefold() for model in list_models()}:
+        return f"There is a model “{name}” already; choose another name."
+    if name.casefold() in {work.name.casefold() for work in list_work()}:
+        return f"A model “{name}” is being learned; choose another name."
+    return ""

@@ -100,6 +100,15 @@ def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
     return _ask(parent, "Another unit", text, note, buttons) is Choice.SAVE
 
 
+def ask_to_discard(parent: QWidget, name: str) -> bool:
+    """Ask whether what a run of learning has done is to be thrown away."""
+    text = f"Discard what has been learned of “{name}”?"
+    note = "The files that it is learned from stay as they are."
+    buttons = ("Discard", "", "Cancel")
+    answer = _ask(parent, "Discard a model", text, note, buttons, Choice.CANCEL)
+    return answer is Choice.SAVE
+
+
 def message_box(parent: QWidget, title: str, text: str, note: str) -> QMessageBox:
     """Return a message that shows names literally; see `widen`."""
     box = QMessageBox(parent)

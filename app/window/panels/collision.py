@@ -32,18 +32,23 @@ class CollisionPanel(QWidget):
     ----------
     document : followed and changed
     resolve_action, options_action : what the buttons of Resolve trigger
+    learn_action : what learns a character that has no estimate
     """
 
     domain_hovered = Signal(object)
 
     def __init__(
-        self, document: PoseDocument, resolve_action: QAction, options_action: QAction
+        self,
+        document: PoseDocument,
+        resolve_action: QAction,
+        options_action: QAction,
+        learn_action: QAction,
     ) -> None:
         super().__init__()
         self._document = document
         self.setMinimumWidth(_MIN_WIDTH)
         self.exact = ExactCard(document)
-        self.prediction = PredictionCard(document)
+        self.prediction = PredictionCard(document, learn_action)
         self.resolve = ResolveCard(document, resolve_action, options_action)
         page = QWidget()
         margins = (NORMAL, 0, NORMAL, CLOSE)

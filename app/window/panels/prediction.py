@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QEvent, QPoint, QPointF, QRectF, QSize, Qt, Signal
-from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPolygonF
+from PySide6.QtGui import QAction, QColor, QPainter, QPaintEvent, QPolygonF
 from PySide6.QtWidgets import QProgressBar, QSizePolicy, QToolButton, QWidget
 
 from app.view.icons import give_icon
@@ -39,9 +39,10 @@ EVEN_ODDS = 0.5
 _BAR_WIDTH, _BAR_STEPS = 40, 1000
 _TIP = "The model's instant estimate of how likely this pose collides with itself"
 _MISSING = (
-    "This model can't estimate collisions, so Resolve is off. Open another model, or train one "
-    "with “lcollision train predictor” in a terminal."
+    "This model can't estimate collisions, so Resolve is off. Open another model, or learn one by "
+    "“New model” in the File menu."
 )
+_BY_RIG = "No estimate: this character is posed by its rig."
 
 
 class ProbabilityMeter(QWidget):
@@ -191,15 +192,25 @@ class PredictionCard(Card):
     Parameters
     ----------
     document : followed; its locks are changed here
+    learn_action : what learns a character that has no estimate
     """
 
     domain_hovered = Signal(object)
     menu_wanted = Signal(object, object, QPoint)
 
-    def __init__(self, document: PoseDocument) -> None:
+    def __init__(self, document: PoseDocument, learn_action: QAction) -> None:
         super().__init__()
         self._document = document
         self.rows: list[DomainRow] = []
+        self.learn = QToolButton()
+        self.learn.setObjectName("action")
+        self.learn.setText("Learn it…")
+        self.learn.setToolTip(learn_action.toolTip())
+        self.learn.clicked.connect(learn_action.trigger)
+        self._by_rig = QWidget()
+        self._by_rig.setLayout(hbox(labelled(_BY_RIG, "caption", wraps=True), self.learn))
+        self._by_rig.layout().setStretch(0, 1)
+        self._by_rig.hide()
         self.verdict = ElidedLabel("")
         self.percent = labelled("", "aside")
         self.meter = ProbabilityMeter()
@@ -211,7 +222,7 @@ class PredictionCard(Card):
         self.verdict.setObjectName("aside")
         head.addWidget(self.percent)
         self._rows = vbox(spacing=0, margins=(0, TIGHT, 0, 0))
-        self.column.addLayout(vbox(head, self.meter, self._missing, self._rows))
+        self.column.addLayout(vbox(head, self.meter, self._missing, self._by_rig, self._rows))
         document.model_changed.connect(self._on_model)
         document.frame_changed.connect(self._on_frame)
         document.exact_changed.connect(self._on_frame)
@@ -243,6 +254,7 @@ class PredictionCard(Card):
             widget.setVisible(predicts)
         self.title.setText("Estimate" if predicts else "Body parts")
         self._missing.setVisible(not (predicts or self._document.can_resolve))
+        self._by_rig.setVisible(not model.is_trained)
         self._on_frame()
         self._on_locks()
 

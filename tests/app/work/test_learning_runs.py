@@ -35,11 +35,12 @@ def tube_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def runs(qtbot: QtBot, monkeypatch: pytest.MonkeyPatch) -> Iterator[LearningRuns]:  # noqa: ARG001
+def runs(qtbot: QtBot, monkeypatch: pytest.MonkeyPatch) -> Iterator[LearningRuns]:
     monkeypatch.setattr(learning_runs, "POLL_MILLISECONDS", 50)
+    monkeypatch.setattr(learning_runs, "LEARNER", QUICK)
     monkeypatch.setenv("SECONDS_PER_STEP", "0.05")
     parent = QObject()
-    held = LearningRuns(parent, QUICK)
+    held = LearningRuns(parent)
     held.begin()
     yield held
     for run in held.runs:
@@ -165,11 +166,15 @@ def test_a_program_that_never_begins_does_not_wait_for_ever(
     qtbot: QtBot, runs: LearningRuns, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(learning_runs, "_SECONDS_TO_BEGIN", 0.2)
-    monkeypatch.setattr(runs, "_command", (sys.executable, "-c", "pass"))
+    monkeypatch.setattr(learning_runs, "LEARNER", (sys.executable, "-c", "pass"))
     path = runs.start(LearningRequest(("/nowhere.npz",)), "hero")
     run = wait_for(qtbot, runs, path, lambda run: not run.is_active)
-    assert run.phase is RunPhase.STOPPED
+    assert run.phase is RunPhase.FAILED
+    assert "doesn't begin" in run.sentence
     assert not (path / WANTED).exists()
+    monkeypatch.setattr(learning_runs, "LEARNER", ("/nowhere/python",))
+    runs.resume(path)
+    assert wait_for(qtbot, runs, path, lambda run: not run.is_active).phase is RunPhase.FAILED
 
 
 def test_names_that_are_taken_are_refused(runs: LearningRuns, editor_model: PoseModel) -> None:
@@ -186,7 +191,10 @@ def test_the_learner_refuses_a_folder_without_a_request(tmp_path: Path) -> None:
     work.path.mkdir()
     began = time.monotonic()
     result = subprocess.run(
-        [*learning_runs.LEARNER, work.path], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "app.work.learner", work.path],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert result.returncode == 2, result.stderr
     assert time.monotonic() - began < 60.0

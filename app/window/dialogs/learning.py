@@ -1,0 +1,377 @@
+"""How far the learning of a model is, and what has come of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QSize, Qt, Signal, Slot
+from PySide6.QtGui import QImage, QPixmap
+from PySide6.QtWidgets import (
+    QComboBox,
+    QDialog,
+    QGridLayout,
+    QLabel,
+    QProgressBar,
+    QPushButton,
+    QWidget,
+)
+
+from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
+from app.window.dialogs.questions import ask_to_discard
+from app.window.widgets import SWATCH, Card, Sign, dialog_vbox, hbox, labelled, swatch, vbox
+from app.wording import counted, duration_text, height_text, one_line, spent_text, with_capital
+from app.work import learning_jobs
+from app.work.learning_runs import LearningRun, LearningRuns, RunPhase
+
+if TYPE_CHECKING:
+    from app.work.learning_jobs import LearnedModel
+    from app.work.long_work import LongWork
+    from app.work.threads import Failure
+    from lcollision_core.learning import LearnedCard
+
+STAGE_WORDS = {
+    "poses": "reading the poses",
+    "latent space": "learning the latent space",
+    "labels": "checking random poses",
+    "predictor": "training the estimate",
+}
+"""What is done in each stage, in its order."""
+
+_ENDED = (RunPhase.STOPPED, RunPhase.FAILED, RunPhase.KILLED)
+_WIDTH, _SIGN, _STAGE_SIGN, _BOLD_WIDTH = 560, 32, 18, 92
+_PICTURE, _VALUE_WIDTH = QSize(300, 300), 200
+_GOES_ON = (
+    "It goes on while you pose, when you close this dialog, and when you close the editor, with "
+    "low priority. “Learning” in the File menu brings this dialog back."
+)
+
+
+class LearningDialog(QDialog):
+    """Shows one of the runs, and what can be done with it.
+
+    Signals
+    -------
+    open_wanted : Path, the work folder of a run whose model is to be opened
+
+    Parameters
+    ----------
+    runs : followed, stopped and continued
+    work : reads models
+    parent : the window that it belongs to
+    attempt : does something and shows what a user can fix of what goes wrong
+
+    Attributes
+    ----------
+    which : lists the runs where there are several
+    headline, state, bar : what goes on, how far
+    stop, resume, discard, open_model, dismiss : buttons
+    """
+
+    open_wanted = Signal(object)
+
+    def __init__(
+        self,
+        runs: LearningRuns,
+        work: LongWork,
+        parent: QWidget,
+        attempt: Callable[[Callable[[], object]], object],
+    ) -> None:
+        super().__init__(parent)
+        self.setWindowTitle("Learning")
+        self._runs, self._work, self._attempt = runs, work, attempt
+        self.path: Path | None = None
+        self._shown: tuple[Path, RunPhase] | None = None
+        self._card_of: Path | None = None
+        self._read_for: Path | None = None
+        self._read_failed = False
+        self.which = QComboBox()
+        self.which.setAccessibleName("Model that is learned")
+        self._sign = Sign(_SIGN)
+        self.headline = labelled("", "headline", wraps=True)
+        self.state = labelled("", wraps=True)
+        self.bar = QProgressBar()
+        self.bar.setTextVisible(False)
+        self.bar.setRange(0, 1000)
+        self._stages = _StageRows()
+        self._note = labelled(_GOES_ON, "caption", wraps=True)
+        self.card = LearnedCardView()
+        self._lay_out()
+        self.which.activated.connect(lambda _: self.show_run(self.which.currentData()))
+        runs.changed.connect(self._on_runs)
+        work.failed.connect(self._on_failed)
+
+    def show_run(self, path: Path) -> None:
+        """Show another run."""
+        self.path = path
+        self._on_runs()
+
+    def _lay_out(self) -> None:
+        self.stop, self.resume = QPushButton("Stop"), QPushButton("Continue")
+        self.discard = QPushButton("Discard…")
+        self.open_model, self.dismiss = QPushButton("Open"), QPushButton("Dismiss")
+        self.open_model.setToolTip("Open the model in the editor")
+        self.dismiss.setToolTip("Keep the model for later: it is in File, Models")
+        close = self._close = QPushButton("Close")
+        for button in (self.resume, self.open_model):
+            # Their bold letters take more than Qt reckons with.
+            button.setMinimumWidth(_BOLD_WIDTH)
+        for button in (self.stop, self.resume, self.discard, self.dismiss, close):
+            button.setAutoDefault(False)
+        self.stop.clicked.connect(partial(self._do, self._runs.stop))
+        self.resume.clicked.connect(partial(self._do, self._runs.resume))
+        self.discard.clicked.connect(self._discard)
+        self.open_model.clicked.connect(lambda: self.open_wanted.emit(self._require_path()))
+        self.dismiss.clicked.connect(self._dismiss)
+        close.clicked.connect(self.reject)
+        words = vbox(self.headline, self.state, spacing=TIGHT)
+        head = hbox(self._sign, words, spacing=NORMAL)
+        head.setAlignment(self._sign, Qt.AlignmentFlag.AlignTop)
+        head.setStretchFactor(words, 1)
+        buttons = hbox(
+            self.discard, None, self.stop, self.resume, self.dismiss, close, self.open_model
+        )
+        self._column = dialog_vbox(
+            self.which, head, self.bar, self._stages, self.card, self._note, buttons
+        )
+        self._column.setSpacing(NORMAL)
+        self.setLayout(self._column)
+
+    def _do(self, act: Callable[[Path], None]) -> None:
+        self._attempt(partial(act, self._require_path()))
+
+    def _require_path(self) -> Path:
+        assert self.path is not None
+        return self.path
+
+    @Slot()
+    def _on_runs(self) -> None:
+        if not self.isVisible() and self.path is None:
+            return
+        run = self._runs.run_of(self.path)
+        if run is None:
+            # Discarded here or elsewhere, or opened.
+            self.path = None
+            self.reject()
+            return
+        self._list_runs()
+        self._show(run)
+
+    def _list_runs(self) -> None:
+        names = [(run.name, run.path) for run in self._runs.runs]
+        rows = range(self.which.count())
+        if names != [(self.which.itemText(row), self.which.itemData(row)) for row in rows]:
+            self.which.clear()
+            for name, path in names:
+                self.which.addItem(name, path)
+        self.which.setCurrentIndex([path for _, path in names].index(self.path))
+        self.which.setVisible(len(names) > 1)
+
+    def _show(self, run: LearningRun) -> None:
+        phase, name = run.phase, one_line(run.name)
+        is_done, has_ended = phase is RunPhase.DONE, phase in _ENDED
+        headlines = {
+            RunPhase.WAITING: f"“{name}” waits",
+            RunPhase.RUNNING: f"Learning “{name}”",
+            RunPhase.STOPPING: f"Stopping “{name}”",
+            RunPhase.STOPPED: f"“{name}” is stopped",
+            RunPhase.DONE: f"“{name}” is ready",
+        }
+        self.headline.setText(headlines.get(phase, f"Learning “{name}” has stopped"))
+        self.state.setText(self._state(run))
+        signs = {RunPhase.DONE: ("check", "free"), RunPhase.STOPPED: ("wait", "waiting")}
+        failed = phase in (RunPhase.FAILED, RunPhase.KILLED)
+        sign = ("warning", "colliding") if failed else signs.get(phase, ("wait", "accent"))
+        self._sign.show_icon(*sign)
+        self.bar.setValue(round(1000 * run.status.done))
+        self._stages.follow(run)
+        for widget, wanted in (
+            *(
+                (self.bar, not is_done),
+                (self._stages, not is_done),
+                (self.card, is_done and self._card_of == run.path),
+            ),
+            *((self.stop, phase in (RunPhase.RUNNING, RunPhase.WAITING)), (self.resume, has_ended)),
+            *((self.open_model, is_done), (self.dismiss, is_done)),
+            *((self.discard, not is_done), (self._note, run.is_active)),
+        ):
+            widget.setVisible(wanted)
+        self.discard.setEnabled(phase is not RunPhase.STOPPING)
+        if is_done and run.path not in (self._card_of, self._read_for):
+            self._read_for = run.path
+            read = partial(learning_jobs.read_card, run.status.model)
+            self._work.start("Reading the model", read, self._on_card, self._on_no_card)
+        if self._shown != (run.path, phase):
+            self._shown = run.path, phase
+            self.open_model.setDefault(is_done)
+            self.resume.setDefault(has_ended)
+            (self.open_model if is_done else self.resume if has_ended else self._close).setFocus()
+            self._fit()
+
+    def _state(self, run: LearningRun) -> str:
+        status, phase = run.status, run.phase
+        if phase in (RunPhase.FAILED, RunPhase.KILLED):
+            return f"{with_capital(one_line(run.sentence))}."
+        if phase is RunPhase.DONE:
+            return f"It is among your models. It took {spent_text(sum(status.seconds.values()))}."
+        if phase is RunPhase.WAITING:
+            others = [held.name for held in self._runs.runs if held.phase is RunPhase.RUNNING]
+            when = f"after “{one_line(others[0])}”" if others else "in a moment"
+            return f"It begins {when}."
+        words = [f"{100 * status.done:.0f} %"]
+        if phase is RunPhase.RUNNING and status.seconds_left is not None and status.done > 0.0:
+            words.append(f"{duration_text(status.seconds_left)} left")
+        if phase is RunPhase.STOPPED:
+            words = [f"{words[0]} is done: Continue goes on from there."]
+        return ", ".join((*words, *(status.facts if run.is_active else ())))
+
+    def _fit(self) -> None:
+        """Take the size that the content needs, and stay on the screen."""
+        self.setMinimumWidth(_WIDTH)
+        self._column.activate()
+        width = max(_WIDTH, self.sizeHint().width())
+        self.resize(width, max(self.sizeHint().height(), self._column.totalHeightForWidth(width)))
+        screen, frame = self.screen().availableGeometry(), self.frameGeometry()
+        left = min(frame.x(), screen.right() + 1 - frame.width())
+        top = min(frame.y(), screen.bottom() + 1 - frame.height())
+        if self.isVisible() and (left, top) != (frame.x(), frame.y()):
+            self.move(max(left, screen.x()), max(top, screen.y()))
+
+    @Slot()
+    def _discard(self) -> None:
+        path = self._require_path()
+        run = self._runs.run_of(path)
+        if run is not None and ask_to_discard(self, run.name):
+            self._attempt(lambda: self._runs.stop(path, discard=True))
+
+    @Slot()
+    def _dismiss(self) -> None:
+        """Remove what is left of a run that is done; its model stays."""
+        run = self._runs.run_of(self._require_path())
+        if run is not None:
+            run.work.remove()
+        self._runs.look()
+
+    def _on_card(self, learned: LearnedModel) -> None:
+        from app.view.masks_figure import parts_image
+
+        ratio = self.devicePixelRatioF()
+        width, height = round(ratio * _PICTURE.width()), round(ratio * _PICTURE.height())
+        drawn = parts_image(learned.model, width, height)
+        pixels = QImage(drawn.tobytes(), *drawn.size, 4 * width, QImage.Format.Format_RGBA8888)
+        pixels.setDevicePixelRatio(ratio)
+        self.card.show_model(learned, QPixmap.fromImage(pixels))
+        self._card_of = self._read_for
+        self._on_runs()
+        self._fit()
+
+    def _on_no_card(self) -> None:
+        self._read_failed = True
+
+    @Slot(object)
+    def _on_failed(self, failure: Failure) -> None:
+        if self._read_failed:
+            self._read_failed = False
+            self.state.setText(f"{with_capital(one_line(failure.headline))}.")
+
+
+class _StageRows(Card):
+    """The stages, each with a sign, its name and the time that it has taken."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._rows: dict[str, tuple[Sign, QLabel, QLabel]] = {}
+        for stage, words in STAGE_WORDS.items():
+            sign, name, spent = (
+                Sign(_STAGE_SIGN),
+                labelled(with_capital(words)),
+                labelled("", "caption"),
+            )
+            self._rows[stage] = sign, name, spent
+            self.column.addLayout(hbox(sign, name, None, spent))
+
+    def follow(self, run: LearningRun) -> None:
+        """Show how far a run is."""
+        stages = list(self._rows)
+        now = stages.index(run.status.stage) if run.status.stage in stages else 0
+        for index, (stage, (sign, name, spent)) in enumerate(self._rows.items()):
+            is_done = index < now or run.phase is RunPhase.DONE
+            is_now = index == now and run.phase in (RunPhase.RUNNING, RunPhase.STOPPING)
+            icon = ("check", "free") if is_done else ("right", "accent" if is_now else "track")
+            sign.show_icon(*icon)
+            name.setObjectName("title" if is_now else "" if is_done else "caption")
+            name.style().unpolish(name)
+            name.style().polish(name)
+            seconds = run.status.seconds.get(stage, 0.0)
+            text = spent_text(seconds) if seconds >= 1.0 else ""
+            if is_now and run.status.stage_done > 0.0:
+                text = f"{100 * run.status.stage_done:.0f} %   {text}"
+            spent.setText(text)
+
+
+class LearnedCardView(QWidget):
+    """The figures of a learned model, and its body parts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.facts = QGridLayout(horizontalSpacing=WIDE, verticalSpacing=TIGHT)
+        self.picture = QLabel()
+        self.picture.setFixedSize(_PICTURE)
+        self.picture.setAccessibleName("The body parts that were found, from the front and back")
+        self._parts = QGridLayout(horizontalSpacing=NORMAL, verticalSpacing=2)
+        card = Card()
+        card.column.addLayout(self.facts)
+        card.column.addStretch()
+        column = vbox(self.picture, self._parts, spacing=CLOSE)
+        self.setLayout(hbox(card, column, wide=card, spacing=WIDE))
+
+    def show_model(self, learned: LearnedModel, picture: QPixmap) -> None:
+        """Show another model."""
+        for grid in (self.facts, self._parts):
+            while (item := grid.takeAt(0)) is not None:
+                item.widget().deleteLater()
+        for row, (name, value) in enumerate(_figures(learned.card)):
+            words = labelled(value, wraps=True)
+            words.setMinimumWidth(_VALUE_WIDTH)
+            self.facts.addWidget(labelled(name, "caption"), row, 0, Qt.AlignmentFlag.AlignTop)
+            self.facts.addWidget(words, row, 1)
+        model = learned.model
+        for index, (name, colour) in enumerate(
+            zip(model.domain_names, model.domain_colours, strict=True)
+        ):
+            sign, text = QLabel(), labelled(with_capital(one_line(name)), "aside")
+            sign.setPixmap(swatch(colour, SWATCH, self.devicePixelRatioF()).pixmap(SWATCH, SWATCH))
+            row, column = divmod(index, 2)
+            self._parts.addWidget(sign, row, 2 * column)
+            self._parts.addWidget(text, row, 2 * column + 1)
+        for column in (1, 3):
+            self._parts.setColumnStretch(column, 1)
+        self.picture.setPixmap(picture)
+
+
+def _figures(card: LearnedCard) -> list[tuple[str, str]]:
+    """Return what a card says, name by name."""
+    error = f"{100 * card.error_mean:.2f} % of the body size"
+    figures = [
+        ("Vertices", f"{card.vertices}"),
+        ("Learned from", counted(card.poses, "pose")),
+        ("Body parts", f"{card.parts}"),
+        (
+            "Error",
+            f"{error}, at most {height_text(card.error_max)}",
+        ),
+        ("Estimate", f"right for {_percent(card.accuracy)} of new poses"),
+        ("False alarms", f"{_percent(card.false_positive_rate)} of the free poses"),
+        ("Misses", f"{_percent(card.false_negative_rate)} of the colliding poses"),
+        ("Collide", f"{_percent(card.colliding_share)} of {card.samples} random poses"),
+        ("Not counted", card.rules or "nothing: all contacts count"),
+    ]
+    for stage, words in STAGE_WORDS.items():
+        figures.append((with_capital(words), spent_text(card.seconds.get(stage, 0.0))))
+    return figures
+
+
+def _percent(share: float | None) -> str:
+    return "none" if share is None else f"{100 * share:.1f} %"

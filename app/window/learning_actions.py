@@ -1,0 +1,221 @@
+"""Learning a model from the window: the dialogs, and the indicator at the window's foot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from PySide6.QtCore import QObject, Qt, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QDialog, QStatusBar, QToolButton, QWidget
+
+from app.window.dialogs.learning import STAGE_WORDS, LearningDialog
+from app.window.dialogs.new_model import NewModelDialog
+from app.window.file_actions import FileActions
+from app.window.widgets import plain_tip
+from app.wording import duration_text, menu_text, one_line
+from app.work import learning_jobs
+from app.work.learning_runs import LearningRun, LearningRuns, RunPhase
+from app.work.long_work import LongWork
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from lcollision_core.learning import LearningRequest
+
+Dialog = TypeVar("Dialog", bound=QDialog)
+
+_SECONDS_TO_CLOSE = 5.0
+_INDICATOR_SHARE = 0.45
+"""Of the window's width, that the indicator has at most."""
+
+_MOST_URGENT = (
+    *(RunPhase.RUNNING, RunPhase.STOPPING, RunPhase.FAILED, RunPhase.KILLED),
+    *(RunPhase.DONE, RunPhase.WAITING, RunPhase.STOPPED),
+)
+"""Of several runs the indicator shows the first of these."""
+
+
+class LearningActions(QObject):
+    """Opens the dialog of a new model, and shows how far those are that are being learned.
+
+    Runs are looked for once the first body is on the screen, also those of an earlier window.
+
+    Parameters
+    ----------
+    window : that the dialogs belong to
+    document : the finished model is opened into
+    files : opens it, and tells of what is dropped to be learned from
+    bar : gets the indicator
+    actions : the window's, by key
+    attempt : does something and shows what a user can fix of what goes wrong
+
+    Attributes
+    ----------
+    acts : callables by the actions' keys
+    runs : what is being learned
+    indicator : says how far, and opens the dialog
+    """
+
+    def __init__(
+        self,
+        window: QWidget,
+        document: PoseDocument,
+        files: FileActions,
+        bar: QStatusBar,
+        actions: Mapping[str, QAction],
+        attempt: Callable[[Callable[[], object]], object],
+    ) -> None:
+        super().__init__(window)
+        self._window, self._document, self._files = window, document, files
+        self._actions, self._attempt = actions, attempt
+        self._work = LongWork(self, "learning")
+        self.runs = LearningRuns(self)
+        self._told: dict[Path, RunPhase] = {}
+        self._opening: tuple[Path, Path] | None = None
+        self.indicator = QToolButton()
+        self.indicator.setObjectName("indicator")
+        self.indicator.setFocusPolicy(Qt.FocusPolicy.TabFocus)
+        self.indicator.clicked.connect(self.show_runs)
+        self.indicator.hide()
+        bar.insertPermanentWidget(0, self.indicator)
+        self.acts: dict[str, Callable[[], object]] = {
+            "new_model": self.new_model,
+            "learn_character": self._learn_character,
+            "learning": self.show_runs,
+        }
+        actions["learning"].setEnabled(False)
+        actions["learn_character"].setEnabled(False)
+        self.runs.changed.connect(self._on_runs)
+        files.learning_wanted.connect(self.new_model)
+        document.opened.connect(self._on_opened)
+        document.model_changed.connect(self._on_model)
+        self._began = False
+        if document.has_model:
+            self._on_model()
+
+    @Slot(object)
+    def new_model(self, paths: Sequence[Path] = ()) -> None:
+        """Open the dialog of a new model; while it is open, more files are added to it."""
+        dialog = self._visible(NewModelDialog)
+        if dialog is None:
+            dialog = NewModelDialog(self._work, self._files.settings, self._window)
+            dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+            dialog.started.connect(self._start)
+            dialog.show()
+        dialog.activateWindow()
+        if paths:
+            dialog.add(paths)
+
+    @Slot()
+    def show_runs(self) -> None:
+        """Show how far the most urgent run is."""
+        run = self._most_urgent()
+        if run is not None:
+            self._show(run.path)
+
+    def close(self) -> None:
+        """Look no more; what is being learned goes on."""
+        self.runs.close()
+        self._work.close(time.monotonic() + _SECONDS_TO_CLOSE)
+
+    def _learn_character(self) -> None:
+        self.new_model((Path(self._document.model_file),))
+
+    def _show(self, path: Path, activates: bool = True) -> None:
+        dialog = self._visible(LearningDialog)
+        if dialog is None:
+            dialog = LearningDialog(self.runs, self._work, self._window, self._attempt)
+            dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+            dialog.setAttribute(Qt.WidgetAttribute.WA_ShowWithoutActivating, not activates)
+            dialog.open_wanted.connect(self._open)
+        dialog.show_run(path)
+        dialog.show()
+        if activates:
+            dialog.activateWindow()
+
+    def _visible(self, kind: type[Dialog]) -> Dialog | None:
+        shown = (held for held in self._window.findChildren(kind) if held.isVisible())
+        return next(shown, None)
+
+    @Slot(object, str)
+    def _start(self, request: LearningRequest, name: str) -> None:
+        path = self._attempt(lambda: self.runs.start(request, name))
+        dialog = self._visible(NewModelDialog)
+        if isinstance(path, Path) and dialog is not None:
+            dialog.accept()
+            self._show(path)
+
+    @Slot(object)
+    def _open(self, path: Path) -> None:
+        """Open what came of a run in the document's normal way."""
+        run = self.runs.run_of(path)
+        if run is not None:
+            model = Path(run.status.model)
+            self._opening = model, path
+            self._attempt(lambda: self._files.open_path(model))
+
+    @Slot(object)
+    def _on_opened(self, opened: Path) -> None:
+        """Remove what is left of a run whose model is open now."""
+        if self._opening is not None and self._opening[0] == opened:
+            run = self.runs.run_of(self._opening[1])
+            self._opening = None
+            if run is not None:
+                run.work.remove()
+            self.runs.look()
+
+    @Slot()
+    def _on_model(self) -> None:
+        self._actions["learn_character"].setEnabled(not self._document.model.is_trained)
+        if not self._began:
+            self._began = True
+            # What it imports takes longer than a frame.
+            work = learning_jobs.load_learning
+            self._work.start("Looking for runs", work, lambda _: self.runs.begin())
+
+    @Slot()
+    def _on_runs(self) -> None:
+        run = self._most_urgent()
+        self.indicator.setVisible(run is not None)
+        self._actions["learning"].setEnabled(run is not None)
+        if run is not None:
+            others = len(self.runs.runs) - 1
+            text = indicator_text(run) + (f" (and {others} more)" if others else "")
+            # A status bar is never narrower than what it shows.
+            most = round(_INDICATOR_SHARE * self._window.width())
+            cut = self.indicator.fontMetrics().elidedText(text, Qt.TextElideMode.ElideRight, most)
+            self.indicator.setText(menu_text(cut))
+            self.indicator.setToolTip(plain_tip(run.sentence or text))
+            self.indicator.setAccessibleName(text)
+            failed = run.phase in (RunPhase.FAILED, RunPhase.KILLED)
+            state = "failed" if failed else "done" if run.phase is RunPhase.DONE else ""
+            if self.indicator.property("state") != state:
+                self.indicator.setProperty("state", state)
+                self.indicator.style().unpolish(self.indicator)
+                self.indicator.style().polish(self.indicator)
+        for held in self.runs.runs:
+            if held.phase is RunPhase.DONE and self._told.get(held.path) is not RunPhase.DONE:
+                self._show(held.path, activates=False)
+        self._told = {held.path: held.phase for held in self.runs.runs}
+
+    def _most_urgent(self) -> LearningRun | None:
+        runs = sorted(self.runs.runs, key=lambda run: _MOST_URGENT.index(run.phase))
+        return runs[0] if runs else None
+
+
+def indicator_text(run: LearningRun) -> str:
+    """Say in a line how far a run is."""
+    name, status = one_line(run.name), run.status
+    if run.phase is RunPhase.RUNNING:
+        words = [f"Learning {name}: {100 * status.done:.0f} %"]
+        if status.seconds_left is not None and status.done > 0.0:
+            words.append(f"{duration_text(status.seconds_left)} left")
+        return ", ".join((*words, STAGE_WORDS.get(status.stage, status.stage)))
+    return {
+        RunPhase.WAITING: f"{name} waits to be learned",
+        RunPhase.STOPPING: f"Learning {name}: stopping",
+        RunPhase.DONE: f"{name} is ready",
+        RunPhase.STOPPED: f"Learning {name}: stopped",
+    }.get(run.phase, f"Learning {name} has stopped: see why")

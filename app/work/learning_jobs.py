@@ -1,0 +1,70 @@
+"""The long work round learning a model, in the window's other thread: see `app.work.jobs`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.jobs import CancelToken, Progress
+
+if TYPE_CHECKING:
+    from lcollision_core.learning import LearnedCard
+    from lcollision_core.learning.summary import SourcesSummary
+    from lcollision_core.model import PoseModel
+
+
+@dataclass(frozen=True, eq=False)
+class LookedInto:
+    """What files hold, ready to be drawn.
+
+    Attributes
+    ----------
+    summary : of all of them
+    normals : (P, V, 3) float32 array, of the vertices of `summary.shown`
+    """
+
+    summary: SourcesSummary
+    normals: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedModel:
+    """A model that has been learned, and its figures."""
+
+    model: PoseModel
+    card: LearnedCard
+
+
+def load_learning(_: Progress, __: CancelToken) -> None:
+    """Import what looking at runs needs, which takes longer than a frame."""
+    import lcollision_core.learning  # noqa: F401
+
+
+def look_into_sources(
+    paths: tuple[Path, ...], progress: Progress, cancel: CancelToken
+) -> LookedInto:
+    """Read files that a model is to be learned from.
+
+    Raises
+    ------
+    LCollisionError : nothing can be learned from them.
+    """
+    from lcollision_core.learning.summary import summarise_sources
+    from lcollision_core.meshes.normals import vertex_normals
+
+    summary = summarise_sources(paths, progress, cancel)
+    faces = summary.topology.faces
+    return LookedInto(summary, np.stack([vertex_normals(pose, faces) for pose in summary.shown]))
+
+
+def read_card(model_file: str, _: Progress, __: CancelToken) -> LearnedModel:
+    """Read a model that has been learned."""
+    from lcollision_core.learning import card_of
+    from lcollision_core.model import PoseModel
+
+    model = PoseModel.load(model_file)
+    return LearnedModel(model, card_of(model, model_file))

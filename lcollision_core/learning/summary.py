@@ -1,0 +1,170 @@
+"""What some files hold that a model is to be learned from, before anything is learned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.characters import CHARACTER_SUFFIXES
+from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up, read_pose_set
+from lcollision_core.meshes.joined import join_parts
+from lcollision_core.meshes.pose_set import disagreement
+from lcollision_core.meshes.scene_files import one_sentence, read_scene
+
+_MOST_SHOWN = 8
+"""Poses of each source, evenly spaced, that are kept to be looked at."""
+
+
+@dataclass(frozen=True)
+class SourceClip:
+    """An animation of a file.
+
+    Attributes
+    ----------
+    name : as in the file
+    n_frames : its keys, at most 30 a second
+    seconds : that it lasts
+    """
+
+    name: str
+    n_frames: int
+    seconds: float
+
+    def frames_at(self, fps: float | None) -> int:
+        """Return how many frames it has, `fps` of them a second; None for its keys."""
+        return self.n_frames if fps is None else int(self.seconds * fps + 1e-6) + 1
+
+
+@dataclass(frozen=True, eq=False)
+class SourcesSummary:
+    """What files of one body hold.
+
+    Attributes
+    ----------
+    topology : of all of them
+    shown : (P, V, 3) float32 array, some of the poses, the rest pose first, in the files' unit
+    n_poses : poses without those of clips
+    clips : of the files of characters
+    n_joints : that move the skin; 0 where nothing is rigged
+    up : the axis that is up, as the file says or as it is guessed
+    size : the longest side of the rest pose's bounding box
+    metres : length of the files' unit; None where they do not say it
+    notes : sentences on what was changed on reading
+    """
+
+    topology: Topology
+    shown: npt.NDArray[np.float32]
+    n_poses: int
+    clips: tuple[SourceClip, ...]
+    n_joints: int
+    up: UpGuess
+    size: float
+    metres: float | None
+    notes: tuple[str, ...]
+
+    def n_given(self, clip: str | None = None, fps: float | None = None) -> int:
+        """Return how many poses there are, with the frames of one clip or of all."""
+        frames = (held.frames_at(fps) for held in self.clips if clip in (None, held.name))
+        return self.n_poses + sum(frames)
+
+
+def summarise_sources(
+    paths: Sequence[Path], progress: Progress = no_progress, cancel: CancelToken | None = None
+) -> SourcesSummary:
+    """Read files of one body, and tell what they hold together.
+
+    Parameters
+    ----------
+    paths : files of characters, folders of meshes, point caches and pose sets
+    progress : called with (poses done, poses in all) of each
+    cancel : polled between poses
+
+    Raises
+    ------
+    LCollisionError : one of them cannot be learned from, or they are not of one topology.
+    CancelledError : `cancel` was set.
+    """
+    found = []
+    for path in paths:
+        summary = _of_character(path) if path.suffix.lower() in CHARACTER_SUFFIXES else None
+        found.append(summary or _of_poses(path, progress, cancel))
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+    first = next((one for one in found if one.n_joints), found[0])
+    for path, one in zip(paths, found, strict=True):
+        defect = disagreement(path.name, one.topology, first.topology)
+        if defect is not None:
+            raise defect
+    others = [one for one in found if one is not first]
+    return replace(
+        first,
+        shown=np.concatenate([one.shown for one in (first, *others)]),
+        n_poses=sum(one.n_poses for one in found),
+        clips=tuple(clip for one in (first, *others) for clip in one.clips),
+        notes=tuple(dict.fromkeys(note for one in found for note in one.notes)),
+    )
+
+
+def _of_character(path: Path) -> SourcesSummary | None:
+    """Return what a scene's file holds; None where neither joints nor clips make poses of it."""
+    scene = read_scene(path)
+    with one_sentence(path):
+        mesh = join_parts(scene)
+        if not (scene.clips or mesh.is_skinned.any()):
+            return None
+        shown = [mesh.posed(scene.rest)]
+        for clip in scene.clips[:_MOST_SHOWN]:
+            times = clip.times(None)
+            shown.append(mesh.posed(clip.sample(_some(times, _MOST_SHOWN // len(scene.clips)))))
+        clips = tuple(
+            SourceClip(clip.name, len(clip.times(None)), float(np.ptp(clip.key_times)))
+            for clip in scene.clips
+        )
+    vertices = np.concatenate(shown)
+    if scene.up is None:
+        up = guess_up(mesh.topology, vertices)
+    else:
+        up = UpGuess(int(np.abs(scene.up).argmax()), True, "the file says so")
+    moving = np.unique(mesh.bone_of[(mesh.weights > 0.0) & mesh.is_skinned[:, None]])
+    return SourcesSummary(
+        mesh.topology,
+        vertices.astype(np.float32),
+        1,
+        clips,
+        len(np.unique(mesh.bones[moving])),
+        up,
+        body_size(vertices[0], mesh.topology),
+        scene.metres,
+        mesh.notes,
+    )
+
+
+def _of_poses(path: Path, progress: Progress, cancel: CancelToken | None) -> SourcesSummary:
+    poses = read_pose_set(path, progress, cancel)
+    if len(poses) < 2:
+        raise LCollisionError(
+            "holds a single pose, of which nothing can be learned", "add more poses", where=path
+        )
+    return SourcesSummary(
+        poses.topology,
+        _some(poses.vertices, _MOST_SHOWN).astype(np.float32),
+        len(poses),
+        (),
+        0,
+        poses.up,
+        body_size(np.asarray(poses.vertices[0]), poses.topology),
+        None,
+        poses.notes,
+    )
+
+
+def _some(values: npt.NDArray[Any], most: int) -> npt.NDArray[Any]:
+    """Return some of the values, evenly spaced, the first among them."""
+    return values[np.unique(np.linspace(0, len(values) - 1, max(most, 1)).astype(int))]

@@ -1,0 +1,322 @@
+"""A new model from the window: page by page, in the background, across windows, to Open."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QSize, Qt
+from PySide6.QtGui import QScreen
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QLabel
+from pytestqt.qtbot import QtBot
+
+from app.editing.document import PoseDocument
+from app.window.dialogs.learning import LearningDialog
+from app.window.dialogs.new_model import NewModelDialog
+from app.window.main_window import MainWindow
+from app.work import learning_runs
+from app.work.learning_runs import RunPhase
+from lcollision_core.learning import (
+    EFFORTS,
+    LearningRequest,
+    Quality,
+    WorkFolder,
+    WorkState,
+    WorkStatus,
+)
+from lcollision_core.meshes import locked, write_mesh, write_pose_set
+from lcollision_core.model import PoseModel, RigModel, model_destination
+from tests.app.window.test_words import OUR_OWN
+from tests.app.windows import answer, close_window, drop, open_window, rest, settings_in
+from tests.app.work.test_learning_runs import PATIENCE, QUICK, process_of
+from tests.bending_tube import bending_tube
+from tests.core.gltf_builder import arm
+
+LEFT = Qt.MouseButton.LeftButton
+SMALL = QSize(800, 600)
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learning_runs, "POLL_MILLISECONDS", 50)
+    monkeypatch.setattr(learning_runs, "LEARNER", QUICK)
+
+
+@pytest.fixture
+def tubes(tmp_path: Path) -> Path:
+    """Return a folder of meshes."""
+    folder, poses = tmp_path / "tubes", bending_tube()
+    folder.mkdir()
+    for name, vertices in zip(poses.names, poses.vertices, strict=True):
+        write_mesh(folder / f"{name}.obj", vertices, poses.faces)
+    return folder
+
+
+@pytest.fixture
+def watching(qtbot: QtBot, window: MainWindow) -> MainWindow:
+    """Return a window that looks at runs."""
+    watched = window.learning.runs._timer
+    qtbot.waitUntil(watched.isActive, timeout=PATIENCE)
+    return window
+
+
+@pytest.fixture
+def no_runs(qtbot: QtBot, watching: MainWindow) -> Iterator[None]:
+    yield
+    runs = watching.learning.runs
+    for run in runs.runs:
+        runs.stop(run.path, discard=True)
+        qtbot.waitUntil(lambda run=run: not run.path.exists(), timeout=PATIENCE)
+
+
+def wizard_of(qtbot: QtBot, window: MainWindow) -> NewModelDialog:
+    def shown() -> list[NewModelDialog]:
+        return [d for d in window.findChildren(NewModelDialog) if d.isVisible()]
+
+    qtbot.waitUntil(lambda: len(shown()) == 1, timeout=PATIENCE)
+    return shown()[0]
+
+
+def dialog_of(window: MainWindow) -> LearningDialog:
+    (dialog,) = (d for d in window.findChildren(LearningDialog) if d.isVisible())
+    return dialog
+
+
+def test_a_dropped_folder_of_meshes_is_learned_killed_continued_and_opened(
+    qtbot: QtBot, watching: MainWindow, tubes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SECONDS_PER_STEP", "0.05")
+    window, learning = watching, watching.learning
+    drop(window, tubes)
+    wizard = wizard_of(qtbot, window)
+    assert not wizard.next.isEnabled()
+    qtbot.waitUntil(wizard.next.isEnabled, timeout=PATIENCE)
+    assert wizard.preview.has_body
+    QTest.mouseClick(wizard.next, LEFT)
+    assert wizard.page is wizard.poses
+    assert not wizard.poses.number.isVisible()
+    assert not wizard.poses.clip.isVisible()
+    QTest.mouseClick(wizard.next, LEFT)
+    assert wizard.page is wizard.contacts
+    QTest.mouseClick(wizard.next, LEFT)
+    assert wizard.page is wizard.quality
+    assert wizard.quality.name.text() == "tubes"
+    wizard.quality.choices[Quality.QUICK].click()
+    assert wizard.request() == LearningRequest((str(tubes),), "quick")
+    wizard.quality.name.selectAll()
+    QTest.keyClicks(wizard.quality.name, "Hero")
+    QTest.keyClick(wizard.quality.name, Qt.Key.Key_Return)
+    assert not wizard.isVisible()
+    path = learning.runs.runs[0].path
+    assert path == WorkFolder(model_destination("Hero")).path
+
+    def phase() -> RunPhase | None:
+        run = learning.runs.run_of(path)
+        return run.phase if run else None
+
+    if sys.platform == "linux":
+        qtbot.waitUntil(lambda: "labels" in learning.runs.runs[0].status.seconds, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: phase() is RunPhase.RUNNING, timeout=PATIENCE)
+        assert learning.indicator.text().startswith("Learning Hero: ")
+        # The editor stays usable meanwhile.
+        window.document.set_code(0, 0.3)
+        rest(qtbot, window)
+        os.kill(process_of(path), signal.SIGKILL)
+        qtbot.waitUntil(lambda: phase() is RunPhase.KILLED, timeout=PATIENCE)
+        assert learning.indicator.property("state") == "failed"
+        dialog = dialog_of(window)
+        assert "ended unexpectedly" in dialog.state.text()
+        QTest.mouseClick(dialog.resume, LEFT)
+        window.document.undo()
+    qtbot.waitUntil(lambda: phase() is RunPhase.DONE, timeout=PATIENCE)
+    dialog = dialog_of(window)
+    qtbot.waitUntil(dialog.card.isVisible, timeout=PATIENCE)
+    assert not dialog.card.picture.pixmap().isNull()
+    window.document.mark_saved()
+    with qtbot.waitSignal(window.document.opened, timeout=PATIENCE):
+        QTest.mouseClick(dialog.open_model, LEFT)
+    assert window.document.model.name == "Hero"
+    assert window.document.has_predictor
+    assert not path.exists()
+    assert not window.learning.indicator.isVisible()
+    rest(qtbot, window)
+
+
+def test_a_run_goes_on_without_its_window_and_the_next_window_finds_it(
+    qtbot: QtBot,
+    watching: MainWindow,
+    tmp_path: Path,
+    editor_model: PoseModel,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("SECONDS_PER_STEP", "0.05")
+    poses = tmp_path / "tube.npz"
+    write_pose_set(poses, bending_tube())
+    path = watching.learning.runs.start(LearningRequest((str(poses),), "quick"), "hero")
+    work = WorkFolder.at(path)
+    qtbot.waitUntil(lambda: work.status.stage == "latent space", timeout=PATIENCE)
+    close_window(watching)
+    assert work.is_held
+    document = PoseDocument(editor_model, library_folder=tmp_path / "library")
+    later = open_window(qtbot, document, settings_in(tmp_path))
+    qtbot.waitUntil(lambda: len(later.learning.runs.runs) == 1, timeout=PATIENCE)
+    qtbot.waitUntil(later.learning.indicator.isVisible)
+    qtbot.waitUntil(
+        lambda: later.learning.runs.runs[0].phase is RunPhase.DONE, timeout=2 * PATIENCE
+    )
+    dialog = dialog_of(later)
+    QTest.mouseClick(dialog.dismiss, LEFT)
+    assert not path.exists()
+    assert not dialog.isVisible()
+    assert PoseModel.load("hero").has_predictor
+    close_window(later)
+    assert document.close()
+    document.deleteLater()
+
+
+def test_a_rigged_character_offers_to_be_learned(
+    qtbot: QtBot, watching: MainWindow, tmp_path: Path
+) -> None:
+    window, action = watching, watching.actions_by_key["learn_character"]
+    assert not action.isEnabled()
+    assert not window.collision.prediction.learn.isVisible()
+    file = arm().write(tmp_path / "arm.glb")
+    with qtbot.waitSignal(window.document.opened, timeout=PATIENCE):
+        drop(window, file)
+    rest(qtbot, window)
+    assert isinstance(window.document.model, RigModel)
+    assert action.isEnabled()
+    assert window.collision.prediction.learn.isVisible()
+    QTest.mouseClick(window.collision.prediction.learn, LEFT)
+    wizard = wizard_of(qtbot, window)
+    assert wizard.files.paths == (file,)
+    qtbot.waitUntil(wizard.next.isEnabled, timeout=PATIENCE)
+    wizard.next.click()
+    assert wizard.poses.by_rig.isVisible()
+    assert wizard.poses.up_axis == 1
+    wizard.poses.up.setCurrentIndex(wizard.poses.up.findData(2))
+    assert wizard.preview.up_axis == 2
+    wizard.poses.by_rig.setCurrentIndex(2)
+    wizard.poses.number.setValue(40)
+    wizard.next.click()
+    wizard.contacts.experts.setChecked(True)
+    wizard.contacts._near.own.setChecked(True)
+    wizard.contacts.near.setValue(3.0)
+    wizard.contacts.count_groups.setChecked(True)
+    wizard.next.click()
+    request = wizard.request()
+    assert (request.by_rig, request.up, request.quality) == (40, 2, "good")
+    assert (request.near_exclusion, request.rest_exclusion) == (0.03, None)
+    assert request.ignored == ()
+    said = [label.text() for label in wizard.findChildren(QLabel)]
+    assert [text for text in said if OUR_OWN.search(text)] == []
+    given = wizard.poses.n_poses(EFFORTS[Quality.GOOD].n_poses)
+    assert f": {given} poses, " in wizard.quality._meanings[Quality.GOOD].text()
+    wizard.reject()
+
+
+def test_what_cannot_be_learned_from_stays_on_the_first_page(
+    qtbot: QtBot, watching: MainWindow, tmp_path: Path, tubes: Path, editor_model: PoseModel
+) -> None:
+    window, broken = watching, tmp_path / "broken.npz"
+    broken.write_bytes(b"no poses")
+    window.files.open_path(broken)
+    wizard = wizard_of(qtbot, window)
+    qtbot.waitUntil(lambda: "broken.npz" in wizard.files.found.text(), timeout=PATIENCE)
+    assert not wizard.next.isEnabled()
+    assert not window.findChildren(LearningDialog)
+    wizard.files.list.setCurrentRow(0)
+    QTest.mouseClick(wizard.files.remove, LEFT)
+    assert wizard.files.paths == ()
+    # More that is dropped goes to the dialog that is open.
+    drop(wizard, tubes)
+    qtbot.waitUntil(wizard.next.isEnabled, timeout=PATIENCE)
+    assert not wizard.files.found.text()
+    for _ in range(3):
+        wizard.next.click()
+    editor_model.save(model_destination("taken"))
+    for name in ("taken", "", "a/b", "v1.0", "body"):
+        wizard.quality.name.setText(name)
+        wizard.next.click()
+        assert wizard.isVisible()
+        assert wizard.refusal.text()
+    wizard.back.click()
+    assert wizard.page is wizard.contacts
+    wizard.reject()
+    assert not window.learning.runs.runs
+
+
+def test_several_runs_are_looked_at_and_one_is_discarded(watching: MainWindow) -> None:
+    window, folders = watching, []
+    for name, state in (("hero", WorkState.RUNNING), ("villain", WorkState.FAILED)):
+        work = WorkFolder(model_destination(name))
+        work.prepare(LearningRequest(("/nowhere.npz",)))
+        work.tell(WorkStatus(state, "labels", 0.4, 0.43, 480.0, sentence="the file is gone"))
+        folders.append(work)
+    hero, villain = folders
+    with locked(hero.path / "run"):
+        window.learning.runs.look()
+        text = window.learning.indicator.text()
+        assert text == (
+            "Learning hero: 43 %, about 8 minutes left, checking random poses (and 1 more)"
+        )
+        window.actions_by_key["learning"].trigger()
+        dialog = dialog_of(window)
+        assert dialog.headline.text() == "Learning “hero”"
+        assert dialog.stop.isVisible()
+        assert dialog.which.count() == 2
+        dialog.show_run(villain.path)
+        assert dialog.state.text() == "The file is gone."
+        assert dialog.resume.isVisible()
+        asked = answer(lambda box: box.reject())
+        dialog.discard.click()
+        assert villain.path.exists()
+        asked = answer(lambda box: QTest.mouseClick(box.buttons()[0], LEFT))
+        dialog.discard.click()
+        assert not asked.isActive()
+        assert not villain.path.exists()
+    assert not dialog.isVisible()
+    hero.remove()
+    window.learning.runs.look()
+    assert not window.actions_by_key["learning"].isEnabled()
+
+
+def test_the_pages_fit_800_by_600(
+    qtbot: QtBot, watching: MainWindow, tubes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(QScreen, "availableSize", lambda _: SMALL)
+    watching.learning.new_model((tubes,))
+    wizard = wizard_of(qtbot, watching)
+    qtbot.waitUntil(wizard.next.isEnabled, timeout=PATIENCE)
+    for page in wizard.pages:
+        assert wizard.page is page
+        assert wizard.width() <= SMALL.width()
+        assert wizard.height() <= SMALL.height() - 40
+        area = page.parentWidget()
+        assert page.width() <= area.width()
+        if page is not wizard.quality:
+            wizard.next.click()
+    wizard.reject()
+
+
+def test_the_preview_turns_and_shows_every_pose(
+    qtbot: QtBot, watching: MainWindow, tubes: Path
+) -> None:
+    watching.learning.new_model((tubes,))
+    wizard = wizard_of(qtbot, watching)
+    preview = wizard.preview
+    qtbot.waitUntil(lambda: preview._picture is not None, timeout=PATIENCE)
+    first = preview._picture
+    assert first is not None
+    qtbot.waitUntil(lambda: preview._picture != first, timeout=PATIENCE)
+    pixels = np.asarray(preview._picture.constBits())
+    assert np.ptp(pixels) > 60
+    wizard.hide()
+    assert not preview._timer.isActive()
+    wizard.reject()
