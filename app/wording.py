@@ -38,6 +38,11 @@ def counted(number: int, noun: str, nouns: str | None = None) -> str:
     return f"{number} {noun if number == 1 else nouns or noun + 's'}"
 
 
+def grouped(number: int) -> str:
+    """Write a large number in groups of three digits, as in "50 000" with narrow spaces."""
+    return f"{number:,}".replace(",", "\u202f")
+
+
 def heading(name: str) -> str:
     """Give a domain's name the capital of a heading."""
     return name[:1].upper() + name[1:]

@@ -167,4 +167,6 @@ def _of_poses(path: Path, progress: Progress, cancel: CancelToken | None) -> Sou
 
 def _some(values: npt.NDArray[Any], most: int) -> npt.NDArray[Any]:
     """Return some of the values, evenly spaced, the first among them."""
-    return values[np.unique(np.linspace(0, len(values) - 1, max(most, 1)).astype(int))]
+    chosen = np.unique(np.linspace(0, len(values) - 1, max(most, 1)).astype(int))
+    some: npt.NDArray[Any] = values[chosen]
+    return some

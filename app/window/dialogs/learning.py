@@ -22,7 +22,15 @@ from PySide6.QtWidgets import (
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.dialogs.questions import ask_to_discard
 from app.window.widgets import SWATCH, Card, Sign, dialog_vbox, hbox, labelled, swatch, vbox
-from app.wording import counted, duration_text, height_text, one_line, spent_text, with_capital
+from app.wording import (
+    counted,
+    duration_text,
+    grouped,
+    height_text,
+    one_line,
+    spent_text,
+    with_capital,
+)
 from app.work import learning_jobs
 from app.work.learning_runs import LearningRun, LearningRuns, RunPhase
 
@@ -42,7 +50,7 @@ STAGE_WORDS = {
 
 _ENDED = (RunPhase.STOPPED, RunPhase.FAILED, RunPhase.KILLED)
 _WIDTH, _SIGN, _STAGE_SIGN, _BOLD_WIDTH = 560, 32, 18, 92
-_PICTURE, _VALUE_WIDTH = QSize(300, 300), 200
+_PICTURE, _VALUE_WIDTH = QSize(300, 236), 200
 _GOES_ON = (
     "It goes on while you pose, when you close this dialog, and when you close the editor, with "
     "low priority. “Learning” in the File menu brings this dialog back."
@@ -99,7 +107,7 @@ class LearningDialog(QDialog):
         self._note = labelled(_GOES_ON, "caption", wraps=True)
         self.card = LearnedCardView()
         self._lay_out()
-        self.which.activated.connect(lambda _: self.show_run(self.which.currentData()))
+        self.which.activated.connect(lambda _: self.show_run(Path(self.which.currentData())))
         runs.changed.connect(self._on_runs)
         work.failed.connect(self._on_failed)
 
@@ -160,13 +168,13 @@ class LearningDialog(QDialog):
         self._show(run)
 
     def _list_runs(self) -> None:
-        names = [(run.name, run.path) for run in self._runs.runs]
+        names = [(run.name, str(run.path)) for run in self._runs.runs]
         rows = range(self.which.count())
         if names != [(self.which.itemText(row), self.which.itemData(row)) for row in rows]:
             self.which.clear()
             for name, path in names:
                 self.which.addItem(name, path)
-        self.which.setCurrentIndex([path for _, path in names].index(self.path))
+        self.which.setCurrentIndex(self.which.findData(str(self.path)))
         self.which.setVisible(len(names) > 1)
 
     def _show(self, run: LearningRun) -> None:
@@ -316,11 +324,10 @@ class LearnedCardView(QWidget):
 
     def __init__(self) -> None:
         super().__init__()
-        self.facts = QGridLayout(horizontalSpacing=WIDE, verticalSpacing=TIGHT)
+        self.facts, self._parts = _grid(WIDE, TIGHT + 2), _grid(NORMAL, 2)
         self.picture = QLabel()
         self.picture.setFixedSize(_PICTURE)
         self.picture.setAccessibleName("The body parts that were found, from the front and back")
-        self._parts = QGridLayout(horizontalSpacing=NORMAL, verticalSpacing=2)
         card = Card()
         card.column.addLayout(self.facts)
         card.column.addStretch()
@@ -330,8 +337,8 @@ class LearnedCardView(QWidget):
     def show_model(self, learned: LearnedModel, picture: QPixmap) -> None:
         """Show another model."""
         for grid in (self.facts, self._parts):
-            while (item := grid.takeAt(0)) is not None:
-                item.widget().deleteLater()
+            while (item := grid.takeAt(0)) is not None and (widget := item.widget()) is not None:
+                widget.deleteLater()
         for row, (name, value) in enumerate(_figures(learned.card)):
             words = labelled(value, wraps=True)
             words.setMinimumWidth(_VALUE_WIDTH)
@@ -355,7 +362,7 @@ def _figures(card: LearnedCard) -> list[tuple[str, str]]:
     """Return what a card says, name by name."""
     error = f"{100 * card.error_mean:.2f} % of the body size"
     figures = [
-        ("Vertices", f"{card.vertices}"),
+        ("Vertices", grouped(card.vertices)),
         ("Learned from", counted(card.poses, "pose")),
         ("Body parts", f"{card.parts}"),
         (
@@ -365,12 +372,20 @@ def _figures(card: LearnedCard) -> list[tuple[str, str]]:
         ("Estimate", f"right for {_percent(card.accuracy)} of new poses"),
         ("False alarms", f"{_percent(card.false_positive_rate)} of the free poses"),
         ("Misses", f"{_percent(card.false_negative_rate)} of the colliding poses"),
-        ("Collide", f"{_percent(card.colliding_share)} of {card.samples} random poses"),
+        ("Collide", f"{_percent(card.colliding_share)} of {grouped(card.samples)} random poses"),
         ("Not counted", card.rules or "nothing: all contacts count"),
     ]
     for stage, words in STAGE_WORDS.items():
         figures.append((with_capital(words), spent_text(card.seconds.get(stage, 0.0))))
     return figures
+
+
+def _grid(across: int, down: int) -> QGridLayout:
+    """Return an empty grid with these spacings."""
+    grid = QGridLayout()
+    grid.setHorizontalSpacing(across)
+    grid.setVerticalSpacing(down)
+    return grid
 
 
 def _percent(share: float | None) -> str:

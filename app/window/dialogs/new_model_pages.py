@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from PySide6.QtCore import Qt, Signal, Slot
+from PySide6.QtGui import QKeySequence, QShortcut
 from PySide6.QtWidgets import (
     QButtonGroup,
     QCheckBox,
@@ -24,7 +25,7 @@ from PySide6.QtWidgets import (
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.number_box import NumberBox
 from app.window.widgets import Card, hbox, labelled, plain_tip, vbox
-from app.wording import counted, duration_text, with_capital
+from app.wording import counted, duration_text, grouped, with_capital
 
 if TYPE_CHECKING:
     from lcollision_core.learning import Quality
@@ -111,6 +112,9 @@ class FilesPage(Page):
         for button in (self.add_files, self.add_folder, self.remove):
             button.setAutoDefault(False)
         self.remove.clicked.connect(self._remove)
+        delete = QShortcut(QKeySequence.StandardKey.Delete, self.list)
+        delete.setContext(Qt.ShortcutContext.WidgetShortcut)
+        delete.activated.connect(self._remove)
         self.remove.setEnabled(False)
         self.list.currentRowChanged.connect(lambda row: self.remove.setEnabled(row >= 0))
         self.found = labelled("", "caption", wraps=True)
@@ -452,7 +456,7 @@ class QualityPage(Page):
 
         aims = {
             Quality.QUICK: "To see what comes of it",
-            Quality.GOOD: "For work",
+            Quality.GOOD: "For daily work",
             Quality.BEST: "For a character that stays",
         }
         for quality, label in self._meanings.items():
@@ -462,7 +466,7 @@ class QualityPage(Page):
             self.choices[quality].setText(
                 f"{quality.capitalize()}: {duration_text(seconds)} on this computer"
             )
-            samples = f"{effort.n_samples:,}".replace(",", "\u202f")
+            samples = grouped(effort.n_samples)
             label.setText(
                 f"{aims[quality]}: {counted(number, 'pose')}, {samples} random poses checked."
             )

@@ -232,7 +232,8 @@ def test_what_cannot_be_learned_from_stays_on_the_first_page(
     assert not wizard.next.isEnabled()
     assert not window.findChildren(LearningDialog)
     wizard.files.list.setCurrentRow(0)
-    QTest.mouseClick(wizard.files.remove, LEFT)
+    wizard.files.list.setFocus()
+    QTest.keyClick(wizard.files.list, Qt.Key.Key_Delete)
     assert wizard.files.paths == ()
     # More that is dropped goes to the dialog that is open.
     drop(wizard, tubes)
