@@ -53,14 +53,6 @@ def seconds_text(seconds: float) -> str:
     return f"{1000 * seconds:.0f} ms" if seconds < 0.95 else f"{seconds:.1f} s"
 
 
-def duration_text(seconds: float) -> str:
-    """Write a longer duration as in "40 s", "8 min" or "1 h 20 min"."""
-    if seconds < 90.0:
-        return f"{seconds:.0f} s"
-    hours, minutes = divmod(round(seconds / 60.0), 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
-
-
 def menu_text(name: str) -> str:
     """Write a name so that a menu, a button or a form's label shows it literally."""
     return one_line(name).replace("&", "&&")

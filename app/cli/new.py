@@ -18,7 +18,7 @@ from app.cli.contact_options import (
 )
 from app.cli.inputs import Axis
 from app.cli.interrupt import cancel_on_interrupt
-from app.wording import duration_text
+from app.wording import duration_text, spent_text
 from lcollision_core.errors import CancelledError, LCollisionError
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def _print(card: LearnedCard) -> None:
     """Print the card of a model."""
     tell(
         f"{card.name}: {card.vertices} vertices, {card.parts} body parts, learned from "
-        f"{card.poses} poses in {duration_text(sum(card.seconds.values()))}"
+        f"{card.poses} poses in {spent_text(sum(card.seconds.values()))}"
     )
     tell(
         f"  poses come back to {100.0 * card.error_mean:.2f} % of the body size, at most "
@@ -151,12 +151,12 @@ def _print(card: LearnedCard) -> None:
     )
     tell(
         f"  {100.0 * card.colliding_share:.1f} % of its {card.samples} samples collide; "
-        + ", ".join(f"{stage} {duration_text(spent)}" for stage, spent in card.seconds.items())
+        + ", ".join(f"{stage} {spent_text(spent)}" for stage, spent in card.seconds.items())
     )
 
 
 def told_of_learning(status: LearningStatus) -> Told:
     """Put the stage, how far it is, and the time left into words."""
     stage = f"{status.stage} {100.0 * status.stage_done:.0f} %"
-    left = f"about {duration_text(status.seconds_left)} left"
+    left = f"{duration_text(status.seconds_left)} left"
     return status.done, 1.0, stage, [left, *status.facts]

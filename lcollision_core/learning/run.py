@@ -184,7 +184,7 @@ class _Learner:
             ", ".join(Path(source).name for source in request.sources),
             request.licence,
             {
-                **poses.provenance,
+                "poses": dict(poses.provenance),
                 "program": f"lcollision {version('lcollision')}",
                 "command": "new",
                 "request": request.to_json(),
