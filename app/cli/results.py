@@ -44,7 +44,10 @@ FormOutput = Annotated[
 ]
 FormatOption = Annotated[
     MeshFormat | None,
-    typer.Option("--format", help="Of the meshes in a folder. Default: obj, or glb by --like."),
+    typer.Option(
+        "--format",
+        help="Of the meshes in a folder. Default: obj; glb by --like and of a character.",
+    ),
 ]
 LikeOption = Annotated[
     Path | None,
@@ -91,7 +94,7 @@ class MeshStyle:
 
     Attributes
     ----------
-    mesh_format : of the meshes in a folder, None for that of `like`, else obj
+    mesh_format : of the meshes in a folder, None for that of `like` or of a character, else obj
     axes, scale : see `export_frame`
     like : the user's file whose form they keep
     form : how a character's file holds a pose
@@ -105,11 +108,19 @@ class MeshStyle:
     form: PoseForm | None = None
     fps: float = 30.0
 
-    def suffix(self, output: Output) -> str:
-        """Return the extension of the files that an output of meshes gets."""
+    def suffix(self, output: Output, model: PosableBody) -> str:
+        """Return the extension of the files that an output of meshes of a model gets."""
+        from lcollision_core.characters import PATCHED_SUFFIXES
+        from lcollision_core.model import RigModel
+
         if output.form != "folder":
             return output.path.suffix.lower()
-        is_like_glb = self.like is not None and self.like.suffix.lower() != ".obj"
+        like = self.like
+        # A GLB file has axes and a unit of its own.
+        is_as_stored = self.axes == "model" and self.scale is None
+        if like is None and is_as_stored and isinstance(model, RigModel):
+            like = model.character.source
+        is_like_glb = like is not None and like.suffix.lower() in PATCHED_SUFFIXES
         return f".{self.mesh_format or ('glb' if is_like_glb else 'obj')}"
 
 
@@ -251,7 +262,7 @@ def require_style(
     require_mesh_style(output, style)
     if output.form == "poses":
         return None
-    suffix = style.suffix(output)
+    suffix = style.suffix(output, model)
     source = source_for(suffix, model, style.like)
     if source is not None:
         source.require_form(f"{output.path}{suffix if output.form == 'folder' else ''}", style.form)
@@ -318,7 +329,7 @@ def write_result(
 
     path = output.path
     if output.form == "folder":
-        suffix = style.suffix(output)
+        suffix = style.suffix(output, model)
         names = [f"{stem}{suffix}" for stem in file_stems(pose.name for pose in poses)]
         n_replaced = sum((path / name).exists() for name in names)
         with atomic_files(path) as unfinished:

@@ -21,6 +21,7 @@ from lcollision_core.model import (
 )
 from tests.app.support import Lcollision
 from tests.core.character_file import described, figure
+from tests.rigged_shapes import rigged_body, write_gltf
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +85,23 @@ def test_decode_writes_all_poses_as_frames(
     turned = 100.0 * np.stack(expected)[:, :, [0, 2, 1]] * [1.0, 1.0, -1.0]
     np.testing.assert_allclose(cache.frames, turned, rtol=1e-5, atol=1e-5)
     assert cache.times[1] == pytest.approx(1 / 25 if suffix == ".mdd" else 1.0)
+
+
+def test_a_folder_of_a_character_has_its_own_files(lcollision: Lcollision, tmp_path: Path) -> None:
+    hero = write_gltf(rigged_body(), tmp_path / "hero.glb")
+    model = open_body(hero)
+    poses = tmp_path / "poses.json"
+    turned = np.full(model.latent_size, 0.05)
+    write_poses(poses, model, [NamedPose("one", turned), NamedPose("two", -turned)])
+    out = tmp_path / "out"
+    assert lcollision("decode", hero, poses, "-o", out).exit_code == 0
+    assert sorted(path.name for path in out.iterdir()) == ["one.glb", "two.glb"]
+    posed = read_character(out / "one.glb").rest_vertices
+    np.testing.assert_allclose(posed, model.decode(turned), atol=1e-5)
+    # Programs' axes and units are those of OBJ files.
+    for_maya = tmp_path / "maya"
+    assert lcollision("decode", hero, poses, "-o", for_maya, "--axes", "maya").exit_code == 0
+    assert {path.suffix for path in for_maya.iterdir()} == {".obj"}
 
 
 def test_resolve_writes_what_it_checked(
