@@ -525,7 +525,9 @@ class PoseDocument(LiveEditing):
         edited = held.working or held.poses[0]
         self.begin_with(edited, Source.FILE, read.path, held.poses)
         self._file_stamp = read.stamp
-        self.message.emit(f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}")
+        notes = () if read.opened is None else read.opened.model.notes
+        told = f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}"
+        self.message.emit("; ".join((told, *notes)))
         self.opened.emit(read.path)
 
     def _on_parts(self, changed: jobs.OpenedModel) -> None:

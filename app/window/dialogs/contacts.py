@@ -298,6 +298,12 @@ class ContactsDialog(QDialog):
             share = f"{100 * pair.share:.0f} % of the poses"
             self._list(pair.groups).setText(0, f"{' and '.join(pair.groups)}: {share}")
         self._name_kinds()
+        for name, pairs in proposals.items():
+            kind, least = self._kinds.get(name), min((pair.share for pair in pairs), default=0.0)
+            # Not where others are listed too.
+            if kind is not None and kind.childCount() == len(pairs):
+                share = "all" if least == 1.0 else f"{int(100 * least)} % or more"
+                kind.setText(0, f"{kind.text(0)}: in {share} of the poses")
         if not any(proposals.values()):
             self.total.setText("No two groups touch in nearly every pose.")
 

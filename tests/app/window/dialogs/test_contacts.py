@@ -146,7 +146,9 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     kinds = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
     shown = {kind.text(0): kind for kind in kinds}
     assert list(shown) == [
-        f"{kind.capitalize()} ({len(pairs)})" for kind, pairs in expected.items() if pairs
+        f"{kind.capitalize()} ({len(pairs)}): in all of the poses"
+        for kind, pairs in expected.items()
+        if pairs
     ]
     texts = [kind.child(row).text(0) for kind in kinds for row in range(kind.childCount())]
     assert texts == [
