@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -12,11 +13,16 @@ from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.learning.request import LearningRequest
 from lcollision_core.meshes import PoseSet, groups_by_kind, named_pair
 
+_Pair = tuple[str, str]
+
 _NEAR_EXCLUSIONS = (0.0, 0.02, 0.05, 0.1)
 """Normalised lengths that are tried on poses without a rig, the shortest first."""
 
 _FEW = 0.1
 """Share of the poses that may collide where the near exclusion is long enough."""
+
+_MOST = 0.5
+"""Share of the poses from which a body of shells collides by being made of shells."""
 
 _MOST_POSES = 40
 """Poses, evenly spaced, that are asked."""
@@ -31,8 +37,10 @@ def with_proposed_rules(
     """Give poses the contact rules that a request asks for, and propose what it leaves open.
 
     The near exclusion of poses that say none is the shortest by which few of them collide, or the
-    shortest that is about as good as any. Pairs of groups of faces that still collide in nearly
-    every pose are ignored: pairs of components where there are several, else of body parts.
+    shortest that is about as good as any. Pairs of components that still collide in nearly every
+    pose are ignored, or of body parts where the mesh is in one piece. Where shells make up the body
+    and most poses still collide, so are body parts that touch in nearly every pose, at rest too:
+    neighbours whose shells stick in each other, which robots' set-up assistants never test either.
 
     Parameters
     ----------
@@ -47,7 +55,8 @@ def with_proposed_rules(
     CancelledError : `cancel` was set.
     """
     rest = poses.rules.rest_exclusion if request.rest_exclusion is None else request.rest_exclusion
-    depth = request.tolerated_depth or poses.rules.tolerated_depth
+    depth = request.tolerated_depth
+    depth = poses.rules.tolerated_depth if depth is None else depth
     rules = replace(poses.rules, rest_exclusion=rest, tolerated_depth=depth)
     chosen = np.unique(np.linspace(0, len(poses) - 1, _MOST_POSES).round().astype(int))
     asked = poses.vertices[chosen]
@@ -59,35 +68,48 @@ def with_proposed_rules(
     kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
     named = {group.name: group for kind in kinds.values() for group in kind}
     named |= {group.name: group for group in poses.groups}
-    if request.ignored is None:
-        detector = CollisionDetector(poses.topology, poses.vertices[0], rules, poses.groups)
-        *_, parts, components = kinds
-        asked_kind = components if len(kinds[components]) > 1 else parts
+
+    def ignoring(pairs: Iterable[tuple[str, str]]) -> PoseSet:
+        ignored = tuple(dict.fromkeys((*rules.ignored, *pairs)))
+        held = {group.name for group in poses.groups}
+        used = dict.fromkeys(name for pair in ignored for name in pair if name not in held)
+        groups = (*poses.groups, *(named[name] for name in used))
+        return replace(poses, rules=replace(rules, ignored=ignored), groups=groups)
+
+    if request.ignored is not None:
+        return ignoring(named_pair(entry, named) for entry in request.ignored)
+    *_, parts, components = kinds
+
+    def pairs_of(kind: str, detector: CollisionDetector, counted_only: bool) -> list[_Pair]:
         found = propose_by_kind(
             detector,
             asked,
-            {asked_kind: kinds[asked_kind]},
-            counted_only=True,
+            {kind: kinds[kind]},
+            counted_only=counted_only,
             progress=progress,
             cancel=cancel,
         )
-        new = [pair.groups for pair in found[asked_kind]]
-    else:
-        new = [named_pair(entry, named) for entry in request.ignored]
-    ignored = tuple(dict.fromkeys((*rules.ignored, *new)))
-    held = {group.name for group in poses.groups}
-    used = dict.fromkeys(name for pair in ignored for name in pair if name not in held)
-    groups = (*poses.groups, *(named[name] for name in used))
-    return replace(poses, rules=replace(rules, ignored=ignored), groups=groups)
+        return [pair.groups for pair in found[kind]]
+
+    in_pieces = len(kinds[components]) > 1
+    pairs = pairs_of(components if in_pieces else parts, _detector(ignoring(())), True)
+    proposed = ignoring(pairs)
+    if in_pieces and kinds[parts]:
+        detector = _detector(proposed)
+        if float(np.mean(detector.are_colliding(asked))) > _MOST:
+            return ignoring([*pairs, *pairs_of(parts, detector, False)])
+    return proposed
+
+
+def _detector(poses: PoseSet) -> CollisionDetector:
+    return CollisionDetector(poses.topology, poses.vertices[0], poses.rules, poses.groups)
 
 
 def _near_exclusion(poses: PoseSet, rules: ContactRules, chosen: npt.NDArray[np.intp]) -> float:
     """Return the shortest near exclusion by which few poses collide."""
     shares: dict[float, float] = {}
     for near in _NEAR_EXCLUSIONS:
-        detector = CollisionDetector(
-            poses.topology, poses.vertices[0], replace(rules, near_exclusion=near), poses.groups
-        )
+        detector = _detector(replace(poses, rules=replace(rules, near_exclusion=near)))
         shares[near] = float(np.mean(detector.are_colliding(poses.vertices[chosen])))
         if shares[near] <= _FEW:
             return near
