@@ -15,7 +15,8 @@ class EmbeddingConfig:
     ----------
     n_domains : K = |Z_0|, codes of level 1 and domains
     n_domain_codes : |Z_k|, codes of each domain; fewer where the training poses span less
-    level1_epochs, level2_epochs : passes over the poses
+    level1_epochs, level2_epochs : passes over the poses; without any, level 2 stays as the
+        principal components of what level 1 leaves, for a slightly larger error
     level1_rate, level2_rate : Adam's step sizes for the fully connected layers, whose weights
         have a root mean square of 1 here; the second falls to 0 along a cosine
     convolution_rate : Adam's step size for the graph convolutions of both levels
@@ -37,9 +38,9 @@ class EmbeddingConfig:
     n_domains: int = 10
     n_domain_codes: int = 10
     level1_epochs: int = 60
-    level2_epochs: int = 60
+    level2_epochs: int = 20
     level1_rate: float = 0.1
-    level2_rate: float = 0.01
+    level2_rate: float = 0.04
     convolution_rate: float = 1e-3
     batch_poses: int = 16
     locality_weight: float = 0.03
