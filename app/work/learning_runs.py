@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from PySide6.QtCore import QObject, QProcess, QProcessEnvironment, QTimer, Signal, Slot
 
@@ -246,8 +246,9 @@ class LearningRuns(QObject):
             redirect(str(work.log), QProcess.OpenModeFlag.Append)
         process.setProcessEnvironment(_environment())
         self._starting = work.path, time.monotonic() + _SECONDS_TO_BEGIN
-        has_started, _ = process.startDetached()
-        if not has_started:
+        # A pair by its description, one value in fact.
+        started: Any = process.startDetached()
+        if started is False or (isinstance(started, tuple) and not started[0]):
             self._starting = None
             _tell_not_begun(work)
 
