@@ -349,7 +349,9 @@ class ContactsPage(Page):
             50.0,
             2.0,
         )
-        self._tolerated = _Rule("Tolerated depth", "Everything counts, however shallow.", 10.0, 1.0)
+        self._tolerated = _Rule(
+            "Tolerated depth", "Everything counts, however shallow.", 10.0, 1.0, "Up to"
+        )
         self.near, self.rest, self.tolerated = (
             rule.field for rule in (self._near, self._rest, self._tolerated)
         )
