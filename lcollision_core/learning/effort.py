@@ -36,9 +36,10 @@ class Effort:
 
 
 EFFORTS = {
+    # Level 2 stays as the principal components of what level 1 leaves, and nothing is held out.
     Quality.QUICK: Effort(
-        100, EmbeddingConfig(held_out_stride=0, level2_epochs=10), 20_000, PRESETS["default"]
+        100, EmbeddingConfig(level2_epochs=0, held_out_stride=0), 20_000, PRESETS["default"]
     ),
     Quality.GOOD: Effort(150, EmbeddingConfig(), 50_000, PRESETS["default"]),
-    Quality.BEST: Effort(300, EmbeddingConfig(), 300_000, PRESETS["default"]),
+    Quality.BEST: Effort(300, EmbeddingConfig(level2_epochs=60), 300_000, PRESETS["default"]),
 }
