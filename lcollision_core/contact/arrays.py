@@ -37,24 +37,30 @@ class FaceTree(NamedTuple):
 class Exclusions(NamedTuple):
     """Which pairs of faces do not count, by `ContactRules` on one mesh.
 
-    Those of face f with faces after it, by distance at rest and by touching at rest, are
-    ``face[start[f]:start[f + 1]]``, ascending. Pairs of groups are kept by region, as two groups
-    relate too many faces for a list.
+    Two faces are near each other at rest where a corner of one is a corner of the other or near it:
+    the vertices near vertex v and after it are ``near[near_start[v]:near_start[v + 1]]``. What
+    touches at rest is listed by faces: those of face f with faces after it are
+    ``face[start[f]:start[f + 1]]``. Lists are ascending, and all of one kind may be missing. Pairs
+    of groups are kept by region, as two groups relate too many faces for a list.
 
     Attributes
     ----------
-    start : (F + 1,) int64
+    corners : (F, 3) int32, vertex indices
+    near_start : (V + 1,) or (1,) int64
+    near : (m,) int32, vertex indices
+    start : (F + 1,) or (1,) int64
     face : (n,) int32, face indices
-    rule : (n,) uint8, `kernels.NEAR` or `kernels.REST`
     region : (F,) int32, the region of each face: faces of one region are of the same groups; (0,)
         where no groups are ignored
     ignored : (R, R) bool, symmetric, which pairs of regions are ignored
     squared_tolerance : of the tolerated depth, in normalised length squared
     """
 
+    corners: IntArray
+    near_start: npt.NDArray[np.int64]
+    near: IntArray
     start: npt.NDArray[np.int64]
     face: IntArray
-    rule: npt.NDArray[np.uint8]
     region: IntArray
     ignored: npt.NDArray[np.bool_]
     squared_tolerance: float

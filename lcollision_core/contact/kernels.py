@@ -263,23 +263,35 @@ def _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
 
 
 @compiled
+def _is_listed(start, entry, number, wanted):
+    """Whether list `number` has an entry; all lists are ascending."""
+    low = start[number]
+    end = start[number + 1]
+    high = end
+    while low < high:
+        probe = (low + high) // 2
+        if entry[probe] < wanted:
+            low = probe + 1
+        else:
+            high = probe
+    return low < end and entry[low] == wanted
+
+
+@compiled
 def _rule_of(face_a, face_b, squared_depth, exclusions):
     """Return the first rule by which two faces do not count, or `COUNTED`; depth 0 coincides."""
     if squared_depth == 0.0:
         return np.uint8(COINCIDENT)
+    if len(exclusions.near_start) > 1:
+        for i in range(3):
+            for j in range(3):
+                a, b = exclusions.corners[face_a, i], exclusions.corners[face_b, j]
+                if _is_listed(exclusions.near_start, exclusions.near, min(a, b), max(a, b)):
+                    return np.uint8(NEAR)
     first = min(face_a, face_b)
     second = max(face_a, face_b)
-    low = exclusions.start[first]
-    end = exclusions.start[first + 1]
-    high = end
-    while low < high:
-        probe = (low + high) // 2
-        if exclusions.face[probe] < second:
-            low = probe + 1
-        else:
-            high = probe
-    if low < end and exclusions.face[low] == second:
-        return exclusions.rule[low]
+    if len(exclusions.start) > 1 and _is_listed(exclusions.start, exclusions.face, first, second):
+        return np.uint8(REST)
     region = exclusions.region
     if len(region) > 0 and exclusions.ignored[region[first], region[second]]:
         return np.uint8(IGNORED)

@@ -1,4 +1,4 @@
-"""Which faces lie near each other along the surface, and which lie near a pair that touches."""
+"""What lies near each other along the surface, and which faces lie near a pair that touches."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from lcollision_core.meshes.topology import FloatArray, Topology
 IntArray = npt.NDArray[np.int32]
 LongArray = npt.NDArray[np.int64]
 
-_FACES_AT_ONCE = 512
-"""Faces whose lists a thread makes at a time: few enough that each may list all others."""
+_LISTS_AT_ONCE = 512
+"""Lists that a thread makes at a time: few enough that each may have all entries."""
 
 
 class Surface(NamedTuple):
@@ -40,20 +40,22 @@ class Surface(NamedTuple):
     length: FloatArray
 
 
-class FaceLists(NamedTuple):
-    """Lists of faces, each ascending; list i is ``face[start[i]:start[i + 1]]``.
+class Lists(NamedTuple):
+    """Lists of faces or vertices, each ascending; list i is ``entry[start[i]:start[i + 1]]``.
 
     Attributes
     ----------
     start : (n + 1,) int64
-    face : (m,) int32
+    entry : (m,) int32
     """
 
     start: LongArray
-    face: IntArray
+    entry: IntArray
 
 
-NO_LISTS = FaceLists(np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int32))
+def no_lists(n: int) -> Lists:
+    """Return n empty lists."""
+    return Lists(np.zeros(n + 1, dtype=np.int64), np.empty(0, dtype=np.int32))
 
 
 class TouchingFaces(NamedTuple):
@@ -66,12 +68,9 @@ class TouchingFaces(NamedTuple):
     near_to : F lists of those of the T that each face is near to, or none
     """
 
-    partners: FaceLists
-    around: FaceLists
-    near_to: FaceLists
-
-
-NOTHING_TOUCHES = TouchingFaces(NO_LISTS, NO_LISTS, NO_LISTS)
+    partners: Lists
+    around: Lists
+    near_to: Lists
 
 
 def surface_of(topology: Topology, reference: FloatArray) -> Surface:
@@ -92,7 +91,7 @@ def surface_of(topology: Topology, reference: FloatArray) -> Surface:
 
 def faces_within(
     surface: Surface, faces: IntArray, distance: float, require: Callable[[int], None]
-) -> FaceLists:
+) -> Lists:
     """List the faces to which an edge path of at most `distance` leads from each of some faces.
 
     Parameters
@@ -100,12 +99,28 @@ def faces_within(
     faces : (n,) int32; a list has its own face too
     require : called with how many entries there are so far; may refuse more
     """
-    found, _ = _listed(
-        lambda first, last: _search(surface, faces, first, last, distance, NOTHING_TOUCHES, False),
+    return _listed(
+        lambda first, last: _search_faces(surface, faces, first, last, distance),
         len(faces),
         require,
     )
-    return found
+
+
+def later_vertices(surface: Surface, distance: float, require: Callable[[int], None]) -> Lists:
+    """List for each vertex those after it to which an edge path of at most `distance` leads.
+
+    Two faces are near each other where a corner of one and a corner of the other are: lists of
+    vertices say the same as lists of faces with a quarter of the entries.
+
+    Parameters
+    ----------
+    require : see `faces_within`
+    """
+    return _listed(
+        lambda first, last: _search_vertices(surface, first, last, distance),
+        len(surface.edge_start) - 1,
+        require,
+    )
 
 
 def touching_faces(
@@ -128,58 +143,43 @@ def touching_faces(
     if distance > 0.0:
         around = faces_within(surface, faces.astype(np.int32), distance, require)
     else:
-        around = FaceLists(np.arange(len(faces) + 1), faces.astype(np.int32))
+        around = Lists(np.arange(len(faces) + 1), faces.astype(np.int32))
     owner = np.repeat(np.arange(len(faces)), np.diff(around.start))
-    near_to = _table(around.face, owner, len(surface.corners), len(faces))
+    near_to = _table(around.entry, owner, len(surface.corners), len(faces))
     return TouchingFaces(partners, around, near_to)
 
 
-def later_faces(
-    surface: Surface, distance: float, touching: TouchingFaces, require: Callable[[int], None]
-) -> tuple[FaceLists, npt.NDArray[np.bool_]]:
-    """List for each face those after it that are near, or near what touches something near it.
+def later_faces(touching: TouchingFaces, require: Callable[[int], None]) -> Lists:
+    """List for each of F faces those after it that are near what touches something near it.
 
     Parameters
     ----------
-    distance : within which faces are near each other; below 0 for none
     touching : what touches, and what is near that
     require : see `faces_within`
-
-    Returns
-    -------
-    lists : F lists
-    by_touch : (m,) bool, which entries are there for touching alone
     """
-    n_faces = len(surface.corners)
-    if distance < 0.0 and len(touching.partners.face) == 0:
-        return FaceLists(np.zeros(n_faces + 1, dtype=np.int64), NO_LISTS.face), np.empty(
-            0, np.bool_
-        )
-    everyone = np.arange(n_faces, dtype=np.int32)
     return _listed(
-        lambda first, last: _search(surface, everyone, first, last, distance, touching, True),
-        n_faces,
+        lambda first, last: _search_touching(touching, first, last),
+        len(touching.near_to.start) - 1,
         require,
     )
 
 
 def _listed(
-    search: Callable[[int, int], tuple[LongArray, IntArray, npt.NDArray[np.bool_]]],
+    search: Callable[[int, int], tuple[LongArray, IntArray]],
     n_lists: int,
     require: Callable[[int], None],
-) -> tuple[FaceLists, npt.NDArray[np.bool_]]:
-    parts: dict[int, tuple[LongArray, IntArray, npt.NDArray[np.bool_]]] = {}
+) -> Lists:
+    parts: dict[int, tuple[LongArray, IntArray]] = {}
 
     def work(first: int, last: int) -> None:
         parts[first] = search(first, last)
-        require(sum(len(face) for _, face, _ in list(parts.values())))
+        require(sum(len(entries) for _, entries in list(parts.values())))
 
-    for_blocks(work, n_lists, _FACES_AT_ONCE)
+    for_blocks(work, n_lists, _LISTS_AT_ONCE)
     if not parts:
-        return NO_LISTS, np.empty(0, dtype=np.bool_)
-    counts, faces, by_touch = zip(*(parts[first] for first in sorted(parts)), strict=True)
-    start = _starts(np.concatenate(counts))
-    return FaceLists(start, np.concatenate(faces)), np.concatenate(by_touch)
+        return no_lists(0)
+    counts, entries = zip(*(parts[first] for first in sorted(parts)), strict=True)
+    return Lists(_starts(np.concatenate(counts)), np.concatenate(entries))
 
 
 def _starts(counts: npt.NDArray[np.integer]) -> LongArray:
@@ -188,102 +188,135 @@ def _starts(counts: npt.NDArray[np.integer]) -> LongArray:
 
 def _table(
     rows: npt.NDArray[np.integer], columns: npt.NDArray[np.integer], n_rows: int, n_columns: int
-) -> FaceLists:
+) -> Lists:
     """Return for each of the rows its columns, ascending, each once."""
     ones = np.ones(len(rows), dtype=np.bool_)
     table = sparse.csr_matrix((ones, (rows, columns)), shape=(n_rows, n_columns))
     table.sum_duplicates()
-    return FaceLists(table.indptr.astype(np.int64), table.indices.astype(np.int32))
+    return Lists(table.indptr.astype(np.int64), table.indices.astype(np.int32))
 
 
 @compiled
-def _search(
-    surface: Surface,
-    faces: IntArray,
-    first: int,
-    last: int,
-    distance: float,
-    touching: TouchingFaces,
-    only_later: bool,
-) -> tuple[LongArray, IntArray, npt.NDArray[np.bool_]]:
-    """Make the lists of ``faces[first:last]``: their lengths, entries, and which are by touch."""
+def _search_faces(
+    surface: Surface, faces: IntArray, first: int, last: int, distance: float
+) -> tuple[LongArray, IntArray]:
+    """Make the lists of ``faces[first:last]``: their lengths and entries."""
     n_faces, n_vertices = len(surface.corners), len(surface.face_start) - 1
     counts = np.zeros(last - first, dtype=np.int64)
-    entries = np.empty(1024, dtype=np.int32)
-    by_touch = np.empty(1024, dtype=np.bool_)
-    n_entries = 0
+    entries, n_entries = np.empty(1024, dtype=np.int32), 0
     away = np.full(n_vertices, np.inf)
     reached = np.empty(n_vertices, dtype=np.int32)
     waiting = np.empty(n_vertices, dtype=np.int32)
     is_waiting = np.zeros(n_vertices, dtype=np.bool_)
     listed_for = np.full(n_faces, -1, dtype=np.int32)
-    is_by_touch = np.empty(n_faces, dtype=np.bool_)
-    seen_for = np.full(len(touching.partners.start), -1, dtype=np.int32)
     found = np.empty(n_faces, dtype=np.int32)
     for place in range(first, last):
-        face = faces[place]
+        corners = surface.corners[faces[place]]
         n_found = 0
-        if distance >= 0.0:
-            n_reached = _reach(surface, face, distance, away, reached, waiting, is_waiting)
-            for k in range(n_reached):
-                vertex = reached[k]
-                away[vertex] = np.inf
-                for at in range(surface.face_start[vertex], surface.face_start[vertex + 1]):
-                    other = surface.face[at]
-                    if listed_for[other] != place and (other > face or not only_later):
-                        listed_for[other] = place
-                        is_by_touch[other] = False
-                        found[n_found] = other
-                        n_found += 1
-        if face + 1 < len(touching.near_to.start):
-            partners, around, near_to = touching.partners, touching.around, touching.near_to
-            for i in range(near_to.start[face], near_to.start[face + 1]):
-                near = near_to.face[i]
-                for j in range(partners.start[near], partners.start[near + 1]):
-                    partner = partners.face[j]
-                    if seen_for[partner] == place:
-                        continue
-                    seen_for[partner] = place
-                    for k in range(around.start[partner], around.start[partner + 1]):
-                        other = around.face[k]
-                        if listed_for[other] != place and other > face:
-                            listed_for[other] = place
-                            is_by_touch[other] = True
-                            found[n_found] = other
-                            n_found += 1
-        if n_entries + n_found > len(entries):
-            size = max(2 * len(entries), n_entries + n_found)
-            larger, larger_by_touch = np.empty(size, np.int32), np.empty(size, np.bool_)
-            larger[:n_entries] = entries[:n_entries]
-            larger_by_touch[:n_entries] = by_touch[:n_entries]
-            entries, by_touch = larger, larger_by_touch
-        ascending = np.sort(found[:n_found])
-        for k in range(n_found):
-            entries[n_entries + k] = ascending[k]
-            by_touch[n_entries + k] = is_by_touch[ascending[k]]
+        for k in range(_reach(surface, corners, distance, away, reached, waiting, is_waiting)):
+            vertex = reached[k]
+            away[vertex] = np.inf
+            for at in range(surface.face_start[vertex], surface.face_start[vertex + 1]):
+                other = surface.face[at]
+                if listed_for[other] != place:
+                    listed_for[other] = place
+                    found[n_found] = other
+                    n_found += 1
+        entries = _with_sorted(entries, n_entries, found[:n_found])
         n_entries += n_found
         counts[place - first] = n_found
-    return counts, entries[:n_entries].copy(), by_touch[:n_entries].copy()
+    return counts, entries[:n_entries].copy()
+
+
+@compiled
+def _search_vertices(
+    surface: Surface, first: int, last: int, distance: float
+) -> tuple[LongArray, IntArray]:
+    """Make the lists of the vertices from `first` to `last`."""
+    n_vertices = len(surface.face_start) - 1
+    counts = np.zeros(last - first, dtype=np.int64)
+    entries, n_entries = np.empty(1024, dtype=np.int32), 0
+    away = np.full(n_vertices, np.inf)
+    reached = np.empty(n_vertices, dtype=np.int32)
+    waiting = np.empty(n_vertices, dtype=np.int32)
+    is_waiting = np.zeros(n_vertices, dtype=np.bool_)
+    found = np.empty(n_vertices, dtype=np.int32)
+    start = np.empty(1, dtype=np.int32)
+    for vertex in range(first, last):
+        start[0] = vertex
+        n_found = 0
+        for k in range(_reach(surface, start, distance, away, reached, waiting, is_waiting)):
+            other = reached[k]
+            away[other] = np.inf
+            if other > vertex:
+                found[n_found] = other
+                n_found += 1
+        entries = _with_sorted(entries, n_entries, found[:n_found])
+        n_entries += n_found
+        counts[vertex - first] = n_found
+    return counts, entries[:n_entries].copy()
+
+
+@compiled
+def _search_touching(touching: TouchingFaces, first: int, last: int) -> tuple[LongArray, IntArray]:
+    """Make the lists of the faces from `first` to `last`."""
+    partners, around, near_to = touching.partners, touching.around, touching.near_to
+    n_faces = len(near_to.start) - 1
+    counts = np.zeros(last - first, dtype=np.int64)
+    entries, n_entries = np.empty(1024, dtype=np.int32), 0
+    listed_for = np.full(n_faces, -1, dtype=np.int32)
+    seen_for = np.full(len(partners.start), -1, dtype=np.int32)
+    found = np.empty(n_faces, dtype=np.int32)
+    for face in range(first, last):
+        n_found = 0
+        for i in range(near_to.start[face], near_to.start[face + 1]):
+            near = near_to.entry[i]
+            for j in range(partners.start[near], partners.start[near + 1]):
+                partner = partners.entry[j]
+                if seen_for[partner] == face:
+                    continue
+                seen_for[partner] = face
+                for k in range(around.start[partner], around.start[partner + 1]):
+                    other = around.entry[k]
+                    if listed_for[other] != face and other > face:
+                        listed_for[other] = face
+                        found[n_found] = other
+                        n_found += 1
+        entries = _with_sorted(entries, n_entries, found[:n_found])
+        n_entries += n_found
+        counts[face - first] = n_found
+    return counts, entries[:n_entries].copy()
+
+
+@compiled
+def _with_sorted(entries: IntArray, n_entries: int, found: IntArray) -> IntArray:
+    """Put what was found behind the first entries, ascending; the array grows where it must."""
+    needed = n_entries + len(found)
+    if needed > len(entries):
+        larger = np.empty(max(2 * len(entries), needed), dtype=np.int32)
+        larger[:n_entries] = entries[:n_entries]
+        entries = larger
+    entries[n_entries:needed] = np.sort(found)
+    return entries
 
 
 @compiled
 def _reach(
     surface: Surface,
-    face: int,
+    starts: IntArray,
     distance: float,
     away: FloatArray,
     reached: IntArray,
     waiting: IntArray,
     is_waiting: npt.NDArray[np.bool_],
 ) -> int:
-    """Fill `reached` with the vertices within a distance of a face's corners; return their number.
+    """Fill `reached` with the vertices within a distance of some vertices; return their number.
 
     The shortest paths of a first-in, first-out queue: on a surface few vertices are improved
     more than once, so that no heap pays. `away` is infinite before, and has distances after.
     """
     size, head, n_waiting, n_reached = len(waiting), 0, 0, 0
-    for corner in range(3):
-        vertex = surface.corners[face, corner]
+    for vertex in starts:
         if away[vertex] > 0.0:
             away[vertex] = 0.0
             reached[n_reached] = vertex

@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact.arrays import Exclusions
-from lcollision_core.contact.kernels import NEAR, REST, find_rules
+from lcollision_core.contact.kernels import find_rules
 from lcollision_core.contact.reach import (
-    NOTHING_TOUCHES,
     faces_within,
     later_faces,
+    later_vertices,
+    no_lists,
     surface_of,
     touching_faces,
 )
@@ -25,7 +26,7 @@ from lcollision_core.meshes.topology import FloatArray, Topology
 Pairs = npt.NDArray[np.integer]
 
 MAX_EXCLUDED = 250_000_000
-"""The most pairs of faces that are listed: 1.25 GB. All pairs of 20 000 faces are 200 million."""
+"""The most pairs of vertices or faces that are listed: 1 GB. All of 20 000 are 200 million."""
 
 _MAX_REGIONS = 4096
 
@@ -58,19 +59,21 @@ def exclusions_of(
         too many pairs are excluded.
     """
     require_groups(rules, groups, topology.n_faces)
-    surface, touched = surface_of(topology, reference), NOTHING_TOUCHES
+    surface, near, by_touch = surface_of(topology, reference), no_lists(0), no_lists(0)
+    if rules.near_exclusion > 0.0:
+        distance = rules.near_exclusion * body_size
+        near = later_vertices(surface, distance, partial(require_room, rule=_NEAR))
     if rules.rest_exclusion is not None and len(touching):
         distance = rules.rest_exclusion * body_size
-        touched = touching_faces(surface, touching, distance, partial(require_room, rule=_REST))
-    # Below 0 no face is near another one, not even one that shares a corner.
-    distance = rules.near_exclusion * body_size if rules.near_exclusion > 0.0 else -1.0
-    rule = _NEAR if rules.near_exclusion > 0.0 else _REST
-    lists, by_touch = later_faces(surface, distance, touched, partial(require_room, rule=rule))
+        require = partial(require_room, rule=_REST)
+        by_touch = later_faces(touching_faces(surface, touching, distance, require), require)
     region, ignored = _regions(rules.ignored, groups, topology.n_faces)
     return Exclusions(
-        start=lists.start,
-        face=lists.face,
-        rule=np.where(by_touch, REST, NEAR).astype(np.uint8),
+        corners=topology.faces,
+        near_start=near.start,
+        near=near.entry,
+        start=by_touch.start,
+        face=by_touch.entry,
         region=region,
         ignored=ignored,
         squared_tolerance=rules.tolerated_depth**2,
@@ -93,7 +96,7 @@ def rules_of(
 
 
 def near_pairs_estimate(topology: Topology, reference: FloatArray, distance: float) -> float:
-    """Estimate how many pairs of faces a near exclusion lists, from some of the faces.
+    """Estimate how many pairs of vertices a near exclusion lists, from some of the faces.
 
     Parameters
     ----------
@@ -104,14 +107,16 @@ def near_pairs_estimate(topology: Topology, reference: FloatArray, distance: flo
     listed = faces_within(
         surface_of(topology, reference), some, distance, partial(require_room, rule=_NEAR)
     )
-    return 0.5 * topology.n_faces * len(listed.face) / len(some)
+    # Of a closed surface, half as many vertices as faces are within reach of a place.
+    n_near = 0.5 * len(listed.entry) / len(some)
+    return 0.5 * topology.n_vertices * min(n_near, topology.n_vertices)
 
 
 def require_room(n_excluded: int, rule: str) -> None:
-    """Refuse more than `MAX_EXCLUDED` excluded pairs of faces, with a `ShapeError`."""
+    """Refuse more than `MAX_EXCLUDED` pairs in the lists of a rule, with a `ShapeError`."""
     if n_excluded > MAX_EXCLUDED:
         raise ShapeError(
-            f"excludes more than {MAX_EXCLUDED} pairs of faces",
+            f"excludes more than {MAX_EXCLUDED} pairs",
             "make it smaller or leave it out",
             where=f"the {rule}",
         )

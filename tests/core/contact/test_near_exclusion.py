@@ -194,7 +194,7 @@ def test_a_limit_that_is_no_length_is_refused(near_exclusion: float) -> None:
 
 def test_a_table_beyond_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = grid(30)
-    all_pairs = len(mesh.faces) * (len(mesh.faces) - 1) // 2
+    all_pairs = len(mesh.vertices) * (len(mesh.vertices) - 1) // 2
     monkeypatch.setattr(rules_module, "MAX_EXCLUDED", all_pairs)
     CollisionDetector(mesh.topology, mesh.vertices, rules=ContactRules(10.0))
     monkeypatch.setattr(rules_module, "MAX_EXCLUDED", all_pairs - 1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csgraph
 
-from lcollision_core.contact.reach import faces_within, surface_of
+from lcollision_core.contact.reach import faces_within, later_vertices, surface_of
 from lcollision_core.meshes.topology import length_graph
 from tests.core.shapes import Mesh, grid, join, soup
 
@@ -34,7 +34,19 @@ def test_faces_within_a_distance_are_those_of_the_shortest_paths(distance: float
     for place, face in enumerate(faces):
         away = csgraph.dijkstra(graph, directed=False, indices=mesh.faces[face], min_only=True)
         expected = np.flatnonzero((away[mesh.faces] <= distance).any(axis=1))
-        found = lists.face[lists.start[place] : lists.start[place + 1]]
+        found = lists.entry[lists.start[place] : lists.start[place + 1]]
         assert found.tolist() == expected.tolist()
         assert face in found
-    assert sizes == [len(lists.face)]
+    assert sizes == [len(lists.entry)]
+
+
+@pytest.mark.parametrize("distance", [0.15, 0.4, 10.0])
+def test_later_vertices_are_those_of_the_shortest_paths(distance: float) -> None:
+    mesh = sheet()
+    graph = length_graph(mesh.topology.edges, mesh.vertices)
+    lists = later_vertices(surface_of(mesh.topology, mesh.vertices), distance, lambda _: None)
+    away = csgraph.dijkstra(graph, directed=False)
+    for vertex in range(len(mesh.vertices)):
+        expected = np.flatnonzero(away[vertex] <= distance)
+        found = lists.entry[lists.start[vertex] : lists.start[vertex + 1]]
+        assert found.tolist() == expected[expected > vertex].tolist()
