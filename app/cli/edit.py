@@ -13,10 +13,10 @@ def edit(
     file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[POSE|CHARACTER|MESH]",
+            metavar="[POSE|CHARACTER|MESH|FOLDER]",
             readable=False,
-            help="A .json file of poses, a rigged character, a mesh of the model's topology, or a "
-            "model.",
+            help="A .json file of poses, a rigged character, a mesh of the model's topology, a "
+            "model, or a folder of meshes to learn one from.",
         ),
     ] = None,
     model_name: Annotated[
@@ -28,12 +28,9 @@ def edit(
     from app.window.editor import open_editor
     from lcollision_core.errors import LCollisionError
 
-    if file is not None and not file.is_file():
-        what, instead = "is not there", "none to start a new pose"
-        if file.is_dir():
-            what, instead = "is a folder", "fix all its meshes with `lcollision resolve`"
-        advice = f"name a file of poses, a character, a mesh or a model, or {instead}"
-        raise LCollisionError(what, advice, where=file)
+    if file is not None and not file.is_file() and not file.is_dir():
+        advice = "name a file of poses, a character, a mesh or a model, or none to start a new pose"
+        raise LCollisionError("is not there", advice, where=file)
     raise typer.Exit(open_editor(file, model_name))
 
 

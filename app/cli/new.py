@@ -82,6 +82,7 @@ def new(
     The contact rules are proposed from the poses unless options give them. However it is stopped,
     the same command goes on where it was.
     """
+    from app.work.learner import obeying
     from lcollision_core.learning import LearningRequest, WorkFolder, learn_model
     from lcollision_core.model import PoseModel, model_destination
 
@@ -104,7 +105,7 @@ def new(
     work.prepare(request)
     bar = status_bar("reading files", told_of_learning, estimates=False)
     try:
-        with cancel_on_interrupt() as cancel, bar as progress:
+        with cancel_on_interrupt() as cancel, obeying(work, cancel), bar as progress:
             card = learn_model(work, progress, cancel)
     except CancelledError:
         note(f"stopped; run the same command again to go on from {work.path}")

@@ -339,7 +339,7 @@ class ContactsPage(Page):
         self._near = _Rule(
             "Skin folds",
             "At elbows and knees skin presses into itself. How near along the surface that is, is "
-            "measured on the poses.",
+            "known of rigs, and measured on the poses of others.",
             50.0,
             5.0,
         )

@@ -77,7 +77,6 @@ def test_version_is_that_of_the_package() -> None:
         (["chek"], "No such command 'chek'"),
         (["missing.obj"], "missing.obj is not there; name a file of poses, a character, a mesh"),
         (["edit", "missing.obj"], "missing.obj is not there; name a file of poses, a character"),
-        ([str(Path(__file__).parent)], "is a folder; name a file of poses, a character, a mesh"),
         (["--model"], "Option '--model' requires an argument"),
         (["--bogus"], "No such option: --bogus; see lcollision --help"),
         (["check"], "Missing argument 'MESH...'; see lcollision check --help"),
