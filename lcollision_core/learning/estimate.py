@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from lcollision_core.jobs import available_cores
-from lcollision_core.learning.effort import EFFORTS, Quality
+from lcollision_core.learning.effort import EFFORTS, Effort, Quality
 from lcollision_core.learning.status import Stage
+
+_TRAINED = 0.7
+"""Fraction of the labelled samples that train the predictor."""
 
 
 def estimated_seconds(
@@ -21,12 +24,31 @@ def estimated_seconds(
     Returns
     -------
     seconds : by stage
+
+    Notes
+    -----
+    Measured: 2161 and 14 442 vertices, 71 and 100 poses, 20 000 samples, see docs/results.md; stage
+    1 in docs/experiments.md.
     """
     effort = EFFORTS[quality]
     share = 2.0 / (available_cores() if n_cores is None else n_cores)
+    rows = int(_TRAINED * effort.n_samples)
+    shown = rows * effort.predictor.passes(rows)
     return {
-        Stage.POSES: 5.0 + 2e-5 * n_vertices * n_poses * share,
-        Stage.LATENT_SPACE: 10.0 + 3e-4 * n_vertices * n_poses,
-        Stage.LABELS: effort.n_samples * 1.2e-6 * n_vertices * share,
-        Stage.PREDICTOR: 30.0 + 3e-3 * effort.n_samples * share,
+        Stage.POSES: 5.0 + 1e-5 * n_vertices * n_poses * share,
+        Stage.LATENT_SPACE: 3.0 + _latent_space(effort, share) * n_vertices * n_poses,
+        Stage.LABELS: 6e-7 * effort.n_samples * n_vertices * share,
+        Stage.PREDICTOR: 10.0 + 5e-8 * effort.n_samples * n_vertices * share + 7e-4 * shown * share,
     }
+
+
+def _latent_space(effort: Effort, share: float) -> float:
+    """Return the seconds of stage 1 for each vertex of each pose; codes are fitted on threads."""
+    config = effort.embedding
+    n_codes = config.n_domains * (1 + config.n_domain_codes)
+    micros = 9.0 + 0.45 * config.level1_epochs + 2.3 * config.level2_epochs
+    micros += 0.25 * share * n_codes
+    if config.held_out_stride:
+        micros += 5.0 + 0.4 * config.level1_epochs + 2.1 * config.level2_epochs
+        micros += 0.05 * share * n_codes
+    return 1e-6 * micros
