@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import secrets
@@ -64,7 +65,9 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         if sys.platform == "win32":
             unfinished.replace(target)
     except OSError as error:
-        raise MeshFileError.unwritable(path, error, "choose another place") from error
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        advice = "free some space there and try again" if is_full else "choose another place"
+        raise MeshFileError.unwritable(path, error, advice) from error
     finally:
         if unfinished is not None:
             with suppress(OSError):

@@ -26,7 +26,7 @@ def test_failed_write_leaves_the_old_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(MeshFileError, match="No space left on device"):
+    with pytest.raises(MeshFileError, match="No space left on device; free some space"):
         write_mesh(path, VERTICES, FACES)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
