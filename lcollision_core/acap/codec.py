@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from lcollision_core.acap.components import component_bridges
+from lcollision_core.acap.components import BRIDGE_WEIGHT, component_bridges
 from lcollision_core.acap.consistency import component_roots, consistent_logarithms
 from lcollision_core.acap.features import (
     N_FEATURES,
@@ -75,7 +75,7 @@ class AcapCodec:
         self._poisson, self._rest_mean = factor_poisson(
             rest,
             np.concatenate([topology.edges, bridges]),
-            np.concatenate([weights, np.ones(len(bridges))]),
+            np.concatenate([weights, np.full(len(bridges), BRIDGE_WEIGHT)]),
             self.anchor_weights,
         )
 

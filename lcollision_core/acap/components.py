@@ -2,37 +2,93 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
-from scipy.spatial import cKDTree
+import numpy.typing as npt
+from scipy.sparse import coo_matrix, csgraph
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
+BRIDGE_WEIGHT = 0.01
+"""Of an edge between components: beside those of the mesh it places them, and bends nothing."""
+
+_EDGES_EACH = 128
+"""Most edges between two components, of whose places the mean stays: that of a ball in its socket.
+
+Of the X Bot's poses, encoded and decoded, the mean error is 5.9 % of the body size with one edge
+from each component to the largest, 0.9 % with one to its neighbour, and 0.5 % with 128."""
+
+_LEAST_LENGTH = 1e-12
+"""Normalised, of an edge between components, as a graph has no edge of length 0."""
+
 
 def component_bridges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
-    """Pair each connected component's vertex with the nearest one of the largest component.
+    """Join each connected component to a neighbour by the shortest edges from vertex to vertex.
 
-    Features do not hold the position of a component. One extra edge to its neighbour lets eyes or
-    buttons follow the body that they sit on, and constrains nothing else: no cycle runs through it.
+    Features do not hold the position of a component. Edges to its neighbour let eyes or buttons
+    follow the body that they sit on, and each shell of a robot the next. Joined components form a
+    tree.
 
     Parameters
     ----------
     topology : the connectivity
-    rest_vertices : (V, 3) float64 array, the reference
+    rest_vertices : (V, 3) float64 array, the reference, in normalised lengths
 
     Returns
     -------
-    bridges : (n, 2) int32 array, one row for each component but the largest; vertices in no face
-        have none and stay where the reference has them
+    bridges : (n, 2) int32 array; vertices in no face have none and stay where the reference has
+        them
+
+    Notes
+    -----
+    The Euclidean minimum spanning tree of points is a subgraph of their Delaunay triangulation.
+    Where there is none, as of points in a plane, components are joined to the largest.
     """
     _, component = topology.vertex_components
     size = np.bincount(component)
-    largest = int(np.argmax(size))
-    main = np.flatnonzero(component == largest)
-    others = np.flatnonzero((component != largest) & (size[component] > 1))
-    if len(others) == 0:
+    used = np.flatnonzero(size[component] > 1)
+    _, of_point = np.unique(component[used], return_inverse=True)
+    n_components = int(of_point.max()) + 1
+    if n_components == 1:
         return np.empty((0, 2), dtype=np.int32)
-    distance, nearest = cKDTree(rest_vertices[main]).query(rest_vertices[others])
-    order = np.lexsort((distance, component[others]))
-    _, first = np.unique(component[others][order], return_index=True)
+    points = rest_vertices[used]
+    edges = np.concatenate([_neighbours(points), _to_the_largest(points, of_point)])
+    ends = of_point[edges]
+    across = ends[:, 0] != ends[:, 1]
+    edges, ends = edges[across], np.sort(ends[across], axis=1)
+    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) + _LEAST_LENGTH
+    order = np.lexsort((lengths, ends[:, 1], ends[:, 0]))
+    edges, ends, lengths = edges[order], ends[order], lengths[order]
+    pairs, first, pair_of = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+    shape = (n_components, n_components)
+    graph = coo_matrix((lengths[first], tuple(pairs.T)), shape=shape).tocsr()
+    tree = csgraph.minimum_spanning_tree(graph).tocoo()
+    of_tree = np.zeros(shape, dtype=np.bool_)
+    of_tree[tree.row, tree.col] = True
+    rank = np.arange(len(edges)) - first[pair_of.ravel()]
+    chosen = of_tree[tuple(ends.T)] & (rank < _EDGES_EACH)
+    return used[edges[chosen]].astype(np.int32)
+
+
+def _neighbours(points: FloatArray) -> npt.NDArray[np.intp]:
+    """Return (n, 2) edges of the Delaunay triangulation of points; none where there is none."""
+    try:
+        delaunay = Delaunay(points)
+    except QhullError:
+        return np.empty((0, 2), dtype=np.intp)
+    edges = [delaunay.simplices[:, pair] for pair in combinations(range(4), 2)]
+    # Points that coincide with others are left out of it.
+    return np.concatenate([*edges, delaunay.coplanar[:, [0, 2]]]).astype(np.intp)
+
+
+def _to_the_largest(points: FloatArray, of_point: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Return an edge from each component to the largest, so that all are joined for certain."""
+    main = np.flatnonzero(of_point == np.bincount(of_point).argmax())
+    others = np.setdiff1d(np.arange(len(points)), main)
+    distance, nearest = cKDTree(points[main]).query(points[others])
+    order = np.lexsort((distance, of_point[others]))
+    _, first = np.unique(of_point[others][order], return_index=True)
     chosen = order[first]
-    return np.stack([others[chosen], main[nearest[chosen]]], axis=1).astype(np.int32)
+    return np.stack([others[chosen], main[nearest[chosen]]], axis=1)

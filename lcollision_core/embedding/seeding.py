@@ -24,10 +24,10 @@ _BISECTIONS = 30
 
 
 def bridged_edges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
-    """Return the mesh's edges and the fewest further ones that connect it.
+    """Return the mesh's edges and further ones that connect it.
 
-    Loose components, such as eyeballs, and vertices in no face are tied to the body by their
-    shortest segment, so that distances and neighbourhoods exist across the gap.
+    Loose components, such as eyeballs, are tied to their neighbours, and vertices in no face to the
+    nearest vertex, so that distances and neighbourhoods exist across the gap.
 
     Parameters
     ----------

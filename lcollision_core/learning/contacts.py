@@ -39,8 +39,9 @@ def with_proposed_rules(
     The near exclusion of poses that say none is the shortest by which few of them collide, or the
     shortest that is about as good as any. Pairs of components that still collide in nearly every
     pose are ignored, or of body parts where the mesh is in one piece. Where shells make up the body
-    and most poses still collide, so are body parts that touch in nearly every pose, at rest too:
-    neighbours whose shells stick in each other, which robots' set-up assistants never test either.
+    and most poses still collide, so are the pairs within each body part, and of body parts that
+    touch in nearly every pose, at rest too: links and neighbouring links, which robots' set-up
+    assistants never test either.
 
     Parameters
     ----------
@@ -97,7 +98,8 @@ def with_proposed_rules(
     if in_pieces and kinds[parts]:
         detector = _detector(proposed)
         if float(np.mean(detector.are_colliding(asked))) > _MOST:
-            return ignoring([*pairs, *pairs_of(parts, detector, False)])
+            links = [(part.name, part.name) for part in kinds[parts]]
+            return ignoring([*pairs, *links, *pairs_of(parts, detector, False)])
     return proposed
 
 
