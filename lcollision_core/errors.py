@@ -110,6 +110,10 @@ class ModelFileError(LCollisionError):
     """A file cannot be read as a model or as poses of a model, or cannot be written."""
 
 
+class HeldElsewhereError(MeshFileError):
+    """Another process holds the lock of a file."""
+
+
 class PoseSetError(LCollisionError):
     """Meshes cannot form one pose set: their topology differs, or a pose is not usable."""
 

@@ -26,6 +26,12 @@ if TYPE_CHECKING:
     from lcollision_core.learning import LearnedCard, LearningStatus
 
 
+_QUALITY = (
+    "How much time is spent: quick, 100 poses of a rig and 20 000 samples; good, 150 and 50 000, "
+    "with errors of poses left out; best, 300 and 300 000, with three times the epochs of level 2."
+)
+
+
 def new(
     sources: Annotated[
         list[Path],
@@ -45,9 +51,7 @@ def new(
             help="The model's name, which stores it with yours, or a .safetensors file.",
         ),
     ],
-    quality: Annotated[
-        Literal["quick", "good", "best"], typer.Option(help="How much time is spent.")
-    ] = "good",
+    quality: Annotated[Literal["quick", "good", "best"], typer.Option(help=_QUALITY)] = "good",
     by_rig: Annotated[
         int | None,
         typer.Option(
@@ -82,8 +86,9 @@ def new(
     The contact rules are proposed from the poses unless options give them. However it is stopped,
     the same command goes on where it was.
     """
-    from app.work.learner import obeying
+    from app.work.learner import STOP, obeying
     from lcollision_core.learning import LearningRequest, WorkFolder, learn_model
+    from lcollision_core.meshes import unused_name
     from lcollision_core.model import PoseModel, model_destination
 
     request = LearningRequest(
@@ -103,12 +108,15 @@ def new(
     )
     work = WorkFolder(model_destination(output))
     work.prepare(request)
+    # What a window asked of an earlier process.
+    (work.path / STOP).unlink(missing_ok=True)
     bar = status_bar("reading files", told_of_learning, estimates=False)
     try:
         with cancel_on_interrupt() as cancel, obeying(work, cancel), bar as progress:
             card = learn_model(work, progress, cancel)
     except CancelledError:
-        note(f"stopped; run the same command again to go on from {work.path}")
+        if work.path.is_dir():
+            note(f"stopped; run the same command again to go on from {work.path}")
         raise
     except LCollisionError:
         if not work.poses.exists() and not work.is_held:
@@ -116,10 +124,14 @@ def new(
         raise
     work.remove()
     model = PoseModel.load(card.model)
-    picture = Path(card.model).with_suffix(".png")
+    picture = Path(card.model).with_name(f"{card.name}-parts.png")
+    if picture.exists():
+        picture = unused_name(picture)
     from app.view.masks_figure import draw_masks
 
     draw_masks(model, picture)
+    for remark in card.notes:
+        note(remark)
     note_rules(model)
     if as_json:
         print_json(asdict(card) | {"picture": str(picture), "rules": model.rules.to_json()})

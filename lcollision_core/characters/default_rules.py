@@ -16,7 +16,7 @@ Of the mannequin's joints turned one at a time to their limits, 67 % are free wi
 have no folds, and it makes no difference to them.
 """
 
-_MOST_NEAR_PAIRS = 100_000_000
+MOST_NEAR_PAIRS = 100_000_000
 """Of vertices: 400 MB. The mannequin of 14 442 vertices has 7 million within 0.1."""
 
 _MOST_TOUCHING = 50_000
@@ -43,7 +43,7 @@ def default_rules(character: Character) -> ContactRules:
         fitting = (
             length
             for length in NEAR_EXCLUSIONS
-            if near_pairs_estimate(topology, rest, length * strict.body_size) <= _MOST_NEAR_PAIRS
+            if near_pairs_estimate(topology, rest, length * strict.body_size) <= MOST_NEAR_PAIRS
         )
         near = next(fitting, 0.0)
     return ContactRules(

@@ -29,6 +29,12 @@ from lcollision_core.meshes.precision import can_hold
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import body_size
 
+_JACOBIAN_BYTES = 2_000_000_000
+"""For the Jacobians of poses that are fitted at a time."""
+
+_RIGID = 6
+"""Columns of a Jacobian beside those of the codes."""
+
 _RUN_VERSION = 2
 """Raised when training changes, so that no checkpoint is resumed with other rules."""
 
@@ -203,7 +209,7 @@ class _Trainer:
 
         steps = self._run.steps(model, "codes", len(poses), load, save, part=part, unit="poses")
         # One pose a thread, so that a pose gets the same bits on any number of them.
-        pool = ThreadPoolExecutor(available_cores())
+        pool = ThreadPoolExecutor(self._fit_threads(latent.shape[1]))
         fits: Iterator[LatentFit] | None = None
         try:
             for index in steps:
@@ -215,6 +221,11 @@ class _Trainer:
         finally:
             pool.shutdown(cancel_futures=True)
         return latent, errors
+
+    def _fit_threads(self, n_codes: int) -> int:
+        """Return how many poses are fitted at a time, each with a Jacobian of its own."""
+        n_bytes = 8 * 3 * self._codec.topology.n_vertices * (n_codes + _RIGID)
+        return max(1, min(available_cores(), _JACOBIAN_BYTES // n_bytes))
 
     def _measure_held_out(self) -> dict[str, Any]:
         """Train without the held-out poses and fit those, and plain components of the same."""

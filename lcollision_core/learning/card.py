@@ -27,6 +27,7 @@ class LearnedCard:
     colliding_share : of the latent box
     rules : what is not counted, in words; "" where all pairs count
     seconds : by stage
+    notes : sentences on what was changed when the poses were read
     """
 
     model: str
@@ -44,6 +45,7 @@ class LearnedCard:
     colliding_share: float
     rules: str
     seconds: Mapping[str, Any]
+    notes: tuple[str, ...] = ()
 
 
 def card_of(model: PoseModel, path: str) -> LearnedCard:
@@ -74,4 +76,5 @@ def card_of(model: PoseModel, path: str) -> LearnedCard:
         colliding_share=record.facts.colliding_share,
         rules="" if model.rules.exclude_nothing else model.rules.described(),
         seconds={stage: float(spent.get(stage, 0.0)) for stage in STAGES},
+        notes=tuple(map(str, model.card.provenance.get("notes", ()))),
     )

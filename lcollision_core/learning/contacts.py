@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.characters.default_rules import MOST_NEAR_PAIRS
 from lcollision_core.contact import CollisionDetector, ContactRules, propose_by_kind
+from lcollision_core.contact.rules import near_pairs_estimate
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.learning.request import LearningRequest
-from lcollision_core.meshes import PoseSet, groups_by_kind, named_pair
+from lcollision_core.meshes import PoseSet, body_size, groups_by_kind, named_pair
 
 _Pair = tuple[str, str]
 
@@ -59,12 +61,14 @@ def with_proposed_rules(
     depth = request.tolerated_depth
     depth = poses.rules.tolerated_depth if depth is None else depth
     rules = replace(poses.rules, rest_exclusion=rest, tolerated_depth=depth)
+    if request.ignored == ():
+        rules = replace(rules, ignored=())
     chosen = np.unique(np.linspace(0, len(poses) - 1, _MOST_POSES).round().astype(int))
     asked = poses.vertices[chosen]
     if request.near_exclusion is not None:
         rules = replace(rules, near_exclusion=request.near_exclusion)
     elif not rules.near_exclusion:
-        near = _near_exclusion(poses, rules, chosen)
+        near = _near_exclusion(poses, rules, chosen, cancel)
         rules = replace(rules, near_exclusion=near)
     kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
     named = {group.name: group for kind in kinds.values() for group in kind}
@@ -77,8 +81,9 @@ def with_proposed_rules(
         groups = (*poses.groups, *(named[name] for name in used))
         return replace(poses, rules=replace(rules, ignored=ignored), groups=groups)
 
-    if request.ignored is not None:
-        return ignoring(named_pair(entry, named) for entry in request.ignored)
+    if request.ignored == ():
+        return ignoring(())
+    chosen_pairs = [named_pair(entry, named) for entry in request.ignored or ()]
     *_, parts, components = kinds
 
     def pairs_of(kind: str, detector: CollisionDetector, counted_only: bool) -> list[_Pair]:
@@ -93,11 +98,12 @@ def with_proposed_rules(
         return [pair.groups for pair in found[kind]]
 
     in_pieces = len(kinds[components]) > 1
-    pairs = pairs_of(components if in_pieces else parts, _detector(ignoring(())), True)
+    kind = components if in_pieces else parts
+    pairs = chosen_pairs + pairs_of(kind, _detector(ignoring(chosen_pairs)), True)
     proposed = ignoring(pairs)
     if in_pieces and kinds[parts]:
         detector = _detector(proposed)
-        if float(np.mean(detector.are_colliding(asked))) > _MOST:
+        if float(np.mean(detector.are_colliding(asked, cancel=cancel))) > _MOST:
             links = [(part.name, part.name) for part in kinds[parts]]
             return ignoring([*pairs, *links, *pairs_of(parts, detector, False)])
     return proposed
@@ -107,12 +113,21 @@ def _detector(poses: PoseSet) -> CollisionDetector:
     return CollisionDetector(poses.topology, poses.vertices[0], poses.rules, poses.groups)
 
 
-def _near_exclusion(poses: PoseSet, rules: ContactRules, chosen: npt.NDArray[np.intp]) -> float:
-    """Return the shortest near exclusion by which few poses collide."""
+def _near_exclusion(
+    poses: PoseSet,
+    rules: ContactRules,
+    chosen: npt.NDArray[np.intp],
+    cancel: CancelToken | None,
+) -> float:
+    """Return the shortest near exclusion by which few poses collide, if it can be listed."""
     shares: dict[float, float] = {}
+    rest = poses.vertices[0].astype(np.float64)
+    size = body_size(rest, poses.topology)
     for near in _NEAR_EXCLUSIONS:
+        if near and near_pairs_estimate(poses.topology, rest, near * size) > MOST_NEAR_PAIRS:
+            break
         detector = _detector(replace(poses, rules=replace(rules, near_exclusion=near)))
-        shares[near] = float(np.mean(detector.are_colliding(poses.vertices[chosen])))
+        shares[near] = float(np.mean(detector.are_colliding(poses.vertices[chosen], cancel=cancel)))
         if shares[near] <= _FEW:
             return near
     best = min(shares.values())

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from lcollision_core.errors import LCollisionError
 from lcollision_core.json_values import from_json
 from lcollision_core.learning.effort import Quality
+from lcollision_core.meshes import file_stamp
+from lcollision_core.model_file import digest_of
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,8 @@ class LearningRequest:
         for those alone, an empty list for none
     seed : equal seeds, equal models
     licence : under which the model may be used
+    stamps : of the sources, so that a file that has changed is not taken for the one that was read:
+        see `stamped`
 
     Raises
     ------
@@ -48,6 +55,7 @@ class LearningRequest:
     ignored: tuple[str, ...] | None = None
     seed: int = 0
     licence: str = "unknown"
+    stamps: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.sources:
@@ -59,9 +67,26 @@ class LearningRequest:
                 "the number of poses by the rig", "0 or more", self.by_rig
             )
 
+        if self.up not in (None, 0, 1, 2):
+            raise LCollisionError.must_be("the up axis", "0, 1 or 2", self.up)
+        for what, value in (("the scale", self.scale), ("frames a second", self.fps)):
+            if value is not None and not 0.0 < value < math.inf:
+                raise LCollisionError.must_be(what, "a number above 0", f"{value:g}")
+        for what, value in (
+            ("the near exclusion", self.near_exclusion),
+            ("the rest exclusion", self.rest_exclusion),
+            ("the tolerated depth", self.tolerated_depth),
+        ):
+            if value is not None and not 0.0 <= value < 1.0:
+                raise LCollisionError.must_be(what, "from 0 to below 1", f"{value:g}")
+
+    def stamped(self) -> LearningRequest:
+        """Return the same request with the sizes and times of its sources as they are now."""
+        return replace(self, stamps=tuple(_stamp(Path(source)) for source in self.sources))
+
     def to_json(self) -> dict[str, Any]:
         """Return the JSON values of `of_json`, lists as they come back from a file."""
-        values = asdict(self) | {"sources": list(self.sources)}
+        values = asdict(self) | {"sources": list(self.sources), "stamps": list(self.stamps)}
         return values if self.ignored is None else values | {"ignored": list(self.ignored)}
 
     @classmethod
@@ -73,3 +98,10 @@ class LearningRequest:
         ValueError : a value is missing or of another type.
         """
         return from_json(cls, values, "request")
+
+
+def _stamp(path: Path) -> str:
+    """Return what changes with a file, or with the files of a folder; "" if there is none."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    found = [(file.name, *(file_stamp(file) or ())[2:]) for file in files]
+    return digest_of(json.dumps(found), {})[:16] if path.exists() else ""

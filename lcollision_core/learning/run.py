@@ -185,6 +185,7 @@ class _Learner:
             request.licence,
             {
                 "poses": dict(poses.provenance),
+                "notes": list(poses.notes),
                 "program": f"lcollision {version('lcollision')}",
                 "command": "new",
                 "request": request.to_json(),
@@ -265,7 +266,9 @@ class _Learner:
         now = time.monotonic()
         if now - self._noted > _SECONDS_BETWEEN_NOTES:
             self._noted = now
-            self._work.tell(WorkStatus.of_progress(status, self._seconds()))
+            # A full disk stops what matters; a note that others read just now does not.
+            with suppress(MeshFileError):
+                self._work.tell(WorkStatus.of_progress(status, self._seconds()))
 
     def _leave(self, state: WorkState, sentence: str = "") -> None:
         """Say what has become of the run, unless the disk has no space even for that."""

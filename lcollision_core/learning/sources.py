@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from lcollision_core.characters import CHARACTER_SUFFIXES, is_rigged, read_character
 from lcollision_core.errors import LCollisionError
@@ -45,7 +46,7 @@ def gather_poses(
     by_rig : how many poses the rig is to make, 0 for none; None for as many as are missing to
         `n_wanted`
     n_wanted : poses of a rigged character
-    clip, fps : of animations, as for `read_pose_set`
+    clip, fps : of animations, as for `read_pose_set`; of several files those that have them obey
     up : 0, 1 or 2 where the files are wrong about the axis that is up
     seed : of the poses by the rig
     thin : leave out near-duplicates among what the files have: see `thinned`
@@ -78,12 +79,21 @@ def gather_poses(
             number * _STEPS + _STEPS * done // total, n_steps * _STEPS
         )
 
+    def of_animation(file: Path) -> dict[str, Any]:
+        """Return the options of a file's animation; among several files, where it has them."""
+        if len(files) == 1:
+            return {"clip": clip, "fps": fps}
+        if file.suffix.lower() not in CHARACTER_SUFFIXES:
+            return {}
+        own = characters.get(file)
+        return {"clip": clip if own is None or clip in own.clips else None, "fps": fps}
+
     found = []
     for number, file in enumerate(files):
         if with_still and file in characters and not characters[file].clips:
             found.append(rest_pose_set(characters[file]))
         else:
-            found.append(read_pose_set(file, part(number), cancel, clip=clip, fps=fps))
+            found.append(read_pose_set(file, part(number), cancel, **of_animation(file)))
     if by_rig and rigged is None:
         raise LCollisionError(
             "has no joints to pose it by",
@@ -103,7 +113,8 @@ def gather_poses(
         poses = replace(concatenated([poses, made]), source=files[0])
     if body is not None:
         # As of the character that is posed by its rig, so that verdicts agree.
-        poses = replace(poses, rules=body.rules, groups=body.groups)
+        notes = tuple(dict.fromkeys((*poses.notes, *body.notes)))
+        poses = replace(poses, rules=body.rules, groups=body.groups, notes=notes)
     return poses if up is None else replace(poses, up_axis=up)
 
 

@@ -9,13 +9,18 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.errors import (
+    HeldElsewhereError,
+    LCollisionError,
+    MeshFileError,
+    ModelFileError,
+)
 from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.learning.request import LearningRequest
 from lcollision_core.learning.status import LearningStatus, Stage
@@ -136,21 +141,27 @@ class WorkFolder:
         ModelFileError : there is a model of that name, or another is being learned.
         MeshFileError : it cannot be written.
         """
-        self.made(request)
-        if self.path.is_dir() and (self.is_held or self.poses.exists()):
-            if self.request != request:
-                raise ModelFileError(
-                    f"a model {self.name!r} is being learned from other files or options",
-                    f"choose another name, or remove {self.path}",
-                )
-            return
+        request = request.stamped()
+        if not self.path.is_dir() and self.destination.exists():
+            raise self._taken()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise MeshFileError.because(
                 self.path, "cannot be made", error, "choose another place for the model"
             ) from error
-        self._write("request.json", request.to_json())
+        with self.held():
+            self.made(request)
+            if (self.path / "request.json").exists() and self.request != request:
+                # What failed before it had poses may be asked for anew.
+                if self.poses.exists() or self.status.state != WorkState.FAILED:
+                    raise ModelFileError(
+                        f"a model {self.name!r} is being learned from other files or options, or "
+                        "its files have changed",
+                        f"choose another name, or remove {self.path}",
+                    )
+                (self.path / "status.json").unlink(missing_ok=True)
+            self._write("request.json", request.to_json())
 
     def made(self, request: LearningRequest) -> PoseModel | None:
         """Return the model that came of a request, None if there is none of that name.
@@ -163,12 +174,12 @@ class WorkFolder:
             return None
         model = PoseModel.load(self.destination)
         if model.card.provenance.get("request") != request.to_json():
-            raise ModelFileError(
-                f"there is a model {self.name!r} already",
-                "choose another name, or remove it",
-                where=self.destination,
-            )
+            raise self._taken()
         return model
+
+    def _taken(self) -> ModelFileError:
+        what = f"there is a model {self.name!r} already"
+        return ModelFileError(what, "choose another name, or remove it", where=self.destination)
 
     @property
     def request(self) -> LearningRequest:
@@ -208,21 +219,17 @@ class WorkFolder:
         Raises
         ------
         ModelFileError : another process runs it.
+        MeshFileError : it cannot be locked.
         """
-        try:
-            lock = locked(self.path / "run", wait)
-            lock.__enter__()
-        except MeshFileError as error:
-            if not self.path.is_dir():
-                raise
-            raise ModelFileError(
-                f"a model {self.name!r} is being learned by another process",
-                "wait for it, or stop it first",
-            ) from error
-        try:
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(locked(self.path / "run", wait))
+            except HeldElsewhereError as error:
+                raise ModelFileError(
+                    f"a model {self.name!r} is being learned by another process",
+                    "wait for it, or stop it first",
+                ) from error
             yield
-        finally:
-            lock.__exit__(None, None, None)
 
     @property
     def is_held(self) -> bool:
@@ -232,8 +239,10 @@ class WorkFolder:
         try:
             with self.held(wait=0.0):
                 return False
-        except (ModelFileError, MeshFileError):
+        except ModelFileError:
             return True
+        except MeshFileError:
+            return False
 
     def remove(self) -> None:
         """Remove all of it; the model that came of it stays."""
@@ -245,7 +254,8 @@ class WorkFolder:
             if entry.is_dir():
                 shutil.rmtree(entry, ignore_errors=True)
             elif entry.name not in ("request.json", "status.json") and entry.name[0] != ".":
-                entry.unlink(missing_ok=True)
+                with suppress(OSError):  # on Windows the log is open as long as its process lives
+                    entry.unlink(missing_ok=True)
 
     def _read(self, path: Path) -> Any:
         values = parse_json(read_regular(path, _MOST_BYTES))

@@ -17,9 +17,8 @@ def concatenated(pose_sets: Sequence[PoseSet]) -> PoseSet:
     """Return the poses of several sets, of which the first has the reference.
 
     The reference of a later set is left out where it is the first one's. What else a set has is
-    taken from the first; names get their file's before them if
-    there are several. Where a set has a provenance, that of
-    the result lists all `sources`.
+    taken from the first; names get their file's before them if there are several. Where a set has
+    a provenance, that of the result lists all `sources`.
 
     Parameters
     ----------
@@ -64,8 +63,9 @@ def _provenance(pose_sets: Sequence[PoseSet], counts: Sequence[int]) -> dict[str
         return {}
     parts: list[dict[str, Any]] = []
     for poses, count in zip(pose_sets, counts, strict=True):
-        if "sources" in poses.provenance:
-            parts += poses.provenance["sources"]
+        known = poses.provenance.get("sources")
+        if isinstance(known, list):
+            parts += known
         else:
             file = {"file": poses.source.name} if poses.source else {}
             parts.append({**file, "poses": count, **poses.provenance})

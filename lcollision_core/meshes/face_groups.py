@@ -106,7 +106,7 @@ def named_pair(entry: str, names: Collection[str]) -> tuple[str, str]:
         if one in names and other in names:
             return one, other
     listed = ", ".join(sorted(names)[:_LISTED]) + (" ..." if len(names) > _LISTED else "")
-    where, next_step = f"--ignore {entry!r}", f"name two of {listed}"
+    where, next_step = f"the ignored pair {entry!r}", f"name two of {listed}"
     if not splits:
         what = "is not A:B with the names of two groups of faces"
         raise LCollisionError(what, next_step, where=where)

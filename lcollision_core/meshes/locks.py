@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from lcollision_core.errors import MeshFileError
+from lcollision_core.errors import HeldElsewhereError, MeshFileError
 from lcollision_core.regular_files import require_regular
 
 _LOCKED_BYTE = 1 << 30
@@ -35,15 +35,15 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
 
     Raises
     ------
-    MeshFileError : another holds it for longer, or the folder is missing, read-only or on a disk
-        without locks.
+    HeldElsewhereError : another holds it for longer.
+    MeshFileError : the folder is missing, read-only or on a disk without locks.
     """
     target = Path(os.path.realpath(path))
     lock = target.with_name(f".{shortened(target.name, _MAX_NAME_BYTES)}.lock")
     give_up = time.monotonic() + wait
     while (file := _taken(lock, path)) is None:
         if time.monotonic() >= give_up:
-            raise MeshFileError(
+            raise HeldElsewhereError(
                 "is being written by another command",
                 "wait for that to end, then try again",
                 where=path,

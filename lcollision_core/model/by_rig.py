@@ -276,7 +276,13 @@ class _Draws:
 
     def extents(self, n: int, generator: np.random.Generator) -> FloatArray:
         """Return how far the codes of random poses go: (n, D) from 0, for limbs at rest, to 1."""
-        n_limbs = int(self._limb.max()) + 1
+        n_limbs = int(self._limb.max(initial=-1)) + 1
+        if not n_limbs:
+            raise LCollisionError(
+                "has no joints that turn, apart from the one that moves all of it",
+                "leave out poses by the rig",
+                where=self.space.rig.joint_names[0],
+            )
         # More of them move several limbs than one.
         n_moving = generator.integers(1, n_limbs + 1, size=(n, 2)).max(axis=1)
         order = generator.random((n, n_limbs)).argsort(axis=1).argsort(axis=1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -126,10 +127,8 @@ def remember_file(model: RigModel, file: str | os.PathLike[str]) -> None:
     ------
     ModelFileError : it cannot be kept.
     """
-    known = known_character(model.fingerprint)
-    now = replace(known or KnownCharacter(""), file=str(Path(file).absolute()))
-    if now != known:
-        _write(model, now)
+    path = str(Path(file).absolute())
+    _change(model, lambda known: replace(known, file=path))
 
 
 def remember_choices(model: RigModel) -> None:
@@ -139,29 +138,38 @@ def remember_choices(model: RigModel) -> None:
     ------
     ModelFileError : it cannot be kept.
     """
-    known = known_character(model.fingerprint) or KnownCharacter(str(model.character.source))
     own, card = model.own_card, model.card
     chosen = {name: getattr(card, name) for name in ("rules", *_PARTS)}
     changed: dict[str, Any] = {
         name: None if getattr(own, name) == chosen[name] else chosen[name] for name in chosen
     }
-    _write(model, replace(known, **changed))
+    _change(model, lambda known: replace(known, **changed))
 
 
-def _write(model: RigModel, known: KnownCharacter) -> None:
-    document: dict[str, Any] = {"format": _FORMAT, "format_version": _VERSION, "file": known.file}
-    if known.rules is not None:
-        document["rules"] = known.rules.to_json()
-    held = {name: getattr(known, name) for name in _PARTS}
-    document |= {name: value for name, value in held.items() if value is not None}
+def _change(model: RigModel, change: Callable[[KnownCharacter], KnownCharacter]) -> None:
+    """Read what is remembered, change it and write it back; no other window's change is lost."""
     path = _path(model.fingerprint)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with locked(path), atomic_write(path) as file:
-            file.write(json.dumps(document, indent=1).encode() + b"\n")
+        with locked(path):
+            before = known_character(model.fingerprint)
+            known = change(before or KnownCharacter(str(model.character.source)))
+            if known == before:
+                return
+            document: dict[str, Any] = {
+                "format": _FORMAT,
+                "format_version": _VERSION,
+                "file": known.file,
+            }
+            if known.rules is not None:
+                document["rules"] = known.rules.to_json()
+            held = {name: getattr(known, name) for name in _PARTS}
+            document |= {name: value for name, value in held.items() if value is not None}
+            with atomic_write(path) as file:
+                file.write(json.dumps(document, indent=1).encode() + b"\n")
     except (OSError, MeshFileError) as error:
         raise ModelFileError.because(
-            f"what is remembered of {model.name}", "cannot be kept", error, "make room, try again"
+            f"what is remembered of {model.name}", "cannot be kept", error, "try again"
         ) from error
 
 

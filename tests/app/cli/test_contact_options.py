@@ -67,7 +67,7 @@ def test_components_and_depths_are_left_out_by_check(lcollision: Lcollision, sta
     ("options", "sentence"),
     [
         (("--rest-exclusion", 0.1), "--rest-exclusion needs a rest pose; name it with --rest MESH"),
-        (("--ignore", "hair"), "--ignore 'hair' is not A:B with the names of two groups"),
+        (("--ignore", "hair"), "the ignored pair 'hair' is not A:B with the names of two groups"),
         (("--ignore", "component 1:hair"), "names 'hair', which is no group of faces of this mesh"),
         (("--tolerated-depth", -1), "--tolerated-depth"),
     ],

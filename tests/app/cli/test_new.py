@@ -44,13 +44,12 @@ def test_a_pose_set_becomes_a_model_with_a_card_and_a_picture(
     assert card["rules"] == PoseModel.load(model).rules.to_json()
     # Nothing is left beside it.
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "bent.png",
+        "bent-parts.png",
         "bent.safetensors",
         "tube.npz",
     ]
-    again = lcollision("new", tube, "-o", model, "--quality", "quick")
-    assert again.exit_code == 0
-    assert "bent: 210 vertices, 2 body parts, learned from 16 poses" in again.stdout
+    again = lcollision("new", tube, "-o", tmp_path / "other.safetensors", "--quality", "quick")
+    assert "other: 210 vertices, 2 body parts, learned from 16 poses" in again.stdout
 
 
 def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
@@ -85,7 +84,7 @@ def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
     [
         (("{folder}/none.glb",), "none.glb"),
         (("{tube}", "--by-rig", "5"), "has no joints to pose it by"),
-        (("{tube}", "--ignore", "nose"), "--ignore 'nose' is not A:B"),
+        (("{tube}", "--ignore", "nose"), "the ignored pair 'nose' is not A:B"),
         (("{tube}", "-o", "{folder}/tube.obj"), "a model is a .safetensors file"),
     ],
 )

@@ -56,9 +56,9 @@ def test_what_is_listed_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     module = sys.modules["lcollision_core.characters.default_rules"]
     rest, size = body.rest_vertices, detector_of(body, ContactRules()).body_size
     fitting = near_pairs_estimate(body.topology, rest, 0.05 * size)
-    monkeypatch.setattr(module, "_MOST_NEAR_PAIRS", fitting)
+    monkeypatch.setattr(module, "MOST_NEAR_PAIRS", fitting)
     assert default_rules(body).near_exclusion == 0.05
-    monkeypatch.setattr(module, "_MOST_NEAR_PAIRS", 0)
+    monkeypatch.setattr(module, "MOST_NEAR_PAIRS", 0)
     monkeypatch.setattr(module, "_MOST_TOUCHING", 0)
     assert default_rules(body) == ContactRules(rest_exclusion=0.0)
 

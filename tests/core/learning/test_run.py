@@ -20,6 +20,7 @@ from lcollision_core.learning import (
     EFFORTS,
     STAGES,
     Effort,
+    LearnedCard,
     LearningRequest,
     LearningStatus,
     Quality,
@@ -54,6 +55,19 @@ def request_for_tube(tmp_path: Path, tube_poses: PoseSet) -> LearningRequest:
     return LearningRequest((str(file),), Quality.QUICK)
 
 
+@pytest.fixture(scope="module")
+def whole(
+    tmp_path_factory: pytest.TempPathFactory, tube_poses: PoseSet
+) -> tuple[WorkFolder, LearnedCard, list[LearningStatus]]:
+    """Return a run that nothing stopped: its folder, its card and what it told."""
+    folder, told = tmp_path_factory.mktemp("whole"), []
+    write_pose_set(folder / "tube.npz", tube_poses)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(EFFORTS, Quality.QUICK, SMALL)
+        work = work_in(folder, LearningRequest((str(folder / "tube.npz"),), Quality.QUICK))
+        return work, learn_model(work, told.append), told
+
+
 def work_in(folder: Path, request: LearningRequest, name: str = "tube") -> WorkFolder:
     work = WorkFolder(folder / f"{name}.safetensors")
     work.prepare(request)
@@ -67,13 +81,11 @@ def numbers_of(path: str) -> tuple[str, bytes]:
 
 
 def test_a_run_ends_with_a_model_that_resolves(
-    tmp_path: Path, request_for_tube: LearningRequest
+    whole: tuple[WorkFolder, LearnedCard, list[LearningStatus]],
 ) -> None:
-    work = work_in(tmp_path, request_for_tube)
-    told: list[LearningStatus] = []
-    card = learn_model(work, told.append)
+    work, card, told = whole
     model = PoseModel.load(card.model)
-    assert card.model == str(tmp_path / "tube.safetensors")
+    assert card.model == str(work.destination)
     assert (card.vertices, card.poses, card.parts, card.samples) == (model.n_vertices, 16, 2, 256)
     assert model.domain_names == ("left thigh", "left shin")
     assert card.accuracy == model.predictor_record.metrics.accuracy
@@ -93,10 +105,11 @@ def test_a_run_ends_with_a_model_that_resolves(
 
 
 def test_a_run_that_is_cancelled_anywhere_goes_on_to_the_same_model(
-    tmp_path: Path, request_for_tube: LearningRequest
+    tmp_path: Path,
+    request_for_tube: LearningRequest,
+    whole: tuple[WorkFolder, LearnedCard, list[LearningStatus]],
 ) -> None:
-    told: list[LearningStatus] = []
-    whole = learn_model(work_in(tmp_path, request_for_tube, "whole"), told.append)
+    _, card, told = whole
     work = work_in(tmp_path, request_for_tube, "parts")
     stops = np.linspace(0, len(told) - 2, 10).round().astype(int).tolist()
     for stop in stops:
@@ -113,8 +126,8 @@ def test_a_run_that_is_cancelled_anywhere_goes_on_to_the_same_model(
         assert not work.is_held
         assert work.status.done <= told[stop].done + 0.3
     parts = learn_model(work)
-    assert numbers_of(parts.model) == numbers_of(whole.model)
-    assert parts.error_mean == whole.error_mean
+    assert numbers_of(parts.model) == numbers_of(card.model)
+    assert parts.error_mean == card.error_mean
 
 
 _KILLED = """
@@ -128,11 +141,12 @@ learn_model(WorkFolder(Path(sys.argv[1])))
 
 
 def test_a_run_that_is_killed_goes_on_to_the_same_model(
-    tmp_path: Path, request_for_tube: LearningRequest
+    tmp_path: Path,
+    request_for_tube: LearningRequest,
+    whole: tuple[WorkFolder, LearnedCard, list[LearningStatus]],
 ) -> None:
-    whole = learn_model(work_in(tmp_path, request_for_tube, "whole"))
     work = work_in(tmp_path, request_for_tube, "killed")
-    for stage in STAGES[1:]:
+    for stage in (Stage.LATENT_SPACE, Stage.PREDICTOR):
         process = subprocess.Popen([sys.executable, "-c", _KILLED, work.destination])
         give_up = time.monotonic() + 60.0
         while work.status.stage != stage and process.poll() is None:
@@ -146,26 +160,31 @@ def test_a_run_that_is_killed_goes_on_to_the_same_model(
         assert work.status.state == WorkState.RUNNING
         assert not work.is_held
     killed = learn_model(work)
-    assert numbers_of(killed.model) == numbers_of(whole.model)
+    assert numbers_of(killed.model) == numbers_of(whole[1].model)
 
 
 def test_a_finished_run_is_not_done_again(
-    tmp_path: Path, request_for_tube: LearningRequest
+    whole: tuple[WorkFolder, LearnedCard, list[LearningStatus]],
 ) -> None:
-    first = learn_model(work_in(tmp_path, request_for_tube))
-    stamp = Path(first.model).stat().st_mtime_ns
-    again = learn_model(work_in(tmp_path, request_for_tube))
-    assert again == first
-    assert Path(first.model).stat().st_mtime_ns == stamp
+    work, card, _ = whole
+    stamp = Path(card.model).stat().st_mtime_ns
+    work.prepare(work.request)
+    assert learn_model(work) == card
+    assert Path(card.model).stat().st_mtime_ns == stamp
 
 
 def test_what_another_request_made_or_makes_is_not_touched(
     tmp_path: Path, request_for_tube: LearningRequest
 ) -> None:
     other = replace(request_for_tube, seed=1)
-    work = work_in(tmp_path, other)
-    # What has not begun gives way.
-    assert work_in(tmp_path, request_for_tube).request == request_for_tube
+    failing = replace(request_for_tube, sources=(str(tmp_path / "none.npz"),))
+    with pytest.raises(MeshFileError):
+        learn_model(work_in(tmp_path, failing))
+    # What failed before it had poses gives way, and a run that waits for its turn does not.
+    work = work_in(tmp_path, request_for_tube)
+    assert work.status.state == WorkState.STOPPED
+    with pytest.raises(ModelFileError, match=r"being learned from other files or options"):
+        work_in(tmp_path, other)
     token = CancelToken()
 
     def cancel_later(status: LearningStatus) -> None:
@@ -176,8 +195,11 @@ def test_what_another_request_made_or_makes_is_not_touched(
         learn_model(work, cancel_later, token)
     with pytest.raises(ModelFileError, match=r"being learned from other files or options"):
         work_in(tmp_path, other)
-    learn_model(work_in(tmp_path, request_for_tube))
-    WorkFolder(tmp_path / "tube.safetensors").remove()
+    os.utime(request_for_tube.sources[0], ns=(1, 1))
+    with pytest.raises(ModelFileError, match="its files have changed"):
+        work_in(tmp_path, request_for_tube)
+    learn_model(work)
+    work.remove()
     before = (tmp_path / "tube.safetensors").read_bytes()
     with pytest.raises(ModelFileError, match=r"there is a model 'tube' already"):
         work_in(tmp_path, other)
@@ -208,7 +230,7 @@ def test_what_cannot_be_learned_from_is_said_and_kept(tmp_path: Path) -> None:
 
 def test_damaged_status_and_request(tmp_path: Path, request_for_tube: LearningRequest) -> None:
     work = work_in(tmp_path, request_for_tube)
-    assert work.request == request_for_tube
+    assert work.request == request_for_tube.stamped()
     (work.path / "status.json").write_text("{")
     assert work.status.state == WorkState.STOPPED
     (work.path / "request.json").write_text('{"version": 99}')
@@ -218,3 +240,6 @@ def test_damaged_status_and_request(tmp_path: Path, request_for_tube: LearningRe
         LearningRequest(("a",), "better")
     with pytest.raises(LCollisionError, match="no files"):
         LearningRequest(())
+    for wrong in ({"scale": 0.0}, {"fps": -1.0}, {"up": 7}, {"near_exclusion": 3.0}):
+        with pytest.raises(LCollisionError, match="must be"):
+            LearningRequest(("a",), **wrong)
