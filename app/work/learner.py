@@ -1,11 +1,13 @@
 """The process of its own that learns a model: ``python -m app.work.learner WORK_FOLDER``.
 
 It goes on when the window that started it closes, and gives way to whatever else the computer does.
-A signal stops it, or the file `STOP` in the work folder, which any later window can write.
+It begins by taking away the file `WANTED` of the work folder, and ends at once if that is gone. A
+signal stops it, or the file `STOP` in the work folder, which any later window can write.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -36,7 +38,9 @@ _BUG = "the program has failed ({0}: {1}); continue, or see the log file in {2}"
 _NO_MEMORY = (
     "there is not enough memory; close other programs and continue, or learn a lighter mesh"
 )
-_FULL_OR_GONE = "{0}; free some space on the disk of {1}, then continue"
+_FULL = "{0}; free some space on the disk of {1}, then continue"
+_UNUSABLE = "{0}; check the files and the folder {1}, then continue"
+_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT)
 
 
 def main(arguments: list[str]) -> int:
@@ -59,11 +63,12 @@ def main(arguments: list[str]) -> int:
     from lcollision_core.learning import WorkFolder, learn_model
 
     work, cancel = WorkFolder.at(Path(arguments[0])), CancelToken()
+    start = _Start(work, cancel)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: cancel.cancel())
     try:
         with obeying(work, cancel):
-            learn_model(work, lambda _: _begun(work), cancel)
+            learn_model(work, lambda _: start.take(), cancel)
     except CancelledError:
         return 130
     except LCollisionError as error:
@@ -76,12 +81,15 @@ def main(arguments: list[str]) -> int:
         return 2
     except OSError as error:
         traceback.print_exc()
-        _tell_failure(work, _FULL_OR_GONE.format(error.strerror or error, work.path.parent))
+        advice = _FULL if error.errno in _FULL_ERRORS else _UNUSABLE
+        _tell_failure(work, advice.format(error.strerror or error, work.path.parent))
         return 2
     except Exception as error:
         traceback.print_exc()
         _tell_failure(work, _BUG.format(type(error).__name__, error, work.path))
         return 3
+    finally:
+        start.give_up()
     return 0
 
 
@@ -123,8 +131,31 @@ def _obey(work: WorkFolder, cancel: CancelToken, ended: threading.Event) -> None
             cancel.cancel()
 
 
-def _begun(work: WorkFolder) -> None:
-    (work.path / WANTED).unlink(missing_ok=True)
+class _Start:
+    """The file that asks for a run, taken away by the process that holds the work folder.
+
+    A window that stops a run takes it away first. So whoever finds it gone knows of the other: the
+    process ends, or the window sees that the folder is held, and writes `STOP`.
+    """
+
+    def __init__(self, work: WorkFolder, cancel: CancelToken) -> None:
+        self._work, self._cancel, self._is_taken = work, cancel, False
+
+    def take(self) -> None:
+        """Take it at the first call, which the holder makes; if it is gone, stop the run."""
+        if self._is_taken:
+            return
+        self._is_taken = True
+        try:
+            (self._work.path / WANTED).unlink()
+        except FileNotFoundError:
+            self._cancel.cancel()
+
+    def give_up(self) -> None:
+        """Ask no more for a run that has ended before it began."""
+        if not self._is_taken and not self._work.is_held:
+            with suppress(OSError):
+                (self._work.path / WANTED).unlink(missing_ok=True)
 
 
 def _tell_failure(work: WorkFolder, sentence: str) -> None:
@@ -139,14 +170,16 @@ def _tell_failure(work: WorkFolder, sentence: str) -> None:
 
 
 def _leave(work: WorkFolder) -> None:
-    """Take away what the run was asked by, and all of it if that is wanted."""
+    """Take away what has stopped the run, and all of it if that is wanted."""
+    if work.is_held:
+        # By another process, which that is for.
+        return
     with suppress(OSError):
         if (work.path / STOP).read_text(encoding="utf-8") == DISCARD:
             work.remove()
             return
-    for name in (WANTED, STOP):
-        with suppress(OSError):
-            (work.path / name).unlink(missing_ok=True)
+    with suppress(OSError):
+        (work.path / STOP).unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

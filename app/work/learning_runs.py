@@ -21,8 +21,8 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from lcollision_core.learning import LearningRequest, WorkFolder, WorkStatus
 
-LEARNER = (sys.executable, "-m", "app.work.learner")
-"""The program that learns, and its arguments before the work folder."""
+LEARNER = (sys.executable, "-P", "-m", "app.work.learner")
+"""The program that learns, and its arguments before the work folder; not of the current folder."""
 
 POLL_MILLISECONDS = 1000
 
@@ -192,6 +192,8 @@ class LearningRuns(QObject):
             self.changed.emit()
 
     def _looked_at(self, work: WorkFolder) -> LearningRun:
+        from lcollision_core.learning import WorkState
+
         # In this order: a run that begins or ends meanwhile is seen as it was before.
         is_wanted, stops, is_held = (work.path / WANTED).exists(), _is_to_stop(work), work.is_held
         status = work.status
@@ -202,7 +204,8 @@ class LearningRuns(QObject):
         elif status.state == RunPhase.RUNNING:
             phase = RunPhase.KILLED
         else:
-            phase = RunPhase(status.state)
+            known = status.state in list(WorkState)
+            phase = RunPhase(status.state) if known else RunPhase.STOPPED
         sentence = status.sentence if phase is RunPhase.FAILED else ""
         if phase is RunPhase.KILLED:
             free = shutil.disk_usage(work.path.parent).free
@@ -241,6 +244,8 @@ class LearningRuns(QObject):
         program, *arguments = LEARNER
         process.setProgram(program)
         process.setArguments([*arguments, str(work.path)])
+        # A folder that is being worked in cannot be removed on Windows, so it is the one above.
+        process.setWorkingDirectory(str(work.path.parent))
         process.setStandardInputFile(QProcess.nullDevice())
         for redirect in (process.setStandardOutputFile, process.setStandardErrorFile):
             redirect(str(work.log), QProcess.OpenModeFlag.Append)

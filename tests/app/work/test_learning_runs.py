@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -14,16 +15,17 @@ import pytest
 from PySide6.QtCore import QObject
 from pytestqt.qtbot import QtBot
 
-from app.work import learning_runs
-from app.work.learner import WANTED
+from app.work import learner, learning_runs
+from app.work.learner import STOP, WANTED
 from app.work.learning_runs import LearningRun, LearningRuns, RunPhase
+from lcollision_core import learning
 from lcollision_core.errors import LCollisionError
 from lcollision_core.learning import LearningRequest, WorkFolder, WorkState, WorkStatus
 from lcollision_core.meshes import locked, write_pose_set
 from lcollision_core.model import PoseModel, model_destination
 from tests.bending_tube import bending_tube
 
-QUICK = (sys.executable, "-m", "tests.app.quick_learner")
+QUICK = (sys.executable, "-P", "-m", "tests.app.quick_learner")
 PATIENCE = 60_000
 
 
@@ -141,6 +143,69 @@ def test_what_cannot_be_learned_from_is_said_in_one_sentence(
     assert "Traceback" in failed.work.log.read_text()
 
 
+@linux
+def test_a_run_that_is_stopped_while_its_process_starts_ends_at_once(
+    qtbot: QtBot, runs: LearningRuns, tube_file: Path
+) -> None:
+    path = runs.start(LearningRequest((str(tube_file),), "quick"), "hero")
+    qtbot.waitUntil(lambda: runs._is_starting(path))
+    number = process_of(path)
+    # Another window doesn't know that there is a process.
+    later = LearningRuns(runs)
+    later.look()
+    later.stop(path)
+    qtbot.waitUntil(lambda: not Path(f"/proc/{number}").exists(), timeout=PATIENCE)
+    stopped = wait_for(qtbot, runs, path, lambda run: not run.is_active)
+    assert stopped.phase is RunPhase.STOPPED
+    assert not stopped.work.poses.exists()
+    assert not (path / STOP).exists()
+
+
+def stay_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the learner run in this process, whose priority and signals stay."""
+    monkeypatch.setattr(learner, "_give_way", lambda: None)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+
+
+def test_a_process_that_comes_second_leaves_what_the_first_is_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stay_as_it_is(monkeypatch)
+    work = folder_of("hero", WorkState.RUNNING)
+    for name in (WANTED, STOP):
+        (work.path / name).touch()
+    with locked(work.path / "run"):
+        assert learner.main([str(work.path)]) in (2, 130)
+    assert (work.path / WANTED).exists()
+    assert (work.path / STOP).exists()
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"), [(errno.ENOSPC, "free some space"), (errno.EACCES, "check the files")]
+)
+def test_what_the_disk_refuses_is_advised_on(
+    monkeypatch: pytest.MonkeyPatch, number: int, advice: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    stay_as_it_is(monkeypatch)
+    monkeypatch.setattr(learning, "learn_model", fail)
+    work = folder_of("hero", WorkState.RUNNING)
+    assert learner.main([str(work.path)]) == 2
+    assert advice in work.status.sentence
+
+
+def test_a_state_that_is_not_known_is_one_of_a_run_that_is_stopped(runs: LearningRuns) -> None:
+    work = folder_of("hero", WorkState.RUNNING)
+    status = work.path / "status.json"
+    for state in ("paused", "waiting"):
+        status.write_text(status.read_text().replace("running", state))
+        runs.look()
+        assert [run.phase for run in runs.runs] == [RunPhase.STOPPED]
+        work.tell(WorkStatus(WorkState.RUNNING))
+
+
 def folder_of(name: str, state: WorkState) -> WorkFolder:
     work = WorkFolder(model_destination(name))
     work.prepare(LearningRequest(("/nowhere.npz",)))
@@ -181,7 +246,7 @@ def test_names_that_are_taken_are_refused(runs: LearningRuns, editor_model: Pose
     editor_model.save(model_destination("hero"))
     with pytest.raises(LCollisionError, match="there is a model 'hero' already"):
         runs.start(LearningRequest(("/nowhere.npz",)), "hero")
-    folder_of("villain", WorkState.STOPPED)
+    folder_of("villain", WorkState.STOPPED).poses.touch()
     with pytest.raises(LCollisionError, match="being learned from other files"):
         runs.start(LearningRequest(("/elsewhere.npz",)), "villain")
 
@@ -189,12 +254,19 @@ def test_names_that_are_taken_are_refused(runs: LearningRuns, editor_model: Pose
 def test_the_learner_refuses_a_folder_without_a_request(tmp_path: Path) -> None:
     work = WorkFolder(tmp_path / "hero.safetensors")
     work.path.mkdir()
+    other = tmp_path / "app"
+    other.mkdir()
+    (other / "__init__.py").write_text("raise SystemExit('a package of the folder')")
+    environment = learning_runs._environment()
+    names = environment.keys()
     began = time.monotonic()
     result = subprocess.run(
-        [sys.executable, "-m", "app.work.learner", work.path],
+        [*learning_runs.LEARNER, work.path],
         capture_output=True,
         text=True,
         check=False,
+        cwd=tmp_path,
+        env={name: environment.value(name) for name in names},
     )
     assert result.returncode == 2, result.stderr
     assert time.monotonic() - began < 60.0
