@@ -46,20 +46,21 @@ class ExportDialog(Form):
     ----------
     form, axes : fields
     source : the button that asks for a file of the user's; not of a character, which has its own
-    like : that file, None for none
+    like : that file, at first the one that the model was learned from; None for none
     """
 
     def __init__(self, settings: Settings, parent: QWidget, model: PosableBody) -> None:
-        from lcollision_core.model import EXPORT_SCALES, RigModel
+        from lcollision_core.model import EXPORT_SCALES, RigModel, own_source
 
         super().__init__("Export mesh", "Choose file…", settings, parent)
         self._scales = EXPORT_SCALES
         self._meanings = _meanings(model)
-        self._character = model.character.source if isinstance(model, RigModel) else None
-        self.like: Path | None = None
+        self._own = own_source(model)
+        self._character = self._own if isinstance(model, RigModel) else None
+        self.like = None if isinstance(model, RigModel) else self._own
         self._forms: dict[str, ExportForm] = {}
         if self._character is None:
-            self.source = QPushButton("None: write a mesh")
+            self.source = QPushButton()
             self.source.setAutoDefault(False)
             self.source.setToolTip("Your OBJ or GLB file of this body, whose UVs and groups stay")
             self.source.clicked.connect(self._ask_for_source)
@@ -75,11 +76,15 @@ class ExportDialog(Form):
     @property
     def kinds(self) -> dict[str, str]:
         """The file formats of the chosen form, extensions by name."""
+        from lcollision_core.model import offered_forms
+
         form = self._forms.get(self.form.currentData())
         if form is not None:
             return {form.suffix.removeprefix(".").upper(): form.suffix}
-        # As GLB some characters have forms of their own.
-        taken = {form.suffix for form in self._forms.values()}
+        # Without a form, the file that the body came from is kept where it has the extension.
+        is_own = self._character is not None
+        own = () if self._own is None else offered_forms(self._own, has_rig=is_own)
+        taken = {offered.suffix for offered in own}
         return {kind: suffix for kind, suffix in _MESHES.items() if suffix not in taken}
 
     @property
@@ -101,7 +106,6 @@ class ExportDialog(Form):
             self, "Keep the form of", folder, f"Files of this body ({masks})"
         )
         self.like = Path(name) if name else None
-        self.source.setText(menu_text(self.like.name) if self.like else "None: write a mesh")
         self._offer()
 
     def _offer(self) -> None:
@@ -110,6 +114,8 @@ class ExportDialog(Form):
 
         source = self._character or self.like
         has_rig = self._character is not None
+        if not has_rig:
+            self.source.setText(menu_text(self.like.name) if self.like else "None: write a mesh")
         offered = offered_forms(source, has_rig=has_rig) if source is not None else ()
         self._forms = {form.key: form for form in offered if not form.is_sequence}
         wanted = self._settings["export_form"]

@@ -20,7 +20,7 @@ from app.window.main_window import MainWindow
 from lcollision_core.characters import read_character
 from lcollision_core.meshes import read_mesh
 from lcollision_core.meshes.formats.point_cache import read_point_cache
-from lcollision_core.model import ExportAxes, RigModel, export_mesh
+from lcollision_core.model import ExportAxes, PoseModel, RigModel, export_mesh
 from tests.app.windows import PATIENCE, answer, shown, take_picture
 from tests.core.gltf_builder import arm
 
@@ -168,6 +168,28 @@ def test_a_model_keeps_the_form_of_a_file_that_is_named(
     window.document.export_pose(tmp_path / "out.obj", form.export_style)
     window.document.finish_exports()
     assert (tmp_path / "out.obj").read_text().startswith("# mine\n")
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_a_model_keeps_the_form_of_the_file_that_it_was_learned_from(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
+) -> None:
+    model = window.document.model
+    assert isinstance(model, PoseModel)
+    mine = tmp_path / f"mine{suffix}"
+    export_mesh(mine, model, model.reference)
+    request = {"sources": [str(mine)], "scale": 1.0}
+    provenance = {**model.card.provenance, "request": request}
+    card = replace(model.card, provenance=provenance)
+    learned = PoseModel(model.name, model.embedding, card)
+    form = ExportDialog(window.settings, window, learned)
+    qtbot.addWidget(form)
+    assert form.source.text() == mine.name
+    assert form.export_style.like == mine
+    assert list(form.kinds.values()) == [suffix]
+    form.form.setCurrentIndex(form.form.findData(MESH))
+    assert form.export_style.like is None
+    assert set(form.kinds.values()) == {".obj", ".ply", ".stl", ".glb"} - {suffix}
 
 
 def chooser(change: Callable[[MotionDialog], None], path: Path, timers: list[QTimer]) -> QTimer:
