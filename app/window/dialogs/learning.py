@@ -94,7 +94,7 @@ class LearningDialog(QDialog):
         self._shown: tuple[Path, RunPhase] | None = None
         self._card_of: Path | None = None
         self._read_for: Path | None = None
-        self._read_failed = False
+        self._reading, self._read_failed = 0, False
         self.which = QComboBox()
         self.which.setAccessibleName("Model that is learned")
         self._sign = Sign(_SIGN)
@@ -115,6 +115,12 @@ class LearningDialog(QDialog):
         """Show another run."""
         self.path = path
         self._on_runs()
+
+    def done(self, result: int) -> None:
+        """Read no card any more, and close."""
+        self._work.cancel(self._reading)
+        self.path = self._read_for = None
+        super().done(result)
 
     def _lay_out(self) -> None:
         self.stop, self.resume = QPushButton("Stop"), QPushButton("Continue")
@@ -208,9 +214,11 @@ class LearningDialog(QDialog):
             widget.setVisible(wanted)
         self.discard.setEnabled(phase is not RunPhase.STOPPING)
         if is_done and run.path not in (self._card_of, self._read_for):
+            self._work.cancel(self._reading)
             self._read_for = run.path
             read = partial(learning_jobs.read_card, run.status.model)
-            self._work.start("Reading the model", read, self._on_card, self._on_no_card)
+            done = partial(self._on_card, run.path)
+            self._reading = self._work.start("Reading the model", read, done, self._on_no_card)
         if self._shown != (run.path, phase):
             self._shown = run.path, phase
             self.open_model.setDefault(is_done)
@@ -262,7 +270,7 @@ class LearningDialog(QDialog):
             run.work.remove()
         self._runs.look()
 
-    def _on_card(self, learned: LearnedModel) -> None:
+    def _on_card(self, path: Path, learned: LearnedModel) -> None:
         from app.view.masks_figure import parts_image
 
         ratio = self.devicePixelRatioF()
@@ -271,7 +279,7 @@ class LearningDialog(QDialog):
         pixels = QImage(drawn.tobytes(), *drawn.size, 4 * width, QImage.Format.Format_RGBA8888)
         pixels.setDevicePixelRatio(ratio)
         self.card.show_model(learned, QPixmap.fromImage(pixels))
-        self._card_of = self._read_for
+        self._card_of = path
         self._on_runs()
         self._fit()
 
@@ -280,9 +288,9 @@ class LearningDialog(QDialog):
 
     @Slot(object)
     def _on_failed(self, failure: Failure) -> None:
-        if self._read_failed:
-            self._read_failed = False
+        if self._read_failed and self.path == self._read_for:
             self.state.setText(f"{with_capital(one_line(failure.headline))}.")
+        self._read_failed = False
 
 
 class _StageRows(Card):
@@ -370,8 +378,18 @@ def _figures(card: LearnedCard) -> list[tuple[str, str]]:
             f"{error}, at most {height_text(card.error_max)}",
         ),
         ("Estimate", f"right for {_percent(card.accuracy)} of new poses"),
-        ("False alarms", f"{_percent(card.false_positive_rate)} of the free poses"),
-        ("Misses", f"{_percent(card.false_negative_rate)} of the colliding poses"),
+        (
+            "False alarms",
+            "unknown: no sample was free"
+            if card.false_positive_rate is None
+            else f"{_percent(card.false_positive_rate)} of the free poses",
+        ),
+        (
+            "Misses",
+            "unknown: no sample collided"
+            if card.false_negative_rate is None
+            else f"{_percent(card.false_negative_rate)} of the colliding poses",
+        ),
         ("Collide", f"{_percent(card.colliding_share)} of {grouped(card.samples)} random poses"),
         ("Not counted", card.rules or "nothing: all contacts count"),
     ]
@@ -388,5 +406,5 @@ def _grid(across: int, down: int) -> QGridLayout:
     return grid
 
 
-def _percent(share: float | None) -> str:
-    return "none" if share is None else f"{100 * share:.1f} %"
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"

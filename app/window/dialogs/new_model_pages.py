@@ -25,7 +25,7 @@ from PySide6.QtWidgets import (
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.number_box import NumberBox
 from app.window.widgets import Card, hbox, labelled, plain_tip, vbox
-from app.wording import counted, duration_text, grouped, with_capital
+from app.wording import counted, duration_text, grouped, spent_text, with_capital
 
 if TYPE_CHECKING:
     from lcollision_core.learning import Quality
@@ -36,6 +36,13 @@ _BY_QUALITY, _NO_POSES, _OWN_NUMBER = "quality", "none", "number"
 _MOST_BY_RIG = 2000
 _PERCENT = 100.0
 _AXES = "xyz"
+_STAGES = {
+    "poses": "poses",
+    "latent space": "latent space",
+    "labels": "checking",
+    "predictor": "estimate",
+}
+"""What the stages are called in a line that lists their times."""
 
 
 class Page(QWidget):
@@ -87,11 +94,11 @@ class FilesPage(Page):
     Signals
     -------
     paths_changed : others are listed
-    files_wanted, folder_wanted : a button asks for more
 
     Attributes
     ----------
     list : shows them
+    add_files, add_folder, remove : buttons; the first two are for others to connect
     found : says what they hold
     """
 
@@ -253,7 +260,7 @@ class PosesPage(Page):
                 self.clip.addItem(f"{clip.name} ({counted(clip.n_frames, 'frame')})", clip.name)
         self._clips.setVisible(bool(summary.clips))
         self._rig.setVisible(bool(summary.n_joints))
-        said = "As the file says" if summary.metres is not None else "As it seems to stand"
+        said = "As in the file" if summary.up.is_sure else "As it seems to stand"
         own = summary.up.axis
         self.up.clear()
         self.up.addItem(f"{said}: {_AXES[own]}", None)
@@ -464,13 +471,15 @@ class QualityPage(Page):
         for quality, label in self._meanings.items():
             effort = EFFORTS[quality]
             number = n_poses(effort.n_poses)
-            seconds = sum(estimated_seconds(n_vertices, number, quality).values())
+            stages = estimated_seconds(n_vertices, number, quality)
+            spent = ", ".join(f"{_STAGES[stage]} {spent_text(s)}" for stage, s in stages.items())
             self.choices[quality].setText(
-                f"{quality.capitalize()}: {duration_text(seconds)} on this computer"
+                f"{quality.capitalize()}: {duration_text(sum(stages.values()))} on this computer"
             )
             samples = grouped(effort.n_samples)
             label.setText(
-                f"{aims[quality]}: {counted(number, 'pose')}, {samples} random poses checked."
+                f"{aims[quality]}: {counted(number, 'pose')}, {samples} random poses checked.\n"
+                f"{with_capital(spent)}."
             )
 
     def values(self) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,17 +14,19 @@ import pytest
 from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QScreen
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QLabel
+from PySide6.QtWidgets import QApplication, QLabel
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.window.dialogs.learning import LearningDialog
+from app.view.theme import DARK, LIGHT, Theme, apply_theme
+from app.window.dialogs.learning import LearningDialog, _figures
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.main_window import MainWindow
-from app.work import learning_runs
+from app.work import learning_jobs, learning_runs
 from app.work.learning_runs import RunPhase
 from lcollision_core.learning import (
     EFFORTS,
+    LearnedCard,
     LearningRequest,
     Quality,
     WorkFolder,
@@ -33,7 +36,15 @@ from lcollision_core.learning import (
 from lcollision_core.meshes import locked, write_mesh, write_pose_set
 from lcollision_core.model import PoseModel, RigModel, model_destination
 from tests.app.window.test_words import OUR_OWN
-from tests.app.windows import answer, close_window, drop, open_window, rest, settings_in
+from tests.app.windows import (
+    answer,
+    close_window,
+    drop,
+    open_window,
+    rest,
+    settings_in,
+    take_picture,
+)
 from tests.app.work.test_learning_runs import PATIENCE, QUICK, process_of
 from tests.bending_tube import bending_tube
 from tests.core.gltf_builder import arm
@@ -288,9 +299,62 @@ def test_several_runs_are_looked_at_and_one_is_discarded(watching: MainWindow) -
     assert not window.actions_by_key["learning"].isEnabled()
 
 
-def test_the_pages_fit_800_by_600(
-    qtbot: QtBot, watching: MainWindow, tubes: Path, monkeypatch: pytest.MonkeyPatch
+def finished(name: str, model: PoseModel) -> WorkFolder:
+    work = WorkFolder(model_destination(name))
+    work.prepare(LearningRequest(("/nowhere.npz",)))
+    model.save(work.destination)
+    work.tell(WorkStatus(WorkState.DONE, done=1.0, model=str(work.destination)))
+    return work
+
+
+def test_a_card_that_is_being_read_is_given_up_with_its_dialog_and_for_another_run(
+    qtbot: QtBot, watching: MainWindow, editor_model: PoseModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    runs, asked, shown = watching.learning.runs, threading.Semaphore(0), []
+
+    def read(model_file: str, *_: object) -> str:
+        asked.acquire(timeout=30.0)
+        return model_file
+
+    monkeypatch.setattr(learning_jobs, "read_card", read)
+    monkeypatch.setattr(
+        LearningDialog, "_on_card", lambda _, path, model: shown.append((path, model))
+    )
+    hero, villain = finished("hero", editor_model), finished("villain", editor_model)
+    runs.look()
+    watching.actions_by_key["learning"].trigger()
+    dialog = dialog_of(watching)
+    dialog.show_run(hero.path)
+    dialog.show_run(villain.path)
+    asked.release(2)
+    qtbot.waitUntil(lambda: len(shown) == 1, timeout=PATIENCE)
+    assert shown == [(villain.path, str(villain.destination))]
+    dialog.show_run(hero.path)
+    dialog.reject()
+    assert not watching.learning._work.busy
+    asked.release()
+    hero.remove()
+    villain.remove()
+    runs.look()
+    assert len(shown) == 1
+
+
+def test_rates_that_no_sample_tells_are_unknown() -> None:
+    card = LearnedCard("", "hero", 8, 2, 1, 0.0, 0.0, 1.0, None, None, 1.0, 10, 1.0, "", {})
+    figures = dict(_figures(card))
+    assert figures["False alarms"] == "unknown: no sample was free"
+    assert figures["Misses"] == "unknown: no sample collided"
+
+
+@pytest.mark.parametrize("theme", [LIGHT, DARK], ids=lambda theme: theme.name)
+def test_the_pages_fit_800_by_600(
+    qtbot: QtBot,
+    watching: MainWindow,
+    tubes: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    theme: Theme,
+) -> None:
+    apply_theme(QApplication.instance(), theme)
     monkeypatch.setattr(QScreen, "availableSize", lambda _: SMALL)
     watching.learning.new_model((tubes,))
     wizard = wizard_of(qtbot, watching)
@@ -301,9 +365,12 @@ def test_the_pages_fit_800_by_600(
         assert wizard.height() <= SMALL.height() - 40
         area = page.parentWidget()
         assert page.width() <= area.width()
+        assert page is not wizard.quality or page.height() <= area.height()
         if page is not wizard.quality:
             wizard.next.click()
+    take_picture(wizard, f"new_model_quality_{theme.name}")
     wizard.reject()
+    apply_theme(QApplication.instance(), LIGHT)
 
 
 def test_the_preview_turns_and_shows_every_pose(
