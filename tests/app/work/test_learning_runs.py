@@ -151,9 +151,8 @@ def test_a_run_that_is_stopped_while_its_process_starts_ends_at_once(
     qtbot.waitUntil(lambda: runs._is_starting(path))
     number = process_of(path)
     # Another window doesn't know that there is a process.
-    later = LearningRuns(runs)
-    later.look()
-    later.stop(path)
+    LearningRuns(runs).stop(path)
+    assert not (path / STOP).exists()
     qtbot.waitUntil(lambda: not Path(f"/proc/{number}").exists(), timeout=PATIENCE)
     stopped = wait_for(qtbot, runs, path, lambda run: not run.is_active)
     assert stopped.phase is RunPhase.STOPPED
