@@ -69,7 +69,8 @@ def component_bridges(topology: Topology, rest_vertices: FloatArray) -> IntArray
     of_tree[tree.row, tree.col] = True
     rank = np.arange(len(edges)) - first[pair_of.ravel()]
     chosen = of_tree[tuple(ends.T)] & (rank < _EDGES_EACH)
-    return used[edges[chosen]].astype(np.int32)
+    bridges: IntArray = used[edges[chosen]].astype(np.int32)
+    return bridges
 
 
 def _neighbours(points: FloatArray) -> npt.NDArray[np.intp]:
