@@ -122,6 +122,9 @@ def _give_way() -> None:
         kernel.SetPriorityClass(kernel.GetCurrentProcess(), _BELOW_NORMAL_PRIORITY_CLASS)
     else:
         os.nice(_NICENESS)
+        # Where Linux shares the cores out by sessions, of which this process has its own.
+        with suppress(OSError):
+            Path("/proc/self/autogroup").write_text(str(_NICENESS), encoding="ascii")
 
 
 def _obey(work: WorkFolder, cancel: CancelToken, ended: threading.Event) -> None:
