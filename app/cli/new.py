@@ -172,4 +172,4 @@ def told_of_learning(status: LearningStatus) -> Told:
     """Put the stage, how far it is, and the time left into words."""
     stage = f"{status.stage} {100.0 * status.stage_done:.0f} %"
     left = f"{duration_text(status.seconds_left)} left"
-    return status.done, 1.0, stage, [left, *status.facts]
+    return status.done, 1.0, "learning", [stage, left, *status.facts]

@@ -373,7 +373,7 @@ def _stay_free(
     stay_free = True
     for request, result, file in zip(requests, results, written, strict=True):
         if result.exactly_free and file.mesh is not None:
-            n_pairs = file.mesh.count_colliding_pairs(model)
+            n_pairs = len(file.mesh.checked(model).pairs)
             if n_pairs:
                 stay_free = False
                 pairs = counted(n_pairs, "pair of faces collides", "pairs of faces collide")

@@ -264,10 +264,12 @@ def export(
         axes=style.axes,
         scale=style.scale,
     )
-    n_pairs = written.count_colliding_pairs(model)
+    found = written.checked(model)
+    n_pairs = len(found.pairs)
     collide = f"{counted(n_pairs, 'pair')} of its triangles collide"
     told = f"Exported {path.name}: {collide if n_pairs else 'no collisions (checked)'}"
-    return "; ".join((told, *written.notes))
+    left_out = model.rules.sentence(found.excluded)
+    return "; ".join((told, *filter(None, [left_out]), *written.notes))
 
 
 def export_motion(
@@ -301,7 +303,7 @@ def export_motion(
     n_colliding = 0
     for done, frame in enumerate(written, 1):
         cancel.raise_if_cancelled()
-        n_colliding += frame.count_colliding_pairs(model) > 0
+        n_colliding += frame.checked(model).colliding
         progress(done, len(written))
     collide = f"{n_colliding} of {counted(len(poses), 'frame')} collide"
     names = ", ".join(file.name for file in files)

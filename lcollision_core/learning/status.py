@@ -23,6 +23,9 @@ STAGES = tuple(Stage)
 _TRUSTED_SECONDS = 30.0
 """Of estimated work, as much as which the estimate counts beside the pace of the run."""
 
+_TELLING = 0.05
+"""Fraction of a stage from which its own pace is known."""
+
 _FIRST = 2
 """Reports of a stage that tell where it begins, not how fast it is."""
 
@@ -64,6 +67,7 @@ class Pace:
         self._began = time.monotonic()
         self._stage, self._n_told = Stage.POSES, 0
         self._behind = self._skipped = self._shown = 0.0
+        self._entered, self._entered_at = self._began, 0.0
 
     def expect(self, seconds: Mapping[Stage, float]) -> None:
         """Take better estimates once the poses are known; the pace begins anew."""
@@ -79,13 +83,21 @@ class Pace:
         if stage is not self._stage:
             self._stage, self._n_told = stage, 0
         behind, total = self._seconds_behind(stage, stage_done), sum(self._expected.values())
+        now = time.monotonic()
         if self._n_told < _FIRST:
             self._skipped += behind - self._behind
+            self._entered, self._entered_at = now, stage_done
         self._n_told += 1
         self._behind = behind
-        seconds, worked = time.monotonic() - self._began, behind - self._skipped
+        seconds, worked = now - self._began, behind - self._skipped
         pace = (_TRUSTED_SECONDS + seconds) / (_TRUSTED_SECONDS + max(worked, 0.0))
-        left = (total - behind) * pace
+        done_here = stage_done - self._entered_at
+        if done_here > _TELLING:
+            # How fast the stage is says more of it than how fast those before were.
+            here = (now - self._entered) * (1.0 - stage_done) / done_here
+        else:
+            here = (1.0 - stage_done) * self._expected[stage] * pace
+        left = here + (total - self._seconds_behind(stage, 1.0)) * pace
         # Better estimates never take back what was shown.
         self._shown = max(self._shown, behind / total)
         self._progress(LearningStatus(stage, stage_done, self._shown, left, tuple(facts)))

@@ -25,7 +25,7 @@ from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.learning.request import LearningRequest
 from lcollision_core.learning.status import LearningStatus, Stage
 from lcollision_core.meshes import atomic_write, locked
-from lcollision_core.model import PoseModel, user_models_folder
+from lcollision_core.model import PoseModel, list_models, user_models_folder
 from lcollision_core.model.model_store import MODEL_SUFFIX, WORK_SUFFIX, work_path
 from lcollision_core.regular_files import read_regular
 
@@ -142,7 +142,11 @@ class WorkFolder:
         MeshFileError : it cannot be written.
         """
         request = request.stamped()
-        if not self.path.is_dir() and self.destination.exists():
+        names = {model.name for model in list_models() if model.bundled}
+        is_listed = self.destination.parent == user_models_folder()
+        if not self.path.is_dir() and (
+            self.destination.exists() or (is_listed and self.name in names)
+        ):
             raise self._taken()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -179,6 +183,8 @@ class WorkFolder:
 
     def _taken(self) -> ModelFileError:
         what = f"there is a model {self.name!r} already"
+        if not self.destination.exists():
+            return ModelFileError(f"{what}, which comes with the program", "choose another name")
         return ModelFileError(what, "choose another name, or remove it", where=self.destination)
 
     @property

@@ -20,6 +20,7 @@ from lcollision_core.characters import (
     write_character,
     write_character_clip,
 )
+from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes import (
     RigidTransform,
@@ -165,9 +166,9 @@ class WrittenPose:
     unit: float
     notes: tuple[str, ...] = ()
 
-    def count_colliding_pairs(self, body: PosableBody) -> int:
-        """Return how many pairs of faces collide by the exact check of what the file holds."""
-        return len(body.detector.detect(self.vertices, unit=self.unit).pairs)
+    def checked(self, body: PosableBody) -> SelfCollisions:
+        """Return what the exact check finds in what the file holds, by the body's rules."""
+        return body.detector.detect(self.vertices, unit=self.unit)
 
 
 class SourceFile:

@@ -209,7 +209,10 @@ class LearningDialog(QDialog):
             ),
             *((self.stop, phase in (RunPhase.RUNNING, RunPhase.WAITING)), (self.resume, has_ended)),
             *((self.open_model, is_done), (self.dismiss, is_done)),
-            *((self.discard, not is_done), (self._note, run.is_active)),
+            *(
+                (self.discard, not is_done),
+                (self._note, run.is_active and phase is not RunPhase.WAITING),
+            ),
         ):
             widget.setVisible(wanted)
         self.discard.setEnabled(phase is not RunPhase.STOPPING)
@@ -235,7 +238,7 @@ class LearningDialog(QDialog):
         if phase is RunPhase.WAITING:
             others = [held.name for held in self._runs.runs if held.phase is RunPhase.RUNNING]
             when = f"after “{one_line(others[0])}”" if others else "in a moment"
-            return f"It begins {when}."
+            return f"It begins {when}, as long as the editor is open."
         words = [f"{100 * status.done:.0f} %"]
         if phase is RunPhase.RUNNING and status.seconds_left is not None and status.done > 0.0:
             words.append(f"{duration_text(status.seconds_left)} left")

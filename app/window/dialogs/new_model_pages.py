@@ -345,8 +345,8 @@ class ContactsPage(Page):
         )
         self._near = _Rule(
             "Skin folds",
-            "At elbows and knees skin presses into itself. How near along the surface that is, is "
-            "known of rigs, and measured on the poses of others.",
+            "At elbows and knees skin presses into itself. How near along the surface that is "
+            "follows from the rig, or without one from the poses.",
             50.0,
             5.0,
         )

@@ -100,6 +100,12 @@ def test_what_cannot_be_learned_from_is_one_sentence(
     assert not list(tmp_path.glob("m.safetensors*"))
 
 
+def test_a_bundled_model_is_not_hidden(tube: Path, lcollision: Lcollision) -> None:
+    result = lcollision("new", tube, "-o", "body", "--quality", "quick")
+    assert result.exit_code == 2
+    assert "there is a model 'body' already" in result.stderr
+
+
 def test_a_model_that_is_there_is_not_replaced(
     tube: Path, tmp_path: Path, lcollision: Lcollision
 ) -> None:
