@@ -73,8 +73,9 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
                 return model.path
         if not has_known_suffix(path):
             destination = user_models_folder() / f"{path}{MODEL_SUFFIX}"
-    for unfinished in (checkpoint_path(destination), work_path(destination)):
-        if destination.name and unfinished.exists():
+    beside = (checkpoint_path, work_path) if destination.name else ()
+    for unfinished in (of(destination) for of in beside):
+        if unfinished.exists():
             raise ModelFileError(
                 "is not finished",
                 f"run its command again, which goes on from {unfinished}",

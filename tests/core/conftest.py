@@ -24,7 +24,12 @@ def tube_model(tube_poses: PoseSet) -> PoseModel:
     from lcollision_core.embedding.training import train_embedding
 
     config = EmbeddingConfig(
-        n_domains=2, n_domain_codes=3, level1_epochs=60, level2_epochs=20, held_out_stride=0
+        n_domains=2,
+        n_domain_codes=3,
+        level1_epochs=60,
+        level2_epochs=20,
+        level2_rate=0.01,
+        held_out_stride=0,
     )
     return PoseModel.from_training(
         "tube", train_embedding(tube_poses, config), tube_poses, "a tube", "CC0-1.0"

@@ -6,6 +6,7 @@ import pytest
 
 from lcollision_core.errors import (
     CancelledError,
+    HeldElsewhereError,
     LabelStoreError,
     LCollisionError,
     MeshFileError,
@@ -54,6 +55,7 @@ SENTENCES = [
     ),
     (CancelledError("cancelled on request"), "cancelled on request"),
     (LabelStoreError("has no rows", where="store", got=0), "store has no rows, got 0"),
+    (HeldElsewhereError("is being written", "wait", where="m"), "m is being written; wait"),
     (DamagedPosesError("is not JSON", where="p.json"), "p.json is not JSON"),
     (
         OtherModelError("holds poses of another model", where="p.json", model=None),

@@ -526,6 +526,7 @@ def test_the_benchmark_measures_a_session_of_its_own(
             "drag_lag_ms",
             "idle_cpu",
             "start_seconds",
+            "open_seconds",
         ),
         *("memory_mb", "actions", "exceptions", "errors", "leak_mb", "mesh_is_right"),
     }
