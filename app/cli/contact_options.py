@@ -100,15 +100,12 @@ class RuleOptions:
         rules = replace(rules, **chosen)
         if not self.ignore:
             return rules, groups
-        from lcollision_core.meshes import groups_by_kind, named_pair
+        from lcollision_core.meshes import groups_by_kind, named_pair, with_named_groups
 
-        held = {group.name for group in groups}
-        kinds = groups_by_kind(groups, topology, vertex_labels).values()
-        others = tuple(group for kind in kinds for group in kind if group.name not in held)
-        known = held | {group.name for group in others}
+        kinds = groups_by_kind(groups, topology, vertex_labels)
+        known = {group.name for kind in (groups, *kinds.values()) for group in kind}
         pairs = tuple(named_pair(entry, known) for entry in self.ignore)
-        named = {name for pair in pairs for name in pair}
-        groups = (*groups, *(group for group in others if group.name in named))
+        groups = with_named_groups(groups, kinds, pairs)
         return replace(rules, ignored=tuple(dict.fromkeys((*rules.ignored, *pairs)))), groups
 
 

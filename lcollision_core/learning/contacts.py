@@ -13,7 +13,7 @@ from lcollision_core.contact import CollisionDetector, ContactRules, propose_by_
 from lcollision_core.contact.rules import near_pairs_estimate
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.learning.request import LearningRequest
-from lcollision_core.meshes import PoseSet, body_size, groups_by_kind, named_pair
+from lcollision_core.meshes import PoseSet, body_size, groups_by_kind, named_pair, with_named_groups
 
 _Pair = tuple[str, str]
 
@@ -71,19 +71,16 @@ def with_proposed_rules(
         near = _near_exclusion(poses, rules, chosen, cancel)
         rules = replace(rules, near_exclusion=near)
     kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
-    named = {group.name: group for kind in kinds.values() for group in kind}
-    named |= {group.name: group for group in poses.groups}
+    names = {group.name for kind in (poses.groups, *kinds.values()) for group in kind}
 
     def ignoring(pairs: Iterable[tuple[str, str]]) -> PoseSet:
         ignored = tuple(dict.fromkeys((*rules.ignored, *pairs)))
-        held = {group.name for group in poses.groups}
-        used = dict.fromkeys(name for pair in ignored for name in pair if name not in held)
-        groups = (*poses.groups, *(named[name] for name in used))
+        groups = with_named_groups(poses.groups, kinds, ignored)
         return replace(poses, rules=replace(rules, ignored=ignored), groups=groups)
 
     if request.ignored == ():
         return ignoring(())
-    chosen_pairs = [named_pair(entry, named) for entry in request.ignored or ()]
+    chosen_pairs = [named_pair(entry, names) for entry in request.ignored or ()]
     *_, parts, components = kinds
 
     def pairs_of(kind: str, detector: CollisionDetector, counted_only: bool) -> list[_Pair]:

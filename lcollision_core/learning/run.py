@@ -81,10 +81,10 @@ class _Learner:
     def __init__(self, work: WorkFolder, progress: StatusCallback, cancel: CancelToken) -> None:
         self._work, self._cancel = work, cancel
         self._request = work.request
-        self._effort: Effort = EFFORTS[Quality(self._request.quality)]
+        self._quality = Quality(self._request.quality)
+        self._effort: Effort = EFFORTS[self._quality]
         self._show = progress
-        quality = Quality(self._request.quality)
-        self._pace = Pace(self._tell, estimated_seconds(_VERTICES, _POSES, quality))
+        self._pace = Pace(self._tell, estimated_seconds(_VERTICES, _POSES, self._quality))
         spent = work.status.seconds
         self._before = {str(stage): float(spent.get(stage, 0.0)) for stage in STAGES}
         self._stage, self._began = Stage.POSES, time.monotonic()
@@ -120,13 +120,10 @@ class _Learner:
 
     def _make(self) -> Path:
         """Go through the stages, each of which goes on where it was left."""
-        work = self._work
         poses = self._poses()
-        self._pace.expect(
-            estimated_seconds(poses.topology.n_vertices, len(poses), Quality(self._request.quality))
-        )
+        self._pace.expect(estimated_seconds(poses.topology.n_vertices, len(poses), self._quality))
         model = self._embedding(poses)
-        return self._predictor(model, work)
+        return self._predictor(model)
 
     def _poses(self) -> PoseSet:
         self._enter(Stage.POSES)
@@ -198,12 +195,12 @@ class _Learner:
         checkpoint.unlink(missing_ok=True)
         return model
 
-    def _predictor(self, model: PoseModel, work: WorkFolder) -> Path:
+    def _predictor(self, model: PoseModel) -> Path:
         from lcollision_core.labels import LabelStore, label_poses
         from lcollision_core.predictor import train_predictor
         from lcollision_core.resolve import find_free_poses
 
-        effort, seed = self._effort, self._request.seed
+        work, effort, seed = self._work, self._effort, self._request.seed
         self._enter(Stage.LABELS)
 
         def told_rows(status: LabelStatus) -> None:

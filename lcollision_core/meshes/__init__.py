@@ -21,6 +21,7 @@ from lcollision_core.meshes.face_groups import (
     groups_by_kind,
     named_pair,
     part_groups,
+    with_named_groups,
 )
 from lcollision_core.meshes.file_names import file_stem, file_stems, has_known_suffix
 from lcollision_core.meshes.files import (

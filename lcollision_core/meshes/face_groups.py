@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,6 +88,23 @@ def groups_by_kind(
     taken = {group.name for group in own}
     others = (tuple(group for group in kind if group.name not in taken) for kind in computed)
     return dict(zip(GROUP_KINDS, (own, *others), strict=True))
+
+
+def with_named_groups(
+    groups: Sequence[FaceGroup],
+    kinds: Mapping[str, Sequence[FaceGroup]],
+    ignored: Iterable[tuple[str, str]],
+) -> tuple[FaceGroup, ...]:
+    """Return the groups of a mesh, and of those found on it the ones that ignored pairs name.
+
+    Parameters
+    ----------
+    groups : that the mesh has
+    kinds : all groups by kind: see `groups_by_kind`
+    ignored : pairs of names
+    """
+    wanted = {name for pair in ignored for name in pair} - {group.name for group in groups}
+    return (*groups, *(one for kind in kinds.values() for one in kind if one.name in wanted))
 
 
 def named_pair(entry: str, names: Collection[str]) -> tuple[str, str]:

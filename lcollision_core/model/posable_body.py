@@ -22,6 +22,7 @@ from lcollision_core.meshes import (
     Topology,
     front_direction,
     groups_by_kind,
+    with_named_groups,
 )
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect, code_names
@@ -388,11 +389,8 @@ class PosableBody(ABC):
         ShapeError : an ignored group is unknown, or too many pairs are excluded.
         ModelFileError : a predictor depends on the rules that there are.
         """
-        wanted = {name for pair in rules.ignored for name in pair}
-        wanted -= {group.name for group in self.groups}
-        kinds = self.groups_by_kind.values() if wanted else ()
-        added = (group for kind in kinds for group in kind if group.name in wanted)
-        groups = (*self.groups, *added)
+        kinds = self.groups_by_kind if rules.ignored else {}
+        groups = with_named_groups(self.groups, kinds, rules.ignored)
         detector = CollisionDetector(self.topology, self.reference, rules, groups)
         other = self.with_card(replace(self.card, rules=rules, groups=groups))
         for cached in ("pose_mirror", "resolver", "free_latent"):
