@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,18 @@ def rigged_body(scale: float = 1.0, n_frames: int = 0) -> Character:
     return character_of(
         "body", topology, rest_vertices, rig, [0.0, 0.0, 1.0], n_frames, tuple(groups)
     )
+
+
+def head_in_torso(n_frames: int = 0) -> Character:
+    """Return the body with its head moved down, so that it stands in the trunk in every pose."""
+    body = rigged_body(n_frames=n_frames)
+    assert body.rig is not None
+    (head,) = (group for group in body.groups if group.name == "Head")
+    moved = np.zeros_like(body.rest_vertices)
+    moved[np.unique(body.topology.faces[head.faces])] = [0.0, 0.0, -0.2]
+    rig = replace(body.rig, points=body.rig.points + moved[:, None])
+    rest = body.rest_vertices + moved
+    return character_of("body", body.topology, rest, rig, [0.0, 0.0, 1.0], n_frames, body.groups)
 
 
 def turned(rig: Rig, turns: FloatArray) -> FloatArray:

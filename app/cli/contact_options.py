@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -88,31 +88,42 @@ class RuleOptions:
         ------
         LCollisionError : an ignored pair is not two names of groups.
         """
-        chosen: dict[str, Any] = {
-            name: value
-            for name, value in (
-                ("near_exclusion", self.near_exclusion),
-                ("rest_exclusion", self.rest_exclusion),
-                ("tolerated_depth", self.tolerated_depth),
-            )
-            if value is not None
-        }
-        rules = replace(rules, **chosen)
-        if not self.ignore:
-            return rules, groups
-        from lcollision_core.meshes import groups_by_kind, named_pair, with_named_groups
+        from lcollision_core.meshes import groups_by_kind, with_named_groups
 
-        kinds = groups_by_kind(groups, topology, vertex_labels)
-        known = {group.name for kind in (groups, *kinds.values()) for group in kind}
-        pairs = tuple(named_pair(entry, known) for entry in self.ignore)
-        groups = with_named_groups(groups, kinds, pairs)
-        return replace(rules, ignored=tuple(dict.fromkeys((*rules.ignored, *pairs)))), groups
+        kinds = groups_by_kind(groups, topology, vertex_labels) if self.ignore else {}
+        names = {group.name for kind in (groups, *kinds.values()) for group in kind}
+        changed = self._changed(rules, names)
+        return changed, with_named_groups(groups, kinds, changed.ignored)
+
+    def applied_to(self, body: PosableBody) -> PosableBody:
+        """Return a body with these options added to its rules.
+
+        Raises
+        ------
+        LCollisionError : an ignored pair is not two names of its groups, or a predictor depends on
+            its rules.
+        """
+        groups = body.groups_by_kind.values() if self.ignore else ()
+        rules = self._changed(body.rules, {group.name for kind in groups for group in kind})
+        return body if rules == body.rules else body.with_rules(rules)
+
+    def _changed(self, rules: ContactRules, names: Collection[str]) -> ContactRules:
+        from lcollision_core.meshes import named_pair
+
+        lengths = {
+            "near_exclusion": self.near_exclusion,
+            "rest_exclusion": self.rest_exclusion,
+            "tolerated_depth": self.tolerated_depth,
+        }
+        chosen: dict[str, Any] = {name: to for name, to in lengths.items() if to is not None}
+        pairs = (named_pair(entry, names) for entry in self.ignore or ())
+        return replace(rules, **chosen, ignored=tuple(dict.fromkeys((*rules.ignored, *pairs))))
 
 
 def note_rules(body: PosableBody) -> None:
     """Report the pairs of faces that the figures leave out, and how many that is at rest."""
     if body.rules_are_chosen:
-        note(f"the contact rules of {body.name} are those that you chose in the window")
+        note(f"the contact rules of {body.name} are those that you chose")
     if not body.rules.exclude_nothing:
         note(rules_sentence(body.rules, excluded_at_rest(body)))
 

@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 from app.cli import (
     benchmark,
     check,
+    contacts,
     dataset,
     edit,
     evaluate,
@@ -104,6 +105,7 @@ for command in (
     edit.edit,
     new.new,
     *(models.models, models.info, models.domains, models.upright),
+    contacts.contacts,
     check.check,
     *(poses.encode, poses.decode, poses.sample),
     *(mirror.mirror, resolve.resolve, label.label, evaluate.evaluate),

@@ -120,7 +120,7 @@ def domains(
             )
         renamings[int(number) - 1] = name
     rename = (lambda model: model.edit_domains(renamings)) if renamings else None
-    _print_domains(describe(_changed(model_name, rename)))
+    _print_domains(describe(changed_model(model_name, rename)))
 
 
 def upright(
@@ -131,11 +131,11 @@ def upright(
 ) -> None:
     """Say which axis of a model is up, or change it in the model's file."""
     turn = None if up is None else lambda model: model.turned_upright("xyz".index(up))
-    model = _changed(model_name, turn)
+    model = changed_model(model_name, turn)
     typer.echo(f"{model.name}: {'xyz'[model.up_axis]} is up")
 
 
-def _changed(name: str, change: Callable[[PoseModel], PoseModel] | None) -> PoseModel:
+def changed_model(name: str, change: Callable[[PoseModel], PoseModel] | None) -> PoseModel:
     """Load a model; change it first, in its file, which is not a bundled one."""
     from lcollision_core.model import PoseModel, change_model, find_model, list_models
 

@@ -25,7 +25,13 @@ from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleEr
 if TYPE_CHECKING:
     from lcollision_core.contact import ContactRules
     from lcollision_core.meshes import FileStamp
-    from lcollision_core.model import MirroredPose, NamedPose, OtherModelError, PosableBody
+    from lcollision_core.model import (
+        MirroredPose,
+        NamedPose,
+        OtherModelError,
+        PosableBody,
+        ProposedRules,
+    )
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,6 +58,7 @@ class PoseDocument(LiveEditing):
     Attributes
     ----------
     model_file : that the model was read from, or the name of one that was not
+    proposed_rules : by which more poses of the character would be free, None if there are none
     may_replace : asked before a model or a file comes in over edits made while it was read
 
     Signals
@@ -77,6 +84,7 @@ class PoseDocument(LiveEditing):
     recovered : Path, the poses file that `recover` has put in
     contacts_counted : ContactsAtRest
     pairs_proposed : dict of tuples of ProposedPair, by kind of group
+    rules_proposed : `proposed_rules` is new
     """
 
     model_changed = Signal()
@@ -91,6 +99,7 @@ class PoseDocument(LiveEditing):
     recovered = Signal(object)
     contacts_counted = Signal(object)
     pairs_proposed = Signal(object)
+    rules_proposed = Signal()
 
     def __init__(
         self,
@@ -107,6 +116,7 @@ class PoseDocument(LiveEditing):
         self._mirroring = self._mirroring_poses = self._incoming = self._loading = 0
         self._counting = self._proposing = self._ruling = 0
         self._prepared = False
+        self.proposed_rules: ProposedRules | None = None
         self._exports: list[int] = []
         self._closed = False
         self.may_replace: Callable[[], bool] = lambda: True
@@ -229,7 +239,7 @@ class PoseDocument(LiveEditing):
             *(self._loading, self._counting, self._proposing, self._ruling),
         ):
             self._long.cancel(number)
-        self.frame = self.exact = self.file = None
+        self.frame = self.exact = self.file = self.proposed_rules = None
         self._gesture = self._drag = self._last_grip = None
         self.file_poses = ()
         folder = self._library_folder or user_poses_folder()
@@ -544,6 +554,7 @@ class PoseDocument(LiveEditing):
         self._close_gesture()
         # What was found by other rules.
         self.exact = None
+        self.proposed_rules = None
         self._amend(replace(self._state, outcome=None))
         self._exchange(changed)
         self.message.emit("The new contact rules apply")
@@ -650,6 +661,13 @@ class PoseDocument(LiveEditing):
             self._predicts = model.has_predictor
             if self._predicts and self._drag is None:
                 self._live.follow(self.model, self.latent, self._predicts)
+            if not (model.is_trained or model.rules_are_chosen):
+                label, work = "Looking for pairs in contact", partial(jobs.propose_rules, model)
+                self._proposing = self._long.start(label, work, self._on_rules_proposed)
+
+    def _on_rules_proposed(self, proposed: ProposedRules | None) -> None:
+        self.proposed_rules = proposed
+        self.rules_proposed.emit()
 
     def _bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:
         """Start work that replaces the pose; the newest request wins, also over Resolve.

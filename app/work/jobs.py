@@ -27,11 +27,9 @@ if TYPE_CHECKING:
         OtherModelError,
         PosableBody,
         PoseFile,
+        ProposedRules,
     )
     from lcollision_core.resolve import ResolveOptions, ResolveResult
-
-_MOST_PROPOSING = 40
-"""Poses, evenly spaced, that tell which groups are always in contact."""
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
@@ -348,13 +346,24 @@ def propose_pairs(
 ) -> dict[str, tuple[ProposedPair, ...]]:
     """Propose groups to ignore, by kind, by some of the poses that the body came with."""
     from lcollision_core.contact import propose_by_kind
+    from lcollision_core.model import typical_poses
 
-    count = len(model.training_latent)
-    chosen = np.unique(np.linspace(0, count - 1, _MOST_PROPOSING).round().astype(int))
-    poses = model.decode(model.training_latent[chosen])
     return propose_by_kind(
-        model.detector, poses, model.groups_by_kind, progress=progress, cancel=cancel
+        model.detector,
+        typical_poses(model),
+        model.groups_by_kind,
+        progress=progress,
+        cancel=cancel,
     )
+
+
+def propose_rules(
+    model: PosableBody, progress: Progress, cancel: CancelToken
+) -> ProposedRules | None:
+    """Propose rules for a character most of whose poses collide: see `model.propose_rules`."""
+    from lcollision_core.model import propose_rules
+
+    return propose_rules(model, progress, cancel)
 
 
 def change_rules(

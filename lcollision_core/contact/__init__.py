@@ -15,5 +15,12 @@ from lcollision_core.contact.detector import (
     SelfCollisions,
 )
 from lcollision_core.contact.energy import domain_energy
-from lcollision_core.contact.propose import ProposedPair, propose_by_kind
+from lcollision_core.contact.propose import (
+    LEAST_GAIN,
+    MOSTLY,
+    GroupPair,
+    ProposedPair,
+    propose_by_kind,
+    propose_ignored,
+)
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -21,7 +22,7 @@ from lcollision_core.contact.kernels import (
     add_vertex_energy,
     search_pose,
 )
-from lcollision_core.contact.rules import exclusions_of, require_room, rules_of
+from lcollision_core.contact.rules import exclusions_of, require_room, rules_of, with_ignored
 from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress
@@ -200,7 +201,7 @@ class CollisionDetector:
             vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
             raise ShapeError("is not finite", where=f"vertex {vertex} of the reference")
         self.topology = topology
-        self.rules, self.groups = rules, tuple(groups)
+        self.rules, self.groups, self._reference = rules, tuple(groups), vertices
         self.body_size = body_size(vertices, topology)
         if self.body_size == 0.0:
             raise ShapeError("all vertices are in one point", "give it a mesh with an extent")
@@ -212,6 +213,27 @@ class CollisionDetector:
         if not rules.exclude_nothing:
             self._exclusions = self._exclusions_of(vertices, rules, groups)
         self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()
+
+    def with_rules(
+        self, rules: ContactRules, groups: Sequence[FaceGroup] = ()
+    ) -> CollisionDetector:
+        """Return a detector of the same mesh by other rules; lists that stay the same are shared.
+
+        Parameters and errors are those of the class.
+        """
+        held = self.rules
+        lengths = (rules.near_exclusion, rules.rest_exclusion)
+        if lengths != (held.near_exclusion, held.rest_exclusion):
+            return CollisionDetector(self.topology, self._reference, rules, groups)
+        other = copy(self)
+        vars(other).update(
+            rules=rules,
+            groups=tuple(groups),
+            _exclusions=with_ignored(self._exclusions, rules, groups),
+            # Searchers keep the exclusions.
+            _idle=queue.LifoQueue(),
+        )
+        return other
 
     def rules_of(
         self, pairs: npt.NDArray[np.integer], penetration_depth: FloatArray

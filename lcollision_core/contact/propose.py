@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +12,19 @@ from scipy import sparse
 from lcollision_core.contact.detector import CollisionDetector
 from lcollision_core.contact.kernels import NEAR
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes.contact_rules import STRICT
-from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, require_groups
+from lcollision_core.meshes.contact_rules import MAX_IGNORED, STRICT
+from lcollision_core.meshes.face_groups import GROUP_KINDS, MAX_GROUPS, FaceGroup, require_groups
 
 NEARLY_ALWAYS = 0.95
 """Share of the poses from which contact says nothing about a pose."""
+
+MOSTLY = 0.5
+"""Share of the poses from which a body of shells collides by being made of shells."""
+
+LEAST_GAIN = 0.25
+"""Share of the poses that ignored pairs must free: what collides by its pose does so without."""
+
+GroupPair = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -29,8 +37,71 @@ class ProposedPair:
     share : of the poses, from 0 to 1
     """
 
-    groups: tuple[str, str]
+    groups: GroupPair
     share: float
+
+
+def propose_ignored(
+    detector_without: Callable[[Sequence[GroupPair]], CollisionDetector],
+    poses: npt.ArrayLike,
+    kinds: Mapping[str, Sequence[FaceGroup]],
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> tuple[GroupPair, ...]:
+    """Choose pairs of groups to ignore so that poses collide for what they are, not by the mesh.
+
+    Pairs of components that collide in nearly every pose, or of body parts where the mesh is in one
+    piece. Where shells make up the body and most poses still collide, also the pairs within each
+    body part, and of body parts that touch in nearly every pose, at rest too, if that frees many:
+    links and neighbouring links, which robots' set-up assistants never test either.
+
+    Parameters
+    ----------
+    detector_without : makes a detector that ignores further pairs
+    poses, kinds, progress, cancel : see `propose_by_kind`
+
+    Returns
+    -------
+    pairs : in the order found, none where nothing collides nearly always; no more than rules may
+        ignore
+
+    Raises
+    ------
+    ShapeError, CancelledError : see `propose_by_kind`.
+    """
+    _, parts, components = GROUP_KINDS
+
+    def pairs_of(kind: str, detector: CollisionDetector, *, counted_only: bool) -> list[GroupPair]:
+        found = propose_by_kind(
+            detector,
+            poses,
+            {kind: kinds[kind]},
+            counted_only=counted_only,
+            progress=progress,
+            cancel=cancel,
+        )
+        return [pair.groups for pair in found[kind]]
+
+    in_pieces = len(kinds[components]) > 1
+    kind = components if in_pieces else parts
+    detector = detector_without(())
+    most = MAX_IGNORED - len(detector.rules.ignored)
+    pairs = pairs_of(kind, detector, counted_only=True)[:most]
+    if not in_pieces or not kinds[parts]:
+        return tuple(pairs)
+
+    def share(detector: CollisionDetector) -> float:
+        return float(np.mean(detector.are_colliding(poses, cancel=cancel)))
+
+    detector = detector_without(pairs)
+    colliding = share(detector)
+    if colliding > MOSTLY:
+        links = [(part.name, part.name) for part in kinds[parts]]
+        links += pairs_of(parts, detector, counted_only=False)
+        links = [*pairs, *links][:most]
+        if colliding - share(detector_without(links)) >= LEAST_GAIN:
+            pairs = links
+    return tuple(pairs)
 
 
 def propose_by_kind(

@@ -58,7 +58,6 @@ def exclusions_of(
     ShapeError : a group of an ignored pair is unknown, a group has faces that the mesh has not, or
         too many pairs are excluded.
     """
-    require_groups(rules, groups, topology.n_faces)
     surface, near, by_touch = surface_of(topology, reference), no_lists(0), no_lists(0)
     if rules.near_exclusion > 0.0:
         distance = rules.near_exclusion * body_size
@@ -67,16 +66,33 @@ def exclusions_of(
         distance = rules.rest_exclusion * body_size
         require = partial(require_room, rule=_REST)
         by_touch = later_faces(touching_faces(surface, touching, distance, require), require)
-    region, ignored = _regions(rules.ignored, groups, topology.n_faces)
-    return Exclusions(
+    listed = Exclusions(
         corners=topology.faces,
         near_start=near.start,
         near=near.entry,
         start=by_touch.start,
         face=by_touch.entry,
-        region=region,
-        ignored=ignored,
-        squared_tolerance=rules.tolerated_depth**2,
+        region=np.empty(0, dtype=np.int32),
+        ignored=np.zeros((0, 0), dtype=np.bool_),
+        squared_tolerance=0.0,
+    )
+    return with_ignored(listed, rules, groups)
+
+
+def with_ignored(
+    exclusions: Exclusions, rules: ContactRules, groups: Sequence[FaceGroup]
+) -> Exclusions:
+    """Return exclusions with other ignored pairs and tolerated depth, and the same lists.
+
+    Raises
+    ------
+    ShapeError : see `exclusions_of`.
+    """
+    n_faces = len(exclusions.corners)
+    require_groups(rules, groups, n_faces)
+    region, ignored = _regions(rules.ignored, groups, n_faces)
+    return exclusions._replace(
+        region=region, ignored=ignored, squared_tolerance=rules.tolerated_depth**2
     )
 
 

@@ -9,22 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters.default_rules import MOST_NEAR_PAIRS
-from lcollision_core.contact import CollisionDetector, ContactRules, propose_by_kind
+from lcollision_core.contact import CollisionDetector, ContactRules, GroupPair, propose_ignored
 from lcollision_core.contact.rules import near_pairs_estimate
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.learning.request import LearningRequest
 from lcollision_core.meshes import PoseSet, body_size, groups_by_kind, named_pair, with_named_groups
-
-_Pair = tuple[str, str]
 
 _NEAR_EXCLUSIONS = (0.0, 0.02, 0.05, 0.1)
 """Normalised lengths that are tried on poses without a rig, the shortest first."""
 
 _FEW = 0.1
 """Share of the poses that may collide where the near exclusion is long enough."""
-
-_MOST = 0.5
-"""Share of the poses from which a body of shells collides by being made of shells."""
 
 _MOST_POSES = 40
 """Poses, evenly spaced, that are asked."""
@@ -39,11 +34,7 @@ def with_proposed_rules(
     """Give poses the contact rules that a request asks for, and propose what it leaves open.
 
     The near exclusion of poses that say none is the shortest by which few of them collide, or the
-    shortest that is about as good as any. Pairs of components that still collide in nearly every
-    pose are ignored, or of body parts where the mesh is in one piece. Where shells make up the body
-    and most poses still collide, so are the pairs within each body part, and of body parts that
-    touch in nearly every pose, at rest too: links and neighbouring links, which robots' set-up
-    assistants never test either.
+    shortest that is about as good as any. The pairs that `propose_ignored` finds are ignored.
 
     Parameters
     ----------
@@ -73,7 +64,7 @@ def with_proposed_rules(
     kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
     names = {group.name for kind in (poses.groups, *kinds.values()) for group in kind}
 
-    def ignoring(pairs: Iterable[tuple[str, str]]) -> PoseSet:
+    def ignoring(pairs: Iterable[GroupPair]) -> PoseSet:
         ignored = tuple(dict.fromkeys((*rules.ignored, *pairs)))
         groups = with_named_groups(poses.groups, kinds, ignored)
         return replace(poses, rules=replace(rules, ignored=ignored), groups=groups)
@@ -81,29 +72,14 @@ def with_proposed_rules(
     if request.ignored == ():
         return ignoring(())
     chosen_pairs = [named_pair(entry, names) for entry in request.ignored or ()]
-    *_, parts, components = kinds
+    detector = _detector(ignoring(chosen_pairs))
 
-    def pairs_of(kind: str, detector: CollisionDetector, counted_only: bool) -> list[_Pair]:
-        found = propose_by_kind(
-            detector,
-            asked,
-            {kind: kinds[kind]},
-            counted_only=counted_only,
-            progress=progress,
-            cancel=cancel,
-        )
-        return [pair.groups for pair in found[kind]]
+    def detector_without(pairs: Iterable[GroupPair]) -> CollisionDetector:
+        others = ignoring([*chosen_pairs, *pairs])
+        return detector.with_rules(others.rules, others.groups)
 
-    in_pieces = len(kinds[components]) > 1
-    kind = components if in_pieces else parts
-    pairs = chosen_pairs + pairs_of(kind, _detector(ignoring(chosen_pairs)), True)
-    proposed = ignoring(pairs)
-    if in_pieces and kinds[parts]:
-        detector = _detector(proposed)
-        if float(np.mean(detector.are_colliding(asked, cancel=cancel))) > _MOST:
-            links = [(part.name, part.name) for part in kinds[parts]]
-            return ignoring([*pairs, *links, *pairs_of(parts, detector, False)])
-    return proposed
+    pairs = propose_ignored(detector_without, asked, kinds, progress, cancel)
+    return ignoring([*chosen_pairs, *pairs])
 
 
 def _detector(poses: PoseSet) -> CollisionDetector:

@@ -131,7 +131,7 @@ class ContactRules:
 
     def described(self) -> str:
         """Say what is not counted, as in "pairs that touch at rest"; empty for the strict rule."""
-        groups = ", ".join(f"{a} and {b}" for a, b in self.ignored[:_NAMED_PAIRS])
+        groups = ", ".join(map(pair_in_words, self.ignored[:_NAMED_PAIRS]))
         more = len(self.ignored) - _NAMED_PAIRS
         around = f" or within {self.rest_exclusion:g} of such a pair" if self.rest_exclusion else ""
         said = (
@@ -145,7 +145,7 @@ class ContactRules:
     def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
         """Say how many pairs are not counted, and by which rules; empty if there are none."""
         counts = counts if isinstance(counts, RuleCounts) else RuleCounts(**counts)
-        groups = " or ".join(f"{a} and {b}" for a, b in self.ignored[:_NAMED_PAIRS])
+        groups = " or ".join(map(pair_in_words, self.ignored[:_NAMED_PAIRS]))
         if len(self.ignored) > _NAMED_PAIRS:
             groups = f"{len(self.ignored)} ignored pairs of groups"
         said = [
@@ -162,6 +162,12 @@ class ContactRules:
             return ""
         listed = " and ".join(filter(None, [", ".join(said[:-1]), said[-1]]))
         return f"{listed} {'is' if counts.total == 1 else 'are'} not counted"
+
+
+def pair_in_words(pair: tuple[str, str]) -> str:
+    """Write a pair of groups, as in "Head and Neck" or "Head with itself"."""
+    first, second = pair
+    return f"{first} with itself" if first == second else f"{first} and {second}"
 
 
 STRICT = ContactRules()

@@ -39,6 +39,7 @@ from lcollision_core.model.pose_file import (
 )
 from lcollision_core.model.pose_library import LibraryChange, PoseLibrary, user_poses_folder
 from lcollision_core.model.pose_model import PoseModel
+from lcollision_core.model.proposed_rules import ProposedRules, propose_rules, typical_poses
 from lcollision_core.model.rig_model import RigModel
 from lcollision_core.model.sampling import sample_poses
 from lcollision_core.model.saving import change_model, save_trained

@@ -178,6 +178,17 @@ def rest_pose_set(character: Character) -> PoseSet:
     return poses
 
 
+def random_codes(space: RigPoseSpace, n_poses: int, generator: np.random.Generator) -> FloatArray:
+    """Draw (n_poses, D) codes of poses within limits of a person, which may collide.
+
+    Raises
+    ------
+    LCollisionError : no joint turns but the one that moves all.
+    """
+    draws = _Draws(space)
+    return draws.extents(n_poses, generator) * draws.codes(n_poses, generator)
+
+
 @dataclass(frozen=True, eq=False)
 class _Draws:
     """What random poses of a rig are drawn from.

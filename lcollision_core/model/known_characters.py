@@ -110,10 +110,10 @@ def with_remembered(model: RigModel) -> RigModel:
         if known.rules is None:
             return changed
         return changed.with_rules(known.rules).noted(
-            "its contact rules are those that you chose for it in the window"
+            "its contact rules are those that you chose for it"
         )
     except LCollisionError as error:
-        return model.noted(f"what you chose for it in the window is left out: {error.headline}")
+        return model.noted(f"what you chose for it is left out: {error.headline}")
 
 
 def remember_file(model: RigModel, file: str | os.PathLike[str]) -> None:

@@ -391,7 +391,7 @@ class PosableBody(ABC):
         """
         kinds = self.groups_by_kind if rules.ignored else {}
         groups = with_named_groups(self.groups, kinds, rules.ignored)
-        detector = CollisionDetector(self.topology, self.reference, rules, groups)
+        detector = self.detector.with_rules(rules, groups)
         other = self.with_card(replace(self.card, rules=rules, groups=groups))
         for cached in ("pose_mirror", "resolver", "free_latent"):
             other.__dict__.pop(cached, None)

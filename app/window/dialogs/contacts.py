@@ -294,9 +294,11 @@ class ContactsDialog(QDialog):
     @Slot(object)
     def _on_proposed(self, proposals: dict[str, tuple[ProposedPair, ...]]) -> None:
         """List pairs of groups that touch in nearly every pose, for the user to tick."""
+        from lcollision_core.meshes.contact_rules import pair_in_words
+
         for pair in (pair for kind in proposals.values() for pair in kind):
             share = f"{100 * pair.share:.0f} % of the poses"
-            self._list(pair.groups).setText(0, f"{' and '.join(pair.groups)}: {share}")
+            self._list(pair.groups).setText(0, f"{pair_in_words(pair.groups)}: {share}")
         self._name_kinds()
         for name, pairs in proposals.items():
             kind, least = self._kinds.get(name), min((pair.share for pair in pairs), default=0.0)
@@ -309,12 +311,14 @@ class ContactsDialog(QDialog):
 
     def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QTreeWidgetItem:
         """Return the item of a pair, which is listed now if it was not."""
+        from lcollision_core.meshes.contact_rules import pair_in_words
+
         for known in (pair, pair[::-1]):
             if known in self._pairs:
                 return self._pairs[known]
         kind = self._kind(pair)
         # One that is made in its parent takes part in the parent's tick.
-        item = self._pairs[pair] = QTreeWidgetItem(kind, [" and ".join(pair)])
+        item = self._pairs[pair] = QTreeWidgetItem(kind, [pair_in_words(pair)])
         item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
         item.setCheckState(0, state)
         item.setSizeHint(0, _ROW)

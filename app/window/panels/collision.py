@@ -11,6 +11,7 @@ from PySide6.QtWidgets import QWidget
 from app.view.theme import CLOSE, NORMAL, TIGHT
 from app.window.panels.exact import ExactCard
 from app.window.panels.prediction import PredictionCard
+from app.window.panels.proposal import ProposalCard
 from app.window.panels.resolve import ResolveCard
 from app.window.widgets import scrolling, vbox
 
@@ -22,7 +23,7 @@ _MIN_WIDTH = 288
 
 
 class CollisionPanel(QWidget):
-    """Three cards, one below the other; the first, the headline, is always in sight.
+    """Cards, one below the other; the first, the headline, is always in sight.
 
     Signals
     -------
@@ -48,11 +49,12 @@ class CollisionPanel(QWidget):
         self._document = document
         self.setMinimumWidth(_MIN_WIDTH)
         self.exact = ExactCard(document)
+        self.proposal = ProposalCard(document)
         self.prediction = PredictionCard(document, learn_action)
         self.resolve = ResolveCard(document, resolve_action, options_action)
         page = QWidget()
         margins = (NORMAL, 0, NORMAL, CLOSE)
-        page.setLayout(vbox(self.prediction, self.resolve, None, margins=margins))
+        page.setLayout(vbox(self.proposal, self.prediction, self.resolve, None, margins=margins))
         self._area = scrolling(page)
         headline = vbox(self.exact, margins=(NORMAL, TIGHT, NORMAL, 0))
         self.setLayout(vbox(headline, self._area))

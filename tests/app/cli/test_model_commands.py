@@ -44,7 +44,7 @@ from lcollision_core.model_file import Section
 from tests.app.support import Lcollision
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube
 from tests.core.shapes import random_rotation
-from tests.rigged_shapes import rigged_body, write_gltf
+from tests.rigged_shapes import head_in_torso, rigged_body, write_gltf
 
 TRAINING = ("--domains", "2", "--domain-codes", "3", "--seed", "1", "--licence", "CC0-1.0")
 
@@ -158,16 +158,59 @@ def test_commands_apply_the_rules_that_were_chosen_for_a_character_and_say_so(
     assert isinstance(body, RigModel)
     remember_choices(body.with_rules(ContactRules(tolerated_depth=0.5)))
     words = lcollision("info", file).stdout
-    assert "its contact rules are those that you chose for it in the window" in words
+    assert "its contact rules are those that you chose for it" in words
     assert "not counted are pairs not deeper than 0.5" in words
     assert json.loads(lcollision("info", file, "--json").stdout)["rules"]["tolerated_depth"] == 0.5
     sampled = lcollision("sample", file, "-n", "1", "-o", tmp_path / "poses.json")
     assert sampled.exit_code == 0
-    chosen = "the contact rules of hero are those that you chose in the window"
+    chosen = "the contact rules of hero are those that you chose"
     assert (
         chosen
         in lcollision("mirror", file, tmp_path / "poses.json", "-o", tmp_path / "m.json").stderr
     )
+
+
+def test_contact_rules_of_a_character_are_shown_proposed_and_chosen(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    file = write_gltf(head_in_torso(30), tmp_path / "hero.glb")
+    strict = lcollision("contacts", file, "--near-exclusion", 0, "--tolerated-depth", 1e-6)
+    assert "the contact rules of hero are changed" in strict.stderr
+    body = open_body(file)
+    assert isinstance(body, RigModel)
+    remember_choices(body.with_rules(ContactRules()))
+    first = lcollision("contacts", file)
+    assert first.stdout.startswith("hero: every pair counts\n  11 of 11 poses collide, 1 without")
+    assert "--ignore-proposed" in first.stdout
+    assert first.stderr == ""
+    report = json.loads(lcollision("contacts", file, "--json").stdout)
+    assert report["rules"]["ignored"] == []
+    (pair,) = report["proposed"]["rules"]["ignored"]
+    assert lcollision("check", file, "--ignore", ":".join(pair)).exit_code == 0
+    accepted = lcollision("contacts", file, "--ignore-proposed")
+    assert accepted.exit_code == 0
+    assert f"pairs of {pair[0]} and {pair[1]}" in accepted.stdout
+    assert open_body(file).rules == ContactRules(ignored=(tuple(pair),))
+    restored = lcollision("contacts", file, "--defaults", "--ignore", "Head:Head")
+    assert restored.exit_code == 0
+    assert open_body(file).rules == replace(body.own_rules, ignored=(("Head", "Head"),))
+    unknown = lcollision("contacts", file, "--ignore", "Hat:Head")
+    assert unknown.exit_code == 2
+    assert "'Hat'" in unknown.stderr
+    assert open_body(file).rules.ignored == (("Head", "Head"),)
+
+
+def test_contact_rules_of_a_model_are_kept_in_its_file_until_a_predictor_depends_on_them(
+    lcollision: Lcollision, trained: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "own.safetensors"
+    shutil.copy(trained, path)
+    changed = lcollision("contacts", path, "--near-exclusion", 0.05)
+    assert changed.exit_code == 0
+    assert PoseModel.load(path).rules == ContactRules(near_exclusion=0.05)
+    bundled = lcollision("contacts", "body", "--near-exclusion", 0.05)
+    assert bundled.exit_code == 2
+    assert "has a predictor" in bundled.stderr
 
 
 def test_figure_shows_each_domain_in_its_colour(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from lcollision_core.contact import (
     ContactRules,
     ProposedPair,
     propose_by_kind,
+    propose_ignored,
 )
 from lcollision_core.errors import CancelledError, ShapeError
 from lcollision_core.jobs import CancelToken
@@ -20,6 +23,7 @@ from lcollision_core.meshes import (
     groups_by_kind,
     part_groups,
 )
+from lcollision_core.meshes.contact_rules import MAX_IGNORED
 from lcollision_core.meshes.face_groups import MAX_GROUPS
 from tests.core.shapes import Mesh, soup, strip
 
@@ -145,3 +149,68 @@ def test_of_very_many_groups_the_first_are_looked_at() -> None:
     many = (*GROUPS, *(FaceGroup(f"copy {n}", np.array([n % 3])) for n in range(MAX_GROUPS)))
     found = propose_by_kind(detector(), poses(), {"meshes": many})
     assert found["meshes"] == (ProposedPair(("floor", "post"), 1.0),)
+
+
+def chosen(poses: np.ndarray, kinds: dict[str, tuple[FaceGroup, ...]]) -> set[tuple[str, str]]:
+    """Return what is ignored of poses; a detector of them knows the groups of all kinds."""
+    groups = tuple(group for kind in kinds.values() for group in kind)
+    strict = CollisionDetector(MESH.topology, MESH.vertices, ContactRules(), groups)
+    pairs = propose_ignored(
+        lambda others: strict.with_rules(ContactRules(ignored=tuple(others)), groups), poses, kinds
+    )
+    return set(pairs)
+
+
+def test_shells_that_always_touch_are_ignored_and_links_where_most_poses_still_collide() -> None:
+    meshes, parts, pieces = GROUP_KINDS
+    components = component_groups(MESH.topology)
+    of_face = {int(group.faces[0]): group.name for group in components}
+    links = (FaceGroup("arm", np.array([0, 1])), FaceGroup("hand", np.array([2])))
+    kinds = {meshes: (), parts: links, pieces: components}
+    always = (of_face[0], of_face[2])
+    # The blade, which is of the arm too, is in the floor in 8 poses of 10: by being an arm.
+    by_parts = {("arm", "arm"), ("hand", "hand"), ("arm", "hand")}
+    assert chosen(poses(), kinds) == {always} | by_parts
+    # It is in the floor in 2 of 5: most poses are free without the pair that always touches.
+    mostly_free = np.concatenate([poses()[:3], poses()[:2], poses()[:2], poses()[2:3]])
+    assert chosen(mostly_free, kinds) == {always}
+    assert chosen(poses()[:2], kinds) == {always}
+    out_of_floor = poses()[:2].copy()
+    out_of_floor[:, 6:9] += [0.0, 0.0, 5.0]
+    assert chosen(out_of_floor, kinds) == set()
+
+
+def test_parts_of_one_piece_are_compared_with_each_other() -> None:
+    meshes, parts, pieces = GROUP_KINDS
+    whole = FaceGroup("component 1", np.arange(3))
+    kinds = {meshes: (), parts: (FLOOR_GROUP, POST_GROUP), pieces: (whole,)}
+    assert chosen(poses(), kinds) == {("floor", "post")}
+
+
+def test_no_more_pairs_are_chosen_than_rules_may_ignore() -> None:
+    meshes, parts, pieces = GROUP_KINDS
+    kinds = {meshes: (), parts: (), pieces: component_groups(MESH.topology)}
+    names = [f"group {n}" for n in range(50)]
+    full = ContactRules(ignored=tuple(combinations(names, 2))[:MAX_IGNORED])
+    groups = [FaceGroup(name, np.array([0])) for name in names]
+    crowded = CollisionDetector(MESH.topology, MESH.vertices, full, groups)
+    assert propose_ignored(lambda _: crowded, poses(), kinds) == ()
+
+
+def test_a_detector_by_other_rules_finds_what_a_new_one_does() -> None:
+    strict = detector()
+    for rules in (
+        ContactRules(ignored=(("floor", "post"),)),
+        ContactRules(tolerated_depth=0.3),
+        ContactRules(rest_exclusion=0.0),
+        ContactRules(near_exclusion=0.2),
+    ):
+        other, new = strict.with_rules(rules, GROUPS), detector(rules)
+        assert other.rules == rules
+        for pose in poses():
+            np.testing.assert_array_equal(other.detect(pose).pairs, new.detect(pose).pairs)
+            assert other.detect(pose).excluded == new.detect(pose).excluded
+        back = other.with_rules(ContactRules())
+        assert len(back.detect(MESH.vertices).pairs) == len(strict.detect(MESH.vertices).pairs) == 2
+    with pytest.raises(ShapeError, match="'hat'"):
+        strict.with_rules(ContactRules(ignored=(("hat", "floor"),)))

@@ -15,7 +15,7 @@ from lcollision_core.errors import CancelledError, LCollisionError, PoseSetError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import PoseSet
 from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
-from lcollision_core.model.by_rig import _HUMAN, _Draws
+from lcollision_core.model.by_rig import _HUMAN, _Draws, random_codes
 from tests.rigged_shapes import rigged_body, rigged_tube
 
 SCALE = 100.0
@@ -37,8 +37,7 @@ def joint_of(body: RigModel, name: str) -> int:
 
 def codes_of(body: RigModel, n: int, seed: int = 0) -> np.ndarray:
     """Draw the codes of poses, of which no collision is looked at."""
-    draws, generator = _Draws(body.space), np.random.default_rng(seed)
-    return draws.extents(n, generator) * draws.codes(n, generator)
+    return random_codes(body.space, n, np.random.default_rng(seed))
 
 
 def test_the_rest_pose_comes_first_and_the_others_are_free(body: RigModel, poses: PoseSet) -> None:

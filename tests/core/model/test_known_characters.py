@@ -62,7 +62,7 @@ def test_what_is_chosen_comes_back_with_the_character_and_defaults_too(path: Pat
     assert again.card.domain_colours == other.card.domain_colours
     assert again.domain_order == other.domain_order
     assert {group.name for group in again.groups} == {group.name for group in other.groups}
-    assert again.notes[-1] == "its contact rules are those that you chose for it in the window"
+    assert again.notes[-1] == "its contact rules are those that you chose for it"
     assert again.fingerprint == other.fingerprint
     remember_choices(again.with_rules(again.own_rules))
     plain = opened(path)
@@ -99,7 +99,7 @@ def test_what_does_not_apply_is_left_out_and_said(path: Path, change: dict, why:
     body = opened(path)
     assert not body.rules_are_chosen
     assert body.card.domain_names == body.own_card.domain_names
-    assert body.notes[-1].startswith("what you chose for it in the window is left out: ")
+    assert body.notes[-1].startswith("what you chose for it is left out: ")
     assert why in body.notes[-1]
     if "format_version" in change or "format" in change:
         for keep in (remember_choices, lambda held: remember_file(held, path)):

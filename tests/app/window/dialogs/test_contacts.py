@@ -18,10 +18,10 @@ from app.work.jobs import contacts_at_rest
 from lcollision_core.contact import propose_by_kind
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes import ContactRules
-from lcollision_core.model import PoseModel, RigModel, open_body
+from lcollision_core.model import PoseModel, RigModel, open_body, typical_poses
 from tests.app.windows import PATIENCE, rest, take_picture
 from tests.core.gltf_builder import arm
-from tests.rigged_shapes import rigged_body
+from tests.rigged_shapes import head_in_torso, rigged_body
 
 LEFT = Qt.MouseButton.LeftButton
 
@@ -135,13 +135,15 @@ def test_rules_of_a_model_without_predictor_are_kept_in_its_file(
 
 
 def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow
 ) -> None:
+    body = RigModel.of(head_in_torso(30)).with_rules(ContactRules())
+    window.document.set_model(body)
+    rest(qtbot, window)
     document, dialog = window.document, dialog_of(qtbot, window)
     with qtbot.waitSignal(document.pairs_proposed, timeout=PATIENCE) as proposed:
         QTest.mouseClick(dialog.propose, LEFT)
-    poses = body.decode(body.training_latent)
-    expected = propose_by_kind(body.detector, poses, body.groups_by_kind)
+    expected = propose_by_kind(body.detector, typical_poses(body), body.groups_by_kind)
     assert proposed.args[0] == expected
     kinds = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
     shown = {kind.text(0): kind for kind in kinds}
@@ -192,9 +194,48 @@ def test_rules_are_remembered_and_go_back_to_the_defaults(
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
     assert document.model.rules.tolerated_depth == 0.015
     (sentence,) = told
-    assert sentence.endswith("; its contact rules are those that you chose for it in the window")
+    assert sentence.endswith("; its contact rules are those that you chose for it")
     QTest.mouseClick(dialog.restore, LEFT)
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
     assert document.model.rules == own == open_body(path).rules
     assert (dialog.tolerated.value(), dialog.restore.isEnabled()) == (0.0, False)
     dialog.close()
+
+
+def test_parts_that_always_touch_are_offered_to_be_ignored(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    document, card = window.document, window.collision.proposal
+    assert card.isHidden()
+    body = RigModel.of(head_in_torso(30))
+    # As if these were the rules that it starts with.
+    strict = ContactRules()
+    body.own_card = replace(body.own_card, rules=strict)
+    with qtbot.waitSignal(document.rules_proposed, timeout=PATIENCE):
+        document.set_model(body.with_rules(strict))
+    rest(qtbot, window)
+    proposed = document.proposed_rules
+    assert proposed is not None
+    assert card.isVisible()
+    assert card.text.text().startswith(f"{proposed.n_colliding} of {proposed.n_poses} poses")
+    assert "1 such pair" in card.text.text()
+    ((first, second),) = proposed.rules.ignored
+    assert f"{first} and {second}" in card.ignore.toolTip()
+    take_picture(window, "proposal")
+    QTest.mouseClick(card.dismiss, LEFT)
+    assert card.isHidden()
+    document.rules_proposed.emit()
+    QTest.mouseClick(card.ignore, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    rest(qtbot, window)
+    assert document.model.rules == proposed.rules
+    assert card.isHidden()
+    assert document.exact is not None
+    assert not document.exact.colliding
+    # What the user has chosen is not questioned, nor is what has nothing to offer.
+    document.set_model(document.model)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert card.isHidden()
+    with qtbot.waitSignal(document.rules_proposed, timeout=PATIENCE):
+        document.set_model(RigModel.of(rigged_body(n_frames=30)))
+    assert card.isHidden()

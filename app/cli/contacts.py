@@ -1,0 +1,96 @@
+"""``lcollision contacts``: which pairs of faces a model or a character does not count."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli.console import JsonOption, note, print_json, progress_bar, tell
+from app.cli.contact_options import (
+    IgnoreOption,
+    NearExclusionOption,
+    RestExclusionOption,
+    RuleOptions,
+    ToleratedDepthOption,
+    excluded_at_rest,
+    rules_json,
+    rules_sentence,
+)
+from app.cli.models import ModelArgument, changed_model
+from app.wording import counted
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PosableBody, ProposedRules
+
+
+def contacts(
+    model_name: ModelArgument,
+    near_exclusion: NearExclusionOption = None,
+    rest_exclusion: RestExclusionOption = None,
+    ignore: IgnoreOption = None,
+    tolerated_depth: ToleratedDepthOption = None,
+    ignore_proposed: Annotated[
+        bool,
+        typer.Option(
+            "--ignore-proposed",
+            help="Do not count the pairs of groups that touch in nearly every pose.",
+        ),
+    ] = False,
+    defaults: Annotated[
+        bool,
+        typer.Option("--defaults", help="Begin with the rules that a character starts with."),
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Say which pairs of faces a model or a character does not count, or change that.
+
+    Options add to the rules that apply, and are kept: of a character in your data folder, where the
+    editor finds them too; of a model without a predictor in its file.
+    """
+    from lcollision_core.model import open_body, propose_rules
+
+    before = open_body(model_name)
+    body = before.with_rules(before.own_rules) if defaults else before
+    body = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth).applied_to(body)
+    proposed = None
+    if not body.has_predictor:
+        with progress_bar("Looking for pairs in contact") as progress:
+            proposed = propose_rules(body, progress)
+    if ignore_proposed and proposed is not None:
+        body, proposed = body.with_rules(proposed.rules), None
+    if body.rules != before.rules:
+        _keep(body, model_name)
+    if as_json:
+        print_json({"name": body.name, **rules_json(body), "proposed": _proposed_json(proposed)})
+        return
+    rules = rules_sentence(body.rules, excluded_at_rest(body))
+    tell(f"{body.name}: {'every pair counts' if body.rules.exclude_nothing else rules}")
+    if proposed is not None:
+        new = len(proposed.rules.ignored) - len(body.rules.ignored)
+        tell(
+            f"  {proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, "
+            f"{proposed.n_colliding_then or 'none'} without {counted(new, 'pair')} of groups that "
+            "touch in nearly all of them; --ignore-proposed leaves these out"
+        )
+
+
+def _keep(body: PosableBody, model_name: str) -> None:
+    from lcollision_core.model import RigModel, remember_choices
+
+    if isinstance(body, RigModel):
+        remember_choices(body)
+    else:
+        changed_model(model_name, lambda held: held.with_rules(body.rules))
+    note(f"the contact rules of {body.name} are changed")
+
+
+def _proposed_json(proposed: ProposedRules | None) -> dict[str, Any] | None:
+    if proposed is None:
+        return None
+    return {
+        "rules": proposed.rules.to_json(),
+        "poses": proposed.n_poses,
+        "colliding": proposed.n_colliding,
+        "colliding_then": proposed.n_colliding_then,
+    }
