@@ -55,7 +55,7 @@ SETTINGS: dict[str, Setting] = {
     "motion_form": Setting("clip", choices=("clip", "pc2", "mdd")),
     "export_rate": Setting(30, 1, 240),
     "export_axes": Setting("model", choices=("model", "y-up", "blender", "maya", "unreal")),
-    "export_scale": Setting(1.0, 1e-6, 1e6),
+    "export_rescale": Setting(1.0, 1e-6, 1e6),
     "screenshot_width": Setting(1920, 16, 16384),
     "screenshot_height": Setting(1080, 16, 16384),
     "screenshot_transparent": Setting(True),

@@ -41,6 +41,7 @@ class AnimatedMesh:
     up_axis : 0, 1 or 2 where the file says it, else None
     vertex_labels : (V,) strings, the body part of each vertex by the joints; None without joints
     groups : named meshes and materials of a scene
+    metres : length of the file's unit, None where that does not say it
     """
 
     vertices: FloatArray
@@ -50,6 +51,7 @@ class AnimatedMesh:
     up_axis: int | None
     vertex_labels: npt.NDArray[np.str_] | None
     groups: tuple[FaceGroup, ...] = ()
+    metres: float | None = None
 
 
 def read_animated(
@@ -125,6 +127,7 @@ def _read_clips(
         None if scene.up is None else int(np.abs(scene.up).argmax()),
         labels_of(scene, mesh),
         mesh.groups,
+        scene.metres,
     )
 
 

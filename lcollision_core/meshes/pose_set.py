@@ -48,7 +48,7 @@ FORMAT_VERSION = 1
 _MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
 _EXTRA_ARRAYS = (
     *("format_version", "names", "notes", "near_exclusion", "up_axis", "vertex_labels"),
-    "provenance",
+    *("metres", "provenance"),
     *RULE_ARRAYS,
 )
 _MAX_TEXT_LENGTH = 500
@@ -74,6 +74,7 @@ class PoseSet:
     up_axis : 0, 1 or 2 for x, y or z; None if it is to be guessed
     vertex_labels : (V,) array of printable strings, the body part of each vertex, if known
     provenance : how the poses were made, JSON values by name
+    metres : length of the vertices' unit, None if it is unknown
 
     Raises
     ------
@@ -90,6 +91,7 @@ class PoseSet:
     up_axis: int | None = None
     vertex_labels: npt.NDArray[np.str_] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    metres: float | None = None
 
     def __post_init__(self) -> None:
         shape = self.vertices.shape
@@ -103,6 +105,8 @@ class PoseSet:
             raise ShapeError.must_be("names", f"one for each of {shape[0]} poses", len(self.names))
         if self.up_axis not in (None, 0, 1, 2):
             raise ShapeError.must_be("up_axis", "0, 1 or 2", self.up_axis)
+        if self.metres is not None and not 0.0 < self.metres < np.inf:
+            raise ShapeError.must_be("metres", "a number above 0", self.metres)
         if not self.near_exclusion < 1.0:
             raise ShapeError.must_be("near_exclusion", "in [0, 1)", self.near_exclusion)
         require_groups(self.rules, self.groups, self.topology.n_faces)
@@ -132,7 +136,9 @@ class PoseSet:
             raise ShapeError.must_be("the scale", "a number above 0", f"{factor:g}")
         if float(np.abs(self.vertices).max()) > np.finfo(np.float64).max / max(factor, 1.0):
             raise ShapeError("is too large for the coordinates", where=f"the scale {factor:g}")
-        return replace(self, vertices=self.vertices.astype(np.float64) * factor)
+        vertices = self.vertices.astype(np.float64) * factor
+        metres = None if self.metres is None else self.metres / factor
+        return replace(self, vertices=vertices, metres=metres)
 
     @property
     def near_exclusion(self) -> float:
@@ -460,6 +466,7 @@ def _collect_frames(
         vertex_labels=held.vertex_labels,
         rules=ContactRules(rest_exclusion=CHARACTER_REST_EXCLUSION),
         groups=held.groups,
+        metres=held.metres,
     )
     kept = []
     for pose, vertices in enumerate(held.vertices):
@@ -524,6 +531,7 @@ def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> d
     for name, kinds, needed in (
         ("format_version", "iu", ()),
         ("near_exclusion", "fiu", ()),
+        ("metres", "f", ()),
         ("up_axis", "iu", ()),
         ("names", "U", shape[:1]),
         ("notes", "U", (np.size(arrays.get("notes", ())),)),
@@ -582,6 +590,8 @@ def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
         arrays["notes"] = np.array(pose_set.notes, dtype=np.str_)
     if pose_set.up_axis is not None:
         arrays["up_axis"] = np.array(pose_set.up_axis)
+    if pose_set.metres is not None:
+        arrays["metres"] = np.array(pose_set.metres)
     if pose_set.vertex_labels is not None:
         arrays["vertex_labels"] = pose_set.vertex_labels
     if pose_set.provenance:

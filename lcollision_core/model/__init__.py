@@ -5,11 +5,11 @@ from lcollision_core.model.card import ModelCard
 from lcollision_core.model.encode import encode_mesh, read_model_mesh, with_detail
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.export import (
-    EXPORT_SCALES,
     ExportAxes,
     ExportFrame,
     export_frame,
     export_mesh,
+    export_scale,
 )
 from lcollision_core.model.known_characters import remember_choices, remember_file
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace

@@ -173,6 +173,7 @@ def rest_pose_set(character: Character) -> PoseSet:
         character.groups,
         int(np.abs(character.up).argmax()) if character.up_is_sure else None,
         joint_parts(character.rig),
+        metres=character.metres,
     )
     require_usable_reference(poses)
     return poses

@@ -55,6 +55,7 @@ class ModelCard:
     domain_order : all K domains, indices from 0, in listing order; empty for that of the latent
     rules : which pairs of faces do not count
     groups : named groups of faces, of which the rules may ignore pairs
+    metres : length of the data's unit, 1 where it is unknown
 
     Raises
     ------
@@ -72,6 +73,7 @@ class ModelCard:
     domain_order: tuple[int, ...] = ()
     rules: ContactRules = STRICT
     groups: tuple[FaceGroup, ...] = ()
+    metres: float = 1.0
 
     def __post_init__(self) -> None:
         names, order, largest = self.domain_names, self.domain_order, 1.0 / _LEAST_BODY_SIZE
@@ -79,6 +81,8 @@ class ModelCard:
             raise ModelFileError(
                 f"its body size (height) must be from {_LEAST_BODY_SIZE:g} to {largest:g}"
             )
+        if not 0.0 < self.metres < np.inf:
+            raise ModelFileError("its unit (metres) must be a number above 0")
         if self.up_axis not in (0, 1, 2):
             raise ModelFileError("its up_axis must be 0, 1 or 2")
         if not self.near_exclusion < 1.0:
@@ -113,6 +117,8 @@ class ModelCard:
         del values["rules"], values["groups"]
         if not self.domain_order:
             del values["domain_order"]
+        if self.metres == 1.0:
+            del values["metres"]
         values["near_exclusion"] = self.near_exclusion
         if self.rules != ContactRules(self.near_exclusion):
             values["rules"] = self.rules.to_json()

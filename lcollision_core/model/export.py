@@ -19,7 +19,7 @@ _X, _Y, _Z = _AXES
 
 
 class ExportAxes(StrEnum):
-    """For which program a mesh is written: its axes, and its unit for a model in metres.
+    """For which program a mesh is written: its axes, and its unit.
 
     Each is what the program's own importer, with its default settings, puts upright and facing
     its front: Blender's turns an OBJ file from y up to z up and leaves PLY and STL unchanged;
@@ -34,14 +34,11 @@ class ExportAxes(StrEnum):
     UNREAL = "unreal"
 
 
-EXPORT_SCALES = {
-    ExportAxes.MODEL: 1.0,
-    ExportAxes.Y_UP: 1.0,
+_UNITS_IN_A_METRE = {
     ExportAxes.BLENDER: 1.0,
     ExportAxes.MAYA: 100.0,
     ExportAxes.UNREAL: 100.0,
 }
-"""The file's units in a metre, the assumed unit of models."""
 
 _ALREADY_FIXED = (".glb", ".vrm")
 """glTF's own axes and unit are y up, z forward and the metre."""
@@ -69,8 +66,18 @@ class ExportFrame:
         return turned * self.scale
 
 
+def export_scale(model: PosableBody, axes: str) -> float:
+    """Return the units that a program counts in one of a model's, 1 for the model's own."""
+    units = _UNITS_IN_A_METRE.get(ExportAxes(axes))
+    return 1.0 if units is None else units * model.card.metres
+
+
 def export_frame(
-    model: PosableBody, axes: str, path: str | os.PathLike[str], scale: float | None = None
+    model: PosableBody,
+    axes: str,
+    path: str | os.PathLike[str],
+    scale: float | None = None,
+    placement: RigidTransform | None = None,
 ) -> ExportFrame:
     """Return the axes and the unit that a file gets.
 
@@ -78,16 +85,15 @@ def export_frame(
     ----------
     model : of the poses
     axes : one of `ExportAxes`
-    path : its extension says the format: a GLB file is never turned or scaled here, as
-        `write_mesh` does it
-    scale : the file's units in one of the model's; that of the axes, for a model in metres, if
-        None
+    path : its extension says the format: a GLB file is in metres, and turned by `write_mesh`
+    scale : the file's units in one of the model's; `export_scale` if None
+    placement : of an imported mesh, which has brought its unit along
     """
     chosen = ExportAxes(axes)
     suffix = Path(path).suffix.lower()
     if suffix in _ALREADY_FIXED:
-        return ExportFrame(np.eye(3), 1.0)
-    factor = EXPORT_SCALES[chosen] if scale is None else scale
+        return ExportFrame(np.eye(3), model.card.metres if placement is None else 1.0)
+    factor = export_scale(model, axes) if scale is None else scale
     if chosen is ExportAxes.MODEL:
         return ExportFrame(np.eye(3), factor)
     up, front = _Y, _Z

@@ -171,6 +171,7 @@ class PoseModel(PosableBody):
             provenance=dict(provenance or {}),
             rules=pose_set.rules,
             groups=pose_set.groups,
+            metres=pose_set.metres or 1.0,
         )
         return cls(name, embedding, card)
 

@@ -126,6 +126,7 @@ class RigModel(PosableBody):
             source=character.source.name,
             licence="unknown",
             rules=default_rules(character),
+            metres=character.metres,
             groups=(*character.groups, *part_groups(character.topology, joint_parts(space.rig))),
         )
         return cls(character, space, card, poses)

@@ -409,7 +409,7 @@ def write_pose(
     ------
     MeshFileError : the file cannot be written, or cannot hold the pose there or in that form.
     """
-    frame = export_frame(body, axes, path, scale)
+    frame = export_frame(body, axes, path, scale, placement)
     unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
     if source is None:
         if form is not None:

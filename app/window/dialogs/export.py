@@ -34,7 +34,29 @@ _FOLLOWS = "As OBJ, PLY or STL: faces and positions alone."
 _STAY = "Axes and unit stay as in that file."
 
 
-class ExportDialog(Form):
+class _FrameForm(Form):
+    """A form with the axes and the unit of a file."""
+
+    def _add_frame(self, model: PosableBody) -> tuple[QComboBox, NumberBox]:
+        """Add their fields; the unit is remembered relative to that of the axes."""
+        from lcollision_core.model import export_scale
+
+        axes = self.add_choice("export_axes", "Axes", EXPORT_NAMES, "Which way is up in the file")
+        tip = "How many units of the file make one of the model"
+        scale = self.add_number("export_rescale", "Scale by", "", 1.0, tip, 6)
+        # Six decimals are for those who type them.
+        scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
+        scale.setValue(scale.value() * export_scale(model, axes.currentData()))
+        self._readers["export_rescale"] = lambda: (
+            scale.value() / export_scale(model, axes.currentData())
+        )
+        axes.currentIndexChanged.connect(
+            lambda: scale.setValue(export_scale(model, axes.currentData()))
+        )
+        return axes, scale
+
+
+class ExportDialog(_FrameForm):
     """Asks for the form, the axes and the unit of a pose to write.
 
     Parameters
@@ -50,10 +72,9 @@ class ExportDialog(Form):
     """
 
     def __init__(self, settings: Settings, parent: QWidget, model: PosableBody) -> None:
-        from lcollision_core.model import EXPORT_SCALES, RigModel, own_source
+        from lcollision_core.model import RigModel, own_source
 
         super().__init__("Export mesh", "Choose file…", settings, parent)
-        self._scales = EXPORT_SCALES
         self._meanings = _meanings(model)
         self._own = own_source(model)
         self._character = self._own if isinstance(model, RigModel) else None
@@ -67,11 +88,11 @@ class ExportDialog(Form):
             self.add_widget("Keep file", self.source)
         self.form = self.add_choice("export_form", "Form", {MESH: "Mesh"}, "What is written")
         self._readers["export_form"] = self._remembered_form
-        self.axes, self._scale = _add_frame(self)
+        self.axes, self._scale = self._add_frame(model)
         self._about, self._meaning = self.add_note(""), self.add_note("")
         self._offer()
-        self.axes.currentIndexChanged.connect(self._on_axes)
-        self.form.currentIndexChanged.connect(self._explain)
+        for choice in (self.form, self.axes):
+            choice.currentIndexChanged.connect(self._explain)
 
     @property
     def kinds(self) -> dict[str, str]:
@@ -133,11 +154,6 @@ class ExportDialog(Form):
         return form
 
     @Slot()
-    def _on_axes(self) -> None:
-        self._scale.setValue(self._scales[self.axes.currentData()])
-        self._explain()
-
-    @Slot()
     def _explain(self) -> None:
         form = self._forms.get(self.form.currentData())
         has_axes = form is None or form.has_axes
@@ -153,7 +169,7 @@ class ExportDialog(Form):
         self.explain(self._meaning, meaning if has_axes else _STAY)
 
 
-class MotionDialog(Form):
+class MotionDialog(_FrameForm):
     """Asks for the form, the frame rate, the axes and the unit of poses to write as frames.
 
     Parameters
@@ -170,7 +186,7 @@ class MotionDialog(Form):
     def __init__(
         self, settings: Settings, parent: QWidget, model: PosableBody, rate: float | None = None
     ) -> None:
-        from lcollision_core.model import EXPORT_SCALES, RigModel, offered_forms
+        from lcollision_core.model import RigModel, offered_forms
 
         super().__init__("Export motion", "Choose file…", settings, parent)
         self._meanings = _meanings(model)
@@ -188,11 +204,8 @@ class MotionDialog(Form):
             self._readers["export_rate"] = self._remembered_rate
             self.add_note(f"At {rate:g}, poses of a clip last as long as the clip.")
         self._own_rate = rate
-        self.axes, self._scale = _add_frame(self)
+        self.axes, self._scale = self._add_frame(model)
         self._about, self._meaning = self.add_note(""), self.add_note("")
-        self.axes.currentIndexChanged.connect(
-            lambda: self._scale.setValue(EXPORT_SCALES[self.axes.currentData()])
-        )
         for choice in (self.form, self.axes):
             choice.currentIndexChanged.connect(self._explain)
         self._explain()
@@ -226,17 +239,7 @@ class MotionDialog(Form):
         self.explain(self._meaning, meaning if form.has_axes else _STAY)
 
 
-def _add_frame(form: Form) -> tuple[QComboBox, NumberBox]:
-    """Add fields for axes and unit."""
-    axes = form.add_choice("export_axes", "Axes", EXPORT_NAMES, "Which way is up in the file")
-    tip = "How many units of the file make one of the model"
-    scale = form.add_number("export_scale", "Scale by", "", 1.0, tip, 6)
-    # Six decimals are for those who type them.
-    scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
-    return axes, scale
-
-
-_GLB = "A GLB file is always y up and not scaled, as its standard fixes both."
+_GLB = "A GLB file is always y up and in metres, as its standard fixes both."
 
 
 def _meanings(model: PosableBody) -> dict[str, str]:
@@ -250,8 +253,7 @@ def _meanings(model: PosableBody) -> dict[str, str]:
         ExportAxes.MODEL: f"As the model's: {own}.",
         ExportAxes.Y_UP: "y is up, front is +z, in the model's unit.",
         ExportAxes.BLENDER: "Upright and facing you in Blender's front view, with the settings "
-        "that its importers begin with.",
-        ExportAxes.MAYA: "y is up, front is +z; 100 turns metres into Maya's centimetres.",
-        ExportAxes.UNREAL: "z is up, front is +x once imported; 100 turns metres into Unreal's "
-        "centimetres.",
+        "that its importers begin with, in metres.",
+        ExportAxes.MAYA: "y is up, front is +z, in centimetres.",
+        ExportAxes.UNREAL: "z is up, front is +x once imported, in centimetres.",
     }

@@ -9,12 +9,16 @@ import pytest
 
 from lcollision_core.meshes import RigidTransform, front_direction, read_mesh
 from lcollision_core.model import (
-    EXPORT_SCALES,
     ExportAxes,
     PoseModel,
+    RigModel,
     export_frame,
     export_mesh,
+    export_scale,
+    open_body,
+    write_pose,
 )
+from tests.core.fbx_builder import arm_fbx
 
 X, Y, Z = np.eye(3)
 
@@ -48,7 +52,7 @@ def test_a_file_stands_upright_and_faces_the_front_of_its_program(
     read = read_mesh(path, topology=body.topology).vertices
     np.testing.assert_array_equal(read, written)
     sides = np.ptp(read, axis=0)
-    scale = EXPORT_SCALES[axes]
+    scale = 100.0 if axes in ("maya", "unreal") else 1.0
     assert sides.argmax() == up.argmax()
     assert sides.max() == pytest.approx(scale * np.ptp(vertices, axis=0).max(), rel=1e-6)
     np.testing.assert_array_equal(front_direction(read, int(up.argmax())), front)
@@ -70,6 +74,31 @@ def test_turn_and_scale_are_exact(body: PoseModel, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read[:, 1].astype(np.longdouble), exact[:, 2])
     np.testing.assert_array_equal(read[:, 2].astype(np.longdouble), -exact[:, 1])
     np.testing.assert_array_equal(read[:, 0].astype(np.longdouble), exact[:, 0])
+
+
+def test_a_body_in_centimetres_is_written_in_the_unit_of_each_program(tmp_path: Path) -> None:
+    pytest.importorskip("ufbx")
+    body = open_body(arm_fbx(tmp_path / "arm.fbx"))
+    assert isinstance(body, RigModel)
+    assert body.card.metres == pytest.approx(0.01)
+    scales = {axes: export_scale(body, axes) for axes in ExportAxes}
+    assert scales == {"model": 1.0, "y-up": 1.0, "blender": 0.01, "maya": 1.0, "unreal": 1.0}
+    latent = body.training_latent[1]
+    vertices = body.exported_vertices(latent)
+    size = np.ptp(vertices, axis=0).max()
+    # glTF counts in metres, by its standard.
+    for name, expected in (("arm.glb", 0.01 * size), ("arm.ply", 0.01 * size), ("a.obj", size)):
+        axes = "blender" if name == "arm.ply" else "maya"
+        written = write_pose(tmp_path / name, body, latent, vertices, axes=axes)
+        read = read_mesh(tmp_path / name).vertices
+        assert np.ptp(read, axis=0).max() == pytest.approx(expected, rel=1e-5)
+        assert written.unit * np.ptp(written.vertices, axis=0).max() == pytest.approx(size)
+    # A mesh that was imported has its own unit, and goes back in it.
+    placed = RigidTransform(np.eye(3), np.zeros(3), 10.0)
+    moved = placed.apply(vertices)
+    write_pose(tmp_path / "back.glb", body, latent, moved, placed)
+    read = read_mesh(tmp_path / "back.glb").vertices
+    assert np.ptp(read, axis=0).max() == pytest.approx(10.0 * size, rel=1e-5)
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".stl"])
@@ -117,7 +146,7 @@ def test_every_turn_is_a_rotation_by_right_angles(body: PoseModel, up_axis: int)
 
     for axes in ExportAxes:
         for name in ("a.obj", "a.stl"):
-            turn = export_frame(Turned(), axes, name).turn  # type: ignore[arg-type]
+            turn = export_frame(Turned(), axes, name, 1.0).turn  # type: ignore[arg-type]
             assert set(np.abs(turn).ravel()) <= {0.0, 1.0}
             np.testing.assert_array_equal(turn @ turn.T, np.eye(3))
             assert np.linalg.det(turn) == pytest.approx(1.0)

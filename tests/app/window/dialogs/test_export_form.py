@@ -26,7 +26,7 @@ from tests.core.gltf_builder import arm
 
 
 def fields(form: Form) -> tuple[object, object]:
-    return form._fields["export_axes"], form._fields["export_scale"]
+    return form._fields["export_axes"], form._fields["export_rescale"]
 
 
 def test_every_preset_is_offered_and_a_setting() -> None:
@@ -53,6 +53,14 @@ def test_the_scale_follows_the_axes_and_both_are_remembered(
     qtbot.addWidget(again)
     axes, scale = fields(again)
     assert (axes.currentData(), scale.value()) == ("unreal", 2.54)
+    # Of a body in another unit the same file is as large.
+    inches = model.with_card(replace(model.card, metres=0.0254))
+    other = ExportDialog(window.settings, window, inches)
+    qtbot.addWidget(other)
+    axes, scale = fields(other)
+    assert scale.value() == pytest.approx(2.54 * 0.0254, abs=1e-6)
+    axes.setCurrentIndex(axes.findData("maya"))
+    assert scale.value() == pytest.approx(2.54)
 
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
