@@ -18,7 +18,13 @@ from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.meshes.formats.gltf_patch import VERTEX_DATA, GltfPatch
 from lcollision_core.meshes.formats.gltf_scene import ShownPrimitive, read_shown, shown_primitives
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
-from lcollision_core.meshes.formats.scene import Part, ScenePoses, parents_first
+from lcollision_core.meshes.formats.scene import (
+    Part,
+    ScenePoses,
+    character_parts,
+    parents_first,
+    with_parts,
+)
 from lcollision_core.meshes.formats.transforms import compose, decompose
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.normals import moved_normals
@@ -173,7 +179,9 @@ class _Source:
         path = Path(character.source)
         data = read_regular(path, MAX_FILE_BYTES)
         document = GltfDocument(data, path)
-        scene = read_shown(document)
+        whole = read_shown(document)
+        kept = character_parts(whole)
+        scene = with_parts(whole, kept)
         self.patch = GltfPatch(data, path)
         self.size = body_size(character.rest_vertices, character.topology)
         self._nodes: list[dict[str, Any]] = self.patch.description["nodes"]
@@ -191,6 +199,7 @@ class _Source:
         rows = [
             slice(end - len(part.points), end) for part, end in zip(scene.parts, ends, strict=True)
         ]
+        shown = [shown[number] for number in kept]
         self._parts = list(zip(scene.parts, shown, rows, strict=True))
 
     def require_near(

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 from lcollision_core.errors import MeshFileError, PoseSetError
 from lcollision_core.meshes.formats import fbx, gltf
-from lcollision_core.meshes.formats.scene import Scene
+from lcollision_core.meshes.formats.scene import Scene, character_parts, with_parts
 from lcollision_core.regular_files import open_regular
 
 SCENE_SUFFIXES = (".glb", ".gltf", ".vrm", ".fbx")
@@ -19,7 +19,7 @@ SCENE_SUFFIXES = (".glb", ".gltf", ".vrm", ".fbx")
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
-    """Read what a file shows; its extension, in any case, says the format.
+    """Read what a file shows, without scenery about its characters; its extension says the format.
 
     Raises
     ------
@@ -57,7 +57,8 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 def scene_of(file: BinaryIO, path: Path) -> Scene:
     """Read an open file at its start, as `read_scene`; the sentence does not name it."""
-    return fbx.read_scene(file) if _is_fbx(path) else gltf.read_scene(file, path)
+    scene = fbx.read_scene(file) if _is_fbx(path) else gltf.read_scene(file, path)
+    return with_parts(scene, character_parts(scene))
 
 
 def _is_fbx(path: str | os.PathLike[str]) -> bool:

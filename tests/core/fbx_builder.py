@@ -87,6 +87,7 @@ def arm_fbx(
     metres: float = 0.01,
     is_long: bool = True,
     skinning: str = "Linear",
+    others: Sequence[str] = (),
 ) -> Path:
     """Write a tube in a scene of two bones, with a blend shape and the clip "wave".
 
@@ -97,6 +98,8 @@ def arm_fbx(
     metres : the unit
     is_long : whether the file says that the clip lasts as long as its curves, else that it is empty
     skinning : Linear, Rigid, DualQuaternion or Blend, of the upper vertices more
+    others : names of further meshes, which nothing moves: "hidden ..." are not seen, and each
+        "level ..." is one of a group of levels of detail
     """
     vertices, faces = tube()
     corners = faces.copy()
@@ -178,6 +181,27 @@ def arm_fbx(
     """
     links = ["100,200", "200,0", "201,0", "202,201", "300,200", "400,100", "401,400", "402,400"]
     links += ["201,401", "202,402", "403,100", "404,403", "101,404", "501,500"]
+    if any(name.startswith("level") for name in others):
+        objects += """
+    NodeAttribute: 690, "NodeAttribute::Levels", "LodGroup" { }
+    Model: 691, "Model::Levels", "LodGroup" { }
+    """
+        links += ["690,691", "691,0"]
+    for number, name in enumerate(others, 600):
+        seen = 0 if name.startswith("hidden") else 1
+        objects += f"""
+    Geometry: {number}, "Geometry::{name}", "Mesh" {{
+        Vertices: {_numbers(vertices + 5.0)}
+        PolygonVertexIndex: {_numbers(corners)}
+    }}
+    Model: {50 + number}, "Model::{name}", "Mesh" {{
+        Properties70: {{
+            P: "Visibility", "Visibility", "", "A",{seen}
+        }}
+    }}
+    """
+        above = 691 if name.startswith("level") else 0
+        links += [f"{number},{50 + number}", f"{50 + number},{above}"]
     properties = []
     curves = (
         (510, 201, "Lcl Rotation", "XYZ", (10.0, 0.0, -30.0), (-50.0, 40.0, 60.0)),

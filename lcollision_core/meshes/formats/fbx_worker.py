@@ -62,7 +62,7 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
     nodes = list(_items(scene.nodes))
     parents = [_kept(node.parent) for node in nodes]
     settings = _kept(scene.settings)
-    shown = [(node, mesh) for node in nodes if (mesh := _kept(node.mesh)) is not None]
+    shown = list(_shown(nodes))
     if sum(mesh.num_vertices + mesh.num_indices for _, mesh in shown) > most_elements:
         raise _TooLargeError(f"its meshes have more than {most_elements} vertices and corners")
     found: dict[str, np.ndarray] = {
@@ -85,6 +85,22 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
     for number, (_, moved) in enumerate(clips):
         found[f"moved {number}"] = np.array(sorted(moved), dtype=np.int64)
     return found
+
+
+def _shown(nodes: list[Any]) -> Iterator[tuple[Any, Any]]:
+    """Yield the nodes with a mesh that are seen, of levels of detail the finest, and their meshes.
+
+    A file whose meshes are all hidden shows them all.
+    """
+    found = [(node, mesh) for node in nodes if (mesh := _kept(node.mesh)) is not None]
+    seen = [one for one in found if one[0].visible] or found
+    for node, mesh in seen:
+        parent = _kept(node.parent)
+        if parent is not None and parent.attrib_type == ufbx.ElementType.LOD_GROUP:
+            levels = [child.typed_id for child in _items(parent.children)]
+            if levels.index(node.typed_id) > 0:
+                continue
+        yield node, mesh
 
 
 def _clips(scene: Any) -> Iterator[tuple[Any, set[int]]]:

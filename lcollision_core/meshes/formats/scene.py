@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,8 @@ MOST_KEYS_PER_SECOND = 30.0
 """Keys that follow faster are no frames of their own."""
 
 _MOST_FRAMES = 1_000_000
+_NAMED = 3
+"""Meshes that a note names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +159,50 @@ class Scene:
     up: FloatArray | None
     metres: float
     notes: tuple[str, ...] = ()
+
+
+def character_parts(scene: Scene) -> list[int]:
+    """Return which parts are of the characters of a scene; of one without skins all are.
+
+    Floors, backdrops and other scenery are not: no joint carries them, and no clip moves them.
+    """
+    skins = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
+    movers = skins.union(*(clip.moved for clip in scene.clips))
+
+    def is_carried(node: int) -> bool:
+        while node >= 0 and node not in movers:
+            node = int(scene.parents[node])
+        return node >= 0
+
+    return [
+        number
+        for number, part in enumerate(scene.parts)
+        if not skins or part.is_skinned or is_carried(part.node)
+    ]
+
+
+def with_parts(scene: Scene, kept: Sequence[int]) -> Scene:
+    """Return a scene with some of its parts, and a note on the others."""
+    if len(kept) == len(scene.parts):
+        return scene
+
+    def of_kept(poses: ScenePoses) -> ScenePoses:
+        return ScenePoses(poses.transforms, tuple(poses.weights[number] for number in kept))
+
+    def clip_of_kept(clip: Clip) -> Clip:
+        return replace(clip, sample=lambda times: of_kept(clip.sample(times)))
+
+    others = [part.mesh for number, part in enumerate(scene.parts) if number not in kept]
+    names = list(dict.fromkeys(others))
+    more = f" and {len(names) - _NAMED} more meshes" if len(names) > _NAMED else ""
+    note = f"left out, as no joint carries it: {', '.join(names[:_NAMED])}{more}"
+    return replace(
+        scene,
+        parts=tuple(scene.parts[number] for number in kept),
+        rest=of_kept(scene.rest),
+        clips=tuple(map(clip_of_kept, scene.clips)),
+        notes=(*scene.notes, note),
+    )
 
 
 def parents_first(parents: npt.NDArray[np.int64]) -> list[int]:

@@ -11,6 +11,7 @@ import pytest
 from lcollision_core.characters import is_rigged, joint_parts, read_character
 from lcollision_core.errors import MeshFileError, MissingExtraError
 from lcollision_core.meshes import read_mesh, read_pose_set
+from lcollision_core.meshes.scene_files import read_scene
 from tests.core.fbx_builder import arm_fbx, ufbx_frames
 from tests.core.gltf_builder import tube
 
@@ -129,3 +130,11 @@ def test_without_ufbx_a_sentence_says_what_to_install(
         read_mesh(path)
     with pytest.raises(MissingExtraError, match=r"pip install 'lcollision\[fbx\]'"):
         read_pose_set(path)
+
+
+def test_hidden_meshes_lower_levels_of_detail_and_scenery_are_left_out(tmp_path: Path) -> None:
+    scene = read_scene(arm_fbx(tmp_path / "a.fbx", others=["Floor", "hidden floor"]))
+    assert [part.mesh for part in scene.parts] == ["Tube"]
+    assert scene.notes == ("left out, as no joint carries it: Floor",)
+    path = arm_fbx(tmp_path / "levels.fbx", others=["level 0", "level 1", "level 2"])
+    assert read_scene(path).notes == ("left out, as no joint carries it: level 0",)

@@ -227,6 +227,33 @@ def test_lines_and_points_are_left_out_and_the_notes_say_so(tmp_path: Path) -> N
     assert read.notes == ("1 part without triangles (points, lines) was left out",)
 
 
+def test_scenery_about_a_character_is_left_out(tmp_path: Path) -> None:
+    builder = arm()
+    alone = join_parts(read_scene(builder.write(tmp_path / "alone.glb")))
+    vertices, faces = tube()
+    floor = _plain(builder, 50.0 * vertices, faces)
+    builder.description["meshes"][floor]["name"] = "Floor"
+    ring = _plain(builder, 0.1 * vertices, faces)
+    nodes = builder.description["nodes"]
+    nodes.append({"mesh": floor})
+    nodes.append({"mesh": ring})
+    nodes[2]["children"].append(len(nodes) - 1)
+    # A clip moves the arm's other node, and what a node that it moves carries.
+    nodes.append({"mesh": floor, "name": "Moving floor"})
+    nodes[0]["children"].append(len(nodes) - 1)
+    path = builder.write(tmp_path / "arm.glb")
+    scene = read_scene(path)
+    assert [part.mesh for part in scene.parts] == ["Arm", "Floor", "Tube"]
+    assert scene.notes == ("left out, as no joint carries it: Floor",)
+    frames = scene.clips[0].sample(np.array([0.0, 0.5]))
+    assert len(frames.weights) == len(scene.rest.weights) == 3
+    assert join_parts(scene).posed(frames).shape[0] == 2
+    assert len(join_parts(scene).joined) == len(alone.joined) + 2 * len(vertices)
+    # Without a skin everything is shown.
+    del nodes[4]["skin"]
+    assert len(read_scene(builder.write(tmp_path / "rigid.glb")).parts) == 4
+
+
 def test_meshes_outside_the_scene_are_not_shown(tmp_path: Path) -> None:
     builder = GltfBuilder()
     mesh = _plain(builder, *tube())
