@@ -164,20 +164,24 @@ class Scene:
 def character_parts(scene: Scene) -> list[int]:
     """Return which parts are of the characters of a scene; of one without skins all are.
 
-    Floors, backdrops and other scenery are not: no joint carries them, and no clip moves them.
+    Floors, backdrops and other scenery are not: no joint carries them, and no clip moves them, not
+    even by what carries the whole skeleton.
     """
-    skins = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
-    movers = skins.union(*(clip.moved for clip in scene.clips))
+    joints = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
 
-    def is_carried(node: int) -> bool:
-        while node >= 0 and node not in movers:
-            node = int(scene.parents[node])
-        return node >= 0
+    def with_carriers(node: int) -> list[int]:
+        found = [node]
+        while scene.parents[found[-1]] >= 0:
+            found.append(int(scene.parents[found[-1]]))
+        return found
+
+    moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
+    movers = joints | moved.difference(*map(with_carriers, joints))
 
     return [
         number
         for number, part in enumerate(scene.parts)
-        if not skins or part.is_skinned or is_carried(part.node)
+        if not joints or part.is_skinned or not movers.isdisjoint(with_carriers(part.node))
     ]
 
 

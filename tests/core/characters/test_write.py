@@ -223,7 +223,7 @@ def test_a_morph_target_joins_those_that_are_there(tmp_path: Path) -> None:
 def test_a_mesh_that_two_nodes_show_becomes_two(tmp_path: Path) -> None:
     builder = figure()
     other = builder.add("nodes", name="Other hat", mesh=2, translation=[3.0, 0.0, 0.0])
-    builder.description["nodes"][0]["children"].append(other)
+    builder.description["nodes"][1]["children"].append(other)
     character = read_character(builder.write(tmp_path / "figure.glb"))
     path = tmp_path / "posed.glb"
     for form in (CharacterForm.MESH, CharacterForm.MORPH):

@@ -238,12 +238,16 @@ def test_scenery_about_a_character_is_left_out(tmp_path: Path) -> None:
     nodes.append({"mesh": floor})
     nodes.append({"mesh": ring})
     nodes[2]["children"].append(len(nodes) - 1)
-    # A clip moves the arm's other node, and what a node that it moves carries.
-    nodes.append({"mesh": floor, "name": "Moving floor"})
+    # A clip moves the whole skeleton, and what hangs beside it on the same node.
+    nodes.append({"mesh": floor, "name": "Carried floor"})
     nodes[0]["children"].append(len(nodes) - 1)
+    # And another moves a part of its own.
+    nodes.append({"mesh": ring, "name": "Engine"})
+    engine = {"node": len(nodes) - 1, "path": "translation", "times": [0.0, 1.0]}
+    builder.animation("hum", engine | {"values": [[0.0, 9.0, 0.0], [0.0, 9.1, 0.0]]})
     path = builder.write(tmp_path / "arm.glb")
     scene = read_scene(path)
-    assert [part.mesh for part in scene.parts] == ["Arm", "Floor", "Tube"]
+    assert [part.mesh for part in scene.parts] == ["Arm", "Tube", "Tube"]
     assert scene.notes == ("left out, as no joint carries it: Floor",)
     frames = scene.clips[0].sample(np.array([0.0, 0.5]))
     assert len(frames.weights) == len(scene.rest.weights) == 3
@@ -251,7 +255,7 @@ def test_scenery_about_a_character_is_left_out(tmp_path: Path) -> None:
     assert len(join_parts(scene).joined) == len(alone.joined) + 2 * len(vertices)
     # Without a skin everything is shown.
     del nodes[4]["skin"]
-    assert len(read_scene(builder.write(tmp_path / "rigid.glb")).parts) == 4
+    assert len(read_scene(builder.write(tmp_path / "rigid.glb")).parts) == 5
 
 
 def test_meshes_outside_the_scene_are_not_shown(tmp_path: Path) -> None:
