@@ -193,9 +193,14 @@ def character_of(
                 for time in times
             ]
         )
-        posed = np.stack([skinned(rig, one) for one in transforms])
         names = tuple(f"moves {frame}" for frame in range(n_frames))
-        return ClipFrames("moves", names, times, posed, transforms)
+        return ClipFrames(
+            "moves",
+            names,
+            times,
+            transforms,
+            lambda: np.stack([skinned(rig, one) for one in transforms]),
+        )
 
     return Character(
         name=name,
@@ -208,7 +213,7 @@ def character_of(
         metres=1.0,
         groups=groups,
         rig=rig,
-        clips=("moves",) if n_frames else (),
+        clips={"moves": (n_frames - 1) / 30.0} if n_frames else {},
         sample=sample,
     )
 
@@ -277,7 +282,8 @@ def write_gltf(character: Character, path: Path) -> Path:
     bind = np.linalg.inv(upright @ rig.rest)
     builder.add("skins", joints=joints, inverseBindMatrices=builder.matrices(bind))
     if character.clips:
-        frames = character.sample(character.clips[0], None)
+        (clip,) = character.clips
+        frames = character.sample(clip, None)
         assert frames.transforms is not None
         moved = frames.transforms @ np.linalg.inv(rig.rest)
         channels = []
@@ -286,5 +292,5 @@ def write_gltf(character: Character, path: Path) -> Path:
             turns = Rotation.from_matrix((above @ moved[:, joint])[:, :3, :3]).as_quat()
             channel = {"node": first + joint, "path": "rotation", "values": turns}
             channels.append(channel | {"times": frames.times})
-        builder.animation(character.clips[0], *channels)
+        builder.animation(clip, *channels)
     return builder.write(path)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -51,15 +52,20 @@ class ClipFrames:
     clip : its name
     names : N names, as "moves 12", numbered from 0 by frame
     times : (N,) float64 array, in seconds
-    vertices : (N, V, 3) float64 array, as the file says, in the character's frame and unit
     transforms : (N, J, 4, 4) float64 array, global transforms of the rig's joints; None without rig
+    skin : makes `vertices`, which takes long
     """
 
     clip: str
     names: tuple[str, ...]
     times: FloatArray
-    vertices: FloatArray
     transforms: FloatArray | None
+    skin: Callable[[], FloatArray]
+
+    @cached_property
+    def vertices(self) -> FloatArray:
+        """(N, V, 3) float64 array, as the file says, in the character's frame and unit."""
+        return self.skin()
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +85,7 @@ class Character:
     metres : length of the file's unit
     groups : named meshes and materials, of the joined faces
     rig : None for one without joints
-    clips : names of its animations
+    clips : lengths in seconds of its animations, by their names
     sample : (clip, fps) to its frames; None for the clip's own key frames at at most 30 a second
     notes : sentences on what was changed on reading
     """
@@ -94,6 +100,6 @@ class Character:
     metres: float
     groups: tuple[FaceGroup, ...]
     rig: Rig | None
-    clips: tuple[str, ...]
+    clips: Mapping[str, float]
     sample: Callable[[str, float | None], ClipFrames]
     notes: tuple[str, ...] = ()

@@ -45,10 +45,15 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
 
     def sample(clip: str, fps: float | None) -> ClipFrames:
         with one_sentence(path):
-            found = sample_clip(scene, mesh, clip, fps)
-        names = tuple(f"{clip} {frame}" for frame in range(len(found.times)))
-        transforms = None if rig is None else found.poses.transforms[:, rig.nodes]
-        return ClipFrames(clip, names, found.times, found.vertices, transforms)
+            times, poses = sample_clip(scene, clip, fps)
+
+        def skin() -> FloatArray:
+            with one_sentence(path):
+                return mesh.posed(poses)
+
+        names = tuple(f"{clip} {frame}" for frame in range(len(times)))
+        transforms = None if rig is None else poses.transforms[:, rig.nodes]
+        return ClipFrames(clip, names, times, transforms, skin)
 
     up_direction, is_sure = scene.up, True
     if axis is not None:
@@ -68,7 +73,7 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
         scene.metres,
         mesh.groups,
         rig,
-        tuple(clip.name for clip in scene.clips),
+        {clip.name: float(np.ptp(clip.key_times)) for clip in scene.clips},
         sample,
         mesh.notes + notes,
     )

@@ -110,15 +110,15 @@ def _read_clips(
             def report(done: int, total: int, number: int = number) -> None:
                 progress(number * total + done, len(chosen) * total)
 
-            found = sample_clip(scene, mesh, name, fps, report, cancel)
-            n_numbers += found.vertices.size
+            times, poses = sample_clip(scene, name, fps, mesh.topology.n_vertices)
+            n_numbers += len(times) * 3 * mesh.topology.n_vertices
             if n_numbers > MAX_FRAME_NUMBERS:
                 raise MeshFileError(
                     f"its {len(chosen)} clips have more than {MAX_FRAME_NUMBERS} coordinates",
                     "choose one of them, or fewer frames a second",
                 )
-            frames.append(found.vertices)
-            names += [f"{name} {frame}" for frame in range(len(found.times))]
+            frames.append(mesh.posed(poses, report, cancel))
+            names += [f"{name} {frame}" for frame in range(len(times))]
     return AnimatedMesh(
         np.concatenate(frames),
         mesh.topology,

@@ -127,51 +127,40 @@ class JoinedMesh:
         return blended
 
 
-@dataclass(frozen=True, eq=False)
-class SampledClip:
-    """N frames of a clip: (N,) `times`, `poses` of the scene and (N, V, 3) `vertices`."""
-
-    times: FloatArray
-    poses: ScenePoses
-    vertices: FloatArray
-
-
 def sample_clip(
-    scene: Scene,
-    mesh: JoinedMesh,
-    name: str,
-    fps: float | None = None,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
-) -> SampledClip:
+    scene: Scene, name: str, fps: float | None, n_vertices: int = 0
+) -> tuple[FloatArray, ScenePoses]:
     """Return the frames of a clip, as `Clip.times` chooses them.
 
     Parameters
     ----------
     scene : of the clip
-    mesh : of its parts
     name : the clip's
     fps : frames a second; None for the clip's keys
-    progress, cancel : as of `JoinedMesh.posed`
+    n_vertices : of which each frame is to have the coordinates; 0 for its transforms alone
+
+    Returns
+    -------
+    times : (N,) float64 array, in seconds
+    poses : N of the scene
 
     Raises
     ------
-    MeshFileError : there is no such clip, it has too many frames, or one is not finite.
+    MeshFileError : there is no such clip, or it has too many frames.
     """
     found = [clip for clip in scene.clips if clip.name == name]
     if not found:
         known = ", ".join(repr(clip.name) for clip in scene.clips[:8]) or "none"
         raise MeshFileError(f"it has no clip {name!r}, its clips are: {known}", "name one of them")
     times = found[0].times(fps)
-    numbers_each = max(3 * mesh.topology.n_vertices, 16 * len(scene.parents))
+    numbers_each = max(3 * n_vertices, 16 * len(scene.parents))
     if len(times) * numbers_each > MAX_FRAME_NUMBERS:
         raise MeshFileError(
-            f"its clip {name!r} has {len(times)} frames of {mesh.topology.n_vertices} vertices, "
-            f"which take more than {MAX_FRAME_NUMBERS} numbers",
+            f"its clip {name!r} has {len(times)} frames of {numbers_each} numbers, more than "
+            f"{MAX_FRAME_NUMBERS} in all",
             "choose fewer frames a second",
         )
-    poses = found[0].sample(times)
-    return SampledClip(times, poses, mesh.posed(poses, progress, cancel))
+    return times, found[0].sample(times)
 
 
 def join_parts(scene: Scene) -> JoinedMesh:

@@ -39,8 +39,9 @@ FloatArray = npt.NDArray[np.float64]
 REST = "rest"
 """The name of the rest pose."""
 
-_MOST_FRAMES = 300
-"""Of the clips, that are taken as poses."""
+_MOST_FRAMES, _MOST_RATE = 300, 10.0
+"""Of the clips, that are taken as poses, and in a second: enough to know what the character does.
+"""
 
 _SAME = 1e-5
 """Normalised: what is alike to so much is the same rig."""
@@ -72,9 +73,6 @@ class RigModel(PosableBody):
     frame_rate : of the poses that are frames of its clips, in frames a second
     """
 
-    frame_rate = 10.0
-    """Enough to know what the character does."""
-
     def __init__(
         self, character: Character, space: RigPoseSpace, card: ModelCard, poses: FloatArray
     ) -> None:
@@ -88,6 +86,7 @@ class RigModel(PosableBody):
         )
         self.character, self._space = character, space
         self.own_card, self.notes = card, character.notes
+        self.frame_rate = _frame_rate(character)
 
     @classmethod
     def of(cls, character: Character, parts: Sequence[str] | None = None) -> RigModel:
@@ -102,14 +101,12 @@ class RigModel(PosableBody):
         ------
         LCollisionError : the character has no rig.
         """
-        names, frames = [REST], []
+        names, frames, rate = [REST], [], _frame_rate(character)
         for clip in character.clips if character.rig is not None else ():
-            found = character.sample(clip, cls.frame_rate)
+            found = character.sample(clip, rate)
             if found.transforms is not None:
                 names += found.names
                 frames.append(found.transforms)
-            if len(names) > _MOST_FRAMES:
-                break
         transforms = np.concatenate(frames)[:_MOST_FRAMES] if frames else None
         space = RigPoseSpace(character, parts, transforms)
         poses = np.zeros((1, len(space.low)))
@@ -311,3 +308,10 @@ class RigModel(PosableBody):
             for start, end in zip((0, *ends[:-1]), ends, strict=True)
             for name in unique_names(names[start:end])
         )
+
+
+def _frame_rate(character: Character) -> float:
+    """Return how many frames a second of all clips together are no more than are taken."""
+    seconds = sum(character.clips.values())
+    most = max(1, _MOST_FRAMES - len(character.clips))
+    return min(_MOST_RATE, most / seconds) if seconds > 0.0 else _MOST_RATE

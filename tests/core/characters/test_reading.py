@@ -123,7 +123,7 @@ def test_what_the_file_says_of_axes_units_and_groups(tmp_path: Path) -> None:
     assert character.up.tolist() == [0.0, 1.0, 0.0]
     assert character.up_is_sure
     assert character.metres == 1.0
-    assert character.clips == ("wave",)
+    assert character.clips == {"wave": pytest.approx(1.0)}
     assert [group.name for group in character.groups] == ["Arm", "Skin"]
     assert all(len(group.faces) == character.topology.n_faces for group in character.groups)
     assert read_character(path, up="z").up.tolist() == [0.0, 0.0, 1.0]

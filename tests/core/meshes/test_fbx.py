@@ -64,7 +64,7 @@ def test_a_character_of_fbx_has_its_rig_parts_and_clips(tmp_path: Path) -> None:
     assert np.array_equal(character.joined, np.arange(len(vertices)))
     assert np.array_equal(character.topology.faces, faces)
     assert [group.name for group in character.groups] == ["Tube", "Skin"]
-    assert character.clips == ("wave",)
+    assert character.clips == {"wave": pytest.approx(1.0)}
     rig = character.rig
     assert rig is not None
     # The bottom of the tube follows the mesh itself.

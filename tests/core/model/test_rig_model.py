@@ -16,6 +16,7 @@ from lcollision_core.model import PosableBody, RigModel, open_body, sample_poses
 from lcollision_core.model.pose_file import NamedPose, read_poses, write_poses
 from lcollision_core.posing import DragOptions, Pin, Twist, make_grip
 from lcollision_core.resolve import PoseResolver, ResolveOptions, Step
+from tests.core.gltf_builder import arm, rotation
 from tests.core.shapes import random_rotation
 from tests.independent_check import IndependentRules, crossing_pairs
 from tests.rigged_shapes import rigged_body, rigged_tube, write_gltf
@@ -265,6 +266,26 @@ def test_poses_are_saved_and_read_again(model: RigModel, tmp_path: Path) -> None
     read = read_poses(path, model)
     assert [pose.name for pose in read] == ["one", "rest"]
     np.testing.assert_allclose(read[0].latent, model.training_latent[3])
+
+
+def test_frames_are_spread_over_clips_of_any_length(tmp_path: Path) -> None:
+    builder = arm(split=False)
+    for name, seconds in (("short", 2.0), ("dance", 600.0)):
+        turned = {"node": 2, "path": "rotation", "times": [0.0, seconds]}
+        builder.animation(name, turned | {"values": [rotation(0, 0.0), rotation(0, 1.0)]})
+    body = open_body(builder.write(tmp_path / "dancer.glb"))
+    assert isinstance(body, RigModel)
+    assert body.character.clips == {"wave": 1.0, "short": 2.0, "dance": 600.0}
+    assert 290 <= len(body.pose_names) <= 301
+    assert body.frame_rate == pytest.approx(297 / 603)
+    # The last frame of the longest clip is among them, and that its vertices were not made.
+    assert body.pose_names[-1] == "dance 295"
+    bend = body.training_latent[-1]
+    assert np.abs(bend).max() == pytest.approx(1.0, abs=0.1)
+    frames = body.character.sample("dance", body.frame_rate)
+    assert "vertices" not in vars(frames)
+    assert frames.vertices.shape == (296, body.n_vertices, 3)
+    assert "vertices" in vars(frames)
 
 
 def test_a_character_file_is_opened_as_a_body(tmp_path: Path) -> None:

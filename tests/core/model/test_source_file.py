@@ -200,7 +200,7 @@ def test_a_motion_of_the_rig_becomes_a_clip_of_its_file(
     files, written = write_sequence(path, model, latents, poses, source=source, fps=24.0)
     assert files == [path]
     again = read_character(path)
-    assert again.clips == ("poses", "orbit")
+    assert list(again.clips) == ["poses", "orbit"]
     np.testing.assert_array_equal(again.rest_vertices, model.character.rest_vertices)
     frames = again.sample("poses", None)
     np.testing.assert_allclose(frames.times, [0.0, 1 / 24, 2 / 24], rtol=1e-6)
