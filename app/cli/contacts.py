@@ -17,11 +17,11 @@ from app.cli.contact_options import (
     rules_json,
     rules_sentence,
 )
-from app.cli.models import ModelArgument, changed_model
+from app.cli.models import ModelArgument, changed_body
 from app.wording import counted
 
 if TYPE_CHECKING:
-    from lcollision_core.model import PosableBody, ProposedRules
+    from lcollision_core.model import ProposedRules
 
 
 def contacts(
@@ -60,12 +60,14 @@ def contacts(
     if ignore_proposed and proposed is not None:
         body, proposed = body.with_rules(proposed.rules), None
     if body.rules != before.rules:
-        _keep(body, model_name)
+        kept = body.rules
+        changed_body(model_name, body, lambda held: held.with_rules(kept))
+        note(f"the contact rules of {body.name} are changed")
     if as_json:
         print_json({"name": body.name, **rules_json(body), "proposed": _proposed_json(proposed)})
         return
-    rules = rules_sentence(body.rules, excluded_at_rest(body))
-    tell(f"{body.name}: {'every pair counts' if body.rules.exclude_nothing else rules}")
+    sentence = rules_sentence(body.rules, excluded_at_rest(body))
+    tell(f"{body.name}: {'every pair counts' if body.rules.exclude_nothing else sentence}")
     if proposed is not None:
         new = len(proposed.rules.ignored) - len(body.rules.ignored)
         tell(
@@ -73,16 +75,6 @@ def contacts(
             f"{proposed.n_colliding_then or 'none'} without {counted(new, 'pair')} of groups that "
             "touch in nearly all of them; --ignore-proposed leaves these out"
         )
-
-
-def _keep(body: PosableBody, model_name: str) -> None:
-    from lcollision_core.model import RigModel, remember_choices
-
-    if isinstance(body, RigModel):
-        remember_choices(body)
-    else:
-        changed_model(model_name, lambda held: held.with_rules(body.rules))
-    note(f"the contact rules of {body.name} are changed")
 
 
 def _proposed_json(proposed: ProposedRules | None) -> dict[str, Any] | None:

@@ -16,7 +16,7 @@ from app.cli.contact_options import (
     ToleratedDepthOption,
     rules_sentence,
 )
-from app.cli.inputs import Axis, PoseSetArgument, up_sentence
+from app.cli.inputs import Axis, PoseSetArgument, up_sentence, with_rules_of_character
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
@@ -67,6 +67,7 @@ def check(
         raise inspection.defects[0]
     for remark in poses.notes:
         note(f"{path}: {remark}")
+    poses = with_rules_of_character(poses, path)
     options = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth)
     try:
         rules, groups = options.applied(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,7 +12,7 @@ import typer
 from lcollision_core.errors import LCollisionError, MeshFileError, WrongScaleError
 
 if TYPE_CHECKING:
-    from lcollision_core.meshes import UpGuess
+    from lcollision_core.meshes import PoseSet, UpGuess
 
 
 Axis = Literal["x", "y", "z"]
@@ -78,6 +79,17 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
             )
         files += held
     return files
+
+
+def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
+    """Give the frames of a rigged character the contact rules by which it is posed as well."""
+    from lcollision_core.characters import CHARACTER_SUFFIXES, is_rigged
+    from lcollision_core.model import open_body
+
+    if path.suffix.lower() not in CHARACTER_SUFFIXES or not is_rigged(path):
+        return poses
+    body = open_body(path)
+    return replace(poses, rules=body.rules, groups=body.groups)
 
 
 def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:

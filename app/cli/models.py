@@ -110,7 +110,9 @@ def domains(
         typer.Option("--name", metavar="K=NAME", help="Call domain K (from 1) NAME."),
     ] = None,
 ) -> None:
-    """List the domains of a model, or rename them."""
+    """List the domains of a model or a character, or rename them."""
+    from lcollision_core.model import open_body
+
     renamings: dict[int, str] = {}
     for request in names or []:
         number, _, name = request.partition("=")
@@ -119,29 +121,52 @@ def domains(
                 "does not name a domain", "write K=NAME, such as 3=tail", where=f"{request!r}"
             )
         renamings[int(number) - 1] = name
-    rename = (lambda model: model.edit_domains(renamings)) if renamings else None
-    _print_domains(describe(changed_model(model_name, rename)))
+    body = open_body(model_name)
+    if renamings:
+        body = changed_body(model_name, body, lambda held: held.edit_domains(renamings))
+    _print_domains(describe(body))
 
 
 def upright(
     model_name: ModelArgument,
     up: Annotated[
-        Axis | None, typer.Option(help="The axis that is up, which the model's file keeps.")
+        Axis | None,
+        typer.Option(help="The axis that is up; kept in a model's file, beside a character's."),
     ] = None,
 ) -> None:
-    """Say which axis of a model is up, or change it in the model's file."""
-    turn = None if up is None else lambda model: model.turned_upright("xyz".index(up))
-    model = changed_model(model_name, turn)
-    typer.echo(f"{model.name}: {'xyz'[model.up_axis]} is up")
+    """Say which axis of a model or a character is up, or change it."""
+    from lcollision_core.model import PoseModel, open_body, remember_up
+
+    body, axis = open_body(model_name), None if up is None else "xyz".index(up)
+    if axis is not None and isinstance(body, PoseModel):
+        body = changed_body(model_name, body, lambda held: held.turned_upright(axis))
+    elif axis is not None:
+        remember_up(model_name, axis)
+        body = open_body(model_name)
+    typer.echo(f"{body.name}: {'xyz'[body.up_axis]} is up")
 
 
-def changed_model(name: str, change: Callable[[PoseModel], PoseModel] | None) -> PoseModel:
-    """Load a model; change it first, in its file, which is not a bundled one."""
-    from lcollision_core.model import PoseModel, change_model, find_model, list_models
+def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> PosableBody:
+    """Change a body and keep that: of a model in its file, of a character in the data folder.
 
+    Parameters
+    ----------
+    name : that the body was opened by
+    change : gets the `PoseModel` or `RigModel`, and returns the one to keep
+    """
+    from lcollision_core.model import (
+        RigModel,
+        change_model,
+        find_model,
+        list_models,
+        remember_choices,
+    )
+
+    if isinstance(body, RigModel):
+        changed: RigModel = change(body)
+        remember_choices(changed)
+        return changed
     path = find_model(name)
-    if change is None:
-        return PoseModel.load(path)
     if any(listed.bundled and listed.path == path for listed in list_models()):
         raise LCollisionError(
             "is a bundled model and stays as it is",

@@ -20,7 +20,13 @@ from app.cli.contact_options import (
     ToleratedDepthOption,
 )
 from app.cli.evaluate import StoreArgument, open_store, scores_sentence
-from app.cli.inputs import Axis, PoseSetArgument, RowsOption, up_sentence
+from app.cli.inputs import (
+    Axis,
+    PoseSetArgument,
+    RowsOption,
+    up_sentence,
+    with_rules_of_character,
+)
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import (
     ModelArgument,
@@ -93,7 +99,7 @@ def embedding(
     destination = model_destination(output)
     require_writable(destination)
     before = file_stamp(destination)
-    poses = read_pose_set(dataset)
+    poses = with_rules_of_character(read_pose_set(dataset), dataset)
     if scale != 1.0:
         poses = poses.scaled(scale)
     guess = poses.up

@@ -115,7 +115,7 @@ def open_model(
     name_or_path: str | Path, _: Progress, cancel: CancelToken, up: int | None = None
 ) -> OpenedModel:
     """Read a model and use it once, so that nothing is left to compile before the first frame."""
-    from lcollision_core.model import RigModel, find_model, open_body, remember_file
+    from lcollision_core.model import RigModel, find_model, open_body, remember_file, remember_up
 
     path = find_model(name_or_path).absolute()
     model = open_body(path, up)
@@ -123,6 +123,8 @@ def open_model(
     if isinstance(model, RigModel):
         try:
             remember_file(model, path)
+            if up is not None:
+                remember_up(path, up)
         except ModelFileError as error:
             model = model.noted(error.headline)
     warm_up(model)

@@ -11,7 +11,11 @@ from lcollision_core.model.export import (
     export_mesh,
     export_scale,
 )
-from lcollision_core.model.known_characters import remember_choices, remember_file
+from lcollision_core.model.known_characters import (
+    remember_choices,
+    remember_file,
+    remember_up,
+)
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace
 from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry, fingerprint_of_pose
 from lcollision_core.model.model_store import (

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.characters import read_character
+from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError, ShapeError
 from lcollision_core.json_values import from_json, parse_json, quoted
 from lcollision_core.meshes import ContactRules, locked
 from lcollision_core.meshes.atomic import atomic_write
@@ -34,6 +35,7 @@ class KnownCharacter:
     ----------
     file : where it was last opened from
     rules, domain_names, domain_colours, domain_order : see `ModelCard`
+    up_axis : 0, 1 or 2, where the file is wrong about it
     """
 
     file: str
@@ -41,6 +43,7 @@ class KnownCharacter:
     domain_names: tuple[str, ...] | None = None
     domain_colours: tuple[str, ...] | None = None
     domain_order: tuple[int, ...] | None = None
+    up_axis: int | None = None
 
 
 def user_characters_folder() -> Path:
@@ -95,6 +98,32 @@ def find_character(fingerprint: str) -> ListedModel | None:
     return ListedModel(Path(known.file).stem, Path(known.file), bundled=False)
 
 
+def open_character(path: str | os.PathLike[str], up: int | None = None) -> RigModel:
+    """Read a character, with the axis, the rules and the body parts that the user chose for it.
+
+    Its notes say so, or why what is remembered does not apply.
+
+    Parameters
+    ----------
+    path : its file
+    up : the axis that is up now, whatever was chosen
+
+    Raises
+    ------
+    MeshFileError : see `read_character`.
+    LCollisionError : the character has no rig.
+    """
+    model = RigModel.of(read_character(path, up))
+    try:
+        known = known_character(model.fingerprint) if up is None else None
+        if known is not None and known.up_axis is not None:
+            model = RigModel.of(read_character(path, known.up_axis))
+    except (ModelFileError, ShapeError):
+        # It is damaged, as `with_remembered` says.
+        pass
+    return with_remembered(model)
+
+
 def with_remembered(model: RigModel) -> RigModel:
     """Return a character with the rules and body parts that the user chose for it.
 
@@ -131,6 +160,24 @@ def remember_file(model: RigModel, file: str | os.PathLike[str]) -> None:
     _change(model, lambda known: replace(known, file=path))
 
 
+def remember_up(file: str | os.PathLike[str], up: int) -> None:
+    """Keep which axis is up for a character whose file is wrong about it.
+
+    Parameters
+    ----------
+    file : its file
+    up : 0, 1 or 2; what the file says is not remembered
+
+    Raises
+    ------
+    ModelFileError : it cannot be kept.
+    MeshFileError : see `read_character`.
+    """
+    own = RigModel.of(read_character(file))
+    chosen = None if up == own.up_axis else up
+    _change(own, lambda known: replace(known, up_axis=chosen))
+
+
 def remember_choices(model: RigModel) -> None:
     """Keep what the rules and body parts of a character differ in from those of its file.
 
@@ -163,7 +210,7 @@ def _change(model: RigModel, change: Callable[[KnownCharacter], KnownCharacter])
             }
             if known.rules is not None:
                 document["rules"] = known.rules.to_json()
-            held = {name: getattr(known, name) for name in _PARTS}
+            held = {name: getattr(known, name) for name in (*_PARTS, "up_axis")}
             document |= {name: value for name, value in held.items() if value is not None}
             with atomic_write(path) as file:
                 file.write(json.dumps(document, indent=1).encode() + b"\n")

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from lcollision_core.characters import CHARACTER_SUFFIXES, read_character
-from lcollision_core.model.known_characters import with_remembered
+from lcollision_core.characters import CHARACTER_SUFFIXES
+from lcollision_core.model.known_characters import open_character
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_model import PoseModel
-from lcollision_core.model.rig_model import RigModel
 
 
 def open_body(name_or_path: str | os.PathLike[str], up: int | None = None) -> PosableBody:
@@ -28,5 +27,5 @@ def open_body(name_or_path: str | os.PathLike[str], up: int | None = None) -> Po
     LCollisionError : the character has no rig.
     """
     if Path(name_or_path).suffix.lower() in CHARACTER_SUFFIXES:
-        return with_remembered(RigModel.of(read_character(name_or_path, up)))
+        return open_character(name_or_path, up)
     return PoseModel.load(name_or_path)

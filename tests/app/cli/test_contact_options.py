@@ -129,5 +129,5 @@ def test_a_trained_model_keeps_the_rules_and_says_them(
     said = lcollision("info", path).stdout
     assert (
         "not counted are pairs within 0.02 along the surface, pairs that touch at rest, pairs of "
-        "a and a, pairs not deeper than 0.001; at rest that is no pair"
+        "a with itself, pairs not deeper than 0.001; at rest that is no pair"
     ) in said

@@ -200,6 +200,32 @@ def test_contact_rules_of_a_character_are_shown_proposed_and_chosen(
     assert open_body(file).rules.ignored == (("Head", "Head"),)
 
 
+def test_the_parts_and_the_axis_of_a_character_are_changed_and_remembered(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    file = write_gltf(rigged_body(), tmp_path / "hero.glb")
+    assert "  2  Torso  (" in lcollision("domains", file).stdout
+    renamed = lcollision("domains", file, "--name", "2=trunk")
+    assert "  2  trunk  (" in renamed.stdout
+    assert open_body(file).domain_names[1] == "trunk"
+    assert lcollision("upright", file).stdout == "hero: y is up\n"
+    assert lcollision("upright", file, "--up", "z").stdout == "hero: z is up\n"
+    assert open_body(file).up_axis == 2
+    assert open_body(file, 0).up_axis == 0
+    assert lcollision("upright", file, "--up", "y").stdout == "hero: y is up\n"
+    again = open_body(file)
+    assert (again.up_axis, again.domain_names[1]) == (1, "trunk")
+
+
+def test_frames_of_a_character_are_checked_by_the_rules_that_it_is_posed_by(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    file = write_gltf(rigged_body(n_frames=12), tmp_path / "hero.glb")
+    by_rig = json.loads(lcollision("info", file, "--json").stdout)["rules"]
+    assert by_rig["near_exclusion"] == 0.1
+    assert json.loads(lcollision("dataset", "check", file, "--json").stdout)["rules"] == by_rig
+
+
 def test_contact_rules_of_a_model_are_kept_in_its_file_until_a_predictor_depends_on_them(
     lcollision: Lcollision, trained: Path, tmp_path: Path
 ) -> None:
