@@ -123,7 +123,7 @@ def sample(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal poses.")] = 0,
 ) -> None:
-    """Draw latent poses from the box of 1.2 times the training range."""
+    """Draw random poses: of a model from its latent box, of a character within human limits."""
     from lcollision_core.model import NamedPose, open_body, sample_poses
 
     destination = require_output(output, ".json")

@@ -71,12 +71,11 @@ class CodeEditing(PoseHistory):
 
         Parameters
         ----------
-        amount : 0 leaves the pose, 1 goes all the way to a pose drawn uniformly from the sliders'
-            range
+        amount : 0 leaves the pose, 1 goes all the way to a random one: see `PosableBody.sample`
         seed : equal seeds draw equal poses
         """
         self._tell_if_locked()
-        drawn = self.model.latent_space.sample(1, np.random.default_rng(seed))[0]
+        drawn = self.model.sample(1, np.random.default_rng(seed))[0]
         latent = (1.0 - amount) * self.latent + amount * drawn
         self._edit("Randomise", self._with_locked(latent))
 

@@ -44,7 +44,6 @@ class LatentSpace:
     low, high : (D,) float64 arrays, read-only: the ends of the model's box, below 0 and above
     shown : (D,) float64 array > 0, read-only: people are shown the codes times this
     units : D texts, what the shown numbers are in, as "°"; "" for none
-    n_placing : how many of the first codes move the body as a whole
     """
 
     groups: tuple[LatentGroup, ...]
@@ -52,7 +51,6 @@ class LatentSpace:
     high: npt.NDArray[np.float64]
     shown: npt.NDArray[np.float64]
     units: tuple[str, ...]
-    n_placing: int = 0
 
     @property
     def size(self) -> int:
@@ -60,12 +58,10 @@ class LatentSpace:
         return len(self.low)
 
     def sample(self, n_poses: int, generator: np.random.Generator) -> npt.NDArray[np.float64]:
-        """Draw poses uniformly from the box between `low` and `high`, of the body in its place.
+        """Draw poses uniformly from the box between `low` and `high`.
 
         Returns
         -------
         latent : (n_poses, D) float64 array
         """
-        drawn = self.low + (self.high - self.low) * generator.random((n_poses, self.size))
-        drawn[:, : self.n_placing] = 0.0
-        return drawn
+        return self.low + (self.high - self.low) * generator.random((n_poses, self.size))

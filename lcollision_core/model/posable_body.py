@@ -365,6 +365,10 @@ class PosableBody(ABC):
             )
         )
 
+    def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
+        """Draw (n_poses, D) poses uniformly from the box between the ends of the codes' ranges."""
+        return self.latent_space.sample(n_poses, generator)
+
     def with_card(self, card: ModelCard, name: str | None = None) -> Self:
         """Return the same model with another card; computed properties are kept.
 

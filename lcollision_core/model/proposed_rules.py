@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters.rig_space import ROOT_CODES
 from lcollision_core.contact import (
     LEAST_GAIN,
     MOSTLY,
@@ -18,9 +17,7 @@ from lcollision_core.contact import (
 )
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import ContactRules
-from lcollision_core.model.by_rig import random_codes
 from lcollision_core.model.posable_body import PosableBody
-from lcollision_core.model.rig_model import RigModel
 
 _MOST_POSES, _FEWEST_POSES = 40, 8
 """Of a body's poses, evenly spaced, that are looked at, and how many say enough."""
@@ -48,8 +45,8 @@ def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
     latent = body.training_latent
     chosen = np.unique(np.linspace(0, len(latent) - 1, _MOST_POSES).round().astype(int))
     latent = latent[chosen].astype(np.float64)
-    if len(latent) < _FEWEST_POSES and isinstance(body, RigModel) and body.latent_size > ROOT_CODES:
-        drawn = random_codes(body.space, _MOST_POSES, np.random.default_rng(0))
+    if len(latent) < _FEWEST_POSES and not body.is_trained:
+        drawn = body.sample(_MOST_POSES, np.random.default_rng(0))
         latent = np.concatenate([latent, drawn])
     return body.decode(latent)
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from lcollision_core.characters import Character, RigPoseSpace, default_rules, joint_parts
+from lcollision_core.characters.random_poses import random_codes
 from lcollision_core.characters.rig_space import ROOT_CODES
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
@@ -245,8 +246,13 @@ class RigModel(PosableBody):
             ),
             shown=read_only(np.where(angles, np.degrees(1.0), 100.0)),
             units=tuple("°" if angle else " %" for angle in angles),
-            n_placing=ROOT_CODES,
         )
+
+    def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
+        """Draw (n_poses, D) poses that a person could take, of the body in its place."""
+        if self.latent_size == ROOT_CODES:
+            return np.zeros((n_poses, ROOT_CODES))
+        return random_codes(self.space, n_poses, generator)
 
     @cached_property
     def symmetry(self) -> Symmetry | None:

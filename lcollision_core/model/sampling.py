@@ -20,11 +20,11 @@ def sample_poses(
     colliding: bool | None = None,
     progress: Progress = no_progress,
 ) -> npt.NDArray[np.float64]:
-    """Draw latent poses uniformly from the box of 1.2 times the training range.
+    """Draw latent poses, as `PosableBody.sample` does.
 
     Parameters
     ----------
-    model : whose latent space
+    model : of the poses
     n_poses : how many to return
     seed : equal seeds give equal poses, on any number of cores
     colliding : True and False keep only poses that do and do not intersect themselves, by the
@@ -41,11 +41,11 @@ def sample_poses(
     """
     generator = np.random.default_rng(seed)
     if colliding is None:
-        return model.latent_space.sample(n_poses, generator)
+        return model.sample(n_poses, generator)
     kept = np.empty((n_poses, model.latent_size))
     n_kept = n_misses = 0
     while n_kept < n_poses:
-        drawn = model.latent_space.sample(_DRAWN_AT_ONCE, generator)
+        drawn = model.sample(_DRAWN_AT_ONCE, generator)
         vertices = model.decode(drawn).astype(np.float32)
         found = drawn[model.detector.are_colliding(vertices) == colliding][: n_poses - n_kept]
         kept[n_kept : n_kept + len(found)] = found

@@ -11,11 +11,11 @@ import pytest
 
 from lcollision_core import jobs
 from lcollision_core.characters.joint_roles import Role
+from lcollision_core.characters.random_poses import HUMAN, HumanDraws, random_codes
 from lcollision_core.errors import CancelledError, LCollisionError, PoseSetError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import PoseSet
 from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
-from lcollision_core.model.by_rig import _HUMAN, _Draws, random_codes
 from tests.rigged_shapes import rigged_body, rigged_tube
 
 SCALE = 100.0
@@ -63,7 +63,7 @@ def test_each_pose_differs(poses: PoseSet) -> None:
 
 
 def test_poses_reach_far_into_their_limits_and_combine_few_to_many_limbs(body: RigModel) -> None:
-    space, draws = body.space, _Draws(body.space)
+    space, draws = body.space, HumanDraws(body.space)
     codes = codes_of(body, 2000)
     assert (codes >= space.low).all()
     assert (codes <= space.high).all()
@@ -99,7 +99,7 @@ def test_left_and_right_are_alike(body: RigModel) -> None:
     np.testing.assert_allclose(symmetry.image(mean), mean, atol=0.02 * SCALE)
     np.testing.assert_allclose(spread[symmetry.partner], spread, atol=0.02 * SCALE)
     # An arm goes down as far as a person's, whichever way its axes turn.
-    limits = _Draws(body.space).limits
+    limits = HumanDraws(body.space).limits
     left, right = (
         np.degrees(limits[joint_of(body, side + "Arm"), 2]) for side in ("Left", "Right")
     )
@@ -125,8 +125,8 @@ def test_arms_that_hang_at_rest_are_raised_from_there() -> None:
         for name, drop in (("ForeArm", 0.3), ("Hand", 0.55), ("HandEnd", 0.7)):
             hanging[rig.joint_names.index(side + name), :3, 3] = [0.2 * sign, 0.0, 1.45 - drop]
     body = RigModel.of(replace(character, rig=replace(rig, rest=hanging)))
-    limits = np.degrees(_Draws(body.space).limits)
-    (down, up), most = _HUMAN[Role.UPPER_ARM][2], 120.0
+    limits = np.degrees(HumanDraws(body.space).limits)
+    (down, up), most = HUMAN[Role.UPPER_ARM][2], 120.0
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         aside = sign * limits[joint_of(body, side + "Arm"), 2]
         np.testing.assert_allclose(sorted(aside), [down + 90.0, min(up + 90.0, most)], atol=1e-6)
