@@ -56,8 +56,9 @@ def read_shown(document: GltfDocument) -> Scene:
         _default_weights(document, one, part) for one, part in zip(shown, parts, strict=True)
     )
     clips = read_clips(document, local, parents, order, parts, defaults)
+    human = _human_bones(document)
     return Scene(
-        tuple(str(node.name or "") for node in nodes),
+        tuple(human.get(number, str(node.name or "")) for number, node in enumerate(nodes)),
         parents,
         ScenePoses(rest, tuple(weights[None] for weights in defaults)),
         parts,
@@ -105,6 +106,32 @@ def shown_primitives(
     others = "1 part" if n_others == 1 else f"{n_others} parts"
     was = "was" if n_others == 1 else "were"
     return shown, (f"{others} without triangles (points, lines) {was} left out",)
+
+
+def _human_bones(document: GltfDocument) -> dict[int, str]:
+    """Return what the nodes of a VRM avatar are, as "leftUpperArm", whatever they are called.
+
+    By the extensions VRMC_vrm 1.0 and VRM 0.x; what they do not say as specified is left out.
+    """
+    extensions = document.description.extensions or {}
+    for name in ("VRMC_vrm", "VRM"):
+        humanoid = _member(extensions.get(name), "humanoid")
+        held = _member(humanoid, "humanBones")
+        if isinstance(held, dict):
+            named = [(bone, _member(entry, "node")) for bone, entry in held.items()]
+        else:
+            entries = held if isinstance(held, list) else []
+            named = [(_member(entry, "bone"), _member(entry, "node")) for entry in entries]
+        found = {
+            node: bone for bone, node in named if isinstance(node, int) and isinstance(bone, str)
+        }
+        if found:
+            return found
+    return {}
+
+
+def _member(value: object, name: str) -> object:
+    return value.get(name) if isinstance(value, dict) else None
 
 
 def _parents(document: GltfDocument) -> npt.NDArray[np.int64]:

@@ -140,7 +140,7 @@ class Scene:
 
     Attributes
     ----------
-    node_names : as in the file, "" where it has none
+    node_names : as in the file, "" where it has none; of a VRM avatar's bones what they are
     parents : (n,) int64 array, each node's parent, -1 for a root; no circles
     rest : the one pose in which the file stores the nodes
     parts : in the order of the file's meshes, then of the nodes that show each, then of its

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.characters import Character, Rig, is_rigged, joint_parts, read_character
+from lcollision_core.characters.joint_roles import Role, joint_roles
 from lcollision_core.errors import MeshFileError, ShapeError
 from tests.core.gltf_builder import arm, moved, rotation, tube
 
@@ -204,3 +205,31 @@ def test_a_root_scaled_to_nothing_leaves_no_rig_and_a_sentence(tmp_path: Path) -
     assert character.rig is None
     assert any("LeftArm is scaled to nothing" in note for note in character.notes)
     assert np.isfinite(character.sample("wave", None).vertices).all()
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_the_bones_of_an_avatar_are_what_its_description_says(
+    is_first: bool, tmp_path: Path
+) -> None:
+    builder = arm()
+    for number, name in ((1, "Bone"), (2, "Bone.001"), (3, "Knochen")):
+        builder.description["nodes"][number]["name"] = name
+    bones = {"leftUpperArm": 1, "leftLowerArm": 2, "leftHand": 3}
+    if is_first:
+        listed = [{"bone": bone, "node": node} for bone, node in bones.items()]
+        extension = {"VRM": {"humanoid": {"humanBones": [*listed, {"node": "x"}, 7]}}}
+    else:
+        named = {bone: {"node": node} for bone, node in bones.items()} | {"jaw": None}
+        extension = {"VRMC_vrm": {"humanoid": {"humanBones": named}}}
+    builder.description["extensions"] = extension
+    character = read_character(builder.write(tmp_path / "avatar.vrm"))
+    rig = character.rig
+    assert rig is not None
+    assert rig.joint_names == tuple(bones)
+    assert joint_roles(rig) == (Role.UPPER_ARM, Role.FOREARM, Role.HAND)
+    assert set(joint_parts(rig)) == {"Left upper arm", "Left forearm", "Left hand"}
+    for damaged in ({"VRM": 3}, {"VRM": {"humanoid": []}}, {"VRMC_vrm": {"humanoid": {}}}):
+        builder.description["extensions"] = damaged
+        character = read_character(builder.write(tmp_path / "avatar.vrm"))
+        assert character.rig is not None
+        assert character.rig.joint_names == ("Bone", "Bone.001", "Knochen")
