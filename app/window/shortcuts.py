@@ -8,6 +8,13 @@ from PySide6.QtWidgets import QAbstractSpinBox, QApplication, QDialog, QLineEdit
 
 _Key = QKeySequence.StandardKey
 _EDITING = (_Key.Undo, _Key.Redo, _Key.Copy, _Key.Cut, _Key.Paste, _Key.SelectAll, _Key.Delete)
+_KEPT = (
+    *(_Key.DeleteStartOfWord, _Key.DeleteEndOfWord),
+    *(_Key.MoveToStartOfDocument, _Key.MoveToEndOfDocument),
+)
+"""Editing keys that Qt gives to a shortcut, though a field knows them."""
+_KEPT_OF_WORDS = (_Key.DeleteEndOfLine, _Key.DeleteCompleteLine)
+"""Ctrl+K and Ctrl+U on X: for a number, the window's actions are worth more."""
 _Held = Qt.KeyboardModifier
 _COMMANDS = _Held.ControlModifier | _Held.AltModifier | _Held.MetaModifier
 
@@ -15,7 +22,7 @@ _COMMANDS = _Held.ControlModifier | _Held.AltModifier | _Held.MetaModifier
 class WindowShortcuts(QObject):
     """Gives a window's shortcuts priority over rare editing keys of its fields, as Ctrl+E is on X.
 
-    Copying, pasting and the like stay the field's.
+    Copying, pasting, deleting words and the like stay the field's.
 
     Parameters
     ----------
@@ -34,12 +41,16 @@ class WindowShortcuts(QObject):
         if isinstance(now, QLineEdit | QAbstractSpinBox) and not isinstance(now.window(), QDialog):
             now.installEventFilter(self)
 
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: ARG002, N802 - Qt's names
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
         """Reserve the window's shortcuts; see Qt's ShortcutOverride."""
         if event.type() is not QEvent.Type.ShortcutOverride or not isinstance(event, QKeyEvent):
             return False
         if any(event.matches(key) for key in _EDITING):
             return False
+        is_number = isinstance(watched, QAbstractSpinBox)
+        if any(event.matches(key) for key in (*_KEPT, *(() if is_number else _KEPT_OF_WORDS))):
+            event.accept()
+            return True
         if event.text().isprintable() and event.text() and not event.modifiers() & _COMMANDS:
             # A letter is typed.
             return False

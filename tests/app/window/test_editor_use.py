@@ -380,17 +380,35 @@ def test_the_window_s_shortcuts_work_while_a_field_has_the_keyboard(
             lambda _, action=action: fired.append(action.shortcut().toString())
         )
     field.setFocus()
-    for keys in ("Ctrl+E", "Ctrl+Home", "Ctrl+Backspace", "Ctrl+R"):
+    for keys in ("Ctrl+E", "Ctrl+R", *(() if of_words else ("Ctrl+K",))):
         pressed = QKeySequence(keys)[0]
         QTest.keyClick(field, pressed.key(), pressed.keyboardModifiers())
         assert fired.pop() == keys
-    for keys in ("Ctrl+A", "Ctrl+C", "Ctrl+V", "Ctrl+X", "Left", "Right", "Backspace", "Del"):
+    editing = ["Ctrl+A", "Ctrl+C", "Ctrl+V", "Ctrl+X", "Left", "Right", "Backspace", "Del"]
+    editing += ["Ctrl+Backspace", "Ctrl+Del", "Ctrl+Home", "Ctrl+End"]
+    for keys in (*editing, *(("Ctrl+K", "Ctrl+U") if of_words else ())):
         pressed = QKeySequence(keys)[0]
         QTest.keyClick(field, pressed.key(), pressed.keyboardModifiers())
     assert fired == []
     QTest.keyClicks(field, "1")
     QTest.keyClick(field, Qt.Key.Key_Z, Qt.KeyboardModifier.ControlModifier)
     assert fired == ([] if of_words else ["Ctrl+Z"])
+
+
+def test_deleting_a_word_of_a_field_changes_no_pose(window: MainWindow) -> None:
+    document, field = window.document, window.library.search
+    document.set_code(1, 0.5)
+    document.add_pose_to_library("kept")
+    window.library.choose_own("kept")
+    window.actions_by_key["find_pose"].trigger()
+    QTest.keyClicks(field, "ke pt")
+    QTest.keyClick(field, Qt.Key.Key_Backspace, Qt.KeyboardModifier.ControlModifier)
+    assert field.text() == "ke "
+    field.home(False)
+    QTest.keyClick(field, Qt.Key.Key_Delete, Qt.KeyboardModifier.ControlModifier)
+    assert field.text() == ""
+    assert document.latent[1] == 0.5
+    assert [pose.name for pose in document.poses] == ["kept"]
 
 
 def turn_wheel(widget: QWidget) -> None:
