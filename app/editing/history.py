@@ -111,6 +111,11 @@ class PoseHistory(QObject):
         return () if self._library is None else self._library.poses
 
     @property
+    def library_is_written(self) -> bool:
+        """Whether the library's file has all of it."""
+        return self._library is None or self._library.is_written
+
+    @property
     def library_pose(self) -> NamedPose | None:
         """The pose of the library that the working pose came from, as it is there now."""
         origin = self._state.origin
@@ -137,10 +142,10 @@ class PoseHistory(QObject):
         """
         if self._saved is not None and self._saved.same_as(self.pose):
             return False
-        origin, library = self._state.origin, self._library
+        origin = self._state.origin
         if self.file is not None or self._saved is None or origin is None:
             return True
-        if origin.source is Source.LIBRARY and not (library and library.is_written):
+        if origin.source is Source.LIBRARY and not self.library_is_written:
             return True
         is_elsewhere = origin.source is not Source.MESH and self._source_pose() is not None
         return self.changed or not is_elsewhere
@@ -285,16 +290,19 @@ class PoseHistory(QObject):
         poses = [self._required(name) for name in names]
         self._step(f"Remove {_called(poses)}", [(pose, None) for pose in poses])
 
-    def tag_poses(self, names: Sequence[str], tags: Sequence[str]) -> None:
-        """Give poses of the library other tags.
+    def tag_poses(
+        self, names: Sequence[str], tags: Sequence[str], replaced: Sequence[str] = ()
+    ) -> None:
+        """Put tags in the place of others in poses of the library; each keeps the rest of its own.
 
         Raises
         ------
         ModelFileError : there is no such pose.
         """
         poses = [self._required(name) for name in names]
-        changes = [(p, replace(p, tags=tuple(tags))) for p in poses if p.tags != tuple(tags)]
-        self._step(f"Tag {_called(poses)}", changes)
+        tagged = [replace(pose, tags=retagged(pose, tags, replaced)) for pose in poses]
+        pairs = zip(poses, tagged, strict=True)
+        self._step(f"Tag {_called(poses)}", [(p, new) for p, new in pairs if p.tags != new.tags])
 
     def rename_pose(self, old: str, new: str) -> None:
         """Rename a pose of the library, and the working pose where it came from that one.
@@ -355,6 +363,14 @@ class PoseHistory(QObject):
         """Write what could not be written before, as when the disk was full."""
         if self._library is not None and not self._library.is_written:
             self._library.change(())
+            self._tell_modified()
+
+    def discard_library_changes(self) -> None:
+        """Give up what could not be written."""
+        if self._library is not None:
+            self._library.discard_unwritten()
+            self.library_changed.emit()
+            self._tell_modified()
 
     def mark_saved(self) -> None:
         """Count the pose as saved, as when the user discards the changes."""
@@ -522,6 +538,11 @@ def read_only(array: FloatArray) -> FloatArray:
     """Make an array read-only, as other threads read it, and return it."""
     array.flags.writeable = False
     return array
+
+
+def retagged(pose: NamedPose, tags: Sequence[str], replaced: Sequence[str]) -> tuple[str, ...]:
+    """Return the tags of a pose with some in the place of others."""
+    return (*tags, *(tag for tag in pose.tags if tag not in (*tags, *replaced)))
 
 
 def _working(pose: NamedPose) -> NamedPose:

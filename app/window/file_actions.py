@@ -18,6 +18,7 @@ from app.window.dialogs.questions import (
     Choice,
     ask_about_another_s,
     ask_about_changes,
+    ask_about_library,
     ask_about_scale,
     ask_to_switch,
 )
@@ -225,7 +226,7 @@ class FileActions(QObject):
         if suffix in meshes:
             # A step that can be undone.
             self._import_mesh(path)
-        elif self.may_lose_changes():
+        elif self.may_lose_changes(with_library=suffix == MODEL_SUFFIX):
             openers[suffix](path)
             self.settings["last_folder"] = str(path.resolve().parent)
 
@@ -254,7 +255,7 @@ class FileActions(QObject):
             self._dropped = (path, len(paths))
 
     def _new_pose(self) -> None:
-        if self.may_lose_changes():
+        if self.may_lose_changes(with_library=False):
             self._document.new_pose()
 
     def save(self) -> bool:
@@ -317,15 +318,32 @@ class FileActions(QObject):
         kinds = dict(sorted(kinds.items(), key=lambda kind: kind[1] != first))
         return self.ask_save(title, self._name, kinds) if accepted else None
 
-    def may_lose_changes(self) -> bool:
-        """Ask about unsaved changes; False if the user wants to go on editing."""
-        if not (self._document.has_model and self._document.modified):
+    def may_lose_changes(self, with_library: bool = True) -> bool:
+        """Ask about unsaved changes; False if the user wants to go on editing.
+
+        Parameters
+        ----------
+        with_library : whether the pose library goes too, to ask where it could not be written
+        """
+        document = self._document
+        if document.has_model and document.modified:
+            file = document.file
+            answer = ask_about_changes(self._window, self._name, file.name if file else "")
+            may_go_on = self.save() if answer is Choice.SAVE else answer is Choice.DISCARD
+            if not may_go_on:
+                return False
+        return not with_library or self._may_lose_library()
+
+    def _may_lose_library(self) -> bool:
+        document = self._document
+        if document.library_is_written:
             return True
-        file = self._document.file
-        answer = ask_about_changes(self._window, self._name, file.name if file else "")
+        answer = ask_about_library(self._window, document.model.name)
         if answer is Choice.SAVE:
-            return self.save()
-        return answer is Choice.DISCARD
+            document.retry_library()
+        elif answer is Choice.DISCARD:
+            document.discard_library_changes()
+        return document.library_is_written
 
     def _listing(self, title: str, fill: Callable[[], None]) -> QMenu:
         """Make a menu that is refilled whenever it is about to be shown."""
@@ -382,7 +400,8 @@ class FileActions(QObject):
     @Slot(object)
     def _on_other_model(self, found: OtherModelError) -> None:
         assert found.model is not None
-        if ask_to_switch(self._window, Path(found.where).name, found.model.name):
+        may_switch = ask_to_switch(self._window, Path(found.where).name, found.model.name)
+        if may_switch and self._may_lose_library():
             self._document.open_poses(found.where, found.model.path)
 
     @Slot()

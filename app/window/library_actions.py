@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QMenu, QWidget
 
 from app.editing.commands import Source
+from app.editing.history import retagged
 from app.window.actions import ACTIONS, explain_action
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.names import ask_for_name
@@ -165,13 +166,15 @@ class LibraryActions(QObject):
     def _tag(self) -> None:
         chosen = self._panel.chosen_poses
         shared = [tag for tag in chosen[0].tags if all(tag in pose.tags for pose in chosen)]
-        label = f"Tags of {_called(chosen)}, with commas between them:"
-        before = ", ".join(shared)
-        text = ask_for_name(
-            self._window, "Tags", label, before, lambda text: _why_no_tags(_split(text))
-        )
+        which = "Tags of" if len(chosen) == 1 else "Tags that are shared by"
+        label = f"{which} {_called(chosen)}, with commas between them:"
+
+        def refuse(text: str) -> str:
+            return _why_no_tags(max((retagged(p, _split(text), shared) for p in chosen), key=len))
+
+        text = ask_for_name(self._window, "Tags", label, ", ".join(shared), refuse)
         if text is not None:
-            self._document.tag_poses([pose.name for pose in chosen], _split(text))
+            self._document.tag_poses([pose.name for pose in chosen], _split(text), shared)
 
     def _mirror(self) -> None:
         self._document.mirror_poses(self._panel.chosen_poses)
@@ -228,7 +231,7 @@ def _split(text: str) -> list[str]:
     return list(dict.fromkeys(tag for tag in map(str.strip, text.split(",")) if tag))
 
 
-def _why_no_tags(tags: list[str]) -> str:
+def _why_no_tags(tags: Sequence[str]) -> str:
     from lcollision_core.model import MAX_POSE_NAME_LENGTH, MAX_TAGS
 
     if len(tags) > MAX_TAGS or any(len(tag) > MAX_POSE_NAME_LENGTH for tag in tags):

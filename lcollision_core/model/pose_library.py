@@ -119,6 +119,11 @@ class PoseLibrary:
             )
         self._poses = _changed(self._in_file, self._unwritten)
 
+    def discard_unwritten(self) -> None:
+        """Go back to what the file has."""
+        self._unwritten.clear()
+        self._poses = self._in_file
+
     def refresh(self) -> bool:
         """Load what another program has changed; return whether there was anything."""
         self._find_file()

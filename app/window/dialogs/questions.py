@@ -43,6 +43,21 @@ def ask_about_changes(parent: QWidget, pose_name: str, file_name: str = "") -> C
     return _ask(parent, "Unsaved changes", text, note, ("Save", "Discard", "Cancel"))
 
 
+def ask_about_library(parent: QWidget, model: str) -> Choice:
+    """Ask about a pose library whose file could not be written.
+
+    Returns
+    -------
+    answer : SAVE to try again, DISCARD to lose what its file lacks
+    """
+    text = f"Your library of poses of “{model}” couldn't be saved."
+    note = (
+        "Its latest changes will be lost. To keep them in another place, cancel and choose "
+        "Library > Export library."
+    )
+    return _ask(parent, "Unsaved library", text, note, ("Try again", "Discard", "Cancel"))
+
+
 def ask_about_recovery(parent: QWidget, lost: LostPose) -> Choice:
     """Offer a pose that an editor left when it crashed.
 

@@ -25,7 +25,13 @@ from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.names import NameDialog
 from app.window.main_window import MainWindow
 from lcollision_core.meshes import write_mesh
-from lcollision_core.model import NamedPose, read_pose_file, read_poses, write_poses
+from lcollision_core.model import (
+    NamedPose,
+    read_pose_file,
+    read_poses,
+    user_poses_folder,
+    write_poses,
+)
 from tests.app.editor_model import another_model
 from tests.app.windows import (
     PATIENCE,
@@ -334,15 +340,18 @@ def test_search_and_tags_find_poses(window: MainWindow) -> None:
     assert not library.tags.isVisible()
     click(window, "left kick")
     click(window, "T pose", key=CONTROL)
+    document.tag_poses(["T pose"], ["arms"])
+    press(window, Qt.Key.Key_T, CONTROL | SHIFT, typing("leg, low"))
+    # What is not shared was not there to be deleted.
     press(window, Qt.Key.Key_T, CONTROL | SHIFT, typing("leg, high & wide,leg"))
     assert [pose.tags for pose in document.poses] == [
         ("leg", "high & wide"),
         (),
-        ("leg", "high & wide"),
+        ("leg", "high & wide", "arms"),
     ]
     assert library.tags.isVisible()
     entries = {action.text(): action for action in library.tags.menu().actions()}
-    assert list(entries) == ["All poses", "high && wide", "leg"]
+    assert list(entries) == ["All poses", "arms", "high && wide", "leg"]
     entries["leg"].trigger()
     assert names_shown(window) == ["left kick", "T pose"]
     press(window, Qt.Key.Key_F, CONTROL | SHIFT)
@@ -547,3 +556,37 @@ def test_names_that_are_proposed_are_those_of_the_pose_and_never_taken(
     document.save(tmp_path / "squat.json")
     assert window.windowTitle().startswith("squat — squat.json[*]")
     rest(qtbot, window)
+
+
+@pytest.mark.parametrize("choice", ["Try again", "Discard", "Cancel"])
+def test_a_library_that_could_not_be_written_is_asked_about_before_it_goes(
+    window: MainWindow, choice: str
+) -> None:
+    document, blocked = window.document, user_poses_folder()
+    document.begin_with(document.training_pose(2))
+    blocked.parent.mkdir(parents=True, exist_ok=True)
+    blocked.write_text("a file, where the folder should be")
+    document.add_to_library([document.training_pose(3)])
+    (told,) = window.findChildren(FailureDialog)
+    told.close()
+    heard: list[str] = []
+
+    def choose(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        heard.append(dialog.text())
+        take_picture(dialog, "library-unsaved")
+        if choice == "Try again":
+            blocked.unlink()
+        (button,) = (held for held in dialog.buttons() if held.text() == choice)
+        button.click()
+
+    timer = answer(choose)
+    window.actions_by_key["new"].trigger()
+    assert heard == []
+    document.mark_saved()
+    assert window.close() == (choice != "Cancel")
+    timer.stop()
+    assert heard == [f"Your library of poses of “{document.model.name}” couldn't be saved."]
+    assert len(document.poses) == (choice != "Discard")
+    assert blocked.is_dir() == (choice == "Try again")
+    document.discard_library_changes()
