@@ -58,6 +58,7 @@ class PoseDocument(LiveEditing):
     Attributes
     ----------
     model_file : that the model was read from, or the name of one that was not
+    file_stamp : of `file` as it was opened or saved here
     proposed_rules : by which more poses of the character would be free, None if there are none
     may_replace : asked before a model or a file comes in over edits made while it was read
 
@@ -110,7 +111,7 @@ class PoseDocument(LiveEditing):
         super().__init__(parent)
         self._library_folder = library_folder
         self.model_file = ""
-        self._file_stamp: FileStamp | None = None
+        self.file_stamp: FileStamp | None = None
         self._solve: int | None = None
         self._solve_began = 0.0
         self._mirroring = self._mirroring_poses = self._incoming = self._loading = 0
@@ -369,7 +370,7 @@ class PoseDocument(LiveEditing):
         """Whether another program has written the file since it was opened or saved here."""
         from lcollision_core.meshes import file_stamp
 
-        return self.file is not None and file_stamp(self.file) not in (None, self._file_stamp)
+        return self.file is not None and file_stamp(self.file) not in (None, self.file_stamp)
 
     def save(self, path: str | Path | None = None) -> None:
         """Write the working pose and the file's other poses, and clear the modified mark.
@@ -394,7 +395,7 @@ class PoseDocument(LiveEditing):
         name = self.pose_name if self.pose_name != UNNAMED else name_of_file(target)
         pose = replace(self.pose, name=name)
         write_poses(target, self.model, self.file_poses, pose)
-        self._file_stamp = file_stamp(target)
+        self.file_stamp = file_stamp(target)
         self._keep_saved(pose, target)
         self.message.emit(f"Saved {target.name}")
 
@@ -534,7 +535,7 @@ class PoseDocument(LiveEditing):
         held = read.held
         edited = held.working or held.poses[0]
         self.begin_with(edited, Source.FILE, read.path, held.poses)
-        self._file_stamp = read.stamp
+        self.file_stamp = read.stamp
         notes = () if read.opened is None else read.opened.model.notes
         told = f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}"
         self.message.emit("; ".join((told, *notes)))
@@ -569,8 +570,6 @@ class PoseDocument(LiveEditing):
     def _on_recovered(
         self, name: str, file: Path | None, read: jobs.ReadPoses | OtherModelError
     ) -> None:
-        from lcollision_core.meshes import file_stamp
-
         if isinstance(read, LCollisionError):
             self.failed.emit(Failure.of(read))
             return
@@ -579,7 +578,8 @@ class PoseDocument(LiveEditing):
         poses = read.held.poses
         edited = read.held.working or next((p for p in poses if p.name == name), poses[0])
         self.begin_with(edited, Source.FILE, file, poses)
-        self._file_stamp = file_stamp(file) if file is not None else None
+        # Unknown, so that Save asks, until it is said by the session.
+        self.file_stamp = None
         self._saved = None
         self._tell_modified()
         self.message.emit(f"Recovered {edited.name}")

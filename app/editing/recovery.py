@@ -28,6 +28,7 @@ from lcollision_core.meshes import atomic_write
 from lcollision_core.regular_files import read_regular, require_regular
 
 if TYPE_CHECKING:
+    from lcollision_core.meshes import FileStamp
     from lcollision_core.model import NamedPose, PosableBody
 
 _log = logging.getLogger(__name__)
@@ -108,6 +109,7 @@ class LostPose:
     model : the file of its model, or the name of one
     pose_name : of the edited pose
     file : the poses file that it came from or went to
+    file_stamp : of that file as it was then, None if there was none
     locked : its domains that were to stay
     saved : when it was written last, in seconds since 1970
     """
@@ -116,6 +118,7 @@ class LostPose:
     model: str
     pose_name: str
     file: Path | None
+    file_stamp: FileStamp | None
     locked: tuple[int, ...]
     saved: float
 
@@ -147,6 +150,7 @@ def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
                 model=str(held["model"]),
                 pose_name=str(held["pose_name"]),
                 file=Path(held["file"]) if held["file"] else None,
+                file_stamp=_stamp(held.get("file_stamp")),
                 locked=tuple(map(int, held.get("locked", ()))),
                 saved=(folder / _POSES).stat().st_mtime,
             )
@@ -266,6 +270,7 @@ class Autosave(QObject):
             "model": document.model_file,
             "pose_name": document.pose_name,
             "file": str(document.file) if document.file else None,
+            "file_stamp": document.file_stamp,
             "locked": sorted(document.locked_domains),
         }
         return partial(_write, folder, session, document.model, document.file_poses, document.pose)
@@ -278,6 +283,7 @@ class Autosave(QObject):
             if self._session is not None:
                 self._session.discard()
             self._session = lost.session
+            self._document.file_stamp = lost.file_stamp
             for domain in range(len(self._document.model.domain_names)):
                 self._document.set_locked(domain, domain in lost.locked)
 
@@ -292,6 +298,13 @@ class Autosave(QObject):
             self._told = True
             headline = f"your changes cannot be kept safe ({failure.headline})"
             self.failed.emit(Failure(headline, "save them to a file", failure.details))
+
+
+def _stamp(value: list[int] | None) -> FileStamp | None:
+    if value is None:
+        return None
+    device, inode, size, modified = map(int, value)
+    return device, inode, size, modified
 
 
 def _write(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -142,6 +143,35 @@ def test_the_poses_of_the_file_are_recovered_beside_the_working_pose(
     document.save()
     assert not document.modified
     assert read_pose_file(path, document.model).poses[0].latent[0] == held[0].latent[0]
+    assert autosave.close()
+
+
+@pytest.mark.parametrize("end", ["untouched", "newer", "unknown"])
+def test_save_after_a_recovery_sees_that_another_program_wrote_the_file(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path, end: str
+) -> None:
+    path, folder = tmp_path / "poses.json", tmp_path / "sessions"
+    document.save(path)
+    document.set_code(0, 0.5)
+    assert Autosave(document, folder, seconds=1000.0).close(keep=True)
+    document.mark_saved()
+    document.new_pose()
+    if end == "newer":
+        write_poses(path, document.model, document.file_poses, document.pose)
+    if end == "unknown":
+        # As an older program left it.
+        (session,) = folder.glob("*/session.json")
+        held = json.loads(session.read_text())
+        del held["file_stamp"]
+        session.write_text(json.dumps(held))
+    (lost,) = find_lost_poses(folder)
+    autosave = Autosave(document, folder, seconds=1000.0)
+    with qtbot.waitSignal(document.recovered):
+        autosave.recover(lost)
+    assert document.file == path
+    assert document.file_is_another_s == (end != "untouched")
+    document.save()
+    assert not document.file_is_another_s
     assert autosave.close()
 
 
