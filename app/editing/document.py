@@ -412,13 +412,7 @@ class PoseDocument(LiveEditing):
     def export_mesh(
         self, path: str | Path, axes: str = "model", scale: float | None = None
     ) -> None:
-        """Write the mesh on the screen, back in its place, in the format that `path` says.
-
-        Parameters
-        ----------
-        path : of the file
-        axes, scale : see `export_frame`
-        """
+        """Write the mesh on the screen, back in its place; `axes`, `scale`: see `export_frame`."""
         self.export_pose(path, jobs.ExportStyle(axes, scale))
 
     def export_pose(self, path: str | Path, style: jobs.ExportStyle) -> None:
@@ -491,10 +485,14 @@ class PoseDocument(LiveEditing):
             self.solve_finished.emit(None)
 
     def cancel_all(self) -> None:
-        """Stop all long work except preparing the model."""
+        """Stop all long work except preparing the model; `message` tells of each export."""
         self.cancel_resolve()
+        exports = [label for number in self._exports if (label := self._long.label_of(number))]
+        self._exports.clear()
         self._long.cancel_all()
         self._prepare()
+        for label in exports:
+            self.message.emit(f"{label} was cancelled")
 
     def close(self, timeout: float = 5.0) -> bool:
         """Stop all work and end the threads, before any window closes.

@@ -12,6 +12,7 @@ from PySide6.QtGui import (
     QContextMenuEvent,
     QEnterEvent,
     QIcon,
+    QKeyEvent,
     QMouseEvent,
     QPainter,
     QPaintEvent,
@@ -304,6 +305,11 @@ class Slider(QSlider):
 
     The wheel moves it only when it has the focus.
 
+    Signals
+    -------
+    drag_abandoned : Escape was pressed while the handle was held, which is let go without
+        `sliderReleased`
+
     Parameters
     ----------
     colour : "#rrggbb" of the bar, None for that of the theme
@@ -312,6 +318,8 @@ class Slider(QSlider):
     ----------
     held_at : fraction of the groove where contact holds what the handle asks for, None for nowhere
     """
+
+    drag_abandoned = Signal()
 
     held_at: float | None = None
 
@@ -334,6 +342,18 @@ class Slider(QSlider):
     def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
         """Leave the wheel to the panel's scrolling unless focused."""
         wheel_if_focused(self, event, super().wheelEvent)
+
+    def event(self, event: QEvent) -> bool:
+        """Take Escape in a drag before the window's shortcut does."""
+        is_escape = isinstance(event, QKeyEvent) and event.key() == Qt.Key.Key_Escape
+        if is_escape and self.isSliderDown():
+            event.accept()
+            if event.type() is QEvent.Type.KeyPress:
+                with silent(self):
+                    self.setSliderDown(False)
+                self.drag_abandoned.emit()
+            return True
+        return super().event(event)
 
     def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
         """Grab the handle: where it is, or from where the groove was pressed."""

@@ -45,7 +45,8 @@ class CodeSlider(Slider):
 
     Signals
     -------
-    drag_started, drag_ended, drag_abandoned : around a drag; the last where Escape ended it
+    drag_started, drag_ended : around a drag, unless Escape ends it: see `Slider`
+    click_unwanted : of a double click, whose first press may have moved the handle
     reset_wanted : to zero
 
     Parameters
@@ -56,7 +57,7 @@ class CodeSlider(Slider):
 
     drag_started = Signal()
     drag_ended = Signal()
-    drag_abandoned = Signal()
+    click_unwanted = Signal()
     reset_wanted = Signal()
 
     def __init__(self, low: float, high: float, colour: str | None) -> None:
@@ -105,17 +106,16 @@ class CodeSlider(Slider):
         if dragged:
             self.drag_ended.emit()
 
-    def mouseDoubleClickEvent(self, event: QMouseEvent) -> None:  # noqa: ARG002, N802
+    def mouseDoubleClickEvent(self, event: QMouseEvent) -> None:  # noqa: N802
         """Reset."""
-        self.reset_wanted.emit()
+        if event.button() is Qt.MouseButton.LeftButton:
+            self.click_unwanted.emit()
+            self.reset_wanted.emit()
 
     def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
-        """Reset, abandon a drag, or move as any slider does."""
+        """Reset, or move as any slider does."""
         if event.key() in (Qt.Key.Key_Delete, Qt.Key.Key_Backspace):
             self.reset_wanted.emit()
-        elif event.key() == Qt.Key.Key_Escape and self.isSliderDown():
-            self.setSliderDown(False)
-            self.drag_abandoned.emit()
         else:
             super().keyPressEvent(event)
 
@@ -187,8 +187,9 @@ class CodeRow(HoverRow):
         self.setLayout(line)
         self.setFixedHeight(ROW_HEIGHT)
         self.show_number(float(document.latent[code]))
-        gesture = f"Move {document.code_name(code)}"
-        self.slider.drag_started.connect(lambda: document.begin_gesture(gesture))
+        self._n_steps = 0
+        self.slider.drag_started.connect(self._on_drag_started)
+        self.slider.click_unwanted.connect(self._on_click_unwanted)
         self.slider.drag_ended.connect(self._on_drag_ended)
         self.slider.drag_abandoned.connect(document.cancel_gesture)
         self.slider.valueChanged.connect(lambda: self._move(self.slider.number))
@@ -209,6 +210,8 @@ class CodeRow(HoverRow):
                 self.field.setRange(*(self._shown * limit for limit in limits))
                 self._field_limits = limits
             self.field.setValue(self._shown * number)
+        # The slider's own value is a count of steps.
+        self.slider.setAccessibleDescription(self.field.text())
         self._explain(number)
 
     def _move(self, number: float) -> None:
@@ -250,6 +253,16 @@ class CodeRow(HoverRow):
         self.slider.show_held(number)
         self.field.setProperty("held", number is not None)
         self._explain(self.field.value() / self._shown)
+
+    def _on_drag_started(self) -> None:
+        document = self._document
+        document.begin_gesture(f"Move {document.code_name(self.code)}")
+        self._n_steps = document.undo_stack.index()
+
+    def _on_click_unwanted(self) -> None:
+        document = self._document
+        if document.moving or document.undo_stack.index() > self._n_steps:
+            document.undo()
 
     def _on_drag_ended(self) -> None:
         self._document.end_gesture()

@@ -120,6 +120,7 @@ class LibraryPanel(QWidget):
         self.blend.sliderPressed.connect(self._on_blend_pressed)
         self.blend.valueChanged.connect(self._on_blend)
         self.blend.sliderReleased.connect(self._on_blend_released)
+        self.blend.drag_abandoned.connect(self._on_blend_abandoned)
         document.model_changed.connect(self._on_model)
         document.library_changed.connect(self._on_library)
         document.pose_loaded.connect(self._on_pose_loaded)
@@ -412,11 +413,19 @@ class LibraryPanel(QWidget):
         self._document.end_gesture()
         self._rest_blend()
 
+    @Slot()
+    def _on_blend_abandoned(self) -> None:
+        self._document.cancel_gesture()
+        self._clear_blend()
+
     def _rest_blend(self) -> None:
         """Back to 0: the next blend begins at the pose that this one ended in."""
         share = self.blend.value()
         if share and self.chosen is not None:
             self._document.message.emit(f"Blended {share} % of the way to {self.chosen.name}")
+        self._clear_blend()
+
+    def _clear_blend(self) -> None:
         with silent(self.blend):
             self.blend.setValue(0)
         self._share.setText("")

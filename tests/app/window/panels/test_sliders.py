@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -370,3 +371,66 @@ def test_a_blend_tells_its_share_and_leaves_locked_parts_alone(
     np.testing.assert_allclose(document.latent, blended, rtol=1e-12, atol=1e-12)
     QTest.keyClick(slider, Qt.Key.Key_End)
     assert np.array_equal(document.latent, np.where(held, start, target))
+
+
+@pytest.mark.parametrize("solid", [False, True])
+def test_a_double_click_far_from_the_handle_resets_in_one_step(
+    qtbot: QtBot, window: MainWindow, solid: bool
+) -> None:
+    document, slider = window.document, window.sliders.row_of(1).slider
+    document.set_solid(solid)
+    document.set_code(1, 0.25)
+    rest(qtbot, window)
+    qtbot.waitUntil(lambda: not document.moving, timeout=PATIENCE)
+    document.undo_stack.clear()
+    far = QPoint(slider.width() - 12, slider.height() // 2)
+    for press in (QTest.mousePress, QTest.mouseDClick):
+        press(slider, LEFT, pos=far)
+        QTest.mouseRelease(slider, LEFT, pos=far)
+    rest(qtbot, window)
+    qtbot.waitUntil(lambda: not document.moving, timeout=PATIENCE)
+    assert document.latent[1] == 0.0
+    assert document.undo_stack.count() == 1
+    document.undo()
+    assert document.latent[1] == 0.25
+    # One that takes nothing back leaves the steps before.
+    QTest.mouseDClick(slider, Qt.MouseButton.RightButton, pos=far)
+    assert document.latent[1] == 0.25
+    rest(qtbot, window)
+
+
+@pytest.mark.parametrize("of_library", [False, True], ids=["code", "blend"])
+def test_escape_ends_the_drag_of_a_slider_and_no_work(
+    qtbot: QtBot, window: MainWindow, of_library: bool
+) -> None:
+    document = window.document
+    choose(window, document.model.pose_names[4])
+    slider = window.library.blend if of_library else window.sliders.row_of(1).slider
+    before, value = document.latent, slider.value()
+    going = Event()
+    document.write("Exporting a.obj", lambda *_: str(going.wait(PATIENCE / 1000)))
+    middle = QPoint(0, slider.height() // 2)
+    QTest.mousePress(slider, LEFT, pos=middle + QPoint(8, 0))
+    QTest.mouseMove(slider, middle + QPoint(slider.width() - 12, 0))
+    assert not np.array_equal(document.latent, before)
+    QTest.keyClick(slider, Qt.Key.Key_Escape)
+    assert np.array_equal(document.latent, before)
+    assert slider.value() == value
+    assert document.busy == "Exporting a.obj"
+    QTest.mouseMove(slider, middle)
+    QTest.mouseRelease(slider, LEFT, pos=middle)
+    assert np.array_equal(document.latent, before)
+    assert not document.undo_stack.canUndo()
+    # Without a drag it is the window's.
+    with qtbot.waitSignal(document.message) as told:
+        QTest.keyClick(slider, Qt.Key.Key_Escape)
+    assert told.args == ["Exporting a.obj was cancelled"]
+    assert document.busy != "Exporting a.obj"
+    going.set()
+    rest(qtbot, window)
+
+
+def test_a_slider_describes_its_number_as_it_is_shown(window: MainWindow) -> None:
+    row = window.sliders.row_of(1)
+    window.document.set_code(1, 0.25)
+    assert row.slider.accessibleDescription() == row.field.text() == "0.250"
