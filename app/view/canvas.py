@@ -117,6 +117,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         # The default for auto_update draws five times a second for ever.
         super().__init__(parent, auto_update=False, multi_samples=0)
         self.setAcceptDrops(False)
+        self.setAccessibleName("View of the body")
         self._before_paint = before_paint
         self._painting = self.is_settled = self._shut = False
         self._smoothness = Smoothness()
@@ -144,6 +145,11 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._draw_smooth(self._smoothness.while_moving)
         self._rest.start()
         self.update()
+
+    def look_again(self) -> None:
+        """Signal soon what is under the pointer."""
+        if not self._shut:
+            self._hover.start()
 
     def pick(
         self, position: QPointF, actor: vtkActor

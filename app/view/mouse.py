@@ -72,6 +72,8 @@ class Mouse(QObject):
         self._document, self._canvas, self._scene = document, canvas, scene
         self.vertex: int | None = None
         self.pin: int | None = None
+        self._last_vertex: int | None = None
+        self._keeps = False
         self._drag: _Drag | None = None
         self._grip: Grip | None = None
         self._target: FloatArray | None = None
@@ -90,6 +92,7 @@ class Mouse(QObject):
         """Forget what is under the pointer and what is dragged, as of another model."""
         self._drag = self._grip = self._target = None
         self.point_at(None)
+        self._last_vertex = None
 
     def point_at(self, place: QPointF | None) -> None:
         """Find what is under the pointer, and show the patch that a drag would take."""
@@ -104,12 +107,27 @@ class Mouse(QObject):
             else:
                 picked = self._canvas.pick(place, scene.body)
                 self.vertex = None if picked is None else picked[0]
+        if self.vertex is not None:
+            self._last_vertex = self.vertex
         self._show_patch()
         cursor = Qt.CursorShape.ArrowCursor
         if self.vertex is not None:
             cursor = Qt.CursorShape.OpenHandCursor
         self._canvas.setCursor(cursor)
         self.pointed.emit(place)
+
+    def keep_patch(self) -> None:
+        """Point at the patch that was pointed at last, until `look_again`."""
+        self._keeps = True
+        if self.vertex is None and self._last_vertex is not None:
+            self.vertex = self._last_vertex
+            self._show_patch()
+            self.pointed.emit(None)
+
+    def look_again(self) -> None:
+        """Point soon at what is under the pointer."""
+        self._keeps = False
+        self._canvas.look_again()
 
     def toggle_pin(self) -> None:
         """Pin the patch under the pointer, or take its pin away."""
@@ -156,7 +174,7 @@ class Mouse(QObject):
 
     @Slot(object)
     def _on_hovered(self, place: QPointF | None) -> None:
-        if not self._canvas.is_dragging:
+        if not (self._canvas.is_dragging or self._keeps):
             self.point_at(place)
 
     @Slot(QPointF)

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPoint, QPointF, QSize, QTimer, Signal, Slot
 from PySide6.QtGui import QCloseEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
-from PySide6.QtWidgets import QStackedLayout, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QMenu, QStackedLayout, QVBoxLayout, QWidget
 
 from app.view.animation import Animation
-from app.view.camera import View, between, kept_in_view, preset_view
+from app.view.camera import View, between, framing, kept_in_view, preset_view
 from app.view.legend import DomainTag, LegendStrip
 from app.view.mouse import Mouse
 from app.view.pictures import Pictures
@@ -165,6 +165,12 @@ class Viewport(QWidget):
         """The vertex under the pointer."""
         return None if self.mouse is None else self.mouse.vertex
 
+    def follow_menu(self, menu: QMenu) -> None:
+        """Keep the last patch while a menu is open that the pointer leaves the body for."""
+        menu.aboutToShow.connect(lambda: self.mouse and self.mouse.keep_patch())
+        # Soon is after the menu has done what was chosen.
+        menu.aboutToHide.connect(lambda: self.mouse and self.mouse.look_again())
+
     def toggle_pin(self) -> None:
         """Pin the patch under the pointer, or take its pin away."""
         if self.mouse is not None:
@@ -214,6 +220,14 @@ class Viewport(QWidget):
             self.canvas.redraw()
             return
         self._turn.begin(partial(between, self.scene.view, end))
+
+    def show_whole(self) -> None:
+        """Look at the whole pose from the same side."""
+        if self.scene is None or self.shown_frame is None:
+            return
+        view, vertices = self.scene.view, self.shown_frame.vertices
+        end = framing(vertices, view.position - view.focus, view.up, self._aspect)
+        self._turn.begin(partial(between, view, end))
 
     @Slot()
     def frame_pose(self) -> None:

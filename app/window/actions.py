@@ -47,13 +47,15 @@ ACTIONS: dict[str, Spec] = {
         "Ctrl+Alt+N",
         "Give this character body parts of its own and an instant estimate",
     ),
-    "learning": Spec("Learnin&g…", "Ctrl+Alt+P", "How far the models are that are being learned"),
+    "learning": Spec("Learnin&g…", "Ctrl+Alt+P", "Show the progress of models being trained"),
     "save": Spec("&Save", "Ctrl+S", "Save the pose to its file", "save"),
     "save_as": Spec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
     "import": Spec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),
     "export": Spec("&Export mesh…", "Ctrl+E", "Save the pose as a mesh or in your file", "export"),
     "upright": Spec(
-        "Turn &upright", "Ctrl+Shift+U", "Turn the body to its next axis; a model also in its file"
+        "Turn &upright",
+        "Ctrl+Shift+U",
+        "Make the next axis point up (changes a learned model's file)",
     ),
     "screenshot": Spec("S&creenshot…", "Ctrl+P", "Save a picture of the view", "screenshot"),
     "turntable": Spec("&Turntable…", "Ctrl+T", "Save a video of one full turn", "turntable"),
@@ -124,7 +126,9 @@ ACTIONS: dict[str, Spec] = {
         "ghost",
         checkable=True,
     ),
-    "reset_camera": Spec("Show the &whole body", "Ctrl+Home", "Fit the whole body into the view"),
+    "reset_camera": Spec(
+        "Show the &whole body", "Ctrl+Home", "Fit the whole body into the view, from the same side"
+    ),
     "full_screen": Spec("&Full screen", "F11", "Use the whole screen", "", True),
     "reset_layout": Spec("Reset la&yout", "Ctrl+Alt+0", "Put all panels back in their places"),
     "shortcuts": Spec("&Keyboard and mouse", "F1", "All shortcuts", "info"),
@@ -159,10 +163,10 @@ CAMERA_ACTIONS: dict[str, Spec] = {
 
 DRAG_STRENGTHS: dict[float, Spec] = {
     0.0: Spec(
-        "&Loose", "Ctrl+Alt+7", "Let drags stretch limbs and reach poses unlike those of the body"
+        "&Loose", "Ctrl+Alt+7", "Let drags stretch limbs and reach poses far from the model's own"
     ),
     1.0: Spec("&Normal", "Ctrl+Alt+8", "Keep drags from stretching limbs"),
-    4.0: Spec("&Firm", "Ctrl+Alt+9", "Keep drags close to poses like those of the body"),
+    4.0: Spec("&Firm", "Ctrl+Alt+9", "Keep drags close to the model's own poses"),
 }
 """How strongly drags keep to natural poses, by the setting."""
 

@@ -103,7 +103,7 @@ class BodyMenus(QObject):
         text = "Un&pin" if document.is_pinned(vertex) else "&Pin"
         self._add(menu, text, document.toggle_pin, vertex)
         menu.addAction(self._actions["unpin_all"])
-        sizes = menu.addMenu("&Grab radius")
+        sizes = menu.addMenu("Patch si&ze")
         for text, radius in _RADII.items():
             size = self._add(
                 sizes, f"{text} ({100 * radius:g} %)", document.set_grip_radius, radius

@@ -67,7 +67,7 @@ class DragActions(QObject):
         strengths = make_choices(
             DRAG_STRENGTHS, document.drag_strength, self._set_strength, viewport
         )
-        self.strengths_menu = make_menu("Keep &natural", strengths, viewport)
+        self.strengths_menu = make_menu("Drag stiff&ness", strengths, viewport)
         document.set_solid(settings["solid"])
         document.solid_changed.connect(self._on_solid)
         for changed in (document.model_changed, document.pins_changed, viewport.pointed):

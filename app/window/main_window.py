@@ -325,6 +325,7 @@ class MainWindow(QMainWindow):
             rows.menu_wanted.connect(self._body_menus.open_on_part)
         self.viewport.domain_hovered.connect(self.sliders.light_domain)
         self.viewport.domain_hovered.connect(self.collision.prediction.light_domain)
+        self.viewport.follow_menu(self.menus["&Pose"])
         self.viewport.waiting.open_wanted.connect(self.actions_by_key["open_model"].trigger)
         document.model_changed.connect(self._on_model)
         document.frame_changed.connect(self._on_frame)

@@ -9,7 +9,6 @@ from PySide6.QtCore import QObject, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QWidget
 
-from app.view.camera import CAMERAS
 from app.view.shading import Shading
 from app.window.actions import CAMERA_ACTIONS, SHADINGS, make_choices, make_menu
 from app.window.widgets import silent
@@ -52,7 +51,7 @@ class ViewActions(QObject):
         self._viewport, self._ghost, self._reset_camera = viewport, ghost, reset_camera
         self.acts: dict[str, Callable[[], object]] = {
             "ghost": lambda: document.show_ghost(ghost.isChecked()),
-            "reset_camera": lambda: viewport.set_camera(CAMERAS[0]),
+            "reset_camera": viewport.show_whole,
         }
         shading = Shading[settings["shading"].upper()]
         self.shadings = make_choices(SHADINGS, shading, viewport.set_shading, window)

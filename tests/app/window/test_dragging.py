@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from PySide6.QtCore import QPoint, Qt
+from PySide6.QtCore import QEvent, QPoint, Qt
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QMenu, QToolBar
+from PySide6.QtWidgets import QApplication, QMenu, QToolBar
 from pytestqt.qtbot import QtBot
 
 from app.editing.settings import SETTINGS
+from app.view.camera import View
 from app.window.main_window import MainWindow
 from tests.app.views import place_of, point_at, seen_vertex
 from tests.app.windows import (
@@ -59,7 +60,7 @@ def test_how_natural_drags_stay_is_chosen_and_remembered(window: MainWindow) -> 
     menu = next(
         action.menu()
         for action in window.menus["&Pose"].actions()
-        if action.text() == "Keep &natural"
+        if action.text() == "Drag stiff&ness"
     )
     assert isinstance(menu, QMenu)
     assert [action.isChecked() for action in menu.actions()] == [False, True, False]
@@ -130,7 +131,7 @@ def test_the_menu_of_the_body_pins_and_chooses_the_patch(qtbot: QtBot, window: M
         found.trigger()
 
     menu = opened()
-    (sizes,) = (a.menu() for a in menu.actions() if a.text().replace("&", "") == "Grab radius")
+    (sizes,) = (a.menu() for a in menu.actions() if a.text().replace("&", "") == "Patch size")
     assert isinstance(sizes, QMenu)
     choose(sizes, "Large (6 %)")
     assert document.grip_radius == pytest.approx(0.06)
@@ -249,3 +250,48 @@ def test_a_part_is_mirrored_to_the_other_side_by_the_menu(
     assert changed.any()
     assert not changed[~document.model.embedding.codes_of([right])].any()
     assert not document.exact.colliding
+
+
+def test_the_menu_bar_pins_the_patch_that_the_pointer_left(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    document, pin, menu = window.document, window.actions_by_key["pin"], window.menus["&Pose"]
+    viewport = window.viewport
+    vertex = seen_vertex(viewport, 1)
+    point_at(qtbot, viewport, vertex)
+    QApplication.sendEvent(viewport.canvas, QEvent(QEvent.Type.Leave))
+    assert not pin.isEnabled()
+    # The key is for what is under the pointer.
+    QTest.keyClick(window, Qt.Key.Key_P)
+    assert document.pins == ()
+    menu.popup(window.mapToGlobal(QPoint(60, 30)))
+    assert pin.isEnabled()
+    assert viewport.hovered_domain == document.domain_of(vertex)
+    take_picture(window, "pose menu")
+    menu.setActiveAction(pin)
+    QTest.keyClick(menu, Qt.Key.Key_Return)
+    assert [held.vertex for held in document.pins] == [vertex]
+    qtbot.waitUntil(lambda: not pin.isEnabled(), timeout=PATIENCE)
+    menu.popup(window.mapToGlobal(QPoint(60, 30)))
+    assert pin.text().replace("&", "") == "Unpin"
+    menu.close()
+    document.set_model(document.model)
+    menu.popup(window.mapToGlobal(QPoint(60, 30)))
+    assert not pin.isEnabled()
+    menu.close()
+    rest(qtbot, window)
+
+
+def test_the_whole_body_is_shown_from_the_same_side(qtbot: QtBot, window: MainWindow) -> None:
+    viewport = window.viewport
+    assert viewport.scene is not None
+    viewport.set_camera("Back", animated=False)
+    back = viewport.scene.view
+    arm = back.position - back.focus
+    viewport.scene.view = View(back.focus + 0.2 * arm + 0.1, back.focus + 0.1, back.up)
+    window.actions_by_key["reset_camera"].trigger()
+    rest(qtbot, window)
+    for name in ("position", "focus", "up"):
+        np.testing.assert_allclose(
+            getattr(viewport.scene.view, name), getattr(back, name), atol=1e-6
+        )
