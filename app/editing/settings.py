@@ -53,7 +53,7 @@ SETTINGS: dict[str, Setting] = {
     "resolve_time_budget": Setting(20.0, 0.1, 3600.0),
     "export_form": Setting("joints", choices=("joints", "mesh", "morph", "obj", "mesh-alone")),
     "motion_form": Setting("clip", choices=("clip", "pc2", "mdd")),
-    "export_rate": Setting(30, 1, 240),
+    "export_rate": Setting(30.0, 0.001, 240.0),
     "export_axes": Setting("model", choices=("model", "y-up", "blender", "maya", "unreal")),
     "export_rescale": Setting(1.0, 1e-6, 1e6),
     "screenshot_width": Setting(1920, 16, 16384),

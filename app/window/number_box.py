@@ -23,12 +23,16 @@ class NumberBox(QDoubleSpinBox):
     ----------
     decimals : behind the point, 0 for a whole number
     low, high : limits
+    trims : whether zeros at the end are left out; more than three decimals always are
     """
 
     refused = Signal(str)
 
-    def __init__(self, decimals: int, low: float, high: float) -> None:
+    _trims = False
+
+    def __init__(self, decimals: int, low: float, high: float, trims: bool = False) -> None:
         super().__init__()
+        self._trims = trims or decimals > 3
         self.setDecimals(decimals)
         self.setRange(low, high)
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
@@ -37,7 +41,7 @@ class NumberBox(QDoubleSpinBox):
     def textFromValue(self, value: float) -> str:  # noqa: N802
         """Write many decimals only if they carry information."""
         text = super().textFromValue(value)
-        if self.decimals() <= 3:
+        if not self._trims:
             return text
         return text.rstrip("0").rstrip(self.locale().decimalPoint())
 

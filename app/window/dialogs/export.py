@@ -198,12 +198,14 @@ class MotionDialog(_FrameForm):
         if self._settings["motion_form"] not in names:
             # What is not offered now stays remembered.
             del self._readers["motion_form"]
-        self.rate = self.add_number("export_rate", "Frames per second", tip="One pose is one frame")
+        tip = "One pose is one frame"
+        self.rate = self.add_number("export_rate", "Frames per second", "", 1.0, tip, 3, trims=True)
         if rate is not None:
-            self.rate.setValue(round(rate))
+            self.rate.setValue(rate)
             self._readers["export_rate"] = self._remembered_rate
-            self.add_note(f"At {rate:g}, poses of a clip last as long as the clip.")
-        self._own_rate = rate
+            own = self.rate.textFromValue(rate)
+            self.add_note(f"At {own}, poses of a clip last as long as the clip.")
+        self._own_rate = None if rate is None else self.rate.value()
         self.axes, self._scale = self._add_frame(model)
         self._about, self._meaning = self.add_note(""), self.add_note("")
         for choice in (self.form, self.axes):
@@ -219,14 +221,12 @@ class MotionDialog(_FrameForm):
     @property
     def export_style(self) -> ExportStyle:
         """What the fields say."""
-        return ExportStyle(
-            self.axes.currentData(), self._scale.value(), fps=float(self.rate.value())
-        )
+        return ExportStyle(self.axes.currentData(), self._scale.value(), fps=self.rate.value())
 
-    def _remembered_rate(self) -> int:
+    def _remembered_rate(self) -> float:
         """Return the rate for poses of no motion, which that of a clip does not change."""
-        is_own = self._own_rate is not None and self.rate.value() == round(self._own_rate)
-        return int(self._settings["export_rate"] if is_own else self.rate.value())
+        rate = self.rate.value()
+        return float(self._settings["export_rate"]) if rate == self._own_rate else rate
 
     @Slot()
     def _explain(self) -> None:

@@ -106,10 +106,11 @@ class Form(QDialog):
         step: float = 1.0,
         tip: str = "",
         decimals: int = 0,
+        trims: bool = False,
     ) -> NumberBox:
-        """Add a field for a number, by default a whole one."""
+        """Add a field for a number, by default a whole one; see `NumberBox`."""
         setting = SETTINGS[key]
-        field = NumberBox(decimals, setting.low or 0.0, setting.high or 0.0)
+        field = NumberBox(decimals, setting.low or 0.0, setting.high or 0.0, trims)
         field.setSingleStep(step)
         field.setSuffix(suffix)
         field.setValue(self._settings[key])

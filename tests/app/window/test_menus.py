@@ -6,8 +6,10 @@ import time
 from pathlib import Path
 
 import pytest
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QAction, QImage
-from PySide6.QtWidgets import QDialog, QMenu
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QDialog, QMenu, QToolBar, QToolButton
 from pytestqt.qtbot import QtBot
 
 from app.editing.recovery import LostPose, Session
@@ -15,7 +17,7 @@ from app.window.dialogs.questions import ask_about_recovery, ask_to_replace, ask
 from app.window.main_window import MainWindow
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import PoseModel, user_models_folder
-from tests.app.windows import PATIENCE, answer, rest
+from tests.app.windows import PATIENCE, answer, rest, take_picture
 
 WIDEST_TITLE = "Recover a pose — LCollision"
 TITLE_BUTTONS = 160
@@ -134,3 +136,26 @@ def test_no_title_is_cut(window: MainWindow, tmp_path: Path) -> None:
     least = window.fontMetrics().horizontalAdvance(WIDEST_TITLE) + TITLE_BUTTONS
     assert len(widths) == 7
     assert min(widths) >= least
+
+
+def test_the_focus_is_seen_on_what_is_chosen(qtbot: QtBot, window: MainWindow) -> None:
+    window.set_theme("dark")
+    bar, poses = window.findChild(QToolBar), window.library.list
+    segments = bar.findChildren(QToolButton, "segment")
+    (chosen,) = (button for button in segments if button.isChecked())
+    window.viewport.setFocus()
+    before = chosen.grab().toImage()
+    chosen.setFocus(Qt.FocusReason.TabFocusReason)
+    assert chosen.grab().toImage() != before
+    take_picture(window, "focused segment")
+    poses.setFocus()
+    poses.setCurrentRow(1)
+    before = poses.viewport().grab().toImage()
+    # Goes on without choosing.
+    QTest.keyClick(poses, Qt.Key.Key_Right, Qt.KeyboardModifier.ControlModifier)
+    assert poses.currentRow() == 2
+    assert [index.row() for index in poses.selectedIndexes()] == [1]
+    assert poses.viewport().grab().toImage() != before
+    take_picture(window, "focused pose")
+    assert window.viewport.canvas.accessibleName()
+    rest(qtbot, window)

@@ -265,12 +265,19 @@ def test_selected_poses_are_the_frames_of_a_point_cache(
 def test_poses_of_no_motion_keep_the_rate_and_form_that_were_chosen(
     qtbot: QtBot, window: MainWindow
 ) -> None:
-    window.settings["export_rate"] = 12
+    window.settings["export_rate"] = 29.97
     form = MotionDialog(window.settings, window, window.document.model)
     qtbot.addWidget(form)
     assert [form.form.itemData(row) for row in range(form.form.count())] == ["pc2", "mdd"]
-    assert form.rate.value() == 12
+    assert (form.rate.value(), form.rate.text()) == (29.97, "29.97")
+    assert form.export_style.fps == 29.97
+    form.rate.setValue(30.0)
+    assert form.rate.text() == "30"
+    form.rate.setValue(23.976)
+    form.show()
+    take_picture(form, "export_rate")
     form.accept()
+    assert window.settings["export_rate"] == 23.976
     # A model has no clip to choose, which says nothing of the next character.
     assert window.settings["motion_form"] == "clip"
 
