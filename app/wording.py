@@ -94,7 +94,7 @@ def mirrored_text(mirrored: MirroredPose) -> str:
         resolved = counted(mirrored.pairs_mirrored, "pair of faces", "pairs of faces")
         state = f"no collisions (checked), as {resolved} of the mirror image were resolved"
     elif mirrored.lost_freedom:
-        state = f"colliding: {pairs}, which the pose before does not have"
+        state = f"colliding: {pairs} that the original doesn't have"
     elif mirrored.pairs_after:
         state = f"colliding as before: {pairs}, before {mirrored.pairs_before}"
     else:

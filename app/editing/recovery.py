@@ -109,18 +109,18 @@ class LostPose:
     model : the file of its model, or the name of one
     pose_name : of the edited pose
     file : the poses file that it came from or went to
-    file_stamp : of that file as it was then, None if there was none
     locked : its domains that were to stay
     saved : when it was written last, in seconds since 1970
+    file_stamp : of `file` as it was then, None if that is not known
     """
 
     session: Session
     model: str
     pose_name: str
     file: Path | None
-    file_stamp: FileStamp | None
     locked: tuple[int, ...]
     saved: float
+    file_stamp: FileStamp | None = None
 
     @property
     def poses_file(self) -> Path:
@@ -296,7 +296,7 @@ class Autosave(QObject):
     def _on_failed(self, failure: Failure) -> None:
         if not self._told:
             self._told = True
-            headline = f"your changes cannot be kept safe ({failure.headline})"
+            headline = f"Autosave failed ({failure.headline})"
             self.failed.emit(Failure(headline, "save them to a file", failure.details))
 
 

@@ -23,7 +23,7 @@ from app.window.dialogs.questions import (
     ask_to_switch,
 )
 from app.window.widgets import plain_tip
-from app.wording import menu_text
+from app.wording import counted, menu_text
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 
@@ -389,9 +389,8 @@ class FileActions(QObject):
             self._remember(path)
         dropped, self._dropped = self._dropped, None
         if dropped is not None and dropped[0].absolute() == path.absolute():
-            self._document.message.emit(
-                f"{self._told}; of {dropped[1]} files it is the one that was opened"
-            )
+            others = counted(dropped[1] - 1, "other file was", "other files were")
+            self._document.message.emit(f"{self._told}; {others} not opened")
 
     @Slot(str)
     def _on_message(self, sentence: str) -> None:

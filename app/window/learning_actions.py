@@ -214,7 +214,7 @@ def indicator_text(run: LearningRun) -> str:
             words.append(f"{duration_text(status.seconds_left)} left")
         return ", ".join((*words, STAGE_WORDS.get(status.stage, status.stage)))
     return {
-        RunPhase.WAITING: f"{name} waits to be learned",
+        RunPhase.WAITING: f"{name} is queued",
         RunPhase.STOPPING: f"Learning {name}: stopping",
         RunPhase.DONE: f"{name} is ready",
         RunPhase.STOPPED: f"Learning {name}: stopped",

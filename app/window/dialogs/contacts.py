@@ -46,7 +46,7 @@ _OTHERS = "other pairs"
 _MEANINGS = {
     "meshes and materials": "As the file has them",
     "body parts": "Such as an upper arm and its forearm, which cross at the elbow",
-    "components": "Pieces of the surface that hang together, such as shells and buttons",
+    "components": "Connected pieces of the surface, such as shells and buttons",
     _OTHERS: "Groups of two kinds",
 }
 _TINT = "Crosses in the pose shown, but isn't counted"

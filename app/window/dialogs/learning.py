@@ -187,7 +187,7 @@ class LearningDialog(QDialog):
         phase, name = run.phase, one_line(run.name)
         is_done, has_ended = phase is RunPhase.DONE, phase in _ENDED
         headlines = {
-            RunPhase.WAITING: f"“{name}” waits",
+            RunPhase.WAITING: f"“{name}” is queued",
             RunPhase.RUNNING: f"Learning “{name}”",
             RunPhase.STOPPING: f"Stopping “{name}”",
             RunPhase.STOPPED: f"“{name}” is stopped",
@@ -382,13 +382,13 @@ def _figures(card: LearnedCard) -> list[tuple[str, str]]:
         ),
         ("Estimate", f"right for {_percent(card.accuracy)} of new poses"),
         (
-            "False alarms",
+            "False positive rate",
             "unknown: no sample was free"
             if card.false_positive_rate is None
             else f"{_percent(card.false_positive_rate)} of the free poses",
         ),
         (
-            "Misses",
+            "False negative rate",
             "unknown: no sample collided"
             if card.false_negative_rate is None
             else f"{_percent(card.false_negative_rate)} of the colliding poses",

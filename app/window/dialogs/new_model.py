@@ -253,7 +253,7 @@ def _facts(summary: SourcesSummary) -> str:
     lines.append(f"{counted(summary.n_given(), 'pose')} in the files")
     lines.append(f"rig of {summary.n_joints} joints" if summary.n_joints else "no rig")
     if not summary.up.is_sure:
-        lines.append(f"{'xyz'[summary.up.axis]} seems to be up: look whether it stands")
+        lines.append(f"Probably {'xyz'[summary.up.axis]} up: check the preview")
     return "\n".join(map(with_capital, lines))
 
 

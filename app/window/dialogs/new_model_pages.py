@@ -201,7 +201,7 @@ class PosesPage(Page):
             "from them alone.",
         )
         self._summary: SourcesSummary | None = None
-        self.clip, self.rate = QComboBox(), NumberBox(0, 0, 240)
+        self.clip, self.rate = QComboBox(), NumberBox(3, 0, 240, trims=True)
         self.clip.setAccessibleName("Animation")
         self.clip.setMinimumContentsLength(12)
         self.rate.setSpecialValueText("as in the file")
@@ -209,7 +209,7 @@ class PosesPage(Page):
         self._from_clips = labelled("", "caption", wraps=True)
         form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
         form.addRow("Animation", self.clip)
-        form.addRow("Frames a second", self.rate)
+        form.addRow("Frames per second", self.rate)
         self._clips = self._card("Animations", _held(form), self._from_clips)
         self.by_rig, self.number = QComboBox(), NumberBox(0, 1, _MOST_BY_RIG)
         for key, text in (
@@ -260,7 +260,7 @@ class PosesPage(Page):
                 self.clip.addItem(f"{clip.name} ({counted(clip.n_frames, 'frame')})", clip.name)
         self._clips.setVisible(bool(summary.clips))
         self._rig.setVisible(bool(summary.n_joints))
-        said = "As in the file" if summary.up.is_sure else "As it seems to stand"
+        said = "As in the file" if summary.up.is_sure else "Guessed"
         own = summary.up.axis
         self.up.clear()
         self.up.addItem(f"{said}: {_AXES[own]}", None)
@@ -312,7 +312,7 @@ class PosesPage(Page):
             return
         values = self.values()
         frames = summary.n_given(values["clip"], values["fps"]) - summary.n_poses
-        self._from_clips.setText(f"{counted(frames, 'frame')} of the animations are poses.")
+        self._from_clips.setText(f"Uses {counted(frames, 'animation frame')} as poses.")
         size = f"The longest side of the body is {summary.size:.4g} in its file"
         if summary.metres is not None:
             size += f" ({summary.size * summary.metres:.2f} m)"
@@ -362,7 +362,7 @@ class ContactsPage(Page):
         self.near, self.rest, self.tolerated = (
             rule.field for rule in (self._near, self._rest, self._tolerated)
         )
-        self.count_groups = QCheckBox("Count them all the same")
+        self.count_groups = QCheckBox("Count them anyway")
         self._groups = _plain(
             "Pieces that always touch",
             "Hair on a head, a shoe on a foot: pairs of pieces in contact in nearly every pose.",
@@ -464,9 +464,9 @@ class QualityPage(Page):
         from lcollision_core.learning import EFFORTS, Quality, estimated_seconds
 
         aims = {
-            Quality.QUICK: "To see what comes of it",
+            Quality.QUICK: "A first try",
             Quality.GOOD: "For daily work",
-            Quality.BEST: "For a character that stays",
+            Quality.BEST: "For final use",
         }
         for quality, label in self._meanings.items():
             effort = EFFORTS[quality]

@@ -25,7 +25,7 @@ _SIGN_SIZE = 24
 _SOURCE = "computed on the mesh"
 _BEFORE = "previous pose"
 _HELD = "Held by contact"
-_NO_DEEPER = "Solid keeps it from going deeper; Resolve takes it apart"
+_NO_DEEPER = "Solid keeps it from going deeper; Resolve separates it"
 
 
 class ExactCard(Card):
@@ -64,7 +64,7 @@ class ExactCard(Card):
         has_model = self._document.has_model
         self._sign.show_icon("wait", "waiting")
         self.verdict.setText("Checking…" if has_model else "No pose yet")
-        self.details.setText("Follows when the pose rests")
+        self.details.setText("Updates when the pose stops moving")
         if has_model:
             # What does not count is reported on a separate line.
             lines = 1 if self._document.model.rules.exclude_nothing else 2

@@ -35,7 +35,7 @@ _CHECKED = {True: "No collisions (checked)", False: "Still colliding", None: "No
 _ESTIMATED = {
     True: "Estimate: probably clear",
     False: "Estimate: probably colliding",
-    None: "No estimate: nothing was trained",
+    None: "No estimate: this body has no predictor",
 }
 
 

@@ -83,7 +83,7 @@ def test_a_free_pose_that_stays_colliding_is_told_with_an_offer(
     images = tmp_path / "images.json"
     result = lcollision("mirror", bare, poses, "-o", images)
     assert result.exit_code == 1
-    assert "pairs of faces, which the pose before does not have" in result.stdout
+    assert "pairs of faces that the original doesn't have" in result.stdout
     assert "1 free pose collides in the mirror" in result.stderr
     assert "train predictor" in result.stderr
     assert images.is_file()

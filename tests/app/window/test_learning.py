@@ -141,7 +141,7 @@ def test_a_dropped_folder_of_meshes_is_learned_killed_continued_and_opened(
         qtbot.waitUntil(lambda: phase() is RunPhase.KILLED, timeout=PATIENCE)
         assert learning.indicator.property("state") == "failed"
         dialog = dialog_of(window)
-        assert "ended unexpectedly" in dialog.state.text()
+        assert "stopped unexpectedly" in dialog.state.text()
         QTest.mouseClick(dialog.resume, LEFT)
         window.document.undo()
     qtbot.waitUntil(lambda: phase() is RunPhase.DONE, timeout=PATIENCE)
@@ -341,8 +341,8 @@ def test_a_card_that_is_being_read_is_given_up_with_its_dialog_and_for_another_r
 def test_rates_that_no_sample_tells_are_unknown() -> None:
     card = LearnedCard("", "hero", 8, 2, 1, 0.0, 0.0, 1.0, None, None, 1.0, 10, 1.0, "", {})
     figures = dict(_figures(card))
-    assert figures["False alarms"] == "unknown: no sample was free"
-    assert figures["Misses"] == "unknown: no sample collided"
+    assert figures["False positive rate"] == "unknown: no sample was free"
+    assert figures["False negative rate"] == "unknown: no sample collided"
 
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=lambda theme: theme.name)

@@ -105,7 +105,7 @@ def test_a_free_pose_that_would_collide_is_resolved_or_it_is_said(
     for domain in range(len(body.domain_names)):
         document.set_locked(domain, True)
     said = press_mirror(qtbot, window)
-    assert "which the pose before does not have" in said
+    assert "that the original doesn't have" in said
     assert "unlock" in said
     assert "locked parts were mirrored too" in said
     assert document.exact is not None

@@ -95,7 +95,7 @@ def test_killed_in_the_middle_a_run_says_so_and_goes_on_to_its_end(
     os.kill(number, signal.SIGKILL)
     killed = wait_for(qtbot, runs, path, lambda run: not run.is_active)
     assert killed.phase is RunPhase.KILLED
-    assert "ended unexpectedly" in killed.sentence
+    assert "stopped unexpectedly" in killed.sentence
     runs.resume(path)
     done = wait_for(qtbot, runs, path, lambda run: not run.is_active)
     assert done.phase is RunPhase.DONE, done.work.log.read_text()
@@ -234,7 +234,7 @@ def test_a_program_that_never_begins_does_not_wait_for_ever(
     path = runs.start(LearningRequest(("/nowhere.npz",)), "hero")
     run = wait_for(qtbot, runs, path, lambda run: not run.is_active)
     assert run.phase is RunPhase.FAILED
-    assert "doesn't begin" in run.sentence
+    assert "didn't start" in run.sentence
     assert not (path / WANTED).exists()
     monkeypatch.setattr(learning_runs, "LEARNER", ("/nowhere/python",))
     runs.resume(path)
