@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from enum import Enum
 
 import numpy as np
+import numpy.typing as npt
 
 from lcollision_core.characters.character import Rig
 from lcollision_core.meshes.part_names import part_names
@@ -27,15 +29,15 @@ class Role(Enum):
     The first that is found counts. What has none and belongs to the head is of its face.
     """
 
-    TWIST = "twist|roll(?!er)"
+    TWIST = "twist|roll(?!er)|(shoulder|elbow|hip|knee)part[0-9]"
     PALM = "palm|carpal"
     THUMB = "thumb|^bip[0-9]*[lr]finger0"
     FINGER = "finger|index|middle|(?<!sp)(?<!st)ring|pinky|pinkie|little"
-    TOE = "toe|(?<!eye)ball"
+    TOE = "toe|(?<!eye)ball|metatarsal"
     FOOT = "foot|ankle|paw|hoof"
     HAND = "hand|wrist"
     FOREARM = "forearm|lowerarm|lowarm|loarm|armlower|elbow"
-    SHOULDER = "shoulder|clavicle|collar"
+    SHOULDER = "shoulder|clavicle|collar|scapula"
     UPPER_ARM = "arm(?!atu|or)|shldr"
     THIGH = "thigh|upleg|upperleg|legupper"
     SHIN = "shin|calf|knee|leg"
@@ -73,16 +75,28 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
     """Tell what each of the rig's joints is.
 
     A forearm is one only below an arm, a shin below a thigh, and a finger below a hand, so that
-    limits of hinges are not given to what merely sounds like one. Where a rig names both halves of
-    a limb, a joint that is called like the bone that it hangs on is a piece of it, and twists.
+    limits of hinges are not given to what merely sounds like one. What a forearm hangs on is the
+    upper arm also where it is called a shoulder, and a hip of one side above a shin is the thigh.
+    Where a rig names both halves of a limb, a joint that is called like the bone that it hangs on
+    is a piece of it, and twists; in its place it may be the same joint again, see `_repeats`.
     """
     plain = [
         re.sub("[^a-z0-9]", "", re.split("[:|]", name)[-1].lower()) for name in rig.joint_names
     ]
     named = [next(role for role in Role if re.search(role.value, name)) for name in plain]
+    parts = part_names(rig.joint_names)
+    for joint, role in enumerate(named):
+        above = rig.parents[joint]
+        while above >= 0 and named[above] is Role.TWIST:
+            above = rig.parents[above]
+        bone = named[above] if above >= 0 else None
+        if bone is Role.SHOULDER and role is Role.FOREARM:
+            named[above] = Role.UPPER_ARM
+        elif bone is Role.OTHER and role is Role.SHIN and "thigh" in (parts[above] or ""):
+            named[above] = Role.THIGH
+    repeats = _repeats(rig, named)
     halves = {Role.FOREARM: Role.UPPER_ARM, Role.SHIN: Role.THIGH}
     halves |= {above: below for below, above in halves.items()}
-    of_face = [part == "Head" for part in part_names(rig.joint_names)]
     roles: list[Role] = []
     in_hand: list[bool] = []
     for joint, (role, parent) in enumerate(zip(named, rig.parents, strict=True)):
@@ -91,16 +105,39 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
         while above >= 0 and roles[above] is Role.TWIST:
             above = rig.parents[above]
         bone = roles[above] if above >= 0 else None
-        if role in halves and role is bone and halves[role] in named:
+        if repeats[joint]:
+            role = roles[parent]
+        elif role in halves and role is bone and halves[role] in named:
             role = Role.TWIST
         elif role in (Role.FOREARM, Role.SHIN):
             role = role if bone is halves[role] else Role.OTHER
         elif role in (Role.PALM, Role.THUMB, Role.FINGER):
             role = role if in_hand[joint] else Role.OTHER
-        elif role is Role.OTHER and of_face[joint]:
+        elif role is Role.OTHER and parts[joint] == "Head":
             role = Role.FACE
         roles.append(role)
     return tuple(roles)
+
+
+def _repeats(rig: Rig, roles: Sequence[Role]) -> npt.NDArray[np.bool_]:
+    """Return which of the J joints move as their parents do: controls exported with the skin's.
+
+    They lie in the parent's place, have its role, and the parent has no skin of its own. In the
+    trunk, where legs may hang on one of two such joints, their names must be the same too.
+    """
+    skinned = np.isin(np.arange(len(roles)), rig.joint_of[rig.weights > 0.0])
+    places = rig.rest[:, :3, 3]
+    near = _SHORT * float(np.ptp(places, axis=0).max())
+    plain = [re.sub("^(def|org|mch)|[^a-z0-9]", "", name.lower()) for name in rig.joint_names]
+    repeats = np.zeros(len(roles), dtype=np.bool_)
+    for joint, parent in enumerate(rig.parents.tolist()):
+        if parent < 0 or skinned[parent] or roles[parent] is not roles[joint]:
+            continue
+        is_shared = roles[joint] in (Role.SPINE, Role.OTHER, Role.FACE)
+        repeats[joint] = bool(np.linalg.norm(places[joint] - places[parent]) <= near) and (
+            not is_shared or plain[joint] == plain[parent]
+        )
+    return repeats
 
 
 def bone_directions(rig: Rig, origins: FloatArray) -> FloatArray:
@@ -211,4 +248,5 @@ def joint_limits(rig: Rig, roles: tuple[Role, ...]) -> tuple[FloatArray, FloatAr
         # Only the first joint of a finger turns sideways.
         if role is Role.FINGER and parent >= 0 and roles[parent] is Role.FINGER:
             bounds[joint, 2] = 0.0
+    bounds[_repeats(rig, roles)] = 0.0
     return bounds[:, :, 0], bounds[:, :, 1]

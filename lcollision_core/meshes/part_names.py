@@ -11,8 +11,8 @@ import numpy.typing as npt
 from lcollision_core.meshes.topology import FloatArray
 
 _SIDES = {
-    **dict.fromkeys(("left", "lft", "l"), "Left"),
-    **dict.fromkeys(("right", "rgt", "rt", "r"), "Right"),
+    **dict.fromkeys(("left", "lft", "lt", "lf", "l"), "Left"),
+    **dict.fromkeys(("right", "rgt", "rt", "rf", "r"), "Right"),
 }
 _PREFIXES = frozenset(
     ("mixamorig", "bip", "bip01", "bip001", "biped", "valvebiped", "bind", "cc", "base", "def")
@@ -32,7 +32,7 @@ _FACE = frozenset(
 """Words that are too short to be sought inside others."""
 
 _PAIRED = (
-    (r"toe|ball|foot|feet|ankle|heel|tarsal|hallux|paw|hoof|hooves|pastern|fetlock", "foot"),
+    (r"toe|ball|foot|feet|ankle|(?<!w)heel|tarsal|hallux|paw|hoof|hooves|pastern|fetlock", "foot"),
     (_HAND, "hand"),
     (r"forearm|lowerarm|lowarm|armlower|elbow|ulna|forearmbend", "forearm"),
     (r"upperarm|uparm|armupper|bicep|humerus|shldr", "upper arm"),
@@ -76,6 +76,12 @@ def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
         part if part is not None else _limb(*one, present)
         for one, part in zip(words, plain, strict=True)
     ]
+    for side in ("Left", "Right"):
+        # As in clavicle, shoulder, elbow, wrist.
+        if f"{side} forearm" in parts and f"{side} upper arm" not in parts:
+            for joint, (part, (_, own)) in enumerate(zip(parts, words, strict=True)):
+                if part == f"{side} shoulder" and "shoulder" in "".join(own):
+                    parts[joint] = f"{side} upper arm"
     legs = [_with_end(part, *one) for one, part in zip(words, parts, strict=True)]
     # One alone is a helper, as at the front of a thigh.
     has_four_legs = len({leg for leg, part in zip(legs, parts, strict=True) if leg != part}) > 1

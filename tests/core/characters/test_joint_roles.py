@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lcollision_core.characters.joint_roles import Role, joint_roles
+from lcollision_core.characters.joint_roles import Role, joint_limits, joint_roles
 from tests.rigged_shapes import rigged_tube
 
 ARM = (Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.HAND, Role.THUMB, Role.FINGER, Role.FINGER)
@@ -26,7 +27,9 @@ def roles_of(tree: str) -> dict[str, Role]:
     names = [line.strip() for line in lines]
     rig = rigged_tube().rig
     assert rig is not None
-    rig = replace(rig, joint_names=tuple(names), parents=np.array(parents))
+    rest = np.tile(np.eye(4), (len(names), 1, 1))
+    rest[:, 1, 3] = np.arange(len(names))
+    rig = replace(rig, joint_names=tuple(names), parents=np.array(parents), rest=rest)
     return dict(zip(names, joint_roles(rig), strict=True))
 
 
@@ -84,6 +87,48 @@ def chain(*names: str) -> str:
             "Bip001 L Thigh|Bip001 L Calf|Bip001 L Foot|Bip001 L Toe0",
             id="Biped",
         ),
+        pytest.param(
+            "root",
+            "spine_c chest_c neck_c head_c",
+            "clavicle_l shoulder_l elbow_l wrist_l thumb1_l index1_l index2_l",
+            "hip_l knee_l ankle_l ball_l",
+            id="Maya",
+        ),
+        pytest.param(
+            "Root_M",
+            "Spine1_M Chest_M Neck_M Head_M",
+            "Scapula_L Shoulder_L Elbow_L Wrist_L ThumbFinger1_L IndexFinger1_L IndexFinger2_L",
+            "Hip_L Knee_L Ankle_L Toes_L",
+            id="Advanced Skeleton",
+        ),
+        pytest.param(
+            "pelvis",
+            "spine1 spine2 neck head",
+            "left_collar left_shoulder left_elbow left_wrist left_thumb1 left_index1 left_index2",
+            "left_hip left_knee left_ankle left_toe",
+            id="SMPL",
+        ),
+        pytest.param(
+            "Hips",
+            "Chest Chest2 Neck Head",
+            "LeftCollar LeftShoulder LeftElbow LeftWrist LeftThumb1 LeftIndex1 LeftIndex2",
+            "LeftHip LeftKnee LeftAnkle LeftToe",
+            id="BVH",
+        ),
+        pytest.param(
+            "root",
+            "spine05 spine01 neck01 head",
+            "clavicle.L upperarm01.L lowerarm01.L wrist.L thumb1.L finger2-1.L finger2-2.L",
+            "upperleg01.L lowerleg01.L foot.L toe1-1.L",
+            id="MakeHuman",
+        ),
+        pytest.param(
+            "hip",
+            "abdomenLower chestUpper neckLower head",
+            "lCollar lShldrBend lForearmBend lHand lThumb1 lIndex1 lIndex2",
+            "lThighBend lShin lFoot lMetatarsals",
+            id="Daz",
+        ),
     ],
 )
 def test_the_joints_of_usual_rigs_are_known(root: str, trunk: str, arm: str, leg: str) -> None:
@@ -98,6 +143,7 @@ def test_the_joints_of_usual_rigs_are_known(root: str, trunk: str, arm: str, leg
             .replace(".L", ".R").replace(" L ", " R ").replace("_l", "_r")
             for name in joints
         ]  # fmt: skip
+        right = [re.sub("^l(?=[A-Z])", "r", re.sub("_L$", "_R", name)) for name in right]
         assert tuple(roles_of(chain(root, *right))[name] for name in right) == expected
 
 
@@ -110,6 +156,51 @@ def test_the_pieces_of_a_limb_twist_and_its_other_half_is_found_below_them() -> 
     assert tuple(unreal.values()) == (Role.THIGH, Role.TWIST, Role.SHIN, Role.TWIST)
     # Where only one half has a name, what hangs on it may be the other half.
     assert set(roles_of(chain("Arm.L", "Arm.L.001")).values()) == {Role.UPPER_ARM}
+
+
+def test_pieces_between_a_shoulder_or_a_hip_and_the_next_joint_twist() -> None:
+    arm = roles_of(chain("Scapula_L", "Shoulder_L", "ShoulderPart1_L", "Elbow_L", "ElbowPart1_L"))
+    assert tuple(arm.values()) == (
+        Role.SHOULDER, Role.UPPER_ARM, Role.TWIST, Role.FOREARM, Role.TWIST
+    )  # fmt: skip
+    leg = roles_of(chain("Root_M", "Hip_L", "HipPart1_L", "Knee_L"))
+    assert tuple(leg.values()) == (Role.OTHER, Role.THIGH, Role.TWIST, Role.SHIN)
+    # A hip in the middle is none of a leg.
+    assert roles_of(chain("hip", "knee_l"))["hip"] is Role.OTHER
+
+
+def test_a_joint_that_repeats_its_parent_does_not_turn() -> None:
+    names = [
+        "ORG-spine",
+        "DEF-spine",
+        "ORG-upper_arm.L",
+        "DEF-upper_arm.L",
+        "DEF-upper_arm.L.001",
+        "ORG-forearm.L",
+        "DEF-forearm.L",
+        "hips",
+        "spine_base",
+        "spine_01",
+    ]
+    parents = [-1, 0, 0, 2, 3, 2, 5, 0, 7, 8]
+    rest = np.tile(np.eye(4), (len(names), 1, 1))
+    rest[:, 1, 3] = [0, 0, 1, 1, 2, 3, 3, 4, 4, 4]
+    rig = rigged_tube().rig
+    assert rig is not None
+    joint_of = np.array([[1, 3, 4, 6, 9]] * 2, dtype=np.int32)
+    rig = replace(
+        rig, joint_names=tuple(names), parents=np.array(parents), rest=rest,
+        joint_of=joint_of, weights=np.full((2, 5), 0.2),
+    )  # fmt: skip
+    roles = joint_roles(rig)
+    assert roles[2:7] == (
+        Role.UPPER_ARM, Role.UPPER_ARM, Role.TWIST, Role.FOREARM, Role.FOREARM
+    )  # fmt: skip
+    still = ~(np.concatenate(joint_limits(rig, roles), axis=1) != 0.0).any(axis=1)
+    assert np.flatnonzero(still).tolist() == [1, 3, 6]
+    # Skin of its own is a reason to turn.
+    led = replace(rig, joint_of=np.where(joint_of == 1, 2, joint_of))
+    assert (joint_limits(led, joint_roles(led))[1][3] > 0.0).any()
 
 
 def test_faces_and_palms_are_neither_toes_nor_fingers_nor_unknown() -> None:

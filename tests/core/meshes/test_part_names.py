@@ -75,6 +75,17 @@ def test_an_arm_is_the_upper_one_only_where_there_is_a_forearm() -> None:
     assert part_names(["LeftArm", "LeftForeArm", "LeftLeg", "LeftUpLeg"]) == (
         "Left upper arm", "Left forearm", "Left shin", "Left thigh"
     )  # fmt: skip
+    # So is a shoulder, unless the rig names the upper arm.
+    assert part_names(["clavicle_l", "shoulder_l", "elbow_l", "shoulder_r"]) == (
+        "Left shoulder", "Left upper arm", "Left forearm", "Right shoulder"
+    )  # fmt: skip
+
+
+def test_short_words_for_the_sides() -> None:
+    names = ["lt_elbow", "rt_elbow", "lf_knee", "rf_knee", "wheel_lf"]
+    assert part_names(names) == (
+        "Left forearm", "Right forearm", "Left shin", "Right shin", None
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["spring_L", "string.R", "root", "Bone.003", "tail_02.L", "ik"])
