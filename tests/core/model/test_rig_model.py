@@ -242,6 +242,49 @@ def test_mirroring_exchanges_the_sides(model: RigModel) -> None:
     np.testing.assert_array_equal(back.latent, latent)
 
 
+def with_joint(name: str, parent: str, place: tuple[float, float, float]) -> RigModel:
+    """Return the body with one more joint, which moves the end of its parent's skin."""
+    body = rigged_body()
+    rig = body.rig
+    assert rig is not None
+    above = rig.joint_names.index(parent)
+    rest = np.concatenate([rig.rest, np.eye(4)[None]])
+    rest[-1, :3, 3] = place
+    led = np.flatnonzero(rig.joint_of[:, 0] == above)[-3:]
+    joint_of = rig.joint_of.copy()
+    joint_of[led, 0] = len(rig.parents)
+    rig = replace(
+        rig,
+        joint_names=(*rig.joint_names, name),
+        parents=np.append(rig.parents, above),
+        rest=rest,
+        nodes=np.arange(len(rest)),
+        joint_of=joint_of,
+    )
+    return RigModel.of(replace(body, rig=rig))
+
+
+@pytest.mark.parametrize(
+    ("place", "parent"),
+    [((-1.6, 0.3, 1.2), "RightHand"), ((-0.75, 0.0, 1.45), "RightHand"), ((0.2, 0.1, 1.7), "Head")],
+)
+def test_what_only_one_side_has_does_not_keep_from_mirroring(
+    place: tuple[float, float, float], parent: str
+) -> None:
+    model = with_joint("Sword", parent, place)
+    latent = np.zeros(model.latent_size)
+    latent[code_of(model, "LeftForeArm", 0)] = 1.0
+    latent[code_of(model, "Sword", 0)] = 0.4
+    mirrored = model.mirror(latent)
+    assert mirrored.latent[code_of(model, "RightForeArm", 0)] == pytest.approx(1.0, abs=0.02)
+    assert mirrored.latent[code_of(model, "LeftForeArm", 0)] == pytest.approx(0.0, abs=0.02)
+    assert mirrored.latent[code_of(model, "Sword", 0)] == pytest.approx(0.4)
+
+
+def test_a_limb_of_one_side_alone_is_not_mirrored() -> None:
+    assert with_joint("RightHandThumb1", "RightHand", (-0.8, -0.1, 1.45)).symmetry is None
+
+
 def test_a_mesh_of_the_character_is_encoded_wherever_it_lies(model: RigModel) -> None:
     generator = np.random.default_rng(3)
     latent = 0.35 * generator.uniform(model.pose_space.low, model.pose_space.high)
