@@ -14,6 +14,7 @@ from lcollision_core.characters import joint_roles, rig_kernels
 from lcollision_core.characters.character import Character, Rig
 from lcollision_core.characters.joint_roles import Role
 from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.meshes.displacement import DisplacementMetrics
 from lcollision_core.meshes.part_names import joint_labels
 from lcollision_core.meshes.topology import FloatArray, IntArray, length_graph
 from lcollision_core.meshes.units import body_size, front_direction
@@ -35,9 +36,6 @@ _METRIC_VERTICES = 3000
 _STRETCH_POSES = 64
 _STRETCH_SLACK = 1.25
 """Edges at joints get longer than in poses where each joint is bent alone or at random."""
-
-_STIFFENING = 1e-3
-"""Of the mean diagonal: what a code costs that moves no vertex, so that the metric is definite."""
 
 _SPREAD = 0.25
 """Of its range: the deviation of a code in plausible poses, where no clip says more."""
@@ -259,27 +257,36 @@ class RigPoseSpace:
         return poses
 
     @cached_property
-    def domain_metrics(self) -> FloatArray:
+    def domain_metrics(self) -> DisplacementMetrics:
         """J_k^T J_k / V of the Jacobian, averaged over plausible poses; see `PoseSpace`."""
         every = max(1, self.topology.n_vertices // _METRIC_VERTICES)
         chosen = self.topology.used_vertices[::every].astype(np.int64)
         led = self.vertex_domain[chosen]
-        size = len(self.low)
-        gram = np.zeros((self.n_domains, size, size))
-        for codes in self._plausible:
-            moved = self.tangents(codes, chosen)
-            for domain in range(self.n_domains):
-                by_code = moved[:, led == domain].reshape(size, -1)
-                gram[domain] += by_code @ by_code.T
-        gram /= len(self._plausible) * len(chosen)
-        return gram
+        moving = [np.flatnonzero(codes) for codes in self._codes_that_move_parts()]
+        blocks = [np.zeros((len(codes), len(codes))) for codes in moving]
+        for pose in self._plausible:
+            moved = self.tangents(pose, chosen)
+            for domain, (codes, block) in enumerate(zip(moving, blocks, strict=True)):
+                by_code = moved[np.ix_(codes, led == domain)].reshape(len(codes), -1)
+                block += by_code @ by_code.T
+        for block in blocks:
+            block /= len(self._plausible) * len(chosen)
+        return DisplacementMetrics(len(self.low), moving, blocks)
 
-    @cached_property
+    def _codes_that_move_parts(self) -> npt.NDArray[np.bool_]:
+        """Return (K, D) which codes move vertices that a part leads: those of bones above them."""
+        carried = np.eye(len(self._bones), dtype=np.bool_)
+        for bone, parent in enumerate(self._parents[1:].tolist(), 1):
+            carried[bone] |= carried[parent]
+        by_part = np.zeros((self.n_domains, len(self._bones)), dtype=np.bool_)
+        by_part[np.repeat(self.vertex_domain, np.diff(self._first)), self._joints] = True
+        codes: npt.NDArray[np.bool_] = (by_part @ carried)[:, self._bone_of_code]
+        return codes
+
+    @property
     def metric(self) -> FloatArray:
         """The sum of `domain_metrics`, with a little more on the diagonal."""
-        gram: FloatArray = self.domain_metrics.sum(axis=0)
-        gram[np.diag_indices_from(gram)] += _STIFFENING * np.trace(gram) / len(gram)
-        return gram
+        return self.domain_metrics.definite
 
     @cached_property
     def precision(self) -> FloatArray:

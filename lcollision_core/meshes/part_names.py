@@ -45,6 +45,9 @@ _PAIRED = (
 _PAIRED_WORDS = {"arm": ("upper arm", "forearm"), "leg": ("shin", "thigh")}
 """A word that is a part of a limb where the rig names the other part, else the limb."""
 
+_MOST_PARTS = 48
+"""Body parts that a list and colours can show; some rigs have hundreds of unknown joints."""
+
 _ENDS = {
     **dict.fromkeys(("front", "fore"), "front"),
     **dict.fromkeys(("hind", "rear", "back"), "hind"),
@@ -92,8 +95,9 @@ def joint_labels(names: Sequence[str], parents: npt.NDArray[np.int64]) -> tuple[
     """Name the body part of each joint.
 
     A joint whose name does not tell is part of what its parents are, and if they do not tell
-    either, has its own name. Where that makes one part of all, as of a snake's "seg.01" and
-    "seg.02", each keeps its number.
+    either, has its own name. Where that makes more than `_MOST_PARTS`, as of hundreds of
+    "Bone.017", a chain without branches is one part; where it makes one of all, as of a snake's
+    "seg.01" and "seg.02", each keeps its number.
 
     Parameters
     ----------
@@ -110,8 +114,14 @@ def joint_labels(names: Sequence[str], parents: npt.NDArray[np.int64]) -> tuple[
         inherits = own[joint] is None and parent >= 0 and known[parent]
         labels.append(own[joint] or (labels[parent] if inherits else _spelled_out(name)))
         known.append(own[joint] is not None or inherits)
+    if len(set(labels)) > _MOST_PARTS:
+        n_children = np.bincount(parents[parents >= 0], minlength=len(parents))
+        for joint, parent in enumerate(parents.tolist()):
+            if not known[joint] and parent >= 0 and n_children[parent] == 1:
+                labels[joint] = labels[parent]
     if len(set(labels)) == 1 and not any(known):
-        labels = [_printable(name) for name in names]
+        every = -(-len(names) // _MOST_PARTS)
+        labels = [_printable(names[joint // every * every]) for joint in range(len(names))]
     return tuple(labels)
 
 

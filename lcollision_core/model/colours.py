@@ -29,6 +29,9 @@ PALETTE = (
 furthest in CIELAB from those before it, at its worst of full, red-, green- and blue-blind sight
 (Machado et al. 2009)."""
 
+_MOST_ARRANGED = 3 * len(PALETTE)
+"""Domains whose colours are exchanged; among more, each has neighbours of its own colour anyhow."""
+
 _XYZ_OF_RGB = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
 )
@@ -50,12 +53,15 @@ def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
     -----
     A weight's darkness is drawn as a tint, so that a pale colour must not pass for a neighbour's
     full one: only the hue and chroma of CIELAB count here. Colours swap domains as long as that
-    reduces the sum of overlaps over squared distances.
+    reduces the sum of overlaps over squared distances, which takes minutes for hundreds of domains:
+    above `_MOST_ARRANGED` they are taken in turn.
     """
     from scipy.optimize import quadratic_assignment
 
     n_domains = len(attention_mask)
     chosen = [PALETTE[domain % len(PALETTE)] for domain in range(n_domains)]
+    if n_domains > _MOST_ARRANGED:
+        return tuple(chosen)
     chroma = np.array([cielab(colour)[1:] for colour in chosen])
     squared_distance = ((chroma[:, None] - chroma) ** 2).sum(axis=2)
     likeness = 1.0 / (squared_distance + 25.0)

@@ -285,10 +285,8 @@ class PoseDragger:
     def _hold(self, moved: FloatArray) -> FloatArray:
         """Return the (D, D) price of a (D,) change since the start: high for parts that rest."""
         metrics = self._space.domain_metrics
-        squared = metrics @ moved @ moved / self._shares
-        weights = HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / MOVED)
-        price: FloatArray = np.tensordot(weights, metrics, 1)
-        return price
+        squared = metrics.squared(moved) / self._shares
+        return metrics.weighted(HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / MOVED))
 
     def _goes(self, there: FloatArray) -> bool:
         """Go to codes if the pose may be there; else remember what is in the way."""

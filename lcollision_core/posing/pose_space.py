@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from lcollision_core.embedding import Embedding
+from lcollision_core.meshes.displacement import DisplacementMetrics
 from lcollision_core.meshes.topology import FloatArray, Topology, length_graph
 
 MeanSlopes = Callable[[FloatArray, FloatArray], FloatArray]
@@ -18,9 +19,6 @@ MeanSlopes = Callable[[FloatArray, FloatArray], FloatArray]
 see `PoseSpace.mean_slopes`."""
 
 _JACOBIAN_POSES = 8
-_STIFFENING = 1e-3
-"""Of the mean diagonal: what a code costs that moves no vertex, so that the metric is definite."""
-
 _LEAST_VARIANCE = 0.02
 """Of the mean variance of the training codes: few poses leave most directions without any."""
 
@@ -68,8 +66,8 @@ class PoseSpace(Protocol):
         """
 
     @property
-    def domain_metrics(self) -> FloatArray:
-        """(K, D, D): what the vertices that each body part leads add to the metric."""
+    def domain_metrics(self) -> DisplacementMetrics:
+        """What the vertices that each of the K body parts leads add to the metric."""
 
     @property
     def precision(self) -> FloatArray:
@@ -133,7 +131,7 @@ class LatentPoseSpace:
         self._last_features = (np.full(embedding.latent_size, np.nan), np.empty(0))
 
     @cached_property
-    def domain_metrics(self) -> FloatArray:
+    def domain_metrics(self) -> DisplacementMetrics:
         """J_k^T J_k / V of the decoder's Jacobian, averaged over evenly spaced training poses.
 
         J_k has the rows of the vertices that domain k leads.
@@ -151,14 +149,12 @@ class LatentPoseSpace:
                 by_code = moved[:, inside].reshape(size, -1)
                 gram[domain] += by_code @ by_code.T
         gram /= len(chosen) * embedding.topology.n_vertices
-        return gram
+        return DisplacementMetrics(size, [np.arange(size)] * self.n_domains, tuple(gram))
 
-    @cached_property
+    @property
     def metric(self) -> FloatArray:
         """The sum of `domain_metrics`, with a little more on the diagonal."""
-        gram: FloatArray = self.domain_metrics.sum(axis=0)
-        gram[np.diag_indices_from(gram)] += _STIFFENING * np.trace(gram) / len(gram)
-        return gram
+        return self.domain_metrics.definite
 
     @cached_property
     def precision(self) -> FloatArray:

@@ -354,15 +354,22 @@ def test_the_metric_measures_vertices(name: str) -> None:
         ratios.append(np.sqrt(step @ space.metric @ step / squared))
     assert 0.8 < np.median(ratios) < 1.25
     assert (np.linalg.eigvalsh(space.metric) > 0.0).all()
+    # Part by part, and all of it, from the whole Jacobian.
+    everything = np.arange(space.topology.n_vertices)
+    parts = np.zeros((space.n_domains, len(codes), len(codes)))
+    for pose in space._plausible:
+        moved = space.tangents(pose, everything)
+        for domain in range(space.n_domains):
+            by_code = moved[:, space.vertex_domain == domain].reshape(len(codes), -1)
+            parts[domain] += by_code @ by_code.T / len(everything) / len(space._plausible)
+    metrics, weights = space.domain_metrics, generator.uniform(size=space.n_domains)
+    np.testing.assert_allclose(metrics.squared(step), parts @ step @ step, rtol=1e-9)
     np.testing.assert_allclose(
-        space.domain_metrics.sum(axis=0) - space.metric,
-        np.diag(
-            np.full(
-                len(space.low), -1e-3 * np.trace(space.domain_metrics.sum(axis=0)) / len(space.low)
-            )
-        ),
-        atol=1e-12,
+        metrics.weighted(weights), np.tensordot(weights, parts, 1), atol=1e-12
     )
+    whole = parts.sum(axis=0)
+    stiffening = 1e-3 * np.trace(whole) / len(codes) * np.eye(len(codes))
+    np.testing.assert_allclose(space.metric, whole + stiffening, atol=1e-12)
 
 
 def test_a_hand_is_dragged_to_the_hip_and_stays_out_of_it() -> None:

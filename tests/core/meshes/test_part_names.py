@@ -121,3 +121,18 @@ def test_a_body_of_one_name_is_many_parts() -> None:
     assert joint_labels(["seg.01", "seg.02", "seg.03"], parents) == ("Seg.01", "Seg.02", "Seg.03")
     assert joint_labels(["tail_01", "tail_02", "fin"], parents) == ("Tail", "Tail", "Fin")
     assert joint_labels(["LeftHand", "LeftHandIndex1", "x"], parents) == ("Left hand",) * 3
+
+
+def test_of_hundreds_of_unknown_joints_each_chain_is_one_part() -> None:
+    # A trunk of which ten chains of six hang.
+    names = [f"Bone.{joint:03d}" for joint in range(61)]
+    parents = np.array([-1, *(0 if joint % 6 == 0 else joint for joint in range(60))])
+    labels = joint_labels(names, parents)
+    assert labels[:8] == ("Bone.000", *["Bone.001"] * 6, "Bone.007")
+    assert len(set(labels)) == 11
+    # Few are told apart one by one, and so are the pieces of a snake.
+    assert len(set(joint_labels(names[:13], parents[:13]))) == 13
+    assert len(set(joint_labels(names[:40], np.arange(40) - 1))) == 40
+    assert joint_labels(names, np.arange(61) - 1)[:4] == (
+        "Bone.000", "Bone.000", "Bone.002", "Bone.002"
+    )  # fmt: skip

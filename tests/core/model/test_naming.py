@@ -260,3 +260,9 @@ def test_destinations_that_cannot_be_are_refused(folder: Path, tmp_path: Path) -
     folder.parent.write_bytes(b"a file where the folder should be")
     with pytest.raises(LCollisionError, match="cannot be made"):
         model_destination("tail")
+
+
+def test_hundreds_of_domains_get_the_colours_in_turn() -> None:
+    # Exchanging them takes minutes.
+    mask = np.random.default_rng(0).dirichlet(np.full(300, 0.1), 500).T
+    assert domain_colours(mask) == tuple(PALETTE[domain % 16] for domain in range(300))
