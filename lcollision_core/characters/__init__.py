@@ -2,7 +2,12 @@
 
 from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.characters.default_rules import default_rules
-from lcollision_core.characters.posed_gltf import CharacterForm, PosedFile, posed_gltf
+from lcollision_core.characters.posed_gltf import (
+    CharacterFile,
+    CharacterForm,
+    PosedFile,
+    posed_gltf,
+)
 from lcollision_core.characters.reading import (
     CHARACTER_SUFFIXES,
     is_rigged,

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from lcollision_core.characters.character import Character, Rig
 from lcollision_core.errors import MeshFileError, ShapeError
-from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.meshes.formats.gltf_document import GltfDocument, as_float
 from lcollision_core.meshes.formats.gltf_patch import VERTEX_DATA, GltfPatch
 from lcollision_core.meshes.formats.gltf_scene import ShownPrimitive, read_shown, shown_primitives
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
@@ -86,6 +87,7 @@ def posed_gltf(
     vertices: npt.NDArray[Any],
     form: CharacterForm,
     transforms: FloatArray | None = None,
+    file: CharacterFile | None = None,
 ) -> PosedFile:
     """Put a pose into the character's own .glb, .gltf or .vrm file.
 
@@ -99,6 +101,7 @@ def posed_gltf(
     vertices : (V, 3) finite array, in its frame and unit
     form : how the file holds the pose
     transforms : (J, 4, 4) global transforms of the joints, for the form of joints
+    file : the character's, where it is read already
 
     Returns
     -------
@@ -112,8 +115,9 @@ def posed_gltf(
     if vertices.shape != character.rest_vertices.shape:
         expected = f"of shape {character.rest_vertices.shape}"
         raise ShapeError.must_be(f"vertices of {character.name}", expected, vertices.shape)
+    file = file or CharacterFile(character)
     with one_sentence(character.source):
-        source = _Source(character)
+        source = _Source(file)
         pose = np.asarray(vertices, dtype=np.float64)
         if form is CharacterForm.JOINTS:
             if character.rig is None or transforms is None:
@@ -127,7 +131,7 @@ def posed_gltf(
         clips = source.drop_clips()
         data = source.patch.encoded()
     notes = [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
-    return PosedFile(data, stored, tuple(notes))
+    return PosedFile(data, stored, (*source.patch.notes, *notes))
 
 
 def animated_gltf(
@@ -155,19 +159,102 @@ def animated_gltf(
         raise ShapeError.must_be(
             f"frames of {character.name}", f"of a rig, of shape {shape}", vertices.shape
         )
+    file = CharacterFile(character)
     with one_sentence(character.source):
-        source = _Source(character)
+        source = _Source(file)
         clips = source.drop_clips()
         frames = source.animate(character.rig, transforms, fps)
         for stored, wanted in zip(frames, vertices, strict=True):
             source.require_near(stored, wanted, CharacterForm.JOINTS)
         data = source.patch.encoded()
-    notes = tuple(f"its clip {clip!r} is left out" for clip in clips)
+    notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in clips))
     return tuple(PosedFile(data, stored, notes) for stored in frames)
 
 
+class CharacterFile:
+    """The file of a character, read once to be written with many poses.
+
+    Parameters
+    ----------
+    character : read from a .glb, .gltf or .vrm file
+
+    Raises
+    ------
+    MeshFileError : the file cannot be read, or has changed since the character was.
+    """
+
+    def __init__(self, character: Character) -> None:
+        path = Path(character.source)
+        with one_sentence(path):
+            data = read_regular(path, MAX_FILE_BYTES)
+            self.document = GltfDocument(data, path)
+            whole = read_shown(self.document)
+            kept = character_parts(whole)
+            self.scene = scene = with_parts(whole, kept)
+            self.patch = GltfPatch(data, path)
+            self.mesh = join_parts(scene)
+            self.rest = self.mesh.posed(scene.rest)[0]
+            if not (
+                np.array_equal(self.mesh.joined, character.joined)
+                and np.array_equal(self.rest, character.rest_vertices)
+            ):
+                raise MeshFileError(
+                    "it is not the file that the character was read from", "open it again"
+                )
+            self.locals = [_stored_transform(node) for node in self.patch.description["nodes"]]
+            shown, _ = shown_primitives(self.document, scene.parents)
+            ends = np.cumsum([len(part.points) for part in scene.parts]).tolist()
+            rows = [
+                slice(end - len(part.points), end)
+                for part, end in zip(scene.parts, ends, strict=True)
+            ]
+            shown = [shown[number] for number in kept]
+            self.parts = list(zip(scene.parts, shown, rows, strict=True))
+        self.character = character
+
+    @cached_property
+    def stored_normals(self) -> list[FloatArray | None]:
+        """The normals that the file stores for the vertices of each part, (n, 3)."""
+        found: list[FloatArray | None] = []
+        for _, shown, _ in self.parts:
+            mesh = self.document.description.meshes[shown.mesh]
+            number = mesh.primitives[shown.primitive].attributes.NORMAL
+            what = f"the normals of mesh {shown.mesh}"
+            found.append(
+                None
+                if number is None
+                else as_float(self.document.array(number, what, ("VEC3",), shown.n_vertices))
+            )
+        return found
+
+    def normals(self, vertices: FloatArray) -> FloatArray:
+        """Return the unit normals of the file's W vertices in a pose; 0 where it has none."""
+        return moved_normals(*self._normals_at_rest, self.rest, vertices)
+
+    @cached_property
+    def _normals_at_rest(
+        self,
+    ) -> tuple[FloatArray, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        joined = self.character.joined
+        rest = np.zeros((len(joined), 3))
+        transforms = self.scene.rest.transforms[0]
+        for (part, _, rows), stored in zip(self.parts, self.stored_normals, strict=True):
+            if stored is not None:
+                turns = np.linalg.pinv(_blended(part, transforms)[:, :, :3])
+                rest[rows] = _unit(np.einsum("vij,vi->vj", turns, stored))
+        # All triangles of the joined vertex, so that the copies at a seam move alike.
+        faces = self.character.topology.faces.astype(np.int64)
+        corners = np.concatenate([np.roll(faces, -side, axis=1) for side in range(3)])
+        corners = corners[np.argsort(corners[:, 0], kind="stable")]
+        first = np.searchsorted(corners[:, 0], np.arange(len(self.rest) + 1))
+        counts = np.diff(first)[joined]
+        owners = np.repeat(np.arange(len(counts)), counts)
+        within = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
+        return rest, owners, corners[np.repeat(first[joined], counts) + within]
+
+
 class _Source:
-    """The file of a character, read to be written again.
+    """The file of a character, to be written with one pose or clip.
 
     Attributes
     ----------
@@ -175,32 +262,13 @@ class _Source:
     size : body size
     """
 
-    def __init__(self, character: Character) -> None:
-        path = Path(character.source)
-        data = read_regular(path, MAX_FILE_BYTES)
-        document = GltfDocument(data, path)
-        whole = read_shown(document)
-        kept = character_parts(whole)
-        scene = with_parts(whole, kept)
-        self.patch = GltfPatch(data, path)
+    def __init__(self, file: CharacterFile) -> None:
+        self._file, character = file, file.character
+        self.patch = file.patch.copy()
         self.size = body_size(character.rest_vertices, character.topology)
         self._nodes: list[dict[str, Any]] = self.patch.description["nodes"]
-        self._document = document
-        self._scene = scene
-        self._mesh = join_parts(scene)
-        if not np.array_equal(self._mesh.joined, character.joined):
-            raise MeshFileError("it is not the file that the character was read from")
-        self._joined = character.joined
-        self._faces = character.topology.faces
-        self._rest = self._mesh.posed(scene.rest)[0]
-        self._locals = [_stored_transform(node) for node in self._nodes]
-        shown, _ = shown_primitives(document, scene.parents)
-        ends = np.cumsum([len(part.points) for part in scene.parts]).tolist()
-        rows = [
-            slice(end - len(part.points), end) for part, end in zip(scene.parts, ends, strict=True)
-        ]
-        shown = [shown[number] for number in kept]
-        self._parts = list(zip(scene.parts, shown, rows, strict=True))
+        self._scene, self._rest, self._joined = file.scene, file.rest, character.joined
+        self._parts = file.parts
 
     def require_near(
         self, stored: FloatArray, wanted: npt.NDArray[Any], form: CharacterForm
@@ -294,23 +362,24 @@ class _Source:
         for number in parents_first(parents):
             # The parent as the file will have it, so that rounding does not add up.
             above = placed[parents[number]] if parents[number] >= 0 else _IDENTITY
-            local = self._locals[number]
+            local = self._file.locals[number]
             if number in wanted:
                 new = _relative(above, wanted[number])
                 if np.abs(new - local).max() > _SAME_TRANSFORM * np.abs(new).max():
                     local = hold(number, new)
             placed[number] = above @ local
         poses = ScenePoses(placed[None], self._scene.rest.weights)
-        posed: FloatArray = self._mesh.posed(poses)[0]
+        posed: FloatArray = self._file.mesh.posed(poses)[0]
         return posed
 
     def bake(self, vertices: FloatArray) -> FloatArray:
         """Make static meshes of what moves, in the scene's coordinates, and return the vertices."""
         stored = vertices.astype(np.float32).astype(np.float64)
-        normals = self._normals(vertices)
+        normals = self._file.normals(vertices)
         skinned = {part.node for part, _, _ in self._parts if part.is_skinned}
         moves = np.abs(vertices - self._rest).max(axis=1) > _SAME * self.size
         moving = {part.node for part, _, rows in self._parts if moves[self._joined[rows]].any()}
+        had_morphs = False
         for part, shown, rows in self._parts:
             joined = self._joined[rows]
             if part.node not in skinned | moving:
@@ -325,20 +394,51 @@ class _Source:
             for name in [name for name in attributes if name.startswith(("JOINTS_", "WEIGHTS_"))]:
                 del attributes[name]
             attributes.pop("TANGENT", None)
-            primitive.pop("targets", None)
+            had_morphs |= bool(primitive.pop("targets", None))
         for node in sorted(skinned | moving):
-            self.patch.description["meshes"][self._nodes[node]["mesh"]].pop("weights", None)
+            mesh = self.patch.description["meshes"][self._nodes[node]["mesh"]]
+            mesh.pop("weights", None)
+            if isinstance(mesh.get("extras"), dict):
+                mesh["extras"].pop("targetNames", None)
             self._move_to_root(node)
+        if had_morphs:
+            self._drop_binds()
+            self.patch.notes += ("its morph targets are left out of the static mesh",)
         if not any("skin" in node for node in self._nodes):
             self.patch.description.pop("skins", None)
         return stored
 
+    def _drop_binds(self) -> None:
+        """Remove from the expressions of a VRM what weighs morph targets that are not there."""
+        meshes = [
+            number
+            for number, mesh in enumerate(self.patch.description["meshes"])
+            if any("targets" in primitive for primitive in mesh["primitives"])
+        ]
+        nodes = [number for number, node in enumerate(self._nodes) if node.get("mesh") in meshes]
+        # VRM 0 names the mesh, VRM 1 its node.
+        kinds = (("binds", "mesh", meshes), ("morphTargetBinds", "node", nodes))
+        left: list[Any] = [self.patch.description.get("extensions")]
+        while left:
+            one = left.pop()
+            for name, key, fitting in kinds if isinstance(one, dict) else ():
+                if isinstance(one.get(name), list):
+                    one[name] = [
+                        bind
+                        for bind in one[name]
+                        if not isinstance(bind, dict) or key not in bind or bind[key] in fitting
+                    ]
+            if isinstance(one, dict | list):
+                left += one.values() if isinstance(one, dict) else one
+
     def add_morph(self, vertices: FloatArray) -> FloatArray:
         """Add a morph target of weight 1 to each mesh, and return the vertices."""
         stored = np.empty_like(vertices)
-        normals = self._normals(vertices)
+        normals = self._file.normals(vertices)
         rest = self._scene.rest.transforms[0]
-        for (part, shown, rows), weights in zip(self._parts, self._scene.rest.weights, strict=True):
+        for (part, shown, rows), weights, own_normals in zip(
+            self._parts, self._scene.rest.weights, self._file.stored_normals, strict=True
+        ):
             turns = _blended(part, rest)
             base = part.points + np.tensordot(weights[0], part.morphs, axes=1)
             wanted = vertices[self._joined[rows]] - turns[:, :, 3]
@@ -351,14 +451,16 @@ class _Source:
                 ) from error
             deltas = (own - base).astype(np.float32)
             stored[self._joined[rows]] = _moved(turns, base + deltas)
-            mesh = self._own_mesh(shown)
-            primitive = mesh["primitives"][shown.primitive]
+            held = self._file.patch.description["meshes"][shown.mesh]
+            primitive = self._own_mesh(shown)["primitives"][shown.primitive]
             target = {"POSITION": self._vectors(deltas, has_bounds=True)}
-            if "NORMAL" in primitive["attributes"]:
+            if own_normals is not None:
                 # A reader turns normals by the inverse transpose.
                 turned = np.einsum("vij,vi->vj", turns[:, :, :3], normals[rows])
-                target["NORMAL"] = self._vectors(_unit(turned) - self._stored_normals(shown))
-            primitive.setdefault("targets", []).append(target)
+                target["NORMAL"] = self._vectors(_unit(turned) - own_normals)
+            most = max(len(primitive.get("targets", ())) for primitive in held["primitives"])
+            self._fill_targets(primitive, most)
+            primitive["targets"].append(target)
         for node in {part.node for part, _, _ in self._parts}:
             self._weigh_morph(self._nodes[node])
         return stored
@@ -368,11 +470,8 @@ class _Source:
         mesh = self.patch.description["meshes"][node["mesh"]]
         n_targets = max(len(primitive.get("targets", ())) for primitive in mesh["primitives"])
         for primitive in mesh["primitives"]:
-            position = primitive["attributes"].get("POSITION")
-            # Lines and points: all primitives that show something have the same targets.
-            while position is not None and len(primitive.setdefault("targets", [])) < n_targets:
-                zeros = np.zeros((self.patch.description["accessors"][position]["count"], 3))
-                primitive["targets"].append({"POSITION": self._vectors(zeros, has_bounds=True)})
+            # Lines and points.
+            self._fill_targets(primitive, n_targets)
         for owner in (mesh, node):
             if owner is mesh or "weights" in owner:
                 given = list(owner.get("weights", ()))[: n_targets - 1]
@@ -382,6 +481,13 @@ class _Source:
             names = extras.get("targetNames", [])
             if isinstance(names, list) and len(names) == n_targets - 1:
                 extras["targetNames"] = [*names, "pose"]
+
+    def _fill_targets(self, primitive: dict[str, Any], n_targets: int) -> None:
+        """Add morph targets that move nothing, as all primitives of a mesh have equally many."""
+        position = primitive["attributes"].get("POSITION")
+        while position is not None and len(primitive.setdefault("targets", [])) < n_targets:
+            zeros = np.zeros((self.patch.description["accessors"][position]["count"], 3))
+            primitive["targets"].append({"POSITION": self._vectors(zeros, has_bounds=True)})
 
     def drop_clips(self) -> list[str]:
         """Remove the animations that move what shapes the character, and return their names."""
@@ -453,33 +559,6 @@ class _Source:
             roots = description["scenes"][description.get("scene", 0)].setdefault("nodes", [])
             if number not in roots:
                 roots.append(number)
-
-    def _stored_normals(self, shown: ShownPrimitive) -> FloatArray:
-        mesh = self._document.description.meshes[shown.mesh]
-        number = mesh.primitives[shown.primitive].attributes.NORMAL
-        what = f"the normals of mesh {shown.mesh}"
-        stored = self._document.array(number, what, ("VEC3",), shown.n_vertices)
-        return stored.astype(np.float64)
-
-    def _normals(self, vertices: FloatArray) -> FloatArray:
-        """Return the unit normals of the file's W vertices in a pose; 0 where it has none."""
-        rest = np.zeros((len(self._joined), 3))
-        transforms = self._scene.rest.transforms[0]
-        for part, shown, rows in self._parts:
-            mesh = self._document.description.meshes[shown.mesh]
-            if mesh.primitives[shown.primitive].attributes.NORMAL is not None:
-                turns = np.linalg.pinv(_blended(part, transforms)[:, :, :3])
-                rest[rows] = _unit(np.einsum("vij,vi->vj", turns, self._stored_normals(shown)))
-        # All triangles of the joined vertex, so that the copies at a seam move alike.
-        faces = self._faces.astype(np.int64)
-        corners = np.concatenate([np.roll(faces, -side, axis=1) for side in range(3)])
-        corners = corners[np.argsort(corners[:, 0], kind="stable")]
-        first = np.searchsorted(corners[:, 0], np.arange(len(vertices) + 1))
-        counts = np.diff(first)[self._joined]
-        owners = np.repeat(np.arange(len(counts)), counts)
-        within = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
-        used = corners[np.repeat(first[self._joined], counts) + within]
-        return moved_normals(rest, owners, used, self._rest, vertices)
 
 
 def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:

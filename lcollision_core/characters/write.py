@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from lcollision_core.characters.character import Character
 from lcollision_core.characters.posed_gltf import (
+    CharacterFile,
     CharacterForm,
     PosedFile,
     animated_gltf,
@@ -31,13 +32,14 @@ def write_character(
     vertices: npt.NDArray[Any],
     form: CharacterForm | str,
     transforms: FloatArray | None = None,
+    file: CharacterFile | None = None,
 ) -> PosedFile:
     """Write a character's file with a pose in it, whole or not at all: see `posed_gltf`.
 
     Parameters
     ----------
     path : a .glb file, or a .vrm file for a character of one
-    character, vertices, form, transforms : as of `posed_gltf`
+    character, vertices, form, transforms, file : as of `posed_gltf`
 
     Returns
     -------
@@ -49,9 +51,9 @@ def write_character(
     ShapeError : as of `posed_gltf`.
     """
     _require_written(path, character)
-    posed = posed_gltf(character, vertices, CharacterForm(form), transforms)
-    with atomic_write(path) as file:
-        file.write(posed.data)
+    posed = posed_gltf(character, vertices, CharacterForm(form), transforms, file)
+    with atomic_write(path) as out:
+        out.write(posed.data)
     return posed
 
 

@@ -15,6 +15,7 @@ from lcollision_core.characters import (
     CHARACTER_SUFFIXES,
     PATCHED_SUFFIXES,
     Character,
+    CharacterFile,
     CharacterForm,
     read_character,
     write_character,
@@ -194,6 +195,7 @@ class SourceFile:
         self.path = Path(path)
         self._body = body
         self._character: Character | None = None
+        self._file: CharacterFile | None = None
         suffix = self.path.suffix.lower()
         own = body.character if isinstance(body, RigModel) else None
         is_own = own is not None and _is_same_file(own.source, self.path)
@@ -280,7 +282,10 @@ class SourceFile:
         transforms = None
         if form.needs_rig and isinstance(self._body, RigModel):
             transforms = _placed(self._body.space.transforms(latent), placement)
-        posed = write_character(path, self._character, vertices, form.key, transforms)
+        # One read for all poses.
+        if self._file is None and self.path.suffix.lower() in PATCHED_SUFFIXES:
+            self._file = CharacterFile(self._character)
+        posed = write_character(path, self._character, vertices, form.key, transforms, self._file)
         return posed.vertices, posed.notes
 
     def write_clip(

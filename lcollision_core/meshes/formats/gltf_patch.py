@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ class GltfPatch:
     Attributes
     ----------
     description : the file's JSON, to be changed
+    notes : sentences on what is not in the file
 
     Raises
     ------
@@ -66,8 +68,16 @@ class GltfPatch:
             first = self.description["buffers"][0]
             first.pop("uri", None)
             self.description["buffers"] = [first]
+        self.notes: tuple[str, ...] = ()
         for image in self.description.get("images", []):
             self._embed(image, path)
+
+    def copy(self) -> GltfPatch:
+        """Return the same, to be changed on its own."""
+        other = copy(self)
+        other.description = deepcopy(self.description)
+        other._binary = self._binary.copy()
+        return other
 
     def _embed(self, image: dict[str, Any], path: Path) -> None:
         uri = image.get("uri")
@@ -77,14 +87,19 @@ class GltfPatch:
             content = resource(uri, path, MAX_FILE_BYTES - len(self._binary))
         except MeshFileError:
             # Missing beside the source, or elsewhere: it is no more missing afterwards.
-            return
+            content = b""
         media_type = next(
             (t for magic, t in _MEDIA_TYPES.items() if content.startswith(magic)), None
         )
-        if media_type is not None:
-            del image["uri"]
-            image["bufferView"] = self._view(content)
-            image["mimeType"] = media_type
+        if media_type is None:
+            self.notes += (
+                f"its picture {quoted(uri)} is not in the written file, which looks for it beside "
+                "itself",
+            )
+            return
+        del image["uri"]
+        image["bufferView"] = self._view(content)
+        image["mimeType"] = media_type
 
     def _append(self, content: bytes) -> int:
         start = len(self._binary)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import (
     Character,
+    CharacterFile,
     CharacterForm,
     PosedFile,
     RigPoseSpace,
@@ -218,6 +219,60 @@ def test_a_morph_target_joins_those_that_are_there(tmp_path: Path) -> None:
     assert description["meshes"][1]["weights"] == [0.25, 1.0]
     assert description["nodes"][5]["weights"] == [0.5, 1.0]
     assert description["meshes"][1]["extras"] == {"targetNames": ["smile", "pose"]}
+    # One of its primitives may have none.
+    del mesh["primitives"][0]["targets"]
+    character = read_character(builder.write(tmp_path / "figure.glb"))
+    _, posed = _written(character, CharacterForm.MORPH, path)
+    again = read_character(path)
+    in_file = again.rest_vertices[again.joined]
+    assert np.abs(in_file - posed.vertices[character.joined]).max() < 1e-12
+
+
+def test_a_static_mesh_says_that_it_loses_its_morph_targets(tmp_path: Path) -> None:
+    builder = figure()
+    mesh, hat = builder.description["meshes"][1:3]
+    for primitive in (*mesh["primitives"], *hat["primitives"]):
+        n = builder.description["accessors"][primitive["attributes"]["POSITION"]]["count"]
+        primitive["targets"] = [{"POSITION": builder.array(np.full((n, 3), 0.1))}]
+    mesh["extras"] = {"targetNames": ["smile"], "kept": 1}
+    # A hat that no joint moves keeps its own.
+    builder.add("nodes", name="Stand", mesh=2, translation=[3.0, 0.0, 0.0])
+    builder.description["nodes"][6].pop("mesh")
+    group = {"name": "joy", "binds": [{"mesh": 1, "index": 0}, {"mesh": 2, "index": 0}]}
+    smile = {"morphTargetBinds": [{"node": 5, "index": 0}, {"node": 8, "index": 0}]}
+    builder.description["extensions"] = {
+        "VRM": {"blendShapeMaster": {"blendShapeGroups": [group]}},
+        "VRMC_vrm": {"expressions": {"preset": {"happy": smile}}},
+    }
+    character = read_character(builder.write(tmp_path / "figure.vrm"))
+    path = tmp_path / "posed.vrm"
+    posed = write_character(path, character, character.rest_vertices, "mesh")
+    assert "its morph targets are left out of the static mesh" in posed.notes
+    description, _ = described(path)
+    assert description["meshes"][1]["extras"] == {"kept": 1}
+    extensions = description["extensions"]
+    (group,) = extensions["VRM"]["blendShapeMaster"]["blendShapeGroups"]
+    assert group == {"name": "joy", "binds": [{"mesh": 2, "index": 0}]}
+    happy = extensions["VRMC_vrm"]["expressions"]["preset"]["happy"]
+    assert happy == {"morphTargetBinds": [{"node": 8, "index": 0}]}
+    _, posed = _written(character, CharacterForm.JOINTS, path)
+    assert not any("morph" in note for note in posed.notes)
+    assert described(path)[0]["extensions"] == builder.description["extensions"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_file_that_is_read_once_is_written_alike(
+    form: CharacterForm, character: Character, tmp_path: Path
+) -> None:
+    path = tmp_path / "posed.glb"
+    vertices, transforms = _pose(character)
+    file = CharacterFile(character)
+    rest = _space(character).rig.rest
+    write_character(path, character, character.rest_vertices, form, rest, file)
+    again = write_character(path, character, vertices, form, transforms, file)
+    alone = write_character(path, character, vertices, form, transforms)
+    assert again.data == alone.data
+    assert again.notes == alone.notes
 
 
 def test_a_mesh_that_two_nodes_show_becomes_two(tmp_path: Path) -> None:
@@ -299,6 +354,8 @@ def test_gltf_with_its_data_beside_it_becomes_one_file(tmp_path: Path) -> None:
     assert image["mimeType"] == "image/png"
     assert binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]] == PNG
     assert after["images"][1] == {"uri": "missing.png"}
+    (note,) = [note for note in posed.notes if "picture" in note]
+    assert note.startswith("its picture 'missing.png' is not in the written file")
 
 
 def test_vrm_stays_vrm(tmp_path: Path) -> None:
@@ -337,6 +394,12 @@ def test_a_source_that_changed_is_refused(character: Character, tmp_path: Path) 
     other.description["meshes"][2]["primitives"][0]["indices"] = other.array(np.arange(3), "u2")
     other.write(Path(character.source))
     with pytest.raises(MeshFileError, match="is not the file that the character was read from"):
+        write_character(tmp_path / "posed.glb", character, vertices, "mesh")
+    # Its vertices may merely have moved.
+    other = figure()
+    other.description["nodes"][1]["translation"] = [0.0, 1.0, -50.0]
+    other.write(Path(character.source))
+    with pytest.raises(MeshFileError, match=r"is not the file .*; open it again"):
         write_character(tmp_path / "posed.glb", character, vertices, "mesh")
 
 
