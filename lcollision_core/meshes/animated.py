@@ -24,7 +24,7 @@ from lcollision_core.meshes.units import body_size
 ANIMATED_SUFFIXES = (*SCENE_SUFFIXES, *POINT_CACHE_SUFFIXES)
 """Extensions that `read_animated` reads, in lower case."""
 
-_MESHES_OF_CACHES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf", ".vrm")
+_MESHES_OF_CACHES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf", ".vrm", ".fbx")
 """Which file beside a point cache is its mesh: the first that is there."""
 
 
@@ -124,7 +124,7 @@ def _read_clips(
         mesh.topology,
         tuple(names),
         mesh.notes,
-        None if scene.up is None else int(np.abs(scene.up).argmax()),
+        _up_axis(scene),
         labels_of(scene, mesh),
         mesh.groups,
         scene.metres,
@@ -154,12 +154,12 @@ def _read_cache(path: Path) -> AnimatedMesh:
             f"put it there as {beside[0].name}, or with another extension of a mesh",
             where=path,
         )
-    cache = read_point_cache(path)
+    frames = read_point_cache(path)
     mesh = read_mesh(found[0])
-    frames, n_vertices = cache.frames, cache.frames.shape[1]
-    is_scene = found[0].suffix.lower() in SCENE_SUFFIXES
-    if is_scene and n_vertices != mesh.topology.n_vertices:
-        joined = join_parts(read_scene(found[0])).joined
+    n_vertices = frames.shape[1]
+    scene = read_scene(found[0]) if found[0].suffix.lower() in SCENE_SUFFIXES else None
+    if scene is not None and n_vertices != mesh.topology.n_vertices:
+        joined = join_parts(scene).joined
         if len(joined) == n_vertices:
             # Of the file's own vertices, those that seams split among them.
             frames = frames[:, np.unique(joined, return_index=True)[1]]
@@ -174,9 +174,11 @@ def _read_cache(path: Path) -> AnimatedMesh:
     vertices = np.concatenate([mesh.vertices[None], frames])
     names = ("rest", *(f"frame {frame}" for frame in range(len(frames))))
     notes = (f"{found[0].name} is its mesh and rest pose", *mesh.notes)
-    # y is up in glTF, by its standard.
-    up_axis = 1 if is_scene else None
-    return AnimatedMesh(vertices, mesh.topology, names, notes, up_axis, None)
+    return AnimatedMesh(vertices, mesh.topology, names, notes, _up_axis(scene), None)
+
+
+def _up_axis(scene: Scene | None) -> int | None:
+    return None if scene is None or scene.up is None else int(np.abs(scene.up).argmax())
 
 
 def _require_same_body(path: Path, file: Path, mesh: Mesh, frame: FloatArray) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
+from lcollision_core.meshes.npz import MAX_ITEMS
 from lcollision_core.regular_files import open_regular
 
 POINT_CACHE_SUFFIXES = (".pc2", ".mdd")
@@ -33,23 +32,8 @@ _MDD_HEADER = np.dtype([("n_frames", ">i4"), ("n_points", ">i4")])
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-@dataclass(frozen=True, eq=False)
-class PointCache:
-    """The content of a point cache.
-
-    Attributes
-    ----------
-    frames : (N, V, 3) float32 array, read-only, vertices in the order of the mesh, in its unit
-    times : (N,) float64 array: MDD's in seconds, PC2's in frames of a scene whose rate it does
-        not say
-    """
-
-    frames: npt.NDArray[np.float32]
-    times: npt.NDArray[np.float64]
-
-
-def read_point_cache(path: str | os.PathLike[str]) -> PointCache:
-    """Read a point cache; its extension, in any case, says the format.
+def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
+    """Read the frames of a point cache; its extension, in any case, says the format.
 
     What follows the announced frames is left aside: Blender's MDD files hold one frame more.
 
@@ -57,23 +41,23 @@ def read_point_cache(path: str | os.PathLike[str]) -> PointCache:
     ----------
     path : a .pc2 or .mdd file
 
+    Returns
+    -------
+    frames : (N, V, 3) float32 array, read-only, vertices in the order of the mesh, in its unit
+
     Raises
     ------
     MeshFileError : the file is missing, truncated, of another kind, announces more than it holds,
-        has more than `MAX_FILE_BYTES`, or a coordinate is not finite.
+        or more than `MAX_ITEMS` numbers, or a coordinate is not finite.
     """
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
-            if size > MAX_FILE_BYTES:
-                raise MeshFileError(
-                    f"it is larger than {MAX_FILE_BYTES >> 20} MiB", "keep fewer frames"
-                )
-            cache = _read_mdd(file, size) if _suffix(path) == ".mdd" else _read_pc2(file, size)
+            frames = _read_mdd(file, size) if _suffix(path) == ".mdd" else _read_pc2(file, size)
     except (MeshFileError, OSError, MemoryError) as error:
         reason = error if str(error) else "it needs more memory than there is"
         raise MeshFileError.unreadable(path, reason, "export the cache again") from error
-    for index, frame in enumerate(cache.frames):
+    for index, frame in enumerate(frames):
         if not np.isfinite(frame).all():
             vertex = int(np.flatnonzero(~np.isfinite(frame).all(axis=1))[0])
             raise MeshFileError.unreadable(
@@ -82,29 +66,25 @@ def read_point_cache(path: str | os.PathLike[str]) -> PointCache:
                 "is not finite",
                 "export the cache again",
             )
-    cache.frames.flags.writeable = False
-    return cache
+    frames.flags.writeable = False
+    return frames
 
 
-def _read_pc2(file: BinaryIO, size: int) -> PointCache:
+def _read_pc2(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
     header = _header(file, _PC2_HEADER, size)
     if bytes(header["magic"]) != _PC2_MAGIC.rstrip(b"\0"):
         raise MeshFileError("it does not begin with POINTCACHE2, so it is not a PC2 file")
     if header["version"] != 1:
         raise MeshFileError(f"its version is {header['version']}, only 1 is known")
-    frames = _frames(file, header, size - _PC2_HEADER.itemsize, "<f4")
-    times = float(header["start"]) + float(header["step"]) * np.arange(len(frames))
-    return PointCache(frames, _finite(times))
+    return _frames(file, header, size - _PC2_HEADER.itemsize, "<f4")
 
 
-def _read_mdd(file: BinaryIO, size: int) -> PointCache:
+def _read_mdd(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
     header = _header(file, _MDD_HEADER, size)
-    n_frames = max(int(header["n_frames"]), 0)
-    # Their bytes are counted before any is read.
-    left = size - _MDD_HEADER.itemsize - 4 * n_frames
-    times = file.read(4 * n_frames) if left >= 0 else b""
-    frames = _frames(file, header, left, ">f4")
-    return PointCache(frames, _finite(np.frombuffer(times, ">f4")))
+    # The times of the frames come first.
+    start = _MDD_HEADER.itemsize + 4 * max(int(header["n_frames"]), 0)
+    file.seek(start)
+    return _frames(file, header, size - start, ">f4")
 
 
 def _header(file: BinaryIO, layout: np.dtype[Any], size: int) -> Any:
@@ -121,14 +101,14 @@ def _frames(file: BinaryIO, header: Any, n_bytes: int, dtype: str) -> npt.NDArra
             f"it is truncated or damaged: it announces {n_frames} frames of {n_points} vertices, "
             f"and holds {max(n_bytes, 0)} bytes for them"
         )
+    if 3 * n_frames * n_points > MAX_ITEMS:
+        raise MeshFileError(
+            f"it holds {n_frames} frames of {n_points} vertices, at most {MAX_ITEMS} coordinates "
+            "can be read",
+            "keep fewer frames",
+        )
     data = np.frombuffer(file.read(needed), dtype)
-    return data.astype(np.float32).reshape(n_frames, n_points, 3)
-
-
-def _finite(times: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    if not np.isfinite(times).all():
-        raise MeshFileError("the time of a frame is not finite")
-    return times.astype(np.float64)
+    return data.astype(np.float32, copy=False).reshape(n_frames, n_points, 3)
 
 
 def write_point_cache(

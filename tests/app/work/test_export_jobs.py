@@ -71,7 +71,7 @@ def test_a_motion_says_how_many_of_its_frames_collide(body: PoseModel, tmp_path:
             CancelToken(),
         )
         assert told == f"Exported {name}: {verdict}"
-        frames = read_point_cache(tmp_path / name).frames
+        frames = read_point_cache(tmp_path / name)
         drawn = np.stack([body.exported_vertices(row) for row in latent])
         expected = 100.0 * drawn.astype(float)[:, :, [0, 2, 1]] * [1.0, 1.0, -1.0]
         np.testing.assert_array_equal(frames, expected.astype(np.float32))
@@ -88,7 +88,7 @@ def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
         for name in ("run.pc2", "run.glb")
     )
     assert caches == "Exported run Body.pc2, run Core.pc2, run Hat.pc2: 1 of 2 frames collide"
-    assert read_point_cache(tmp_path / "run Hat.pc2").frames.shape[0] == 2
+    assert read_point_cache(tmp_path / "run Hat.pc2").shape[0] == 2
     assert clip.startswith("Exported run.glb: 1 of 2 frames collide; its clip 'wave' is left out;")
     frames = read_character(tmp_path / "run.glb").sample("poses", None)
     drawn = np.stack([character.decode(pose.latent) for pose in poses])

@@ -174,7 +174,7 @@ def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
     assert {pose.unit for pose in written} == {0.01}
     assert [file.name for file in files] == [f"run {n}{suffix}" for n in ("Body", "Core", "Hat")]
     caches = [read_point_cache(file) for file in files]
-    joined = np.concatenate([cache.frames for cache in caches], axis=1)
+    joined = np.concatenate(caches, axis=1)
     np.testing.assert_array_equal(joined, stored[:, model.character.joined])
     np.testing.assert_allclose(stored, [frame.apply(pose) for pose in poses], rtol=1e-6, atol=1e-5)
     # As many as the file's own meshes have.
@@ -186,8 +186,9 @@ def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
         )
         for mesh in description["meshes"]
     ]
-    assert [cache.frames.shape[1] for cache in caches] == counts
-    assert caches[0].times[1] == pytest.approx(1 / 24 if suffix == ".mdd" else 1.0)
+    assert [cache.shape[1] for cache in caches] == counts
+    if suffix == ".mdd":
+        assert np.frombuffer(files[0].read_bytes(), ">f4", 2, 8)[1] == np.float32(1 / 24)
 
 
 def test_a_motion_of_the_rig_becomes_a_clip_of_its_file(
@@ -218,7 +219,7 @@ def test_a_model_s_own_order_needs_no_source(
     vertices = model.exported_vertices(latent)
     files, (written,) = write_sequence(tmp_path / "run.pc2", model, [latent], [vertices])
     assert files == [tmp_path / "run.pc2"]
-    np.testing.assert_array_equal(read_point_cache(files[0]).frames[0], vertices)
+    np.testing.assert_array_equal(read_point_cache(files[0])[0], vertices)
     np.testing.assert_array_equal(written.vertices, vertices)
     with pytest.raises(MeshFileError, match="is no point cache; use one of"):
         write_sequence(tmp_path / "run.glb", model, [latent], [model.reference])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
+from lcollision_core.meshes.formats import point_cache
 from lcollision_core.meshes.formats.point_cache import (
     POINT_CACHE_SUFFIXES,
     read_point_cache,
@@ -36,17 +37,22 @@ def test_an_mdd_file_is_what_its_users_describe(tmp_path: Path) -> None:
 def test_round_trip(tmp_path: Path, suffix: str, dtype: type[np.floating]) -> None:
     path = tmp_path / f"m{suffix}"
     write_point_cache(path, FRAMES.astype(dtype), fps=10.0)
-    cache = read_point_cache(path)
-    assert cache.frames.dtype == np.float32
-    assert not cache.frames.flags.writeable
-    assert np.array_equal(cache.frames, FRAMES)
-    assert cache.times == pytest.approx([0.0, 0.1 if suffix == ".mdd" else 1.0])
+    frames = read_point_cache(path)
+    assert frames.dtype == np.float32
+    assert not frames.flags.writeable
+    assert np.array_equal(frames, FRAMES)
 
 
-def test_a_pc2_file_says_its_times_in_frames(tmp_path: Path) -> None:
-    head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, 4, 5.0, 0.5, 2)
-    (tmp_path / "m.pc2").write_bytes(head + FRAMES.tobytes())
-    assert read_point_cache(tmp_path / "m.pc2").times.tolist() == [5.0, 5.5]
+def test_more_numbers_than_can_be_read_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "m.pc2"
+    write_point_cache(path, FRAMES)
+    monkeypatch.setattr(point_cache, "MAX_ITEMS", FRAMES.size)
+    assert np.array_equal(read_point_cache(path), FRAMES)
+    monkeypatch.setattr(point_cache, "MAX_ITEMS", FRAMES.size - 1)
+    with pytest.raises(MeshFileError, match=r"at most 23 coordinates .* keep fewer frames"):
+        read_point_cache(path)
 
 
 @pytest.mark.parametrize("suffix", POINT_CACHE_SUFFIXES)
@@ -54,7 +60,7 @@ def test_frames_beyond_those_announced_are_left_aside(tmp_path: Path, suffix: st
     path = tmp_path / f"m{suffix}"
     write_point_cache(path, FRAMES)
     path.write_bytes(path.read_bytes() + FRAMES[0].tobytes())
-    assert np.array_equal(read_point_cache(path).frames, FRAMES)
+    assert np.array_equal(read_point_cache(path), FRAMES)
 
 
 @pytest.mark.parametrize("suffix", POINT_CACHE_SUFFIXES)
@@ -81,7 +87,7 @@ def test_damaged_bytes_end_in_one_sentence_or_finite_frames(tmp_path: Path, suff
         damaged[places] = generator.integers(0, 256, 3)
         path.write_bytes(damaged.tobytes())
         try:
-            assert np.isfinite(read_point_cache(path).frames).all()
+            assert np.isfinite(read_point_cache(path)).all()
         except MeshFileError as error:
             sentences.append(str(error))
     assert 0 < len(sentences) < 250
