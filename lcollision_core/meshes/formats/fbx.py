@@ -26,6 +26,7 @@ from lcollision_core.meshes.formats.polygons import (
     triangulate,
 )
 from lcollision_core.meshes.formats.scene import (
+    NO_MESH,
     Clip,
     Part,
     Scene,
@@ -66,6 +67,8 @@ def read_scene(file: BinaryIO) -> Scene:
         if part is not None:
             numbers.append(number)
             parts.append(part)
+    if not shown and len(held["clips"]):
+        raise MeshFileError(*NO_MESH)
     if not parts:
         raise MeshFileError(f"it holds {len(shown)} meshes, none of which shows faces")
     require_plausible_count(sum(len(part.points) for part in parts), "vertices")

@@ -18,7 +18,14 @@ from lcollision_core.meshes.formats.gltf_document import (
     whole,
 )
 from lcollision_core.meshes.formats.polygons import MAX_FACES, require_plausible_count
-from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses, is_mirrored, parents_first
+from lcollision_core.meshes.formats.scene import (
+    NO_MESH,
+    Part,
+    Scene,
+    ScenePoses,
+    is_mirrored,
+    parents_first,
+)
 from lcollision_core.meshes.formats.transforms import compose, global_transforms
 from lcollision_core.meshes.topology import FloatArray
 
@@ -50,6 +57,8 @@ def read_shown(document: GltfDocument) -> Scene:
     shown, notes = shown_primitives(document, parents)
     if not shown:
         n_meshes = len(document.description.meshes)
+        if not n_meshes and document.description.animations:
+            raise MeshFileError(*NO_MESH)
         raise MeshFileError(f"it holds {n_meshes} meshes, none of which shows triangles")
     parts = tuple(_part(document, primitive, rest[0]) for primitive in shown)
     defaults = tuple(
@@ -337,7 +346,11 @@ def _default_weights(document: GltfDocument, shown: ShownPrimitive, part: Part) 
     mesh = document.description.meshes[shown.mesh]
     stored = document.node_weights.get(shown.node) or mesh.weights
     n = len(part.morphs)
-    return numbers(stored, f"the weights of mesh {shown.mesh}", n) if stored and n else np.zeros(n)
+    if not stored or not n:
+        return np.zeros(n)
+    # Primitives of a mesh may have fewer targets than others.
+    own = stored[:n] if isinstance(stored, list) else stored
+    return numbers(own, f"the weights of mesh {shown.mesh}", n)
 
 
 def _require_finite(values: npt.NDArray[Any], what: str) -> None:

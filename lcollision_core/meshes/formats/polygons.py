@@ -158,7 +158,8 @@ def read_rest(file: BinaryIO) -> bytes:
     size = file.seek(0, os.SEEK_END) - start
     if size > MAX_FILE_BYTES:
         raise MeshFileError(
-            f"it is larger than {MAX_FILE_BYTES >> 20} MiB", "decimate the mesh or split the file"
+            f"it is larger than {MAX_FILE_BYTES >> 20} MiB",
+            "export it with smaller textures or none, decimate the mesh, or split the file",
         )
     file.seek(start)
     return file.read(size)

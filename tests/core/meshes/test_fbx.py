@@ -11,6 +11,7 @@ import pytest
 from lcollision_core.characters import is_rigged, joint_parts, read_character
 from lcollision_core.errors import MeshFileError, MissingExtraError
 from lcollision_core.meshes import read_mesh, read_pose_set
+from lcollision_core.meshes.formats.point_cache import write_point_cache
 from lcollision_core.meshes.scene_files import read_scene
 from tests.core.fbx_builder import arm_fbx, ufbx_frames
 from tests.core.gltf_builder import tube
@@ -55,6 +56,23 @@ def test_a_clip_without_a_span_is_as_long_as_its_curves(tmp_path: Path) -> None:
     ]
     assert np.array_equal(frames[0].times, frames[1].times)
     assert np.array_equal(frames[0].vertices, frames[1].vertices)
+
+
+def test_an_animation_without_a_mesh_is_said(tmp_path: Path) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    # Its geometry hangs on nothing.
+    path.write_text(path.read_text().replace('C: "OO",100,200', 'C: "OO",100,300'))
+    with pytest.raises(MeshFileError, match="an animation, but no mesh; export it with its mesh"):
+        read_character(path)
+
+
+def test_a_point_cache_finds_the_fbx_that_is_its_mesh(tmp_path: Path) -> None:
+    character = read_character(arm_fbx(tmp_path / "arm.fbx", up=2))
+    frames = character.sample("wave", 10.0).vertices
+    write_point_cache(tmp_path / "arm.mdd", frames)
+    poses = read_pose_set(tmp_path / "arm.mdd")
+    assert np.array_equal(poses.vertices[1:], frames.astype(np.float32))
+    assert poses.up_axis == 2
 
 
 def test_a_character_of_fbx_has_its_rig_parts_and_clips(tmp_path: Path) -> None:

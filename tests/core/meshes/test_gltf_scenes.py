@@ -132,6 +132,30 @@ def test_morph_targets_agree_with_vtk(tmp_path: Path) -> None:
     assert np.abs(read_mesh(path).vertices - expected).max() < 1e-6
 
 
+def test_a_primitive_may_have_fewer_morph_targets_than_the_mesh_has_weights(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    vertices, faces = tube()
+    deltas = [builder.array(np.full_like(vertices, delta)) for delta in (0.25, 0.5)]
+    mesh = _plain(builder, vertices, faces, targets=[{"POSITION": delta} for delta in deltas])
+    other = _plain(builder, vertices + 2.0, faces, targets=[{"POSITION": deltas[0]}])
+    meshes = builder.description["meshes"]
+    meshes[mesh]["primitives"] += meshes.pop(other)["primitives"]
+    meshes[mesh]["weights"] = [1.0, 1.0]
+    builder.add("nodes", mesh=mesh)
+    found = read_mesh(builder.write(tmp_path / "m.glb")).vertices
+    assert np.abs(found - np.concatenate([vertices + 0.75, vertices + 2.25])).max() < 1e-6
+
+
+def test_an_animation_without_a_mesh_is_said(tmp_path: Path) -> None:
+    builder = arm()
+    builder.description["meshes"] = []
+    for node in builder.description["nodes"]:
+        node.pop("mesh", None)
+    path = builder.write(tmp_path / "walk.glb")
+    with pytest.raises(MeshFileError, match="an animation, but no mesh; export it with its mesh"):
+        read_scene(path)
+
+
 def test_vertices_of_unlike_morphs_or_weights_stay_apart(tmp_path: Path) -> None:
     builder = GltfBuilder()
     vertices, faces = split_corners(*tube())
