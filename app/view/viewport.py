@@ -167,9 +167,18 @@ class Viewport(QWidget):
 
     def follow_menu(self, menu: QMenu) -> None:
         """Keep the last patch while a menu is open that the pointer leaves the body for."""
-        menu.aboutToShow.connect(lambda: self.mouse and self.mouse.keep_patch())
-        # Soon is after the menu has done what was chosen.
-        menu.aboutToHide.connect(lambda: self.mouse and self.mouse.look_again())
+
+        def on_open() -> None:
+            if self.mouse is not None:
+                self.mouse.keep_patch()
+
+        def on_close() -> None:
+            # Soon, which is after the menu has done what was chosen.
+            if self.mouse is not None:
+                self.mouse.look_again()
+
+        menu.aboutToShow.connect(on_open)
+        menu.aboutToHide.connect(on_close)
 
     def toggle_pin(self) -> None:
         """Pin the patch under the pointer, or take its pin away."""

@@ -165,7 +165,8 @@ class CodeRow(HoverRow):
         beyond = _BEYOND * (high - low)
         self._limits = self._field_limits = low - beyond, high + beyond
         decimals = _DECIMALS if self._shown == 1.0 else _DECIMALS_OF_UNITS
-        self.field = NumberBox(decimals, *(self._shown * limit for limit in self._limits))
+        least, most = (self._shown * limit for limit in self._limits)
+        self.field = NumberBox(decimals, least, most)
         self.field.setSuffix(self._unit)
         self.field.setObjectName("code")
         self.field.setSingleStep(self._shown * (high - low) / 100)
