@@ -57,7 +57,7 @@ def test_damaged_json_is_refused_in_a_sentence(values: Any) -> None:
         (
             RuleCounts(2, 3, 4, 5),
             "2 pairs within 0.05 along the surface, 3 pairs that touch at rest, 4 pairs of Hair "
-            "and Body or Belt and Belt and 5 pairs not deeper than 0.0001 are not counted",
+            "and Body or Belt with itself and 5 pairs not deeper than 0.0001 are not counted",
         ),
     ],
 )
