@@ -15,7 +15,7 @@ import numpy.typing as npt
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.meshes import (
     FaceGroup,
     RigidTransform,
@@ -195,9 +195,15 @@ class PosableBody(ABC):
         in_place : the mesh lies as the reference does and stays there
         """
 
-    def _decode(self, codes: FloatArray, n_threads: int | None) -> FloatArray:  # noqa: ARG002
+    def _decode(self, codes: FloatArray, n_threads: int | None) -> FloatArray:
         """Decode (B, D) codes to new (B, V, 3) normalised vertices."""
-        return self.pose_space.decode(codes)
+        vertices = np.empty((len(codes), self.n_vertices, 3))
+
+        def fill(start: int, stop: int) -> None:
+            vertices[start:stop] = self.pose_space.decode(codes[start:stop])
+
+        for_blocks(fill, len(codes), 1, n_threads)
+        return vertices
 
     def decode(self, latent: npt.ArrayLike, n_threads: int | None = None) -> FloatArray:
         """Turn latent poses into meshes.

@@ -105,7 +105,9 @@ def test_limits_are_kept_and_reset_is_the_rest_pose(model: RigModel) -> None:
     poses = model.sample(200, np.random.default_rng(0))
     assert ((space.low <= poses) & (poses <= space.high)).all()
     assert 80.0 < np.degrees(poses[:, bend].max()) <= 135.0
-    assert np.isfinite(model.decode(poses)).all()
+    decoded = model.decode(poses)
+    assert np.isfinite(decoded).all()
+    np.testing.assert_array_equal(decoded, model.decode(poses, n_threads=1))
     # Random poses leave the body in its place.
     assert not poses[:, :6].any()
     assert (np.ptp(poses[:, 6:], axis=0) > 0.0).mean() > 0.7
