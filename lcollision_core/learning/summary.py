@@ -93,7 +93,7 @@ def summarise_sources(
     """
     found = []
     for path in paths:
-        summary = _of_character(path) if path.suffix.lower() in CHARACTER_SUFFIXES else None
+        summary = _of_character(path, cancel) if path.suffix.lower() in CHARACTER_SUFFIXES else None
         found.append(summary or _of_poses(path, progress, cancel))
         if cancel is not None:
             cancel.raise_if_cancelled()
@@ -112,9 +112,9 @@ def summarise_sources(
     )
 
 
-def _of_character(path: Path) -> SourcesSummary | None:
+def _of_character(path: Path, cancel: CancelToken | None) -> SourcesSummary | None:
     """Return what a scene's file holds; None where neither joints nor clips make poses of it."""
-    scene = read_scene(path)
+    scene = read_scene(path, cancel)
     with one_sentence(path):
         mesh = join_parts(scene)
         if not (scene.clips or mesh.is_skinned.any()):

@@ -94,7 +94,7 @@ def _read_clips(
     progress: Progress,
     cancel: CancelToken | None,
 ) -> AnimatedMesh:
-    scene = read_scene(path)
+    scene = read_scene(path, cancel)
     with one_sentence(path):
         if not scene.clips:
             raise MeshFileError(

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lcollision_core.errors import MeshFileError, PoseSetError
+from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.formats import fbx, gltf
 from lcollision_core.meshes.formats.scene import Scene, character_parts, with_parts
 from lcollision_core.regular_files import open_regular
@@ -18,16 +19,22 @@ SCENE_SUFFIXES = (".glb", ".gltf", ".vrm", ".fbx")
 """Extensions that `read_scene` reads, in lower case."""
 
 
-def read_scene(path: str | os.PathLike[str]) -> Scene:
+def read_scene(path: str | os.PathLike[str], cancel: CancelToken | None = None) -> Scene:
     """Read what a file shows, without scenery about its characters; its extension says the format.
+
+    Parameters
+    ----------
+    path : of the file
+    cancel : polled while FBX is read, and its clips sampled
 
     Raises
     ------
+    CancelledError : `cancel` was set.
     MeshFileError : the file is missing, damaged, compressed, too large, or shows no triangles. The
         sentence names the file.
     """
     with one_sentence(path), _opened(path) as file:
-        return scene_of(file, Path(path))
+        return scene_of(file, Path(path), cancel)
 
 
 def has_skin(path: str | os.PathLike[str]) -> bool:
@@ -55,9 +62,9 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         yield file
 
 
-def scene_of(file: BinaryIO, path: Path) -> Scene:
+def scene_of(file: BinaryIO, path: Path, cancel: CancelToken | None = None) -> Scene:
     """Read an open file at its start, as `read_scene`; the sentence does not name it."""
-    scene = fbx.read_scene(file) if _is_fbx(path) else gltf.read_scene(file, path)
+    scene = fbx.read_scene(file, cancel) if _is_fbx(path) else gltf.read_scene(file, path)
     return with_parts(scene, character_parts(scene))
 
 

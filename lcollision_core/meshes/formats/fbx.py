@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import zipfile
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -17,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, MissingExtraError
+from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.formats.gltf_document import MAX_NUMBERS
 from lcollision_core.meshes.formats.polygons import (
     MAX_FACES,
@@ -40,24 +42,26 @@ _MOST_MEMORY = 1 << 32
 """Address space of the process that reads, in bytes, where the system can limit it."""
 
 _MOST_SECONDS = 300
+_POLL_SECONDS = 0.1
 _REFUSED = 3
 _WORKER = Path(__file__).with_name("fbx_worker.py")
 _UNKNOWN_AXIS = 6
 _MOST_FRAMES = 1_000_000
 
 
-def read_scene(file: BinaryIO) -> Scene:
+def read_scene(file: BinaryIO, cancel: CancelToken | None = None) -> Scene:
     """Read what the file shows.
 
     Vertices are the file's control points, in its order of nodes. A clip's own frames are those of
-    the file's frame rate.
+    the file's frame rate. `cancel` is polled here and where clips are sampled.
 
     Raises
     ------
+    CancelledError : `cancel` was set.
     MissingExtraError : the extra `fbx` is not installed.
     MeshFileError : the file is damaged or too large, or shows no faces.
     """
-    source = _FbxFile(read_rest(file))
+    source = _FbxFile(read_rest(file), cancel)
     held = source.asked()
     notes: list[str] = []
     shown = held["shown"].tolist()
@@ -94,9 +98,10 @@ def has_skin(file: BinaryIO) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _FbxFile:
-    """The bytes of a file, and what ufbx says of them."""
+    """The bytes of a file, and what ufbx says of them, until `cancel` is set."""
 
     data: bytes
+    cancel: CancelToken | None
 
     def asked(self, clip: int | None = None, times: FloatArray | None = None) -> dict[str, Any]:
         """Return the arrays of `fbx_worker`."""
@@ -111,26 +116,49 @@ class _FbxFile:
             "most_memory": _MOST_MEMORY,
             "most_elements": 4 * MAX_FACES,
         }
-        try:
-            done = subprocess.run(
-                [sys.executable, "-P", str(_WORKER)],
-                input=json.dumps(request).encode() + b"\n" + self.data,
-                # Each thread of OpenBLAS reserves address space.
-                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-                capture_output=True,
-                timeout=_MOST_SECONDS,
-                check=False,
-            )
-        except subprocess.TimeoutExpired as error:
-            raise MeshFileError(f"reading it took more than {_MOST_SECONDS} s") from error
-        if done.returncode == _REFUSED:
-            reason = done.stderr.decode(errors="replace").strip()[-200:]
+        code, found, said = self._run(json.dumps(request).encode() + b"\n" + self.data)
+        if code == _REFUSED:
+            reason = said.decode(errors="replace").strip()[-200:]
             raise MeshFileError(f"it is a damaged or unsupported FBX file ({reason})")
         try:
-            with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+            with np.load(io.BytesIO(found), allow_pickle=False) as arrays:
                 return dict(arrays)
         except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
             raise MeshFileError("it is a damaged FBX file, on which its reader crashed") from error
+
+    def _run(self, request: bytes) -> tuple[int, bytes, bytes]:
+        """Return the exit status of the process that reads, what it found, and what it said."""
+        with subprocess.Popen(
+            [sys.executable, "-P", str(_WORKER)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            # Each thread of OpenBLAS reserves address space.
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        ) as process:
+            ended = threading.Event()
+
+            def stop_when_cancelled(cancel: CancelToken) -> None:
+                while not ended.wait(_POLL_SECONDS):
+                    if cancel.cancelled:
+                        process.kill()
+
+            watcher = None
+            if self.cancel is not None:
+                watcher = threading.Thread(target=stop_when_cancelled, args=(self.cancel,))
+                watcher.start()
+            try:
+                found, said = process.communicate(request, timeout=_MOST_SECONDS)
+            except subprocess.TimeoutExpired as error:
+                raise MeshFileError(f"reading it took more than {_MOST_SECONDS} s") from error
+            finally:
+                process.kill()
+                ended.set()
+                if watcher is not None:
+                    watcher.join()
+        if self.cancel is not None:
+            self.cancel.raise_if_cancelled()
+        return process.returncode, found, said
 
 
 @dataclass(frozen=True, eq=False)

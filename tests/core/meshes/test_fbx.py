@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lcollision_core.characters import is_rigged, joint_parts, read_character
-from lcollision_core.errors import MeshFileError, MissingExtraError
+from lcollision_core.errors import CancelledError, MeshFileError, MissingExtraError
+from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes import read_mesh, read_pose_set
+from lcollision_core.meshes.formats import fbx
 from lcollision_core.meshes.formats.point_cache import write_point_cache
 from lcollision_core.meshes.scene_files import read_scene
 from tests.core.fbx_builder import arm_fbx, ufbx_frames
@@ -56,6 +59,24 @@ def test_a_clip_without_a_span_is_as_long_as_its_curves(tmp_path: Path) -> None:
     ]
     assert np.array_equal(frames[0].times, frames[1].times)
     assert np.array_equal(frames[0].vertices, frames[1].vertices)
+
+
+def test_reading_stops_when_it_is_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    sleeper = tmp_path / "sleeper.py"
+    sleeper.write_text("import sys, time\nsys.stdin.buffer.read()\ntime.sleep(60)\n")
+    monkeypatch.setattr(fbx, "_WORKER", sleeper)
+    cancel = CancelToken()
+    timer = threading.Timer(0.3, cancel.cancel)
+    timer.start()
+    with pytest.raises(CancelledError):
+        read_pose_set(path, no_progress, cancel)
+    timer.join()
+    monkeypatch.setattr(fbx, "_MOST_SECONDS", 0.2)
+    with pytest.raises(MeshFileError, match=r"reading it took more than 0\.2 s"):
+        read_pose_set(path)
 
 
 def test_an_animation_without_a_mesh_is_said(tmp_path: Path) -> None:
