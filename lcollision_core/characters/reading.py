@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.errors import ShapeError
-from lcollision_core.meshes.formats.scene import Scene, parents_first, unique_names
+from lcollision_core.meshes.formats.scene import Scene, parents_first
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
+from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.part_names import part_labels
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin, one_sentence, read_scene
 from lcollision_core.meshes.topology import FloatArray
@@ -140,7 +141,7 @@ def _rig(
         at_rest[mesh.dual > 0.0] = rest_vertices[mesh.dual > 0.0, None]
         notes = ("its skin is blended by dual quaternions, in poses by its joints linearly",)
     return Rig(
-        unique_names([scene.node_names[node] or f"node {node}" for node in order]),
+        tuple(numbered_where_equal(scene.node_names[node] or f"node {node}" for node in order)),
         np.array([_parent_joint(scene, node, joint) for node in order], dtype=np.int64),
         rest[order],
         np.array(order, dtype=np.int64),

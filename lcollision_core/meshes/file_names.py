@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections import Counter
 from collections.abc import Iterable
 from mimetypes import MimeTypes
 from pathlib import PurePath
 
 from lcollision_core.meshes.locks import shortened
+from lcollision_core.meshes.numbered_names import numbered_where_equal
 
 MAX_STEM_BYTES = 130
 """Most bytes of a name without its extension; file systems allow 143 to 255 in all."""
@@ -44,18 +44,11 @@ def file_stems(names: Iterable[str]) -> list[str]:
 
     Some file systems ignore case and the encoding of accents.
     """
-    taken: set[str] = set()
-    counts: Counter[str] = Counter()
-    stems = []
-    for stem in map(file_stem, names):
-        candidate, base = stem, _folded(stem)
-        while (key := _folded(candidate)) in taken:
-            counts[base] += 1
-            ending = f" {counts[base] + 1}"
-            candidate = _cut(stem, MAX_STEM_BYTES - len(ending)) + ending
-        taken.add(key)
-        stems.append(candidate)
-    return stems
+    return numbered_where_equal(
+        map(file_stem, names),
+        _folded,
+        lambda stem, ending: _cut(stem, MAX_STEM_BYTES - len(ending)) + ending,
+    )
 
 
 def _folded(name: str) -> str:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.meshes.numbered_names import numbered_where_equal
+
 MAX_NAME_LENGTH = 60
 MAX_POSE_NAME_LENGTH = 200
 
@@ -113,17 +115,9 @@ def unique_names(names: Iterable[str], max_length: int = MAX_POSE_NAME_LENGTH) -
 
     Numbered names are at most `max_length` long.
     """
-    taken: set[str] = set()
-    result = []
-    for name in names:
-        candidate, number = name, 1
-        while candidate.casefold() in taken:
-            number += 1
-            ending = f" {number}"
-            candidate = name[: max_length - len(ending)] + ending
-        taken.add(candidate.casefold())
-        result.append(candidate)
-    return result
+    return numbered_where_equal(
+        names, str.casefold, lambda name, ending: name[: max_length - len(ending)] + ending
+    )
 
 
 def _shared(names: Sequence[str]) -> set[str]:

@@ -34,8 +34,8 @@ from lcollision_core.meshes.formats.scene import (
     Scene,
     ScenePoses,
     is_mirrored,
-    unique_names,
 )
+from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.topology import FloatArray
 
 _MOST_MEMORY = 1 << 32
@@ -178,7 +178,7 @@ class _FbxClip:
 
 def _clips(source: _FbxFile, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
     fps = float(held["fps"]) if 0.0 < float(held["fps"]) < np.inf else 24.0
-    names = unique_names([name or "clip" for name in held["clips"].tolist()])
+    names = numbered_where_equal([name or "clip" for name in held["clips"].tolist()])
     clips = []
     for number, (name, (start, end)) in enumerate(zip(names, held["spans"], strict=True)):
         n_steps = (end - start) * fps + 1e-6

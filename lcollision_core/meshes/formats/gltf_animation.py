@@ -11,13 +11,14 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.gltf_document import GltfDocument, as_float, element, numbers
-from lcollision_core.meshes.formats.scene import Clip, Part, ScenePoses, unique_names
+from lcollision_core.meshes.formats.scene import Clip, Part, ScenePoses
 from lcollision_core.meshes.formats.transforms import (
     compose,
     decompose,
     global_transforms,
     slerp,
 )
+from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.topology import FloatArray
 
 _PATHS = {"translation": 3, "rotation": 4, "scale": 3}
@@ -141,7 +142,9 @@ def read_clips(
     MeshFileError : an animation is damaged.
     """
     animations = document.description.animations
-    names = unique_names([str(one.name or f"animation {i}") for i, one in enumerate(animations)])
+    names = numbered_where_equal(
+        str(one.name or f"animation {i}") for i, one in enumerate(animations)
+    )
     n_targets: dict[int, int] = {}
     for part in parts:
         n_targets[part.node] = max(len(part.morphs), n_targets.get(part.node, 0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -246,18 +245,3 @@ def is_mirrored(turns: FloatArray, bone_of: npt.NDArray[np.int32], weights: Floa
     with np.errstate(all="ignore"):
         signs = np.sign(np.linalg.det(turns[:, :3, :3]))
     return bool((signs[bone_of] * weights).sum() < 0.0)
-
-
-def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Return names of which no two are equal: a later one gets a number behind it."""
-    taken: set[str] = set()
-    counts: Counter[str] = Counter()
-    result = []
-    for name in names:
-        unique = name
-        while unique in taken:
-            counts[name] += 1
-            unique = f"{name} {counts[name] + 1}"
-        taken.add(unique)
-        result.append(unique)
-    return tuple(result)
