@@ -37,9 +37,9 @@ from pathlib import Path
 
 from app.benchmarks.timing import Row
 from app.window.editor import why_no_window
-from lcollision_core.characters import CHARACTER_SUFFIXES
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Progress, no_progress
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.model import find_model
 
 START, DROP = -1, -2
@@ -82,7 +82,7 @@ def time_editor(
             is_last = start == _STARTS - 1
             answer = _run(find_model(model), n_actions if is_last else START)
             progress(index * _STARTS + start + 1, len(models) * _STARTS)
-        is_character = find_model(model).suffix.lower() in CHARACTER_SUFFIXES
+        is_character = find_model(model).suffix.lower() in SCENE_SUFFIXES
         dropped = _run(find_model(model), DROP)["open_seconds"] if is_character else None
         rows.append(answer | {"open_seconds": dropped})
     return rows

@@ -68,9 +68,9 @@ def _mesh_suffixes() -> tuple[str, ...]:
 
 
 def _character_suffixes() -> tuple[str, ...]:
-    from lcollision_core.characters import CHARACTER_SUFFIXES
+    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 
-    return CHARACTER_SUFFIXES
+    return SCENE_SUFFIXES
 
 
 def _kind(path: Path) -> str:

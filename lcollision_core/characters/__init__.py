@@ -9,8 +9,6 @@ from lcollision_core.characters.posed_gltf import (
     posed_gltf,
 )
 from lcollision_core.characters.reading import (
-    CHARACTER_SUFFIXES,
-    is_rigged,
     joint_parts,
     read_character,
 )

@@ -14,12 +14,9 @@ from lcollision_core.meshes.formats.scene import Scene, parents_first
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.part_names import part_labels
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin, one_sentence, read_scene
+from lcollision_core.meshes.scene_files import one_sentence, read_scene
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.upright import guess_up
-
-CHARACTER_SUFFIXES = SCENE_SUFFIXES
-"""Extensions that `read_character` reads, in lower case."""
 
 
 def read_character(path: str | os.PathLike[str], up: int | str | None = None) -> Character:
@@ -78,16 +75,6 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
         sample,
         mesh.notes + notes,
     )
-
-
-def is_rigged(path: str | os.PathLike[str]) -> bool:
-    """Whether a file shows something that joints move; its meshes are not read.
-
-    Raises
-    ------
-    MeshFileError : the file is missing or damaged; the sentence names it.
-    """
-    return has_skin(path)
 
 
 def joint_parts(rig: Rig) -> npt.NDArray[np.str_]:

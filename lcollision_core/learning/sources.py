@@ -8,10 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lcollision_core.characters import CHARACTER_SUFFIXES, is_rigged, read_character
+from lcollision_core.characters import read_character
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin
 from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
 from lcollision_core.model.known_characters import with_remembered
 
@@ -83,7 +84,7 @@ def gather_poses(
         """Return the options of a file's animation; among several files, where it has them."""
         if len(files) == 1:
             return {"clip": clip, "fps": fps}
-        if file.suffix.lower() not in CHARACTER_SUFFIXES:
+        if file.suffix.lower() not in SCENE_SUFFIXES:
             return {}
         own = characters.get(file)
         return {"clip": clip if own is None or clip in own.clips else None, "fps": fps}
@@ -120,4 +121,4 @@ def gather_poses(
 
 def _has_rig(path: Path) -> bool:
     """Whether it is a file of a rigged character; what is missing is refused when it is read."""
-    return path.suffix.lower() in CHARACTER_SUFFIXES and path.is_file() and is_rigged(path)
+    return path.suffix.lower() in SCENE_SUFFIXES and path.is_file() and has_skin(path)

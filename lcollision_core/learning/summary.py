@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters import CHARACTER_SUFFIXES
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up, read_pose_set
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.pose_set import disagreement
-from lcollision_core.meshes.scene_files import one_sentence, read_scene
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, one_sentence, read_scene
 
 _MOST_SHOWN = 8
 """Poses of each source, evenly spaced, that are kept to be looked at."""
@@ -93,7 +92,7 @@ def summarise_sources(
     """
     found = []
     for path in paths:
-        summary = _of_character(path, cancel) if path.suffix.lower() in CHARACTER_SUFFIXES else None
+        summary = _of_character(path, cancel) if path.suffix.lower() in SCENE_SUFFIXES else None
         found.append(summary or _of_poses(path, progress, cancel))
         if cancel is not None:
             cancel.raise_if_cancelled()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from lcollision_core.characters import CHARACTER_SUFFIXES
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.model.known_characters import open_character
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_model import PoseModel
@@ -26,6 +26,6 @@ def open_body(name_or_path: str | os.PathLike[str], up: int | None = None) -> Po
     MeshFileError : see `read_character`.
     LCollisionError : the character has no rig.
     """
-    if Path(name_or_path).suffix.lower() in CHARACTER_SUFFIXES:
+    if Path(name_or_path).suffix.lower() in SCENE_SUFFIXES:
         return open_character(name_or_path, up)
     return PoseModel.load(name_or_path)

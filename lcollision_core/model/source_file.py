@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters import (
-    CHARACTER_SUFFIXES,
     PATCHED_SUFFIXES,
     Character,
     CharacterFile,
@@ -34,7 +33,7 @@ from lcollision_core.meshes import (
 )
 from lcollision_core.meshes.formats.obj_rewrite import rewrite_obj
 from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, write_point_cache
-from lcollision_core.meshes.scene_files import read_scene
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
 from lcollision_core.model.export import export_frame, export_mesh
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.rig_model import RigModel
@@ -203,14 +202,14 @@ class SourceFile:
         if suffix == ".obj":
             mesh = read_mesh(path, topology=body.topology)
             body.require_topology(mesh.topology, str(path))
-        elif suffix in CHARACTER_SUFFIXES:
+        elif suffix in SCENE_SUFFIXES:
             self._character = own if own is not None and is_own else read_character(path)
             body.require_topology(self._character.topology, str(path))
             self._require_unit(self._character)
         else:
             raise MeshFileError(
                 f"has a form that is not written ({suffix or 'no extension'})",
-                f"name one of .obj, {', '.join(CHARACTER_SUFFIXES)}",
+                f"name one of .obj, {', '.join(SCENE_SUFFIXES)}",
                 where=path,
             )
 

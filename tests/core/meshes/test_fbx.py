@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.characters import is_rigged, joint_parts, read_character
+from lcollision_core.characters import joint_parts, read_character
 from lcollision_core.errors import CancelledError, MeshFileError, MissingExtraError
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes import read_mesh, read_pose_set
 from lcollision_core.meshes.formats import fbx
 from lcollision_core.meshes.formats.point_cache import write_point_cache
-from lcollision_core.meshes.scene_files import read_scene
+from lcollision_core.meshes.scene_files import has_skin, read_scene
 from tests.core.fbx_builder import arm_fbx, ufbx_frames
 from tests.core.gltf_builder import tube
 
@@ -116,7 +116,7 @@ def test_a_character_of_fbx_has_its_rig_parts_and_clips(tmp_path: Path) -> None:
     assert np.allclose(frames.times, np.arange(31) / 30.0)
     turns = frames.transforms[0] @ np.linalg.inv(rig.rest)
     assert np.abs(turns[1] - np.eye(4)).max() > 0.1
-    assert is_rigged(path)
+    assert has_skin(path)
 
 
 def test_the_poses_of_fbx_know_their_axis(tmp_path: Path) -> None:
