@@ -30,7 +30,7 @@ class NumberBox(QDoubleSpinBox):
 
     _trims = False
 
-    def __init__(self, decimals: int, low: float, high: float, trims: bool = False) -> None:
+    def __init__(self, decimals: int, low: float, high: float, *, trims: bool = False) -> None:
         super().__init__()
         self._trims = trims or decimals > 3
         self.setDecimals(decimals)

@@ -110,7 +110,7 @@ class Form(QDialog):
     ) -> NumberBox:
         """Add a field for a number, by default a whole one; see `NumberBox`."""
         setting = SETTINGS[key]
-        field = NumberBox(decimals, setting.low or 0.0, setting.high or 0.0, trims)
+        field = NumberBox(decimals, setting.low or 0.0, setting.high or 0.0, trims=trims)
         field.setSingleStep(step)
         field.setSuffix(suffix)
         field.setValue(self._settings[key])

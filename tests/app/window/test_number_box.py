@@ -14,6 +14,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import current_theme
 from app.window.dialogs.forms import Form, resolve_form, screenshot_form, turntable_form
+from app.window.dialogs.new_model_pages import PosesPage
 from app.window.main_window import MainWindow
 from app.window.number_box import NumberBox
 from tests.app.windows import settings_in
@@ -138,3 +139,15 @@ def test_the_arrows_of_a_field_are_seen_and_step(window: MainWindow) -> None:
     assert window.document.latent[1] > before
     QTest.mouseClick(row.field, LEFT, pos=QPoint(row.field.width() - 8, row.field.height() - 6))
     assert window.document.latent[1] == pytest.approx(before, abs=1e-3)
+
+
+def test_a_frame_rate_has_three_decimals_and_no_needless_zeros(qtbot: QtBot) -> None:
+    page = PosesPage()
+    qtbot.addWidget(page)
+    field = page.rate
+    for text, shown in (("29.97", "29.97"), ("23.9760", "23.976"), ("100", "100")):
+        type_in(field, text)
+        assert field.text() == shown
+        assert field.value() == float(shown)
+    field.setValue(0.0)
+    assert field.text() == "as in the file"
