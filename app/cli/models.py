@@ -158,7 +158,7 @@ def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> 
         RigModel,
         change_model,
         find_model,
-        list_models,
+        is_bundled,
         remember_choices,
     )
 
@@ -167,7 +167,7 @@ def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> 
         remember_choices(changed)
         return changed
     path = find_model(name)
-    if any(listed.bundled and listed.path == path for listed in list_models()):
+    if path.is_file() and is_bundled(path):
         raise LCollisionError(
             "is a bundled model and stays as it is",
             f"copy {path} and name the copy",

@@ -17,6 +17,8 @@ _log = logging.getLogger(__name__)
 ORGANISATION = "lcollision"
 APPLICATION = "editor"
 
+_RECENT_FILES = 8
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -43,7 +45,6 @@ SETTINGS: dict[str, Setting] = {
     "drag_strength": Setting(1.0, 0.0, 100.0),
     "model": Setting("body"),
     "recent_files": Setting(()),
-    "recent_files_kept": Setting(8, 1, 30),
     "last_folder": Setting(""),
     "window_geometry": Setting(QByteArray()),
     "window_layout": Setting(QByteArray()),
@@ -98,7 +99,7 @@ class Settings:
     def remember_file(self, path: str) -> None:
         """Put a file first among the recent ones."""
         others = [recent for recent in self["recent_files"] if recent != path]
-        self["recent_files"] = (path, *others)[: self["recent_files_kept"]]
+        self["recent_files"] = (path, *others)[:_RECENT_FILES]
 
     def forget_file(self, path: str) -> None:
         """Drop a file that is gone from the recent ones."""

@@ -21,12 +21,12 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import QWidget
 from scipy.spatial.transform import Rotation, Slerp
 
+from app.view.camera import VIEW_ANGLE
+from app.view.offscreen import off_screen_plotter
 from app.view.theme import current_theme
 
 if TYPE_CHECKING:
     import pyvista as pv
-
-    from app.view.surface import Surface
 
 _FRAME_MILLISECONDS = 80
 _LEAST_REST = 3
@@ -37,7 +37,7 @@ _FRAMES_A_POSE = 30
 _FRAMES_UPRIGHT = 8
 """In which the body turns to another axis."""
 
-_VIEW_ANGLE, _MARGIN, _ELEVATION = 24.0, 1.06, 0.12
+_MARGIN, _ELEVATION = 1.06, 0.12
 _MOST_AIMED_AT = 4000
 """Vertices, evenly spaced, that tell how large the body is."""
 
@@ -101,15 +101,22 @@ class BodyPreview(QWidget):
         shown, normals : (P, V, 3) arrays, of its poses
         up_axis : 0, 1 or 2
         """
+        # Loads VTK: not before there is something to see.
+        from app.view.surface import Surface, actor_of
+
         self.clear("")
         centre = 0.5 * (shown[0].min(axis=0) + shown[0].max(axis=0))
         self._shown, self._normals = shown - centre, normals
         self.up_axis = up_axis
         self._from, self._since_turned = _UPRIGHT[up_axis], _FRAMES_UPRIGHT
         self._turn, self._frame = 25.0, 0
-        self._plotter, self._surface, self._body = _plotter_of(
-            faces, self._shown.shape[1], self._pixels()
+        self._plotter = off_screen_plotter(*self._pixels())
+        self._plotter.enable_anti_aliasing("msaa", multi_samples=4)
+        self._surface = Surface(faces, self._shown.shape[1])
+        self._body = actor_of(
+            self._surface.polydata, ambient=0.22, diffuse=0.92, specular=0.1, specular_power=18
         )
+        self._plotter.renderer.AddActor(self._body)
         if self.isVisible():
             self._timer.start()
         self._on_frame()
@@ -222,33 +229,14 @@ class BodyPreview(QWidget):
         low, high = float(upright[:, 2].min()), float(upright[:, 2].max())
         radius = float(np.sqrt((upright[:, :2] ** 2).sum(axis=1).max()))
         width, height = self._pixels()
-        half = np.tan(np.radians(_VIEW_ANGLE / 2.0))
+        half = np.tan(np.radians(VIEW_ANGLE / 2.0))
         distance = _MARGIN * max(0.5 * (high - low) / half, radius / (half * width / height))
         focus = np.array([0.0, 0.0, 0.5 * (low + high)])
         camera = plotter.camera
-        camera.view_angle = _VIEW_ANGLE
+        camera.view_angle = VIEW_ANGLE
         camera.focal_point = focus
         camera.position = focus + (distance + 0.3 * radius) * np.array([0.0, -1.0, _ELEVATION])
         camera.up = (0.0, 0.0, 1.0)
         plotter.renderer.ResetCameraClippingRange()
         # Otherwise pyvista turns the camera to a default view at the first picture.
         plotter.renderer.camera_set = True
-
-
-def _plotter_of(
-    faces: npt.NDArray[np.int32], n_vertices: int, size: tuple[int, int]
-) -> tuple[pv.Plotter, Surface, pv.Actor]:
-    """Return what draws a mesh off the screen, the mesh, and what it looks like."""
-    import pyvista as pv
-    from vtkmodules.vtkCommonCore import vtkLogger
-
-    from app.view.surface import Surface, actor_of
-
-    # Without a display VTK warns of that, then draws all the same.
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
-    plotter = pv.Plotter(off_screen=True, window_size=size, lighting="light kit")
-    plotter.enable_anti_aliasing("msaa", multi_samples=4)
-    surface = Surface(faces, n_vertices)
-    body = actor_of(surface.polydata, ambient=0.22, diffuse=0.92, specular=0.1, specular_power=18)
-    plotter.renderer.AddActor(body)
-    return plotter, surface, body

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    import pyvista as pv
     from PIL import Image
 
     from app.view.palettes import Theme
@@ -18,6 +19,16 @@ _NOTHING = "#000000"
 
 _FINEST = 512 * 512
 """Pixels: up to this size a picture is drawn 16 times as large and shrunk."""
+
+
+def off_screen_plotter(width: int, height: int) -> pv.Plotter:
+    """Return what draws into a picture, for the thread of the window."""
+    import pyvista as pv
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    # Without a display VTK warns of that, then draws all the same.
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    return pv.Plotter(off_screen=True, window_size=(width, height), lighting="light kit")
 
 
 class PoseRenderer:
@@ -34,17 +45,10 @@ class PoseRenderer:
     def __init__(
         self, model: PosableBody, width: int, height: int, theme: Theme, transparent: bool = False
     ) -> None:
-        import pyvista as pv
-        from vtkmodules.vtkCommonCore import vtkLogger
-
         from app.view.scene import Scene
 
-        # Without a display VTK warns of that, then draws all the same.
-        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
         self._transparent = transparent
-        self._plotter = pv.Plotter(
-            off_screen=True, window_size=(width, height), lighting="light kit"
-        )
+        self._plotter = off_screen_plotter(width, height)
         if width * height <= _FINEST:
             self._plotter.enable_anti_aliasing("ssaa")
         else:

@@ -85,14 +85,10 @@ class EditActions(QObject):
         domain : the one to begin with, None for the first
         what : "name" or "colour" of it to change at once, "" for neither
         """
-        from app.work.jobs import is_bundled
-        from lcollision_core.model import list_models
+        from lcollision_core.model import is_bundled
 
         document = self._document
-        taken = [model.name for model in list_models()]
-        dialog = BodyPartsDialog(
-            document.model, is_bundled(document.model_file), taken, self._window
-        )
+        dialog = BodyPartsDialog(document.model, is_bundled(document.model_file), self._window)
         dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         dialog.edited.connect(document.edit_parts)
         # Another model has other parts.

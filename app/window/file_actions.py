@@ -24,7 +24,7 @@ from app.window.dialogs.questions import (
 )
 from app.window.widgets import plain_tip
 from app.wording import counted, menu_text
-from lcollision_core.bundled import bundled_folder
+from app.work import jobs
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -405,11 +405,12 @@ class FileActions(QObject):
 
     @Slot()
     def _on_model(self) -> None:
+        from lcollision_core.model import is_bundled
+
         file = Path(self._document.model_file)
         # By its name a bundled one is found after the program has moved.
-        is_bundled = file.parent == bundled_folder("models")
-        self.settings["model"] = file.stem if is_bundled else str(file)
-        if file.is_file() and not is_bundled:
+        self.settings["model"] = file.stem if is_bundled(file) else str(file)
+        if not is_bundled(file):
             self._remember(file)
 
     @Slot(object)

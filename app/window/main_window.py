@@ -11,8 +11,6 @@ from PySide6.QtCore import QEvent, QSize, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import (
     QAction,
     QCloseEvent,
-    QDragEnterEvent,
-    QDropEvent,
     QGuiApplication,
     QResizeEvent,
     QShowEvent,
@@ -43,6 +41,7 @@ from app.window.panels.sliders import SlidersPanel
 from app.window.shortcuts import WindowShortcuts
 from app.window.status_bar import StatusBar
 from app.window.view_actions import ViewActions
+from app.window.widgets import FileDrops
 from app.wording import one_line
 from app.work.compiling import Preparing
 from app.work.threads import Failure
@@ -95,7 +94,7 @@ class MainWindow(QMainWindow):
         self._announced = self._unasked = False
         self.setObjectName("editor")
         self.setWindowIcon(program_icon())
-        self.setAcceptDrops(True)
+        FileDrops(self).dropped.connect(self._on_dropped)
         self.setDockNestingEnabled(True)
         for corner in (Qt.Corner.TopLeftCorner, Qt.Corner.BottomLeftCorner):
             self.setCorner(corner, Qt.DockWidgetArea.LeftDockWidgetArea)
@@ -289,20 +288,6 @@ class MainWindow(QMainWindow):
         self.viewport.shut_down()
         super().closeEvent(event)
 
-    def dragEnterEvent(self, event: QDragEnterEvent) -> None:  # noqa: N802 - Qt's name
-        """Accept files."""
-        if any(url.isLocalFile() for url in event.mimeData().urls()):
-            event.acceptProposedAction()
-
-    def dropEvent(self, event: QDropEvent) -> None:  # noqa: N802 - Qt's name
-        """Open a file that is dropped, of several the first that can be opened."""
-        paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
-        if not paths:
-            return
-        event.acceptProposedAction()
-        # The program that is dragged from waits until this returns.
-        QTimer.singleShot(0, self, lambda: self.attempt(lambda: self.files.open_dropped(paths)))
-
     # Building.
 
     def _action(self, key: str) -> QAction:
@@ -404,6 +389,10 @@ class MainWindow(QMainWindow):
         file = f" — {document.file.name}" if document.file is not None else ""
         self.setWindowTitle(one_line(f"{name}{file}[*] — {document.model.name}"))
         self.setWindowModified(document.modified)
+
+    @Slot(object)
+    def _on_dropped(self, paths: list[Path]) -> None:
+        self.attempt(lambda: self.files.open_dropped(paths))
 
     @Slot()
     def _on_busy(self) -> None:

@@ -27,9 +27,6 @@ DEFAULT_MODEL = "body"
 _LIVELY = ("dancer", "thinking")
 """Training poses of the built-in body that are worth looking at."""
 
-_POLL_MILLISECONDS = 500
-"""Milliseconds between two chances for Python to handle signals, which Qt's loop prevents."""
-
 _LATER_MILLISECONDS = 300
 _ONCE = Qt.ConnectionType.SingleShotConnection
 
@@ -53,14 +50,11 @@ class StartUp(QObject):
         self._document = window.document
         self._path = path
         self._model: str | Path = model_name or last_model(window.settings["model"])
-        self._poll = QTimer(self, interval=_POLL_MILLISECONDS)
-        self._poll.timeout.connect(lambda: None)
 
     def begin(self) -> None:
         """Start loading; returns at once."""
         signal.signal(signal.SIGINT, self._on_signal)
         signal.signal(signal.SIGTERM, self._on_signal)
-        self._poll.start()
         self._document.model_changed.connect(self._on_model, _ONCE)
         path = self._path
         if path is None or path.suffix.lower() in (MODEL_SUFFIX, POSES_SUFFIX):

@@ -4,12 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from html import escape
+from pathlib import Path
 from typing import TypeVar
 
-from PySide6.QtCore import QEvent, QPoint, QPointF, QRectF, QSignalBlocker, QSize, Qt, Signal
+from PySide6.QtCore import (
+    QEvent,
+    QObject,
+    QPoint,
+    QPointF,
+    QRectF,
+    QSignalBlocker,
+    QSize,
+    Qt,
+    QTimer,
+    Signal,
+)
 from PySide6.QtGui import (
     QColor,
     QContextMenuEvent,
+    QDragEnterEvent,
+    QDropEvent,
     QEnterEvent,
     QIcon,
     QKeyEvent,
@@ -268,6 +282,34 @@ class HoverRow(QWidget):
         if self._colour:
             area = QRectF(self._swatch_left, self.height() / 2 - 6, SWATCH, SWATCH)
             fill_with(painter, area, self._colour, 3)
+
+
+class FileDrops(QObject):
+    """Lets files be dropped on a widget.
+
+    Signals
+    -------
+    dropped : list of Path, at least one; once the program that they come from waits no more
+    """
+
+    dropped = Signal(object)
+
+    def __init__(self, widget: QWidget) -> None:
+        super().__init__(widget)
+        widget.setAcceptDrops(True)
+        widget.installEventFilter(self)
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
+        """Accept files."""
+        if isinstance(event, QDragEnterEvent | QDropEvent):
+            urls = event.mimeData().urls()
+            paths = [Path(url.toLocalFile()) for url in urls if url.isLocalFile()]
+            if paths:
+                event.acceptProposedAction()
+            if paths and event.type() is QEvent.Type.Drop:
+                QTimer.singleShot(0, self, lambda: self.dropped.emit(paths))
+            return True
+        return super().eventFilter(watched, event)
 
 
 class Sign(QLabel):

@@ -22,6 +22,7 @@ from lcollision_core.model.model_store import (
     ListedModel,
     checkpoint_path,
     find_model,
+    is_bundled,
     list_models,
     model_destination,
     user_models_folder,

@@ -50,6 +50,12 @@ def list_models() -> tuple[ListedModel, ...]:
     return tuple(found[name] for name in sorted(found))
 
 
+def is_bundled(file: str | os.PathLike[str]) -> bool:
+    """Whether a model came with the program, or is in no file, so that it is changed in a copy."""
+    path = Path(file)
+    return not path.is_file() or path.absolute().parent == bundled_folder("models")
+
+
 def find_model(name_or_path: str | os.PathLike[str]) -> Path:
     """Return the file of a model.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QSize, Qt, Signal, Slot
@@ -20,7 +19,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import NORMAL, ROW_HEIGHT
-from app.window.dialogs.names import NO_FILE_NAME
+from app.window.dialogs.names import free_model_name, why_no_model_name
 from app.window.widgets import dialog_vbox, hbox, labelled, swatch, vbox
 from app.work.jobs import PartEdits
 from lcollision_core.errors import ModelFileError
@@ -39,7 +38,6 @@ class BodyPartsDialog(QDialog):
     ----------
     model : whose parts they are
     copies : whether the changes go to a copy, as the model came with the program
-    taken : names of existing models, which the copy cannot have
     parent : the window that it belongs to
 
     Signals
@@ -49,13 +47,11 @@ class BodyPartsDialog(QDialog):
 
     edited = Signal(object)
 
-    def __init__(
-        self, model: PosableBody, copies: bool, taken: Collection[str], parent: QWidget
-    ) -> None:
+    def __init__(self, model: PosableBody, copies: bool, parent: QWidget) -> None:
         super().__init__(parent)
         self.setWindowTitle("Body parts")
         self.resize(420, 480)
-        self._model, self._taken = model, taken
+        self._model = model
         self.list = QListWidget()
         self.list.setAccessibleName("Body parts")
         self.list.setIconSize(QSize(_SWATCH, _SWATCH))
@@ -86,7 +82,7 @@ class BodyPartsDialog(QDialog):
         )
         if not model.is_trained:
             note = "The changes are remembered for this character: its file stays as it is."
-        self.copy_name = QLineEdit(self._free_name())
+        self.copy_name = QLineEdit(free_model_name(model.name, 2))
         self.copy_name.setAccessibleName("Name of the copy")
         copy_row = QWidget()
         copy_row.setLayout(hbox(labelled("Name of the copy", "caption"), self.copy_name))
@@ -171,11 +167,8 @@ class BodyPartsDialog(QDialog):
             super().keyPressEvent(event)
 
     def _why_not(self, edits: PartEdits) -> str:
-        name = edits.copy_name
-        if name is not None and (not name or len(name) > 60 or NO_FILE_NAME & set(name)):
-            return "The copy needs a name of up to 60 letters, without a dot or a slash."
-        if name is not None and name in self._taken:
-            return f"There is a model “{name}” already; choose another name for the copy."
+        if edits.copy_name is not None and (reason := why_no_model_name(edits.copy_name)):
+            return reason
         try:
             self._model.edit_domains(edits.names, edits.colours, edits.order)
         except ModelFileError as error:
@@ -186,12 +179,6 @@ class BodyPartsDialog(QDialog):
                 return "A body part needs a name of 1 to 60 letters."
             return str(error)
         return ""
-
-    def _free_name(self) -> str:
-        number = 2
-        while f"{self._model.name}-{number}" in self._taken:
-            number += 1
-        return f"{self._model.name}-{number}"
 
     def _put_colour(self, item: QListWidgetItem, colour: str) -> None:
         item.setData(_COLOUR, colour)

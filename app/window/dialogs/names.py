@@ -94,6 +94,13 @@ def ask_for_name(
     return dialog.name if accepted else None
 
 
+def free_model_name(stem: str, number: int = 1) -> str:
+    """Return a name for a new model of the user's, numbered from a number on until it is free."""
+    stem = stem[:50].replace(".", " ").strip()
+    name = stem if number == 1 else f"{stem}-{number}"
+    return free_model_name(stem, number + 1) if number < 100 and why_no_model_name(name) else name
+
+
 def why_no_model_name(name: str) -> str:
     """Say in a sentence why a new model of the user's cannot have a name, "" if it can."""
     from lcollision_core.learning import list_work

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QSize, Qt, Signal, Slot
-from PySide6.QtGui import QDragEnterEvent, QDropEvent
 from PySide6.QtWidgets import QDialog, QFileDialog, QLabel, QPushButton, QStackedWidget, QWidget
 
 from app.view.body_preview import BodyPreview
 from app.view.theme import CLOSE, NORMAL, WIDE
-from app.window.dialogs.names import why_no_model_name
+from app.window.dialogs.names import free_model_name, why_no_model_name
 from app.window.dialogs.new_model_pages import (
     ContactsPage,
     FilesPage,
@@ -21,7 +20,7 @@ from app.window.dialogs.new_model_pages import (
     PosesPage,
     QualityPage,
 )
-from app.window.widgets import dialog_vbox, hbox, labelled, scrolling, vbox
+from app.window.widgets import FileDrops, dialog_vbox, hbox, labelled, scrolling, vbox
 from app.wording import counted, one_line, with_capital
 from app.work import learning_jobs
 
@@ -68,7 +67,7 @@ class NewModelDialog(QDialog):
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle("New model")
-        self.setAcceptDrops(True)
+        FileDrops(self).dropped.connect(self.add)
         self.resize(_SIZE.boundedTo(self.screen().availableSize() - _MARGIN))
         self._work, self._settings = work, settings
         self._reading, self._read_failed = 0, False
@@ -115,17 +114,6 @@ class NewModelDialog(QDialog):
         self._work.cancel(self._reading)
         self.preview.clear("")
         super().done(result)
-
-    def dragEnterEvent(self, event: QDragEnterEvent) -> None:  # noqa: N802 - Qt's name
-        """Accept files and folders."""
-        if any(url.isLocalFile() for url in event.mimeData().urls()):
-            event.acceptProposedAction()
-
-    def dropEvent(self, event: QDropEvent) -> None:  # noqa: N802 - Qt's name
-        """List what is dropped."""
-        paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
-        event.acceptProposedAction()
-        self.add(paths)
 
     def _lay_out(self) -> None:
         self._steps = [labelled(f"{number}  {name}") for number, name in enumerate(_STEPS, 1)]
@@ -225,7 +213,8 @@ class NewModelDialog(QDialog):
         )
         self._facts.setText(_facts(summary))
         if not self.quality.name.text():
-            self.quality.name.setText(_free_name(self.files.paths[0]))
+            path = self.files.paths[0]
+            self.quality.name.setText(free_model_name(path.name if path.is_dir() else path.stem))
         self._on_changed()
 
     @Slot()
@@ -255,15 +244,6 @@ def _facts(summary: SourcesSummary) -> str:
     if not summary.up.is_sure:
         lines.append(f"Probably {'xyz'[summary.up.axis]} up: check the preview")
     return "\n".join(map(with_capital, lines))
-
-
-def _free_name(path: Path) -> str:
-    """Return a name after a file that no model has."""
-    stem = (path.name if path.is_dir() else path.stem)[:50].replace(".", " ").strip()
-    name, number = stem, 2
-    while why_no_model_name(name) and number < 100:
-        name, number = f"{stem}-{number}", number + 1
-    return name
 
 
 def _mark(label: QLabel, place: str) -> None:

@@ -221,11 +221,6 @@ class CodeRow(HoverRow):
         self.asked.emit(number)
         self._document.set_code(self.code, number)
 
-    @property
-    def is_outside(self) -> bool:
-        """Whether the number is outside the range that the slider reaches."""
-        return bool(self.field.property("verdict") == "outside")
-
     def _explain(self, number: float) -> None:
         """Mark a number outside the slider's range, and say what can be typed."""
         low, high = self._range

@@ -132,7 +132,7 @@ def test_a_bundled_model_is_edited_in_a_copy_that_opens_in_its_place(
     assert "stays as it is" in " ".join(label.text() for label in dialog.findChildren(QLabel))
     assert dialog.copy_name.text() == f"{document.model.name}-2"
     type_name(dialog, "knee")
-    for name, word in (("body", "already"), ("", "needs a name"), ("a/b", "slash"), ("a.b", "dot")):
+    for name, word in (("Body", "already"), ("", "needs a name"), ("a/b", "slash"), ("a.b", "dot")):
         dialog.copy_name.setText(name)
         QTest.mouseClick(dialog.save, LEFT)
         assert dialog.isVisible()
