@@ -76,6 +76,7 @@ class PoseDocument(LiveEditing):
     solve_started, solve_progressed(object), solve_finished(object) : around a Resolve; the last
         carries its ResolveResult, or None if it was cancelled or failed
     busy_changed : str, what the long work is, or "" if there is none
+    work_progressed : int and int, how many steps of the long work are done, and of how many
     message : str, one sentence for the status bar
     failed : Failure, one sentence and its details, for a dialog
     opened : Path, the file of poses or of a model that is in now
@@ -93,6 +94,7 @@ class PoseDocument(LiveEditing):
     solve_progressed = Signal(object)
     solve_finished = Signal(object)
     busy_changed = Signal(str)
+    work_progressed = Signal(int, int)
     opened = Signal(object)
     imported = Signal(object)
     of_other_model = Signal(object)
@@ -515,7 +517,8 @@ class PoseDocument(LiveEditing):
     # The results of the workers.
 
     @Slot(int, object)
-    def _on_progressed(self, number: int, status: object) -> None:
+    def _on_progressed(self, number: int, status: tuple[int, int]) -> None:
+        self.work_progressed.emit(*status)
         if number == self._solve:
             self.solve_progressed.emit(status)
 

@@ -321,6 +321,7 @@ class MainWindow(QMainWindow):
         # Messages on the previous pose are outdated.
         document.pose_loaded.connect(self._status.clearMessage)
         document.message.connect(self._status.tell)
+        document.work_progressed.connect(self._status.show_progress)
         document.failed.connect(self.show_failure)
         self._preparing.begun.connect(self._status.explain)
         self._preparing.begun.connect(self.viewport.waiting.explain)

@@ -22,6 +22,7 @@ class StatusBar(QStatusBar):
         self._bar = QProgressBar()
         self._bar.setFixedWidth(120)
         self._bar.setTextVisible(False)
+        self._bar.setRange(0, 1)
         self._facts = labelled("", "caption")
         for widget in (self.busy, self._bar, self._facts):
             self.addPermanentWidget(widget)
@@ -39,10 +40,20 @@ class StatusBar(QStatusBar):
         self._facts.setText(one_line(facts))
 
     def show_busy(self, work: str) -> None:
-        """Show what is being done, nothing for ""."""
+        """Show what is being done, nothing for ""; how far it is comes later, if at all."""
+        if self._work != one_line(work):
+            # Qt animates an endless bar even while it is hidden.
+            self._bar.setRange(0, 0 if work else 1)
         self._work = one_line(work)
         self._reason = self._reason if work else ""
         self._show()
+
+    @Slot(int, int)
+    def show_progress(self, done: int, total: int) -> None:
+        """Show how many steps of the work are done, and of how many."""
+        if self._work:
+            self._bar.setRange(0, total)
+            self._bar.setValue(done)
 
     @Slot(str)
     def explain(self, reason: str) -> None:
@@ -57,5 +68,3 @@ class StatusBar(QStatusBar):
         self.busy.setText(f"{self._work}… {self._reason}".rstrip() if self._work else "")
         for widget in (self.busy, self._bar):
             widget.setVisible(bool(self._work))
-        # Qt animates an endless bar even while it is hidden.
-        self._bar.setRange(0, 0 if self._work else 1)
