@@ -278,6 +278,11 @@ class PoseDocument(LiveEditing):
         work = partial(jobs.open_model, name_or_path, up=up)
         self._bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
 
+    def turn_upright(self) -> None:
+        """Turn the body by the next axis, a model in its own file, and open it again."""
+        work = partial(jobs.turn_upright, self.model, self.model_file)
+        self._bring(f"Turning {self.model.name}", work, self._on_model)
+
     def look_into(
         self,
         path: Path,

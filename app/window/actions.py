@@ -22,7 +22,7 @@ class Spec:
     Attributes
     ----------
     text : as the menu shows it
-    shortcut : in Qt's portable words; several are separated by ", "
+    shortcut : in Qt's portable words; several are separated by ", "; "" for none
     tip : what it does, in plain words
     icon : name of its icon, or ""
     checkable : whether it is on or off
@@ -54,7 +54,7 @@ ACTIONS: dict[str, Spec] = {
     "export": Spec("&Export mesh…", "Ctrl+E", "Save the pose as a mesh or in your file", "export"),
     "upright": Spec(
         "Turn &upright",
-        "Ctrl+Shift+U",
+        "",
         "Make the next axis point up (changes a learned model's file)",
     ),
     "screenshot": Spec("S&creenshot…", "Ctrl+P", "Save a picture of the view", "screenshot"),
@@ -223,7 +223,7 @@ def equip_action(action: QAction, spec: Spec) -> None:
     """Set up an action, perhaps one of Qt's own, from its `Spec`."""
     action.setText(spec.text)
     keys = QKeySequence.listFromString(spec.shortcut.replace(", ", "; "))
-    action.setShortcuts(keys)
+    action.setShortcuts([held for held in keys if not held.isEmpty()])
     explain_action(action, spec.tip)
     if spec.checkable:
         action.setCheckable(True)
@@ -239,5 +239,5 @@ def equip_action(action: QAction, spec: Spec) -> None:
 def explain_action(action: QAction, tip: str) -> None:
     """Say in an action's tool tip what it does, or why it cannot now, and name its shortcut."""
     shown = action.shortcut().toString(QKeySequence.SequenceFormat.NativeText)
-    action.setToolTip(f"{tip} ({shown})")
+    action.setToolTip(f"{tip} ({shown})" if shown else tip)
     action.setStatusTip(tip)

@@ -21,6 +21,7 @@ from app.window.dialogs.questions import (
     ask_about_library,
     ask_about_scale,
     ask_to_switch,
+    ask_to_turn,
 )
 from app.window.widgets import plain_tip
 from app.wording import counted, menu_text
@@ -128,7 +129,7 @@ class FileActions(QObject):
             "save_as": self._save_as,
             "import": self._import,
             "export": self._export,
-            "upright": self.turn_upright,
+            "upright": self._turn_upright,
             "screenshot": self._screenshot,
             "turntable": self._turntable,
         }
@@ -162,31 +163,21 @@ class FileActions(QObject):
         self._document.import_mesh(path)
         self.settings["last_folder"] = str(path.resolve().parent)
 
-    def turn_upright(self) -> None:
-        """Turn the body by the next axis and open it again; a model is changed in its file.
+    def why_not_upright(self) -> str:
+        """Say why the body cannot be turned, "" if it can."""
+        from lcollision_core.model import is_bundled
 
-        Raises
-        ------
-        LCollisionError : it is a bundled model, or has no file.
-        """
-        from app.work.jobs import is_bundled
-        from lcollision_core.model import change_model
+        if is_bundled(self._document.model_file):
+            return "This model came with the program: copy its file, open the copy and turn that"
+        return ""
 
-        document = self._document
-        file = Path(document.model_file)
-        if is_bundled(document.model_file):
-            raise LCollisionError(
-                f"{document.model.name} comes with the program and stays as it is",
-                f"copy {file}, open the copy and turn that",
-            )
-        if not self.may_lose_changes():
+    def _turn_upright(self) -> None:
+        """Turn the body by the next axis and open it again; a model is changed in its file."""
+        model = self._document.model
+        if model.is_trained and not ask_to_turn(self._window, model.name):
             return
-        axis = (document.model.up_axis + 1) % 3
-        if document.model.is_trained:
-            change_model(file, lambda model: model.turned_upright(axis))
-            document.open_model(file)
-        else:
-            document.open_model(file, axis)
+        if self.may_lose_changes():
+            self._document.turn_upright()
 
     def open_path(self, path: Path) -> None:
         """Open a file as what its extension says: poses, a model, a character, or a mesh.

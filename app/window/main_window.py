@@ -367,7 +367,10 @@ class MainWindow(QMainWindow):
         for key in (*self.files.acts, "contacts"):
             self.actions_by_key[key].setEnabled(has_model or key == "open_model")
         if has_model:
-            model = self.document.model
+            model, upright = self.document.model, self.actions_by_key["upright"]
+            why_not = self.files.why_not_upright()
+            upright.setEnabled(not why_not)
+            actions.explain_action(upright, why_not or ACTIONS["upright"].tip)
             self._status.show_facts(f"{model.name} · {model.n_vertices} vertices")
         self._update_title()
 

@@ -376,7 +376,13 @@ def change_rules(
     Those of a character are remembered beside its file; of a bundled model they change in the
     window alone.
     """
-    from lcollision_core.model import PoseModel, RigModel, change_model, remember_choices
+    from lcollision_core.model import (
+        PoseModel,
+        RigModel,
+        change_model,
+        is_bundled,
+        remember_choices,
+    )
 
     changed = model.with_rules(rules)
     if isinstance(model, PoseModel) and not is_bundled(model_file):
@@ -391,12 +397,22 @@ def change_rules(
     return OpenedModel(changed, model_file)
 
 
-def is_bundled(model_file: str) -> bool:
-    """Whether a model came with the program, or from no file, so that it is changed in a copy."""
-    from lcollision_core.bundled import bundled_folder
+def turn_upright(
+    model: PosableBody, model_file: str, progress: Progress, cancel: CancelToken
+) -> OpenedModel:
+    """Turn a body so that its next axis is up; a model is changed in its file, and then read."""
+    from lcollision_core.model import PoseModel, change_model
 
-    path = Path(model_file)
-    return not path.is_file() or path.parent == bundled_folder("models")
+    axis = (model.up_axis + 1) % 3
+    if not isinstance(model, PoseModel):
+        return open_model(model_file, progress, cancel, up=axis)
+
+    def change(held: PoseModel) -> PoseModel:
+        _require_same(held, model, model_file, "its up axis")
+        return held.turned_upright(axis)
+
+    change_model(model_file, change)
+    return open_model(model_file, progress, cancel)
 
 
 def edit_parts(

@@ -11,11 +11,19 @@ from PySide6.QtWidgets import QGridLayout, QMessageBox, QSpacerItem, QWidget
 
 from app.view.icons import pixmap
 from app.view.theme import WIDE, current_theme
-from app.wording import menu_text, one_line, with_capital
+from app.wording import counted, menu_text, one_line, with_capital
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from app.editing.document import PoseDocument
     from app.editing.recovery import LostPose
+    from app.work.threads import Failure
     from lcollision_core.errors import WrongScaleError
+
+_NAMED = 4
+"""Most files that a question names."""
 
 _WIDTH = 400
 """Least width, so that no title is cut."""
@@ -122,6 +130,55 @@ def ask_to_discard(parent: QWidget, name: str) -> bool:
     buttons = ("Discard", "", "Cancel")
     answer = _ask(parent, "Discard a model", text, note, buttons, Choice.CANCEL)
     return answer is Choice.SAVE
+
+
+def wait_for_exports(parent: QWidget, document: PoseDocument) -> bool:
+    """Wait for what is being exported as the window closes, with a box that can be cancelled.
+
+    Returns
+    -------
+    written : whether all is; not if one fails, which is told elsewhere, or the user goes on editing
+    """
+    if not document.n_exports:
+        return True
+    text = f"Finishing {counted(document.n_exports, 'export')}…"
+    box = message_box(parent, "Closing", text, "The editor closes once that is done.")
+    box.setStandardButtons(QMessageBox.StandardButton.Cancel)
+    widen(box)
+    failed = []
+
+    def look() -> None:
+        if not document.n_exports:
+            box.accept()
+
+    def fail(failure: Failure) -> None:
+        failed.append(failure)
+
+    document.busy_changed.connect(look)
+    document.failed.connect(fail)
+    box.exec()
+    document.busy_changed.disconnect(look)
+    document.failed.disconnect(fail)
+    box.deleteLater()
+    return not (failed or document.n_exports)
+
+
+def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:
+    """Ask whether files that lie beside the one that was chosen are to be replaced."""
+    names = ", ".join(f"“{file.name}”" for file in files[:_NAMED])
+    more = f" and {len(files) - _NAMED} more" if len(files) > _NAMED else ""
+    text = "Replace files that are there already?"
+    note = f"Each mesh of the character gets a file of its own, in place of {names}{more}."
+    buttons = ("Replace", "", "Cancel")
+    answer = _ask(parent, "Replace files", text, note, buttons, Choice.CANCEL)
+    return answer is Choice.SAVE
+
+
+def ask_to_turn(parent: QWidget, model: str) -> bool:
+    """Ask whether a model is to be turned in its file."""
+    text = f"Turn the model “{model}” to its next axis?"
+    note = "This changes the model's file: it stands like that from now on. Undo doesn't revert it."
+    return _ask(parent, "Turn upright", text, note, ("Turn", "", "Cancel")) is Choice.SAVE
 
 
 def message_box(parent: QWidget, title: str, text: str, note: str) -> QMessageBox:

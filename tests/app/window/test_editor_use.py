@@ -332,9 +332,12 @@ def menu_actions(menu: QMenu) -> Iterator[QAction]:
 
 def test_every_action_is_in_a_menu_and_has_a_shortcut_of_its_own(window: MainWindow) -> None:
     entries = [action for menu in window.menus.values() for action in menu_actions(menu)]
-    assert [action.text() for action in entries if not action.shortcuts()] == ["No files yet"]
+    without = {action.text() for action in entries if not action.shortcuts()}
+    # One slip from Ctrl+U, it would change the model's file.
+    assert without == {"No files yet", "Turn &upright"}
     named = [action for action in entries if action.shortcuts()]
-    assert set(window.actions_by_key.values()) <= set(named)
+    keyed = {held for key, held in window.actions_by_key.items() if key != "upright"}
+    assert keyed <= set(named)
     assert len(named) == len(set(named))
     keys = [key.toString() for action in named for key in action.shortcuts()]
     assert len(keys) > len(window.actions_by_key)

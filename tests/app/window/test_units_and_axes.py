@@ -11,13 +11,12 @@ from PySide6.QtWidgets import QApplication, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.window.main_window import MainWindow
-from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import read_mesh, write_mesh
 from lcollision_core.model import PoseModel
 from tests.app.windows import take_picture
 
 
-def answer_with(words: str, told: list[str]) -> None:
+def answer_with(words: str, told: list[str], picture: str = "scale_and_import") -> None:
     """Click a button of the question that is about to be asked."""
 
     def click() -> None:
@@ -26,7 +25,7 @@ def answer_with(words: str, told: list[str]) -> None:
             QTimer.singleShot(20, click)
             return
         told.extend([box.text(), box.informativeText()])
-        take_picture(box, "scale_and_import")
+        take_picture(box, picture)
         next(button for button in box.buttons() if button.text() == words).click()
 
     QTimer.singleShot(0, click)
@@ -58,21 +57,33 @@ def test_a_mesh_in_millimetres_is_scaled_and_goes_back_to_its_size(
     assert np.abs(back - vertices).max() < 1000.0 * 0.02 * model.body_size
 
 
-def test_the_window_turns_a_model_upright_in_its_file(
-    qtbot: QtBot, window: MainWindow, tmp_path: Path
+@pytest.mark.parametrize("words", ["Turn", "Cancel"])
+def test_a_model_is_turned_upright_in_its_file_where_the_user_agrees(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, words: str
 ) -> None:
-    document = window.document
+    document, upright = window.document, window.actions_by_key["upright"]
     path = tmp_path / "own.safetensors"
     document.model.save(path)
     with qtbot.waitSignal(document.model_changed, timeout=20_000):
         document.open_model(path)
-    assert document.model.up_axis == 1
+    before, told = path.read_bytes(), []
+    assert (document.model.up_axis, upright.isEnabled()) == (1, True)
+    answer_with(words, told, "turn_upright")
+    if words == "Cancel":
+        upright.trigger()
+        assert path.read_bytes() == before
+        assert not document.incoming
+        return
     with qtbot.waitSignal(document.model_changed, timeout=20_000):
-        window.actions_by_key["upright"].trigger()
+        upright.trigger()
+        # It is done in the other thread.
+        assert document.incoming == "Turning own"
+    assert "This changes the model's file" in told[1]
     assert document.model.up_axis == 2
     assert PoseModel.load(path).up_axis == 2
 
 
-def test_the_window_leaves_a_bundled_model_as_it_is(window: MainWindow) -> None:
-    with pytest.raises(LCollisionError, match="copy"):
-        window.files.turn_upright()
+def test_a_bundled_model_cannot_be_turned_and_the_tip_says_why(window: MainWindow) -> None:
+    upright = window.actions_by_key["upright"]
+    assert not upright.isEnabled()
+    assert upright.toolTip().startswith("This model came with the program: copy its file")
