@@ -305,7 +305,7 @@ def write_result(
     LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
     from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, unused_name
-    from lcollision_core.model import write_pose, write_poses, write_sequence
+    from lcollision_core.model import sequence_files, write_pose, write_poses, write_sequence
 
     require_one_mesh(output, len(poses))
     style = style or MeshStyle()
@@ -348,6 +348,8 @@ def write_result(
         if output.form == "poses":
             write_poses(path, model, poses)
         elif output.form == "frames":
+            targets = sequence_files(path, model, source)
+            n_replaced = sum(target.exists() for target in targets)
             files, meshes = write_sequence(
                 path,
                 model,
@@ -358,7 +360,7 @@ def write_result(
                 scale=style.scale,
                 fps=style.fps,
             )
-            path, n_replaced = files[0], n_replaced if files == [path] else 0
+            path = files[0]
             for file in files[1:]:
                 note(f"wrote {file}")
         else:

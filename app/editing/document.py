@@ -143,6 +143,11 @@ class PoseDocument(LiveEditing):
         return self._long.busy
 
     @property
+    def n_exports(self) -> int:
+        """How many files wait to be written."""
+        return sum(bool(self._long.label_of(number)) for number in self._exports)
+
+    @property
     def incoming(self) -> str:
         """What brings another pose or model, or "" if nothing does."""
         return self._long.label_of(self._incoming)
@@ -416,46 +421,16 @@ class PoseDocument(LiveEditing):
             f"Importing {Path(path).name}", work, partial(self._on_encoded, Path(path)), ask=False
         )
 
-    def export_mesh(
-        self, path: str | Path, axes: str = "model", scale: float | None = None
-    ) -> None:
-        """Write the mesh on the screen, back in its place; `axes`, `scale`: see `export_frame`."""
-        self.export_pose(path, jobs.ExportStyle(axes, scale))
-
-    def export_pose(self, path: str | Path, style: jobs.ExportStyle) -> None:
-        """Write the pose on the screen, back in its place, as a mesh or in the user's own file."""
-        path = Path(path)
-        work = partial(jobs.export, self.model, self.pose, self.outcome, path, style)
-        self.write(f"Exporting {path.name}", work)
-
-    def export_motion(
-        self, path: str | Path, poses: Sequence[NamedPose], style: jobs.ExportStyle
-    ) -> None:
-        """Write poses as the frames of a point cache, or of a clip of the character's own file."""
-        path = Path(path)
-        work = partial(jobs.export_motion, self.model, tuple(poses), path, style)
-        self.write(f"Exporting {path.name}", work)
-
-    def write(self, label: str, work: Job) -> None:
-        """Write a file in the long worker; `finish_exports` waits for it.
+    def write(self, label: str, work: Job, done: Callable[[Any], None] | None = None) -> None:
+        """Write a file in the long worker; it is one of `n_exports` until then.
 
         Parameters
         ----------
         label : as in "Exporting body.obj"
         work : returns what the status bar is to say of it
+        done : called in this thread with the work's value instead
         """
-        self._exports.append(self._long.start(label, work, self.message.emit))
-
-    def finish_exports(self) -> None:
-        """Write at once what still waits to be exported, as before the window closes.
-
-        Raises
-        ------
-        MeshFileError : a file cannot be written; called again, the others are.
-        """
-        for number in self._exports:
-            self._long.finish(number)
-        self._exports.clear()
+        self._exports.append(self._long.start(label, work, done or self.message.emit))
 
     # Resolve.
 

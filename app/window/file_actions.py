@@ -274,13 +274,16 @@ class FileActions(QObject):
         return True
 
     def _export(self) -> None:
-        form = ExportDialog(self.settings, self._window, self._document.model)
+        document = self._document
+        # As they are now: another model may come in while the dialogs are open.
+        export = partial(jobs.export, document.model, document.pose, document.outcome)
+        form = ExportDialog(self.settings, self._window, document.model)
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, style = form.kinds, form.export_style
         form.deleteLater()
         path = self.ask_save("Export mesh", self._name, kinds) if accepted else None
         if path is not None:
-            self._document.export_pose(path, style)
+            document.write(f"Exporting {path.name}", partial(export, path, style))
 
     def _screenshot(self) -> None:
         form = screenshot_form(self.settings, self._window)

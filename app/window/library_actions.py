@@ -16,9 +16,10 @@ from app.editing.history import retagged
 from app.window.actions import ACTIONS, explain_action
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.names import ask_for_name
-from app.window.dialogs.questions import ask_to_replace
+from app.window.dialogs.questions import ask_to_replace, ask_to_replace_files
 from app.window.menus import MENUS, SEPARATOR
 from app.wording import counted, menu_text
+from app.work import jobs
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -213,8 +214,17 @@ class LibraryActions(QObject):
         kinds, style = form.kinds, form.export_style
         form.deleteLater()
         path = self._files.ask_save("Export motion", poses[0].name, kinds) if accepted else None
-        if path is not None:
-            self._document.export_motion(path, poses, style)
+        if path is None:
+            return
+        label, write = f"Exporting {path.name}", self._document.write
+
+        def ask_and_write(files: list[Path]) -> None:
+            # The file dialog has asked about the path itself.
+            there = [file for file in files if file != path and file.exists()]
+            if not there or ask_to_replace_files(self._window, there):
+                write(label, partial(jobs.export_motion, model, poses, path, style))
+
+        write(label, partial(jobs.motion_files, model, path, style), ask_and_write)
 
     def _export(self, poses: tuple[NamedPose, ...], title: str) -> None:
         from lcollision_core.model import write_poses

@@ -27,6 +27,7 @@ from app.window.body_menus import BodyMenus
 from app.window.contact_actions import ContactActions
 from app.window.dialogs.failure import FailureDialog, open_log_file
 from app.window.dialogs.help import show_about, show_shortcuts
+from app.window.dialogs.questions import wait_for_exports
 from app.window.drag_actions import DragActions
 from app.window.edit_actions import EditActions
 from app.window.file_actions import FileActions
@@ -262,8 +263,8 @@ class MainWindow(QMainWindow):
         """Settle unsaved changes, then end all work before the view goes."""
 
         def settle() -> bool:
-            self.document.finish_exports()
-            return self._unasked or self.files.may_lose_changes()
+            written = wait_for_exports(self, self.document)
+            return written and (self._unasked or self.files.may_lose_changes())
 
         may_close = self.attempt(settle)
         # `close_unasked` takes an open question away, but cannot close what is closing.

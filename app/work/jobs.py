@@ -272,6 +272,15 @@ def export(
     return "; ".join((told, *filter(None, [left_out]), *written.notes))
 
 
+def motion_files(
+    model: PosableBody, path: Path, style: ExportStyle, _: Progress, __: CancelToken
+) -> list[Path]:
+    """Return the files that `export_motion` writes: one for each mesh of the user's file."""
+    from lcollision_core.model import sequence_files, source_for
+
+    return list(sequence_files(path, model, source_for(path.suffix, model, style.like)))
+
+
 def export_motion(
     model: PosableBody,
     poses: Sequence[NamedPose],
@@ -280,7 +289,7 @@ def export_motion(
     progress: Progress,
     cancel: CancelToken,
 ) -> str:
-    """Write poses as the frames of one file, in the model's coordinates, and check each.
+    """Write poses as the frames of `motion_files`, in the model's coordinates, and check each.
 
     Returns a sentence for the status bar.
     """

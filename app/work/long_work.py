@@ -9,8 +9,8 @@ from typing import Any
 
 from PySide6.QtCore import QObject, Signal, Slot
 
-from app.work.threads import Response, end_thread, guarded, started_thread
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from app.work.threads import Failure, Response, end_thread, guarded, started_thread
+from lcollision_core.jobs import CancelToken, Progress
 
 Job = Callable[[Progress, CancelToken], Any]
 """Long work: called in another thread; its value is the result."""
@@ -135,16 +135,6 @@ class LongWork(QObject):
         """Stop all jobs."""
         for number in list(self._jobs):
             self.cancel(number)
-
-    def finish(self, number: int) -> None:
-        """Do a job here and now, instead of in its turn; does nothing if it is done.
-
-        Raises whatever its work raises.
-        """
-        job = self._jobs.get(number)
-        if job is not None:
-            self.cancel(number)
-            job.done(job.work(no_progress, CancelToken()))
 
     def close(self, deadline: float) -> bool:
         """Cancel all jobs and end the thread.

@@ -55,6 +55,7 @@ from lcollision_core.model.source_file import (
     WrittenPose,
     offered_forms,
     own_source,
+    sequence_files,
     source_for,
     write_pose,
     write_sequence,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -318,8 +319,9 @@ class SourceFile:
         frames = write_character_clip(path, self._character, vertices, transforms, fps)
         return [(frame.vertices, frame.notes) for frame in frames]
 
+    @cached_property
     def objects(self) -> list[tuple[str, npt.NDArray[np.integer]]]:
-        """Return each mesh that a program shows of the file: its name, and its vertices.
+        """Each mesh that a program shows of the file: its name, and its vertices.
 
         Those are vertices of the body, in the file's order.
         """
@@ -462,29 +464,50 @@ def write_sequence(
     ------
     MeshFileError : the extension is of no form for frames, or a file cannot be written.
     """
+    files = sequence_files(path, body, source)
+    if source is not None and source.require_form(path, None).suffix == ".glb":
+        frames = np.stack([as_stored(path, pose, body.topology) for pose in vertices])
+        clip = source.write_clip(path, frames, latents, fps)
+        return list(files), [WrittenPose(stored, 1.0, notes) for stored, notes in clip]
+    frame = export_frame(body, axes, path, scale)
+    stored = np.stack([as_stored(path, frame.apply(pose), body.topology) for pose in vertices])
+    written = [WrittenPose(pose, 1.0 / frame.scale) for pose in stored]
+    if len(files) == 1:
+        write_point_cache(path, stored[:, files[Path(path)]], fps)
+        return list(files), written
+    with atomic_files(Path(path).parent) as folder:
+        for file, rows in files.items():
+            write_point_cache(folder / file.name, stored[:, rows], fps)
+    return list(files), written
+
+
+def sequence_files(
+    path: str | os.PathLike[str], body: PosableBody, source: SourceFile | None = None
+) -> dict[Path, npt.NDArray[np.integer]]:
+    """Return the files that `write_sequence` writes, and the vertices of the body in each.
+
+    Parameters
+    ----------
+    path, body, source : see `write_sequence`
+
+    Raises
+    ------
+    MeshFileError : the extension is of no form for frames.
+    """
     target = Path(path)
     if source is not None and source.require_form(path, None).suffix == ".glb":
         source.require_form(path, CLIP)
-        frames = np.stack([as_stored(path, pose, body.topology) for pose in vertices])
-        clip = source.write_clip(path, frames, latents, fps)
-        return [target], [WrittenPose(stored, 1.0, notes) for stored, notes in clip]
+        return {target: np.arange(body.n_vertices)}
     if target.suffix.lower() not in POINT_CACHE_SUFFIXES:
         raise MeshFileError.unwritable(
             path, "it is no point cache", f"use one of {', '.join(POINT_CACHE_SUFFIXES)}"
         )
-    frame = export_frame(body, axes, path, scale)
-    stored = np.stack([as_stored(path, frame.apply(pose), body.topology) for pose in vertices])
-    written = [WrittenPose(pose, 1.0 / frame.scale) for pose in stored]
-    objects = [("", np.arange(body.n_vertices))] if source is None else source.objects()
+    objects = [("", np.arange(body.n_vertices))] if source is None else source.objects
     if len(objects) == 1:
-        write_point_cache(target, stored[:, objects[0][1]], fps)
-        return [target], written
+        return {target: objects[0][1]}
     stems = file_stems(f"{target.stem} {name}" for name, _ in objects)
     names = [f"{stem}{target.suffix}" for stem in stems]
-    with atomic_files(target.parent) as folder:
-        for name, (_, rows) in zip(names, objects, strict=True):
-            write_point_cache(folder / name, stored[:, rows], fps)
-    return [target.with_name(name) for name in names], written
+    return {target.with_name(name): rows for name, (_, rows) in zip(names, objects, strict=True)}
 
 
 def _placed(transforms: FloatArray, placement: RigidTransform | None) -> FloatArray:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
 from typing import Protocol
 
 from typer.testing import Result
+
+from app.editing.document import PoseDocument
+from app.work import jobs
 
 STABBED = """\
 v 0 0 0
@@ -23,3 +28,16 @@ class Lcollision(Protocol):
     """Runs the command line in this process."""
 
     def __call__(self, *arguments: object) -> Result: ...
+
+
+def export_pose(document: PoseDocument, path: Path, style: jobs.ExportStyle | None = None) -> None:
+    """Write the pose on the screen, as the window does."""
+    work = partial(
+        jobs.export,
+        document.model,
+        document.pose,
+        document.outcome,
+        path,
+        style or jobs.ExportStyle(),
+    )
+    document.write(f"Exporting {path.name}", work)

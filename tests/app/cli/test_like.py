@@ -105,6 +105,20 @@ def test_a_folder_of_a_character_has_its_own_files(lcollision: Lcollision, tmp_p
     assert {path.suffix for path in for_maya.iterdir()} == {".obj"}
 
 
+def test_every_file_that_a_motion_replaces_is_counted(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    hero = figure().write(tmp_path / "hero.glb")
+    model, poses, out = open_body(hero), tmp_path / "poses.json", tmp_path / "run.pc2"
+    write_poses(poses, model, [NamedPose("one", np.zeros(model.latent_size))])
+    for told in ("wrote 1 pose to", "in place of 3 files of the same names"):
+        done = lcollision("decode", hero, poses, "-o", out)
+        assert done.exit_code == 0, done.output
+        assert told in done.stderr
+        assert ("in place of" in done.stderr) is told.startswith("in place")
+    assert not out.exists()
+
+
 def test_resolve_writes_what_it_checked(
     lcollision: Lcollision, body: PoseModel, poses: Path, own: Path, tmp_path: Path
 ) -> None:

@@ -24,6 +24,7 @@ from lcollision_core.model import (
     sample_poses,
     write_poses,
 )
+from tests.app.support import export_pose
 from tests.bending_tube import LENGTH_IN_FILES, RADIUS, SIDES
 
 QUARTER_TURN = RigidTransform(
@@ -339,7 +340,7 @@ def test_garbage_is_refused_in_a_sentence_and_changes_nothing(
         lambda: document.open_poses(garbage),
         lambda: document.import_mesh(mesh),
         lambda: document.open_model(tmp_path / "none.safetensors"),
-        lambda: document.export_mesh(tmp_path / "mesh.xyz"),
+        lambda: export_pose(document, tmp_path / "mesh.xyz"),
     ):
         failure = failure_of(qtbot, document, act)
         assert "\n" not in failure.headline + failure.next_step
@@ -366,7 +367,7 @@ def test_an_exported_mesh_is_the_one_on_the_screen_in_its_place(
     settle(qtbot, document)
     path = tmp_path / f"placed{suffix}"
     with qtbot.waitSignal(document.message):
-        document.export_mesh(path)
+        export_pose(document, path)
     assert document.frame is not None
     placed = QUARTER_TURN.apply(document.frame.vertices).astype(np.float32)
     mesh = read_mesh(path)
@@ -377,11 +378,11 @@ def test_an_export_says_whether_the_mesh_collides(
     qtbot: QtBot, document: PoseDocument, colliding: np.ndarray, tmp_path: Path
 ) -> None:
     with qtbot.waitSignal(document.message) as free:
-        document.export_mesh(tmp_path / "free.obj")
+        export_pose(document, tmp_path / "free.obj")
     assert free.args == ["Exported free.obj: no collisions (checked)"]
     document.blend_towards(colliding, 1.0)
     with qtbot.waitSignal(document.message) as told:
-        document.export_mesh(tmp_path / "bad.obj")
+        export_pose(document, tmp_path / "bad.obj")
     mesh = read_mesh(tmp_path / "bad.obj")
     n_pairs = len(document.model.detector.detect(mesh.vertices.astype(np.float32)).pairs)
     assert told.args == [f"Exported bad.obj: {counted(n_pairs, 'pair')} of its triangles collide"]
@@ -416,7 +417,7 @@ def test_what_resolve_checked_is_what_is_exported(
     document.blend_towards(colliding, 1.0)
     resolve(qtbot, document)
     with qtbot.waitSignal(document.message):
-        document.export_mesh(tmp_path / "resolved.ply")
+        export_pose(document, tmp_path / "resolved.ply")
     assert document.outcome is not None
     assert np.array_equal(read_mesh(tmp_path / "resolved.ply").vertices, document.outcome.vertices)
 
@@ -426,7 +427,7 @@ def test_another_model_stops_no_export(
 ) -> None:
     model = document.model
     with qtbot.waitSignal(document.message):
-        document.export_mesh(tmp_path / "pose.obj")
+        export_pose(document, tmp_path / "pose.obj")
         document.set_model(PoseModel("bare", model.embedding, model.card))
     assert (tmp_path / "pose.obj").is_file()
 
@@ -436,7 +437,7 @@ def test_an_exported_mesh_comes_back_as_the_same_mesh(
 ) -> None:
     document.load_pose(NamedPose("placed", document.model.training_latent[4], QUARTER_TURN))
     with qtbot.waitSignal(document.message):
-        document.export_mesh(tmp_path / "placed.obj")
+        export_pose(document, tmp_path / "placed.obj")
     document.new_pose()
     with qtbot.waitSignal(document.message, timeout=20_000) as told:
         document.import_mesh(tmp_path / "placed.obj")
@@ -444,7 +445,7 @@ def test_an_exported_mesh_comes_back_as_the_same_mesh(
     assert "of the body size" in told.args[0]
     assert document.pose_name == "placed"
     with qtbot.waitSignal(document.message):
-        document.export_mesh(tmp_path / "again.obj")
+        export_pose(document, tmp_path / "again.obj")
     first, again = (read_mesh(tmp_path / name) for name in ("placed.obj", "again.obj"))
     off = np.abs(first.vertices - again.vertices).max() / document.model.body_size
     assert off < 1e-3

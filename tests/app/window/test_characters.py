@@ -20,6 +20,7 @@ from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
 from app.work.jobs import ExportStyle
 from lcollision_core.model import NamedPose, PoseModel, RigModel, open_body, write_poses
+from tests.app.support import export_pose
 from tests.app.windows import PATIENCE, answer, close_window, drop, rest, settings_in
 from tests.core.gltf_builder import arm
 from tests.rigged_shapes import rigged_body, write_gltf
@@ -110,8 +111,8 @@ def test_a_file_without_rig_is_a_mesh_of_the_character(
     model, document = dropped(qtbot, window, arm_file), window.document
     posed = model.training_latent[2]
     document.blend_towards(posed, 1.0)
-    document.export_pose(tmp_path / "posed.glb", ExportStyle(form="mesh"))
-    document.finish_exports()
+    export_pose(document, tmp_path / "posed.glb", ExportStyle(form="mesh"))
+    qtbot.waitUntil(lambda: not document.n_exports, timeout=PATIENCE)
     document.reset_all()
     with qtbot.waitSignal(document.imported, timeout=PATIENCE):
         drop(window, tmp_path / "posed.glb")

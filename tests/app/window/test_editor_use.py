@@ -33,7 +33,7 @@ from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import PoseModel
-from tests.app.support import Lcollision
+from tests.app.support import Lcollision, export_pose
 from tests.app.views import on_screen
 from tests.app.windows import (
     PATIENCE,
@@ -513,7 +513,7 @@ def test_random_actions_tell_what_goes_wrong_and_go_on(
         raise ValueError("not today")
 
     def fail_in_a_thread(*_: object) -> None:
-        window.document.export_mesh(tmp_path / "no such folder" / "pose.obj")
+        export_pose(window.document, tmp_path / "no such folder" / "pose.obj")
 
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
     monkeypatch.setattr(window.document, "reset_all", fail)

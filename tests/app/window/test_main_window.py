@@ -17,16 +17,15 @@ from PySide6.QtGui import QAction
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QAbstractButton,
-    QApplication,
     QDialog,
     QFileDialog,
     QLabel,
     QLineEdit,
     QMessageBox,
+    QProgressBar,
     QWidget,
 )
 from pytestqt.qtbot import QtBot
-from shiboken6 import isValid
 
 from app.editing.document import PoseDocument
 from app.view.shading import Shading
@@ -38,8 +37,10 @@ from app.work import jobs
 from app.work.compiling import REASON
 from app.work.threads import Failure
 from lcollision_core.errors import MeshFileError
+from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.meshes import read_mesh, write_mesh
 from lcollision_core.model import EncodedPose, PoseModel, read_poses, sample_poses
+from tests.app.support import export_pose
 from tests.app.views import on_screen
 from tests.app.windows import (
     PATIENCE,
@@ -50,7 +51,6 @@ from tests.app.windows import (
     drag,
     drop,
     handle,
-    is_open,
     move_held,
     rest,
     settings_in,
@@ -551,19 +551,23 @@ def test_no_file_is_saved_over_under_another_name_than_was_asked_about(
     assert window.document.file is None
 
 
-def test_closing_writes_what_waits_to_be_exported(
-    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64], tmp_path: Path
+def test_work_that_says_not_how_far_it_is_has_an_endless_bar(
+    qtbot: QtBot, window: MainWindow
 ) -> None:
-    document = window.document
-    document.blend_towards(colliding, 1.0)
-    rest(qtbot, window)
-    window.actions_by_key["resolve"].trigger()
-    document.export_mesh(tmp_path / "no such folder" / "pose.obj")
-    document.export_mesh(tmp_path / "pose.obj")
-    assert not window.close()
-    assert "no folder" in failures(window)[0].what.text()
-    close_window(window)
-    assert (tmp_path / "pose.obj").is_file()
+    go_on, bar = threading.Event(), window.statusBar().findChild(QProgressBar)
+
+    def work(progress: Progress, _: CancelToken) -> str:
+        progress(3, 3)
+        return "Counted"
+
+    window.document.write("Counting", work)
+    window.document.write("Waiting", lambda *_: str(go_on.wait(PATIENCE / 1000)))
+    qtbot.waitUntil(lambda: window.document.busy == "Waiting", timeout=PATIENCE)
+    assert (bar.minimum(), bar.maximum()) == (0, 0)
+    assert bar.isVisible()
+    go_on.set()
+    qtbot.waitUntil(lambda: not bar.isVisible(), timeout=PATIENCE)
+    assert bar.maximum() == 1
 
 
 def test_a_wait_for_compiling_is_explained_while_it_lasts(
@@ -600,30 +604,6 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
     assert log.handlers == []
 
 
-def test_a_window_that_closes_is_gone_before_its_work_has_ended(
-    window: MainWindow, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    close, seen = window.document.close, []
-    window.docks["sliders"].setFloating(True)
-    window.show_failure(Failure("the disk is full", "make room", "details"))
-
-    def look() -> bool:
-        seen.extend(w for w in QApplication.topLevelWidgets() if w.isVisible())
-        return close()
-
-    monkeypatch.setattr(window.document, "close", look)
-    close_window(window)
-    assert seen == []
-
-
-def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -> None:
-    window.document.set_code(0, 0.5)
-    asked = answer(lambda _: window.close_unasked())
-    assert window.close()
-    assert not asked.isActive()
-    assert not is_open(window)
-
-
 def test_a_failure_says_what_happened_and_below_it_what_to_do(window: MainWindow) -> None:
     error = MeshFileError("was truncated", "copy it again", where="a; b.obj", expected=9, got=4)
     window.show_failure(Failure.of(error))
@@ -647,25 +627,10 @@ def test_a_failure_is_told_once_while_its_dialog_is_open(window: MainWindow) -> 
 def test_a_failing_worker_leaves_the_editor_usable(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
-    window.document.export_mesh(tmp_path / "no such folder" / "pose.obj")
+    export_pose(window.document, tmp_path / "no such folder" / "pose.obj")
     qtbot.waitUntil(lambda: bool(failures(window)), timeout=PATIENCE)
     assert "no folder" in failures(window)[0].what.text()
     QTest.keyClick(failures(window)[0], Qt.Key.Key_Escape)
     drag(qtbot, window.sliders.row_of(0), by=12)
     rest(qtbot, window)
     assert np.array_equal(shown(window), decoded(window.document))
-
-
-def test_nothing_is_left_open(window: MainWindow) -> None:
-    """Closing by the menu, with nothing to save, asks nothing."""
-    window.actions_by_key["quit"].trigger()
-    assert not window.isVisible()
-    assert window.document.close()
-    assert QApplication.activeModalWidget() is None
-
-
-def test_a_closed_window_is_deleted_at_once(qtbot: QtBot, window: MainWindow) -> None:
-    """The garbage collector takes widgets apart in any order, which Qt does not survive."""
-    with qtbot.waitSignal(window.destroyed, timeout=PATIENCE):
-        window.actions_by_key["quit"].trigger()
-    assert not isValid(window)

@@ -13,6 +13,7 @@ from pytestqt.qtbot import QtBot
 from app.window.main_window import MainWindow
 from lcollision_core.meshes import read_mesh, write_mesh
 from lcollision_core.model import PoseModel
+from tests.app.support import export_pose
 from tests.app.windows import take_picture
 
 
@@ -51,7 +52,7 @@ def test_a_mesh_in_millimetres_is_scaled_and_goes_back_to_its_size(
         return
     qtbot.waitUntil(lambda: document.placement is not None, timeout=20_000)
     assert document.pose_name == "scan"
-    document.export_mesh(tmp_path / "back.obj")
+    export_pose(document, tmp_path / "back.obj")
     qtbot.waitUntil((tmp_path / "back.obj").exists, timeout=20_000)
     back = read_mesh(tmp_path / "back.obj").vertices
     assert np.abs(back - vertices).max() < 1000.0 * 0.02 * model.body_size

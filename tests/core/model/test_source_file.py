@@ -19,6 +19,7 @@ from lcollision_core.model import (
     export_frame,
     offered_forms,
     open_body,
+    sequence_files,
     source_for,
     write_pose,
     write_sequence,
@@ -166,12 +167,15 @@ def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
     latents = [share * latent for share in (0.0, 0.5, 1.0)]
     poses = [model.exported_vertices(codes) for codes in latents]
     path = tmp_path / f"run{suffix}"
+    wanted = sequence_files(path, model, source)
+    assert not any(file.exists() for file in wanted)
     frame = export_frame(model, "unreal", path)
     files, written = write_sequence(
         path, model, latents, poses, source=source, axes="unreal", fps=24.0
     )
     stored = np.stack([pose.vertices for pose in written])
     assert {pose.unit for pose in written} == {0.01}
+    assert files == list(wanted)
     assert [file.name for file in files] == [f"run {n}{suffix}" for n in ("Body", "Core", "Hat")]
     caches = [read_point_cache(file) for file in files]
     joined = np.concatenate(caches, axis=1)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PySide6.QtCore import QTimer
-from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QLineEdit
+from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QLineEdit, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.editing.settings import SETTINGS
@@ -21,7 +21,9 @@ from lcollision_core.characters import read_character
 from lcollision_core.meshes import read_mesh
 from lcollision_core.meshes.formats.point_cache import read_point_cache
 from lcollision_core.model import ExportAxes, PoseModel, RigModel, export_mesh
+from tests.app.support import export_pose
 from tests.app.windows import PATIENCE, answer, shown, take_picture
+from tests.core.character_file import figure
 from tests.core.gltf_builder import arm
 
 
@@ -173,8 +175,8 @@ def test_a_model_keeps_the_form_of_a_file_that_is_named(
     assert form.axes.isEnabled()
     assert (form.export_style.like, form.export_style.form) == (mine, "obj")
     form.accept()
-    window.document.export_pose(tmp_path / "out.obj", form.export_style)
-    window.document.finish_exports()
+    export_pose(window.document, tmp_path / "out.obj", form.export_style)
+    qtbot.waitUntil(lambda: not window.document.n_exports, timeout=PATIENCE)
     assert (tmp_path / "out.obj").read_text().startswith("# mine\n")
 
 
@@ -259,6 +261,56 @@ def test_selected_poses_are_the_frames_of_a_point_cache(
         window.actions_by_key["export_motion"].trigger()
     assert len(read_point_cache(path)) == len(arm_model.pose_names)
     assert window.settings["export_rate"] == 25
+
+
+@pytest.mark.parametrize("words", ["Replace", "Cancel"])
+def test_files_of_a_motion_that_nobody_has_named_are_asked_about(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, words: str
+) -> None:
+    document, timers = window.document, []
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        document.open_model(figure().write(tmp_path / "figure.glb"))
+    precious = tmp_path / "run Body.pc2"
+    precious.write_bytes(b"precious")
+    told: list[str] = []
+
+    def decide(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        take_picture(dialog, "replace_files")
+        told.extend([dialog.text(), dialog.informativeText()])
+        next(button for button in dialog.buttons() if button.text() == words).click()
+
+    def change(dialog: MotionDialog) -> None:
+        dialog.form.setCurrentIndex(dialog.form.findData("pc2"))
+
+    window.library.list.selectAll()
+    timers.append(chooser(change, tmp_path / "run.pc2", timers))
+    window.actions_by_key["export_motion"].trigger()
+    # The question comes once the names of the files are known.
+    timers.append(answer(decide))
+    qtbot.waitUntil(lambda: bool(told) and not document.busy, timeout=PATIENCE)
+    assert told[0] == "Replace files that are there already?"
+    assert "“run Body.pc2”" in told[1]
+    assert (precious.read_bytes() == b"precious") is (words == "Cancel")
+    assert (tmp_path / "run Hat.pc2").exists() is (words == "Replace")
+
+
+def test_what_is_exported_is_what_was_shown_as_the_dialog_opened(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document, path, timers = window.document, tmp_path / "shown.obj", []
+    on_screen, other = shown(window), RigModel.of(read_character(arm().write(tmp_path / "arm.glb")))
+    accept = named(path, timers)
+
+    def fill(dialog: QDialog) -> None:
+        document.set_model(other)
+        accept(dialog)
+
+    timers.append(answer(fill))
+    with qtbot.waitSignal(document.message, timeout=PATIENCE) as told:
+        window.actions_by_key["export"].trigger()
+    assert told.args[0].startswith("Exported shown.obj")
+    np.testing.assert_array_equal(read_mesh(path).vertices.astype(np.float32), on_screen)
 
 
 def test_poses_of_no_motion_keep_the_rate_and_form_that_were_chosen(

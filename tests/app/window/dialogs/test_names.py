@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from app.wording import one_line
 from app.work.threads import Failure
 from lcollision_core.meshes import write_pose_set
 from lcollision_core.model import NamedPose, PoseModel, write_poses
-from tests.app.support import STABBED, Lcollision
+from tests.app.support import STABBED, Lcollision, export_pose
 from tests.app.windows import PATIENCE, answer
 from tests.bending_tube import bending_tube
 
@@ -162,7 +163,7 @@ def test_the_window_tells_of_a_name_that_is_too_long(
     path, document = tmp_path / f"{LONG}{suffix}", window.document
     write = {
         ".json": document.save,
-        ".obj": document.export_mesh,
+        ".obj": partial(export_pose, document),
         ".png": lambda path: window.viewport.pictures.screenshot(path, 64, 64, False),
     }[suffix]
     window.attempt(lambda: write(path))

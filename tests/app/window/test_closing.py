@@ -1,0 +1,118 @@
+"""The window closes: what it waits for, what it asks, and that nothing of it is left."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+from PySide6.QtWidgets import QApplication, QDialog, QProgressBar
+from pytestqt.qtbot import QtBot
+from shiboken6 import isValid
+
+from app.window.dialogs.failure import FailureDialog
+from app.window.main_window import MainWindow
+from app.work.threads import Failure
+from lcollision_core.jobs import CancelToken, Progress
+from tests.app.support import export_pose
+from tests.app.windows import PATIENCE, answer, close_window, is_open, take_picture
+
+
+def test_closing_waits_for_what_is_being_exported(window: MainWindow, tmp_path: Path) -> None:
+    document, asked, go_on = window.document, [], threading.Event()
+
+    def look(box: QDialog) -> None:
+        take_picture(box, "closing")
+        asked.append(box.text())
+        go_on.set()
+
+    document.write("Waiting", lambda *_: str(go_on.wait(PATIENCE / 1000)))
+    export_pose(document, tmp_path / "no such folder" / "pose.obj")
+    export_pose(document, tmp_path / "pose.obj")
+    waiting = answer(look)
+    # One fails, which is told; the other is written all the same.
+    assert not window.close()
+    assert not waiting.isActive()
+    assert asked == ["Finishing 3 exports…"]
+    (told,) = (held for held in window.findChildren(FailureDialog) if held.isVisible())
+    assert "no folder" in told.what.text()
+    assert (tmp_path / "pose.obj").is_file()
+    export_pose(document, tmp_path / "again.obj")
+    document.mark_saved()
+    assert window.close()
+    assert (tmp_path / "again.obj").is_file()
+
+
+@pytest.mark.parametrize("how", ["cancelled", "told to end"])
+def test_an_export_runs_once_while_the_window_waits_for_it(
+    qtbot: QtBot, window: MainWindow, how: str
+) -> None:
+    document, started, go_on, runs = window.document, [], threading.Event(), []
+
+    def write(progress: Progress, _: CancelToken) -> str:
+        runs.append(threading.current_thread())
+        progress(1, 4)
+        go_on.wait(PATIENCE / 1000)
+        return "Written"
+
+    def give_up(box: QDialog) -> None:
+        take_picture(window, f"closing_{how.replace(' ', '_')}")
+        started.append(box)
+        if how == "told to end":
+            go_on.set()
+            window.close_unasked()
+        else:
+            box.reject()
+
+    document.write("Exporting slow.obj", write)
+    bar = window.statusBar().findChild(QProgressBar)
+    qtbot.waitUntil(lambda: (bar.value(), bar.maximum()) == (1, 4), timeout=PATIENCE)
+    waiting = answer(give_up)
+    assert window.close() is (how == "told to end")
+    assert not waiting.isActive()
+    if how == "cancelled":
+        with qtbot.waitSignal(document.message, timeout=PATIENCE):
+            go_on.set()
+        assert window.isVisible()
+        qtbot.waitUntil(lambda: not bar.isVisible(), timeout=PATIENCE)
+    assert len(runs) == 1
+    assert runs[0] is not threading.main_thread()
+
+
+def test_a_window_that_closes_is_gone_before_its_work_has_ended(
+    window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close, seen = window.document.close, []
+    window.docks["sliders"].setFloating(True)
+    window.show_failure(Failure("the disk is full", "make room", "details"))
+
+    def look() -> bool:
+        seen.extend(w for w in QApplication.topLevelWidgets() if w.isVisible())
+        return close()
+
+    monkeypatch.setattr(window.document, "close", look)
+    close_window(window)
+    assert seen == []
+
+
+def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -> None:
+    window.document.set_code(0, 0.5)
+    asked = answer(lambda _: window.close_unasked())
+    assert window.close()
+    assert not asked.isActive()
+    assert not is_open(window)
+
+
+def test_nothing_is_left_open(window: MainWindow) -> None:
+    """Closing by the menu, with nothing to save, asks nothing."""
+    window.actions_by_key["quit"].trigger()
+    assert not window.isVisible()
+    assert window.document.close()
+    assert QApplication.activeModalWidget() is None
+
+
+def test_a_closed_window_is_deleted_at_once(qtbot: QtBot, window: MainWindow) -> None:
+    """The garbage collector takes widgets apart in any order, which Qt does not survive."""
+    with qtbot.waitSignal(window.destroyed, timeout=PATIENCE):
+        window.actions_by_key["quit"].trigger()
+    assert not isValid(window)
