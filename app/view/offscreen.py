@@ -6,6 +6,7 @@ import os
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 
     from app.view.palettes import Theme
     from lcollision_core.model import PosableBody
+
+UInt8Array = npt.NDArray[np.uint8]
 
 _NOTHING = "#000000"
 """Behind a cut-out picture: adds nothing to the pixels that a rim covers in part."""
@@ -60,22 +63,31 @@ class PoseRenderer:
 
     def drawn(self) -> Image.Image:
         """Draw the scene as it is, in RGBA where it is `transparent` and else in RGB."""
-        from PIL import Image
+        return picture_of(self.pixels())
 
+    def pixels(self) -> UInt8Array:
+        """Draw the scene as it is, (H, W, C), for `picture_of` in any thread."""
         # Otherwise pyvista returns the picture before.
         self._plotter.render()
-        pixels = np.array(
+        return np.array(
             self._plotter.screenshot(return_img=True, transparent_background=self._transparent)
         )
-        if self._transparent:
-            # Pixels of a rim get the colour of what covers them, without the black behind it.
-            alpha = np.maximum(pixels[:, :, 3:], 1).astype(np.float32)
-            pixels[:, :, :3] = np.minimum(pixels[:, :, :3] * (255.0 / alpha), 255.0)
-        return Image.fromarray(pixels)
 
     def close(self) -> None:
         """Free the picture's memory on the graphics card."""
         self._plotter.close()
+
+
+def picture_of(pixels: UInt8Array) -> Image.Image:
+    """Return a picture of `PoseRenderer.pixels`, which may change."""
+    from PIL import Image
+
+    if pixels.shape[2] == 4:
+        # Pixels of a rim get the colour of what covers them, without the black behind it.
+        for row in pixels:
+            alpha = np.maximum(row[:, 3:], 1).astype(np.float32)
+            row[:, :3] = np.minimum(row[:, :3] * (255.0 / alpha), 255.0)
+    return Image.fromarray(pixels)
 
 
 def save_png(picture: Image.Image, path: str | os.PathLike[str]) -> None:

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, QTimer, Signal, Slot
 
-from app.view.offscreen import PoseRenderer, save_png
+from app.view.offscreen import PoseRenderer, UInt8Array, picture_of, save_png
 from app.view.theme import current_theme
 from app.view.turntable import TurntableStyle, TurntableVideo
 from app.work.threads import guarded
+from lcollision_core.errors import MeshFileError
+from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.view.scene import Scene
+
+_MOST_PIXELS = 2**25
+"""Of a screenshot: drawing takes about 80 bytes of memory for each."""
 
 
 class Pictures(QObject):
@@ -57,7 +63,7 @@ class Pictures(QObject):
     def screenshot(
         self, path: str | os.PathLike[str], width: int, height: int, transparent: bool
     ) -> None:
-        """Save what is seen, without legend, in another size.
+        """Draw what is seen, without legend, in another size; the document's long worker saves it.
 
         Parameters
         ----------
@@ -67,13 +73,21 @@ class Pictures(QObject):
 
         Raises
         ------
-        MeshFileError : the file cannot be written.
+        MeshFileError : so many pixels would not fit into the memory.
         """
+        path = Path(path)
+        if width * height > _MOST_PIXELS:
+            raise MeshFileError(
+                f"would have {width} by {height} pixels, which takes too much memory",
+                f"choose at most {_MOST_PIXELS // 10**6} million, such as 7680 by 4320",
+                where=path.name,
+            )
         renderer = self._copy(width, height, transparent)
         try:
-            save_png(renderer.drawn(), path)
+            pixels = renderer.pixels()
         finally:
             renderer.close()
+        self._document.write(f"Saving {path.name}", partial(_save, pixels, path))
 
     def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> None:
         """Begin a video of one turn round what is seen, in place of one that is being drawn.
@@ -136,3 +150,8 @@ class Pictures(QObject):
         if video.n_drawn == video.n_frames:
             self._end().close()
             self._document.write(label, video.pack)
+
+
+def _save(pixels: UInt8Array, path: Path, _: Progress, __: CancelToken) -> str:
+    save_png(picture_of(pixels), path)
+    return f"Saved {path.name}"

@@ -292,7 +292,6 @@ class FileActions(QObject):
             names = ("width", "height", "transparent")
             values = (self.settings[f"screenshot_{name}"] for name in names)
             self._viewport.pictures.screenshot(path, *values)
-            self._document.message.emit(f"Saved {path.name}")
 
     def _turntable(self) -> None:
         from app.view.turntable import TurntableStyle

@@ -386,9 +386,13 @@ def test_resolve_transitions_to_the_new_pose_and_leaves_a_ghost(
     assert scene.surface.vertices.tobytes() == start.tobytes()
 
 
-def test_a_screenshot_has_its_size_and_is_cut_out(viewport: Viewport, tmp_path: Path) -> None:
+def test_a_screenshot_has_its_size_and_is_cut_out(
+    qtbot: QtBot, document: PoseDocument, viewport: Viewport, tmp_path: Path
+) -> None:
     path = tmp_path / "cut out.png"
-    viewport.pictures.screenshot(path, 300, 200, transparent=True)
+    with qtbot.waitSignal(document.message, timeout=20_000) as told:
+        viewport.pictures.screenshot(path, 300, 200, transparent=True)
+    assert told.args == ["Saved cut out.png"]
     cut_out = np.asarray(Image.open(path)).astype(int)
     alpha = cut_out[:, :, 3]
     assert alpha.shape == (200, 300)
@@ -397,11 +401,15 @@ def test_a_screenshot_has_its_size_and_is_cut_out(viewport: Viewport, tmp_path: 
     inside, rim = (cut_out[where, :3].sum(axis=1) for where in (alpha == 255, alpha % 255 > 0))
     assert np.median(rim) > 0.6 * np.median(inside), "the rim is mixed with what is not there"
     opaque = tmp_path / "opaque.png"
-    viewport.pictures.screenshot(opaque, 800, 600, transparent=False)
+    with qtbot.waitSignal(document.message, timeout=20_000):
+        viewport.pictures.screenshot(opaque, 800, 600, transparent=False)
     with Image.open(opaque) as image:
         assert (image.size, image.mode) == ((800, 600), "RGB")
-    with pytest.raises(MeshFileError, match="missing"):
+    with qtbot.waitSignal(document.failed, timeout=20_000) as failed:
         viewport.pictures.screenshot(tmp_path / "missing" / "x.png", 30, 20, transparent=True)
+    assert "missing" in failed.args[0].headline
+    with pytest.raises(MeshFileError, match="8192 by 8192 pixels, which takes too much memory"):
+        viewport.pictures.screenshot(path, 8192, 8192, transparent=True)
 
 
 def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
