@@ -292,18 +292,23 @@ class PoseDocument(LiveEditing):
         self,
         path: Path,
         done: Callable[[bool], None],
-        failed: Callable[[], None] = lambda: None,
+        failed: Callable[[Failure], None] | None = None,
     ) -> None:
         """Find in the long worker whether a file is a character's: `done` is called with that.
 
         Parameters
         ----------
         path : of any file
-        done, failed : called in this thread, the latter before `failed` tells why
+        done, failed : called in this thread, see `LongWork.start`
         """
-        self._long.cancel(self._incoming)
         work = partial(jobs.is_character, path)
-        self._incoming = self._long.start(f"Opening {path.name}", work, done, failed)
+        start = partial(self._long.start, f"Opening {path.name}", work, done, failed)
+        if self.incoming and not self.has_model:
+            # The first body stays wanted: what becomes of the file may need it.
+            start()
+            return
+        self._long.cancel(self._incoming)
+        self._incoming = start()
         self.busy_changed.emit(self.busy)
 
     def edit_parts(self, edits: jobs.PartEdits) -> None:
@@ -456,7 +461,7 @@ class PoseDocument(LiveEditing):
         chosen = replace(options or ResolveOptions(), locked_domains=self.locked_domains)
         work = partial(jobs.resolve, self.model, self.latent, self.placement, chosen)
         self._solve_began = time.monotonic()
-        self._solve = self._long.start("Resolving", work, self._on_resolved, self.cancel_resolve)
+        self._solve = self._long.start("Resolving", work, self._on_resolved, self._on_unresolved)
         self.solve_started.emit()
 
     def cancel_resolve(self) -> None:
@@ -628,6 +633,10 @@ class PoseDocument(LiveEditing):
             after = replace(self._state, pose=pose, ghost=ghost, outcome=result)
             self._push("Resolve", replace(after, outcome_seconds=seconds))
         self.solve_finished.emit(result)
+
+    def _on_unresolved(self, failure: Failure) -> None:
+        self.cancel_resolve()
+        self.failed.emit(failure)
 
     def _prepare(self) -> None:
         """Load the predictor and compile drags in the background; the pose can be edited."""

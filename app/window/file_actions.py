@@ -160,6 +160,7 @@ class FileActions(QObject):
             self._import_mesh(path)
 
     def _import_mesh(self, path: Path) -> None:
+        self._require_model(path)
         self._document.import_mesh(path)
         self.settings["last_folder"] = str(path.resolve().parent)
 
@@ -218,13 +219,23 @@ class FileActions(QObject):
             # A step that can be undone.
             self._import_mesh(path)
         elif self.may_lose_changes(with_library=suffix == MODEL_SUFFIX):
+            if suffix == POSES_SUFFIX:
+                self._require_model(path)
             openers[suffix](path)
             self.settings["last_folder"] = str(path.resolve().parent)
+
+    def _require_model(self, path: Path) -> None:
+        if not self._document.has_model:
+            raise LCollisionError(
+                "can only be opened once a body is there",
+                "wait until one is open, or open a model or a character first",
+                where=path.name,
+            )
 
     def _open_looked_into(self, path: Path, is_character: bool) -> None:
         """Open a rigged file as a body, another as a mesh of the one that is open."""
         if not is_character:
-            self._import_mesh(path)
+            self._attempt(partial(self._import_mesh, path))
         elif self._attempt(self.may_lose_changes):
             self._document.open_model(path)
             self.settings["last_folder"] = str(path.resolve().parent)

@@ -71,6 +71,7 @@ class LearningActions(QObject):
         self._window, self._document, self._files = window, document, files
         self._actions, self._attempt = actions, attempt
         self._work = LongWork(self, "learning")
+        self._work.failed.connect(document.failed)
         self.runs = LearningRuns(self)
         self._told: dict[Path, RunPhase] = {}
         self._opening: tuple[Path, Path] | None = None

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from app.window.main_window import MainWindow
+    from app.work.threads import Failure
     from lcollision_core.model import NamedPose, PosableBody
 
 _log = logging.getLogger(__name__)
@@ -68,8 +69,9 @@ class StartUp(QObject):
             self._model, self._path = self._path, None
         self._document.open_model(self._model)
 
-    def _open_without_path(self) -> None:
+    def _open_without_path(self, failure: Failure) -> None:
         """Begin as without a file, as the one that there is cannot be read."""
+        self._document.failed.emit(failure)
         self._path = None
         self._open_model(False)
 

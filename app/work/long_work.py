@@ -29,7 +29,7 @@ class JobRequest:
     label : what is done, as in "Opening poses.json"
     work : called in the worker's thread
     cancel : set by the document to stop the work
-    done, failed : called in the window's thread with the work's value, or where it fails
+    done, failed : called in the window's thread with the work's value, or with its `Failure`
     """
 
     request_id: int
@@ -37,7 +37,7 @@ class JobRequest:
     work: Job
     cancel: CancelToken
     done: Callable[[Any], None]
-    failed: Callable[[], None]
+    failed: Callable[[Failure], None]
 
 
 class LongWorker(QObject):
@@ -69,7 +69,8 @@ class LongWork(QObject):
     """Does jobs one after the other in its own thread, and tells of them in the window's.
 
     `busy_changed` carries the label of the oldest job that is not done, "" if there is none;
-    `failed` a `Failure`; `progressed` the job's number and its progress.
+    `failed` the `Failure` of a job that nothing else is told of; `progressed` the job's number and
+    its progress.
     """
 
     busy_changed = Signal(str)
@@ -102,7 +103,7 @@ class LongWork(QObject):
         label: str,
         work: Job,
         done: Callable[[Any], None],
-        failed: Callable[[], None] = lambda: None,
+        failed: Callable[[Failure], None] | None = None,
     ) -> int:
         """Queue some work behind the jobs started before.
 
@@ -111,14 +112,16 @@ class LongWork(QObject):
         label : as in "Opening poses.json"
         work : called in the other thread with (progress, cancel)
         done : called in this thread with the work's value; not after `cancel`
-        failed : called in this thread where the work fails, before `LongWork.failed` tells why
+        failed : called in this thread with the `Failure` where the work fails; the signal `failed`
+            tells of it where None
 
         Returns
         -------
         number : of the job
         """
         self._last_id += 1
-        job = JobRequest(self._last_id, label, work, CancelToken(), done, failed)
+        told = self.failed.emit if failed is None else failed
+        job = JobRequest(self._last_id, label, work, CancelToken(), done, told)
         self._jobs[job.request_id] = job
         self._wanted.emit(job)
         self.busy_changed.emit(self.busy)
@@ -160,9 +163,10 @@ class LongWork(QObject):
         job = self._jobs.pop(answer.request_id, None)
         if job is None:
             return
-        if answer.failure is not None:
-            job.failed()
-            self.failed.emit(answer.failure)
-        elif not answer.cancelled:
-            job.done(answer.value)
-        self.busy_changed.emit(self.busy)
+        try:
+            if answer.failure is not None:
+                job.failed(answer.failure)
+            elif not answer.cancelled:
+                job.done(answer.value)
+        finally:
+            self.busy_changed.emit(self.busy)

@@ -94,7 +94,7 @@ class LearningDialog(QDialog):
         self._shown: tuple[Path, RunPhase] | None = None
         self._card_of: Path | None = None
         self._read_for: Path | None = None
-        self._reading, self._read_failed = 0, False
+        self._reading = 0
         self.which = QComboBox()
         self.which.setAccessibleName("Model that is learned")
         self._sign = Sign(_SIGN)
@@ -109,7 +109,6 @@ class LearningDialog(QDialog):
         self._lay_out()
         self.which.activated.connect(lambda _: self.show_run(Path(self.which.currentData())))
         runs.changed.connect(self._on_runs)
-        work.failed.connect(self._on_failed)
 
     def show_run(self, path: Path) -> None:
         """Show another run."""
@@ -286,14 +285,9 @@ class LearningDialog(QDialog):
         self._on_runs()
         self._fit()
 
-    def _on_no_card(self) -> None:
-        self._read_failed = True
-
-    @Slot(object)
-    def _on_failed(self, failure: Failure) -> None:
-        if self._read_failed and self.path == self._read_for:
+    def _on_no_card(self, failure: Failure) -> None:
+        if self.path == self._read_for:
             self.state.setText(f"{with_capital(one_line(failure.headline))}.")
-        self._read_failed = False
 
 
 class _StageRows(Card):

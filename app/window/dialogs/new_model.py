@@ -70,14 +70,13 @@ class NewModelDialog(QDialog):
         FileDrops(self).dropped.connect(self.add)
         self.resize(_SIZE.boundedTo(self.screen().availableSize() - _MARGIN))
         self._work, self._settings = work, settings
-        self._reading, self._read_failed = 0, False
+        self._reading = 0
         self._summary: SourcesSummary | None = None
         self.files, self.poses, self.contacts = FilesPage(), PosesPage(), ContactsPage()
         self.quality = QualityPage(why_no_model_name)
         self.preview, self._facts = BodyPreview(), labelled("", "caption", wraps=True)
         self.preview.clear(_EMPTY)
         self._lay_out()
-        work.failed.connect(self._on_failed)
         self.files.paths_changed.connect(self._read)
         self.files.add_files.clicked.connect(self._ask_for_files)
         self.files.add_folder.clicked.connect(self._ask_for_folder)
@@ -161,13 +160,17 @@ class NewModelDialog(QDialog):
 
     @Slot()
     def _on_changed(self) -> None:
-        self.next.setEnabled(self._summary is not None)
         if self.refusal.text():
-            self.refusal.setText(self.page.why_not())
+            self.refusal.setText(self._why_not())
+
+    def _why_not(self) -> str:
+        """Say why there is no next page, "" if there is one."""
+        unread = "" if self._summary is not None else "Wait until the files are read."
+        return self.page.why_not() or unread
 
     @Slot()
     def _go_on(self) -> None:
-        reason = self.page.why_not()
+        reason = self._why_not()
         self.refusal.setText(reason)
         if reason:
             return
@@ -191,17 +194,11 @@ class NewModelDialog(QDialog):
             work = partial(learning_jobs.look_into_sources, paths)
             self._reading = self._work.start("Reading files", work, self._on_read, self._on_unread)
 
-    def _on_unread(self) -> None:
-        self._read_failed = True
-
-    @Slot(object)
-    def _on_failed(self, failure: Failure) -> None:
-        """Say why the files cannot be used, if it is they that have failed."""
-        if not self._read_failed:
-            return
-        self._read_failed = False
+    def _on_unread(self, failure: Failure) -> None:
+        """Say why the files cannot be used."""
         sentence = "; ".join(filter(None, (failure.headline, failure.next_step)))
         self.files.tell(f"{with_capital(one_line(sentence))}.", is_problem=True)
+        self._on_changed()
         self.preview.clear("These files can't be learned from")
 
     def _on_read(self, looked: LookedInto) -> None:

@@ -24,6 +24,7 @@ from app.window.dialogs.new_model import NewModelDialog
 from app.window.main_window import MainWindow
 from app.work import learning_jobs, learning_runs
 from app.work.learning_runs import RunPhase
+from lcollision_core.errors import LCollisionError
 from lcollision_core.learning import (
     EFFORTS,
     LearnedCard,
@@ -106,7 +107,7 @@ def test_a_dropped_folder_of_meshes_is_learned_killed_continued_and_opened(
     window, learning = watching, watching.learning
     drop(window, tubes)
     wizard = wizard_of(qtbot, window)
-    qtbot.waitUntil(wizard.next.isEnabled, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: wizard.preview.has_body, timeout=PATIENCE)
     assert wizard.preview.has_body
     QTest.mouseClick(wizard.next, LEFT)
     assert wizard.page is wizard.poses
@@ -206,7 +207,7 @@ def test_a_rigged_character_offers_to_be_learned(
     QTest.mouseClick(window.collision.prediction.learn, LEFT)
     wizard = wizard_of(qtbot, window)
     assert wizard.files.paths == (file,)
-    qtbot.waitUntil(wizard.next.isEnabled, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: wizard.preview.has_body, timeout=PATIENCE)
     wizard.next.click()
     assert wizard.poses.by_rig.isVisible()
     assert wizard.poses.up_axis == 1
@@ -239,15 +240,23 @@ def test_what_cannot_be_learned_from_stays_on_the_first_page(
     window.files.open_path(broken)
     wizard = wizard_of(qtbot, window)
     qtbot.waitUntil(lambda: "broken.npz" in wizard.files.found.text(), timeout=PATIENCE)
-    assert not wizard.next.isEnabled()
+    wizard.next.click()
+    assert wizard.page is wizard.files
+    assert wizard.refusal.text() == "Remove the file that can't be used."
+    take_picture(wizard, "new_model_refused")
     assert not window.findChildren(LearningDialog)
     wizard.files.list.setCurrentRow(0)
     wizard.files.list.setFocus()
     QTest.keyClick(wizard.files.list, Qt.Key.Key_Delete)
     assert wizard.files.paths == ()
+    assert wizard.refusal.text() == "Add a file or a folder first."
     # More that is dropped goes to the dialog that is open.
     drop(wizard, tubes)
-    qtbot.waitUntil(wizard.next.isEnabled, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: wizard.files.paths == (tubes,), timeout=PATIENCE)
+    wizard.files.paths_changed.emit()
+    wizard.next.click()
+    assert wizard.refusal.text() == "Wait until the files are read."
+    qtbot.waitUntil(lambda: wizard.preview.has_body, timeout=PATIENCE)
     assert not wizard.files.found.text()
     for _ in range(3):
         wizard.next.click()
@@ -357,7 +366,7 @@ def test_the_pages_fit_800_by_600(
     monkeypatch.setattr(QScreen, "availableSize", lambda _: SMALL)
     watching.learning.new_model((tubes,))
     wizard = wizard_of(qtbot, watching)
-    qtbot.waitUntil(wizard.next.isEnabled, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: wizard.preview.has_body, timeout=PATIENCE)
     for page in wizard.pages:
         assert wizard.page is page
         assert wizard.width() <= SMALL.width()
@@ -387,3 +396,16 @@ def test_the_preview_turns_and_shows_every_pose(
     wizard.hide()
     assert not preview._timer.isActive()
     wizard.reject()
+
+
+def test_a_failure_to_look_for_runs_is_told(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise LCollisionError("cannot be read", "free some memory", where="the list of runs")
+
+    monkeypatch.setattr(learning_jobs, "load_learning", fail)
+    with qtbot.waitSignal(document.failed, timeout=PATIENCE) as failed:
+        window = open_window(qtbot, document, settings_in(tmp_path))
+    assert failed.args[0].headline == "the list of runs cannot be read"
+    close_window(window)

@@ -604,6 +604,40 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
     assert log.handlers == []
 
 
+def test_files_dropped_while_the_first_model_loads_wait_for_it_or_are_refused(
+    qtbot: QtBot, editor_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warm_up, go_on = jobs.warm_up, threading.Event()
+
+    def slow(model: PoseModel) -> None:
+        go_on.wait(PATIENCE / 1000)
+        warm_up(model)
+
+    monkeypatch.setattr(jobs, "warm_up", slow)
+    editor_model.save(tmp_path / "tube.safetensors")
+    for name in ("bent.glb", "bent.obj"):
+        write_mesh(tmp_path / name, editor_model.reference, editor_model.faces)
+    (tmp_path / "pose.json").write_text("{}")
+    document = PoseDocument()
+    window = MainWindow(document, settings_in(tmp_path))
+    window.show()
+    document.open_model(tmp_path / "tube.safetensors")
+    for name in ("bent.obj", "pose.json"):
+        drop(window, tmp_path / name)
+        qtbot.waitUntil(lambda: bool(failures(window)), timeout=PATIENCE)
+        (told,) = failures(window)
+        assert told.what.text() == f"{name} can only be opened once a body is there"
+        told.reject()
+    drop(window, tmp_path / "bent.glb")
+    qtbot.waitUntil(lambda: len(document._long._jobs) == 2, timeout=PATIENCE)
+    with qtbot.waitSignal(document.imported, timeout=PATIENCE):
+        go_on.set()
+    assert document.pose_name == "bent"
+    rest(qtbot, window)
+    assert not failures(window)
+    close_window(window)
+
+
 def test_a_failure_says_what_happened_and_below_it_what_to_do(window: MainWindow) -> None:
     error = MeshFileError("was truncated", "copy it again", where="a; b.obj", expected=9, got=4)
     window.show_failure(Failure.of(error))

@@ -19,6 +19,7 @@ from app.window.garbage_collection import GarbageCollector
 from app.work.frames import FrameEvaluator, LiveFrame
 from app.work.long_work import LongWork
 from app.work.threads import Failure
+from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.model import NamedPose, PoseModel, sample_poses, write_poses
 
@@ -353,6 +354,34 @@ def test_jobs_run_in_turn_and_a_cancelled_one_is_not_heard_of(qtbot: QtBot) -> N
     qtbot.waitUntil(lambda: done == ["second"])
     assert work.busy == ""
     assert labels == ["first", "first", "second", ""]
+    assert work.close(time.monotonic() + 5)
+
+
+def test_who_asks_for_work_is_told_of_its_failure_or_else_all_are(qtbot: QtBot) -> None:
+    work, told, own = LongWork(), [], []
+    work.failed.connect(told.append)
+
+    def fail(*_: object) -> None:
+        raise LCollisionError("the disk is full", "make room")
+
+    work.start("first", fail, lambda _: None, own.append)
+    work.start("second", fail, lambda _: None)
+    qtbot.waitUntil(lambda: not work.busy)
+    assert [failure.headline for failure in (*own, *told)] == ["the disk is full"] * 2
+    assert work.close(time.monotonic() + 5)
+
+
+def test_work_is_over_also_where_what_follows_from_it_breaks(qtbot: QtBot) -> None:
+    work, labels = LongWork(), []
+    work.busy_changed.connect(labels.append)
+
+    def break_down(_: object) -> None:
+        raise ValueError("nobody expects this")
+
+    with qtbot.capture_exceptions() as raised:
+        work.start("first", lambda *_: None, break_down)
+        qtbot.waitUntil(lambda: labels == ["first", ""])
+    assert [kind for kind, *_ in raised] == [ValueError]
     assert work.close(time.monotonic() + 5)
 
 
