@@ -117,7 +117,7 @@ class PoseDocument(LiveEditing):
         self._solve: int | None = None
         self._solve_began = 0.0
         self._mirroring = self._mirroring_poses = self._incoming = self._loading = 0
-        self._counting = self._proposing = self._ruling = 0
+        self._counting = self._proposing = self._changing = 0
         self._prepared = False
         self.proposed_rules: ProposedRules | None = None
         self._exports: list[int] = []
@@ -244,7 +244,7 @@ class PoseDocument(LiveEditing):
         # What is being exported is a snapshot, and goes on.
         for number in (
             *(self._mirroring, self._mirroring_poses, self._incoming),
-            *(self._loading, self._counting, self._proposing, self._ruling),
+            *(self._loading, self._counting, self._proposing, self._changing),
         ):
             self._long.cancel(number)
         self.frame = self.exact = self.file = self.proposed_rules = None
@@ -314,14 +314,15 @@ class PoseDocument(LiveEditing):
     def edit_parts(self, edits: jobs.PartEdits) -> None:
         """Rename, recolour or reorder body parts in the model's file, in the long worker.
 
-        The pose, its history and the locks stay; nothing of it can be undone.
+        The pose, its history and the locks stay; nothing of it can be undone. Not while
+        `changing_model`, as of the rules.
 
         Parameters
         ----------
         edits : what changes, and the name of the copy where the model's own file is not to
         """
         work = partial(jobs.edit_parts, self.model, self.model_file, edits)
-        self._long.start("Saving the body parts", work, self._on_parts)
+        self._change("Saving the body parts", work, self._on_parts)
 
     def count_contacts(self) -> None:
         """Count the pairs of the rest pose by contact rule; `contacts_counted` tells."""
@@ -343,9 +344,9 @@ class PoseDocument(LiveEditing):
         )
 
     @property
-    def changing_rules(self) -> bool:
-        """Whether other contact rules are being applied."""
-        return bool(self._long.label_of(self._ruling))
+    def changing_model(self) -> bool:
+        """Whether other body parts or contact rules are on their way: one change at a time."""
+        return bool(self._long.label_of(self._changing))
 
     def set_rules(self, rules: ContactRules) -> None:
         """Apply other contact rules in the long worker, and keep them in the model's own file.
@@ -353,7 +354,11 @@ class PoseDocument(LiveEditing):
         The pose, its history and the locks stay; nothing of it can be undone.
         """
         work = partial(jobs.change_rules, self.model, self.model_file, rules)
-        self._ruling = self._long.start("Applying the contact rules", work, self._on_rules)
+        self._change("Applying the contact rules", work, self._on_rules)
+
+    def _change(self, label: str, work: Job, done: Callable[[Any], None]) -> None:
+        self._changing = self._long.start(label, work, done)
+        self.busy_changed.emit(self.busy)
 
     def new_pose(self) -> None:
         """Start again from the reference pose: unnamed, no file, no history; the library stays."""

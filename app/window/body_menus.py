@@ -133,8 +133,9 @@ class BodyMenus(QObject):
             if code is None:
                 self._add(menu, "&Show in sliders", self._sliders.show_domain, domain)
             menu.addSeparator()
-            self._add(menu, f"Re&name {name}…", self._edit_parts, domain, "name")
-            self._add(menu, f"&Colour of {name}…", self._edit_parts, domain, "colour")
+            for text, what in ((f"Re&name {name}…", "name"), (f"&Colour of {name}…", "colour")):
+                edit = self._add(menu, text, self._edit_parts, domain, what)
+                edit.setEnabled(actions["parts"].isEnabled())
         menu.addAction(actions["parts"])
         menu.addSeparator()
         menu.addActions([actions["unlock"], actions["mirror"]])

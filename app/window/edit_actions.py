@@ -134,12 +134,15 @@ class EditActions(QObject):
             "redo": stack.canRedo(),
             "mirror": document.can_mirror,
             "unlock": bool(document.locked_domains),
+            "parts": not document.changing_model,
             "resolve": document.can_resolve and not (document.solving or document.incoming),
             "resolve_options": document.can_resolve,
             "cancel": bool(document.busy or self._pictures.busy),
         }
         for key in self.acts:
             self._actions[key].setEnabled(document.has_model and allowed.get(key, True))
+        for dialog in self._window.findChildren(BodyPartsDialog):
+            dialog.save.setEnabled(not document.changing_model)
         waits = f"{document.incoming}, which replaces this pose"
         tip = waits if document.incoming else ACTIONS["resolve"].tip
         explain_action(self._actions["resolve"], tip)

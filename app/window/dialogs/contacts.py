@@ -261,7 +261,7 @@ class ContactsDialog(QDialog):
         several = can_change and self.first.count() > 1
         for choice in (self.first, self.second, self.add):
             choice.setEnabled(several)
-        free = can_change and not self._document.changing_rules
+        free = can_change and not self._document.changing_model
         self.propose.setEnabled(can_change)
         self.restore.setEnabled(free and model.rules_are_chosen)
         self.apply.setEnabled(free and self._differ())
@@ -277,12 +277,10 @@ class ContactsDialog(QDialog):
     @Slot()
     def _apply(self) -> None:
         self._document.set_rules(self.rules())
-        self._on_edited()
 
     @Slot()
     def _restore(self) -> None:
         self._document.set_rules(self._document.model.own_rules)
-        self._on_edited()
 
     @Slot()
     def _add_pair(self) -> None:

@@ -43,6 +43,7 @@ class ProposalCard(Card):
         self.column.addLayout(hbox(self.ignore, self.dismiss, None))
         for changed in (document.rules_proposed, document.model_changed):
             changed.connect(self._show_proposed)
+        document.busy_changed.connect(lambda: self.ignore.setEnabled(not document.changing_model))
         self._show_proposed()
 
     @Slot()

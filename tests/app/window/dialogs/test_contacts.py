@@ -12,9 +12,10 @@ from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
 from app.view.shading import Shading
+from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.contacts import ContactsDialog
 from app.window.main_window import MainWindow
-from app.work.jobs import contacts_at_rest
+from app.work.jobs import PartEdits, contacts_at_rest
 from lcollision_core.contact import propose_by_kind
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes import ContactRules
@@ -239,3 +240,25 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     with qtbot.waitSignal(document.rules_proposed, timeout=PATIENCE):
         document.set_model(RigModel.of(rigged_body(n_frames=30)))
     assert card.isHidden()
+
+
+def test_parts_and_rules_are_changed_one_after_the_other_and_neither_is_lost(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    document, parts = window.document, window.actions_by_key["parts"]
+    dialog = dialog_of(qtbot, window)
+    dialog.tolerated.setValue(1.5)
+    parts.trigger()
+    (named,) = (d for d in window.findChildren(BodyPartsDialog) if d.isVisible())
+    assert dialog.apply.isEnabled()
+    document.edit_parts(PartEdits({0: "knee"}, {}))
+    assert not any(held.isEnabled() for held in (dialog.apply, named.save, parts))
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert parts.isEnabled()
+    dialog.tolerated.setValue(1.5)
+    QTest.mouseClick(dialog.apply, LEFT)
+    assert not any(held.isEnabled() for held in (dialog.apply, parts))
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert document.model.domain_names[0] == "knee" != body.domain_names[0]
+    assert document.model.rules.tolerated_depth == 0.015
+    dialog.close()
