@@ -210,7 +210,7 @@ class MainWindow(QMainWindow):
             return
         dialog = FailureDialog(failure, self)
         dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
-        dialog.open()
+        dialog.show()
 
     def set_theme(self, choice: str) -> None:
         """Apply a theme: "system", "light" or "dark"."""

@@ -54,7 +54,7 @@ class ViewActions(QObject):
             "reset_camera": viewport.show_whole,
         }
         shading = Shading[settings["shading"].upper()]
-        self.shadings = make_choices(SHADINGS, shading, viewport.set_shading, window)
+        self.shadings = make_choices(SHADINGS, shading, self._choose_shading, window)
         self.cameras = make_choices(CAMERA_ACTIONS, None, viewport.set_camera, window)
         self.shading_menu = make_menu("C&olour by", self.shadings, window)
         self.camera_menu = make_menu("&Camera view", self.cameras, window)
@@ -81,8 +81,12 @@ class ViewActions(QObject):
             self._ghost.setChecked(self._document.ghost_shown)
         self._settings["show_ghost"] = self._document.ghost_shown
 
+    def _choose_shading(self, shading: Shading) -> None:
+        """Colour the body as the user wants it, also the next time."""
+        self._settings["shading"] = shading.name.lower()
+        self._viewport.set_shading(shading)
+
     @Slot(object)
     def _on_shading(self, shading: Shading) -> None:
         for action in self.shadings:
             action.setChecked(action.data() is shading)
-        self._settings["shading"] = shading.name.lower()

@@ -645,7 +645,11 @@ def test_a_failure_says_what_happened_and_below_it_what_to_do(window: MainWindow
     first, second = failures(window)
     assert first.what.text() == "a; b.obj was truncated, expected 9, got 4"
     assert first.advice.text() == "Copy it again."
-    assert (second.what.text(), second.advice.text()) == ("Nothing to do", "Nothing was changed.")
+    assert second.what.text() == "Nothing to do"
+    # Nobody knows whether something was changed.
+    assert not second.advice.isVisible()
+    assert not first.isModal()
+    assert not second.isModal()
 
 
 def test_a_failure_is_told_once_while_its_dialog_is_open(window: MainWindow) -> None:

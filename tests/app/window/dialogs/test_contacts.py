@@ -54,8 +54,11 @@ def test_rules_are_applied_counted_and_tinted(
 ) -> None:
     document, viewport = window.document, window.viewport
     viewport.set_shading(Shading.DOMAINS)
+    remembered = window.settings["shading"]
     dialog = dialog_of(qtbot, window)
     assert viewport.shading is Shading.EXACT
+    # It is what the dialog shows, not what the user has chosen.
+    assert window.settings["shading"] == remembered != "exact"
     pairs = contacts_at_rest(body, no_progress, CancelToken()).n_counted
     assert pairs > 0
     assert dialog.total.text().startswith(f"At rest 0 pairs not counted, {pairs} pairs counted.")
