@@ -12,7 +12,7 @@ import pytest
 
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.meshes import RigidTransform
-from lcollision_core.model import PosableBody, RigModel, open_body, sample_poses
+from lcollision_core.model import PosableBody, RigModel, open_body, propose_rules, sample_poses
 from lcollision_core.model.pose_file import NamedPose, read_poses, write_poses
 from lcollision_core.posing import DragOptions, Pin, Twist, make_grip
 from lcollision_core.resolve import PoseResolver, ResolveOptions, Step
@@ -199,6 +199,11 @@ def test_colliding_poses_of_a_real_character_are_resolved(characters: Path, name
     assert isinstance(body, RigModel)
     n_poses = int(os.environ.get("LCOLLISION_POSES", "1"))
     assert_resolved(body, sample_poses(body, n_poses, seed=1, colliding=True))
+    proposed = propose_rules(body)
+    assert (proposed is not None) == (name == "xbot")
+    if proposed is not None:
+        other = body.with_rules(proposed.rules)
+        assert_resolved(other, sample_poses(other, n_poses, seed=1, colliding=True))
 
 
 def test_a_motion_is_resolved_frame_by_frame(model: RigModel) -> None:
