@@ -395,6 +395,7 @@ def test_a_double_click_far_from_the_handle_resets_in_one_step(
     assert document.latent[1] == 0.25
     # One that takes nothing back leaves the steps before.
     QTest.mouseDClick(slider, Qt.MouseButton.RightButton, pos=far)
+    QTest.mouseRelease(slider, Qt.MouseButton.RightButton, pos=far)
     assert document.latent[1] == 0.25
     rest(qtbot, window)
 
