@@ -113,7 +113,9 @@ def resolve(
     n_poses: Annotated[
         int, typer.Option("-n", min=1, max=100_000, metavar="N", help="Colliding poses.")
     ] = 100,
-    metric: Annotated[str, typer.Option(metavar="eye|latent", help="What is kept small.")] = "eye",
+    metric: Annotated[
+        str, typer.Option(metavar="eye|latent", help="Distance to minimise.")
+    ] = "eye",
     solvers: Annotated[
         list[str] | None,
         typer.Option("--solver", metavar="NAME", help="Only this; may be repeated."),

@@ -24,8 +24,8 @@ NearExclusionOption = Annotated[
         min=0.0,
         max=1.0,
         metavar="X",
-        help="Count pairs within X body sizes along the surface separately. Default: what the "
-        "pose set says, else 0.",
+        help="Count pairs within X body sizes along the surface separately. Default: what its "
+        "own rules say, else 0.",
     ),
 ]
 RestExclusionOption = Annotated[

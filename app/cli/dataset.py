@@ -241,7 +241,9 @@ def make(
 def _require_only_body(sources: list[str], **options: object) -> None:
     if len(sources) > 1:
         raise LCollisionError(
-            f"{sources[0]} is made alone", "name nothing else", got=", ".join(sources)
+            f"{sources[0]} can't be combined with other sources",
+            "name it alone",
+            got=", ".join(sources),
         )
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
     if given:

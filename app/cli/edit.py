@@ -21,7 +21,7 @@ def edit(
     ] = None,
     model_name: Annotated[
         str | None,
-        typer.Option("--model", metavar="M", help="A model file, or the name of a model."),
+        typer.Option("--model", metavar="M", help="A model or a character: its file, or a name."),
     ] = None,
 ) -> None:
     """Open the editor."""

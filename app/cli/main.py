@@ -129,7 +129,7 @@ def _global_options(
     context: typer.Context,
     version: Annotated[  # noqa: ARG001 - its eager callback acts
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Say the version."),
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
     ] = False,
 ) -> None:
     tell_what_takes_time()

@@ -24,7 +24,8 @@ _ERRORS = ("level1_mean", "mean", "max", "held_out_mean", "held_out_max", "pca_h
 _MASKS = ("connected_share", "domains_per_vertex")
 
 ModelArgument = Annotated[
-    str, typer.Argument(metavar="M", help="A model file, or the name of a model.")
+    str,
+    typer.Argument(metavar="M", help="The file of a model or a character, or a model's name."),
 ]
 
 

@@ -148,7 +148,7 @@ def _print(card: LearnedCard) -> None:
         f"{card.poses} poses in {spent_text(sum(card.seconds.values()))}"
     )
     tell(
-        f"  poses come back to {100.0 * card.error_mean:.2f} % of the body size, at most "
+        f"  reconstruction error {100.0 * card.error_mean:.2f} % of the body size, at most "
         f"{100.0 * card.error_max:.2f} %"
     )
     rates = (

@@ -64,7 +64,7 @@ def resolve(
     ] = "sqp",
     metric: Annotated[
         str,
-        typer.Option(metavar="eye|latent", help="What is kept small: moves of vertices, or codes."),
+        typer.Option(metavar="eye|latent", help="Distance to minimise: of vertices, or of codes."),
     ] = "eye",
     threshold: Annotated[
         float,
@@ -97,10 +97,12 @@ def resolve(
     ] = False,
     time_budget: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="For each pose, then straight to the last step."),
+        typer.Option(
+            metavar="SECONDS", help="Search time per pose; then a known free pose is taken."
+        ),
     ] = None,
     workers: ThreadsOption = None,
-    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the solver's starts.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the solver's restarts.")] = 0,
     mesh_format: FormatOption = None,
     like: LikeOption = None,
     form: PoseFormOption = None,
@@ -378,7 +380,7 @@ def _stay_free(
                 stay_free = False
                 pairs = counted(n_pairs, "pair of faces collides", "pairs of faces collide")
                 note(
-                    f"{request.source}: as {file.path} holds it, {pairs} by rounding; --form mesh "
+                    f"{request.source}: in {file.path}, {pairs} after rounding; --form mesh "
                     f"holds the vertices that were checked"
                 )
     return stay_free

@@ -208,7 +208,7 @@ def predictor(
         if trained.metrics is not None:
             note(f"wrote {written}: {scores_sentence(trained.metrics)}")
             share = 100.0 * trained.facts.colliding_share
-            note(f"{measured_model_sentence(model)}; {share:.1f} % of its box collides")
+            note(f"{measured_model_sentence(model)}; {share:.1f} % of random poses collide")
 
 
 @contextmanager

@@ -185,7 +185,7 @@ def test_a_set_whose_up_axis_is_not_sure_asks_for_it(
     ("arguments", "sentence"),
     [
         (["body", "--clip", "wave"], "--clip is for files, not for body"),
-        (["body", "body-jump"], "body is made alone, got body, body-jump"),
+        (["body", "body-jump"], "body can't be combined with other sources, got body, body-jump"),
         (["body", "--by-rig", "5"], "--by-rig is for files, not for body"),
         (["arm.glb", "--vertices", "600"], "--vertices is for the built-in body"),
         (["arm.glb", "--seed", "1"], "--seed is for the built-in body and for poses by the rig"),

@@ -231,7 +231,7 @@ def test_resolve_frees_a_character_in_its_own_file(
     if form == "mesh":
         assert is_free
     elif not is_free:
-        assert "by rounding; --form mesh holds the vertices that were checked" in done.stderr
+        assert "after rounding; --form mesh holds the vertices that were checked" in done.stderr
 
 
 def _joined(path: Path) -> np.ndarray:

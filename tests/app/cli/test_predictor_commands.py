@@ -210,7 +210,7 @@ def test_a_killed_training_goes_on_to_the_same_model(
     assert wrote.startswith(f"lcollision: wrote {whole}: ")
     share = 100.0 * LabelStore.open(store).load(600).colliding.mean()
     sizes = "|Z_0| = 2, |Z_k| = 3 for 2 domains, no near exclusion"
-    assert measured == f"lcollision: {sizes}; {share:.1f} % of its box collides"
+    assert measured == f"lcollision: {sizes}; {share:.1f} % of random poses collide"
     assert not checkpoint.exists()
     assert killed.read_bytes() == whole.read_bytes()
 
