@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import shiboken6
 from PySide6.QtCore import QEvent, QPointF, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import (
     QContextMenuEvent,
@@ -181,6 +183,15 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         del self._vtk_interactor
         self._before_paint = lambda: None
         self.close()
+
+    def initializeGL(self) -> None:  # noqa: N802 - Qt's name
+        """Let PySide forget the surface of the context when Qt deletes both.
+
+        It counts as a part of the widget, and would pass for what takes its place in memory.
+        """
+        super().initializeGL()
+        context = self.context()
+        context.aboutToBeDestroyed.connect(partial(shiboken6.invalidate, context.surface()))
 
     def paintGL(self) -> None:  # noqa: N802 - Qt's name
         """Bring the scene up to date and draw it."""

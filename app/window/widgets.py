@@ -12,6 +12,7 @@ from PySide6.QtCore import (
     QObject,
     QPoint,
     QPointF,
+    QRect,
     QRectF,
     QSignalBlocker,
     QSize,
@@ -25,6 +26,7 @@ from PySide6.QtGui import (
     QDragEnterEvent,
     QDropEvent,
     QEnterEvent,
+    QGuiApplication,
     QIcon,
     QKeyEvent,
     QMouseEvent,
@@ -472,6 +474,16 @@ class Slider(QSlider):
     def _value_at(self, x: float) -> int:
         fraction = (x - HANDLE) / max(self.width() - 2 * HANDLE, 1.0)
         return self.minimum() + round(fraction * (self.maximum() - self.minimum()))
+
+
+def screen_of(window: QWidget) -> QRect:
+    """Return the part of a window's screen that windows may cover.
+
+    Not from `QWidget.screen`: PySide counts the screen, which is the application's, as a part of
+    the widget that it asks, and may delete it with that.
+    """
+    screen = QGuiApplication.screenAt(window.frameGeometry().center())
+    return (screen or QGuiApplication.primaryScreen()).availableGeometry()
 
 
 def wheel_if_focused(widget: QWidget, event: QWheelEvent, handle: object) -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPoint, QPointF
-from PySide6.QtGui import (
-    QImage,
-)
+from PySide6.QtGui import QGuiApplication, QImage
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
@@ -45,7 +43,7 @@ def pixels(viewport: Viewport) -> npt.NDArray[np.int64]:
     """Return what the screen shows of the viewport, (SIDE, SIDE, 3)."""
     # Qt hands the picture to the screen after it is drawn.
     QTest.qWait(30)
-    image = viewport.screen().grabWindow(viewport.winId()).toImage()
+    image = QGuiApplication.primaryScreen().grabWindow(viewport.winId()).toImage()
     image = image.convertToFormat(QImage.Format.Format_RGB888)
     rows = np.frombuffer(image.constBits(), dtype=np.uint8).reshape(image.height(), -1)
     return rows[:, : 3 * image.width()].reshape(image.height(), image.width(), 3).astype(int)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import PySide6
 from PySide6.QtCore import QEvent, QMimeData, QPoint, QPointF, QRect, QSettings, Qt, QTimer, QUrl
-from PySide6.QtGui import QDragEnterEvent, QDropEvent, QMouseEvent
+from PySide6.QtGui import QDragEnterEvent, QDropEvent, QGuiApplication, QMouseEvent
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialog, QDockWidget, QWidget
 from pytestqt.qtbot import QtBot
@@ -189,6 +189,7 @@ def take_picture(window: QWidget, name: str) -> None:
     QApplication.processEvents()
     SHOTS.mkdir(parents=True, exist_ok=True)
     corner = window.mapToGlobal(QPoint(0, 0))
-    picture = window.screen().grabWindow(0, corner.x(), corner.y(), window.width(), window.height())
+    area = QRect(corner, window.size())
+    picture = QGuiApplication.primaryScreen().grabWindow(0, *area.getRect())
     assert not picture.isNull()
     assert picture.save(str(SHOTS / f"{name}.png"))

@@ -22,7 +22,7 @@ from app.view.icons import program_icon
 from app.view.theme import CLOSE, NORMAL, WIDE
 from app.window.actions import ACTIONS
 from app.window.dialogs.questions import message_box, widen
-from app.window.widgets import dialog_vbox, labelled, scrolling
+from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling
 
 if TYPE_CHECKING:
     from lcollision_core.model import PosableBody
@@ -98,7 +98,7 @@ class ShortcutsDialog(QDialog):
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle("Keyboard and mouse")
-        self.resize(560, min(620, self.screen().availableSize().height() - _TITLE_BAR))
+        self.resize(560, min(620, screen_of(parent or self).height() - _TITLE_BAR))
         page = QWidget()
         form = QFormLayout(page, horizontalSpacing=WIDE * 2, verticalSpacing=CLOSE - 2)
         form.setContentsMargins(0, 0, NORMAL, 0)

@@ -21,7 +21,17 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.dialogs.questions import ask_to_discard
-from app.window.widgets import SWATCH, Card, Sign, dialog_vbox, hbox, labelled, swatch, vbox
+from app.window.widgets import (
+    SWATCH,
+    Card,
+    Sign,
+    dialog_vbox,
+    hbox,
+    labelled,
+    screen_of,
+    swatch,
+    vbox,
+)
 from app.wording import (
     counted,
     duration_text,
@@ -251,7 +261,7 @@ class LearningDialog(QDialog):
         self._column.activate()
         width = max(_WIDTH, self.sizeHint().width())
         self.resize(width, max(self.sizeHint().height(), self._column.totalHeightForWidth(width)))
-        screen, frame = self.screen().availableGeometry(), self.frameGeometry()
+        screen, frame = screen_of(self), self.frameGeometry()
         left = min(frame.x(), screen.right() + 1 - frame.width())
         top = min(frame.y(), screen.bottom() + 1 - frame.height())
         if self.isVisible() and (left, top) != (frame.x(), frame.y()):

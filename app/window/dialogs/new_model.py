@@ -20,7 +20,7 @@ from app.window.dialogs.new_model_pages import (
     PosesPage,
     QualityPage,
 )
-from app.window.widgets import FileDrops, dialog_vbox, hbox, labelled, scrolling, vbox
+from app.window.widgets import FileDrops, dialog_vbox, hbox, labelled, screen_of, scrolling, vbox
 from app.wording import counted, one_line, with_capital
 from app.work import learning_jobs
 
@@ -68,7 +68,7 @@ class NewModelDialog(QDialog):
         super().__init__(parent)
         self.setWindowTitle("New model")
         FileDrops(self).dropped.connect(self.add)
-        self.resize(_SIZE.boundedTo(self.screen().availableSize() - _MARGIN))
+        self.resize(_SIZE.boundedTo(screen_of(parent).size() - _MARGIN))
         self._work, self._settings = work, settings
         self._reading = 0
         self._summary: SourcesSummary | None = None

@@ -6,6 +6,7 @@ from PySide6.QtCore import QEvent, QPoint, QRect, QTimer, Slot
 from PySide6.QtWidgets import QDockWidget, QMainWindow, QWidget
 
 from app.view.theme import CLOSE
+from app.window.widgets import screen_of
 
 
 class Panel(QDockWidget):
@@ -48,7 +49,7 @@ class Panel(QDockWidget):
         view = self._window.centralWidget()
         if view is None or not (self.isFloating() and self.isVisible()):
             return
-        screen = self._window.screen().availableGeometry()
+        screen = screen_of(self._window)
         # The body stands in the middle of the view.
         body = QRect(0, 0, view.width() // 2, view.height())
         body.moveCenter(QRect(view.mapToGlobal(QPoint(0, 0)), view.size()).center())

@@ -572,3 +572,20 @@ def test_pairs_that_do_not_count_have_a_colour_of_their_own(
     viewport.set_shading(Shading.PLAIN)
     rest(qtbot, viewport)
     assert scene.uncounted.n_faces == 0
+
+
+def test_nothing_stands_for_the_surface_of_a_context_that_is_gone(
+    qtbot: QtBot, document: PoseDocument
+) -> None:
+    viewport = Viewport(document)
+    viewport.show()
+    rest(qtbot, viewport)
+    assert viewport.canvas is not None
+    context = viewport.canvas.context()
+    surface = context.surface()
+    held = []
+    context.aboutToBeDestroyed.connect(lambda: held.append(isValid(surface)))
+    assert isValid(surface)
+    dispose(viewport)
+    # It was forgotten before Qt deleted it.
+    assert held == [False]

@@ -25,6 +25,7 @@ from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.forms import resolve_form, screenshot_form, turntable_form
 from app.window.main_window import MainWindow
 from app.window.panels.dock import beside
+from app.window.widgets import screen_of
 from app.work.threads import Failure
 from tests.app.windows import close_window, open_window, rest, settings_in, settle_layout
 
@@ -111,7 +112,7 @@ def test_what_a_narrow_tool_bar_leaves_out_is_behind_its_arrow(
 def test_dialogs_fit_800_by_600(
     small: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(QScreen, "availableSize", lambda _: SMALL)
+    monkeypatch.setattr(QScreen, "availableGeometry", lambda _: QRect(QPoint(), SMALL))
     settings = settings_in(tmp_path)
     dialog: QDialog
     if kind in ("shortcuts", "about"):
@@ -169,7 +170,7 @@ def test_a_panel_floats_beside_the_window(
         QTest.mouseClick(button, Qt.MouseButton.LeftButton)
         qtbot.waitUntil(dock.isFloating)
         qtbot.waitUntil(lambda dock=dock: not overlaps(dock, held))
-        assert held.screen().availableGeometry().contains(dock.frameGeometry())
+        assert screen_of(held).contains(dock.frameGeometry())
         dock.setFloating(False)
         rest(qtbot, held)
     close_window(held)
