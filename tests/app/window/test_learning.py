@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PySide6.QtCore import QSize, Qt
+from PySide6.QtCore import QPoint, QRect, QSize, Qt
 from PySide6.QtGui import QScreen
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QLabel
@@ -363,7 +363,7 @@ def test_the_pages_fit_800_by_600(
     theme: Theme,
 ) -> None:
     apply_theme(QApplication.instance(), theme)
-    monkeypatch.setattr(QScreen, "availableSize", lambda _: SMALL)
+    monkeypatch.setattr(QScreen, "availableGeometry", lambda _: QRect(QPoint(), SMALL))
     watching.learning.new_model((tubes,))
     wizard = wizard_of(qtbot, watching)
     qtbot.waitUntil(lambda: wizard.preview.has_body, timeout=PATIENCE)
