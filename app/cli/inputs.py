@@ -83,10 +83,10 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
 
 def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
     """Give the frames of a rigged character the contact rules by which it is posed as well."""
-    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin
+    from lcollision_core.meshes.scene_files import is_character
     from lcollision_core.model import open_body
 
-    if path.suffix.lower() not in SCENE_SUFFIXES or not has_skin(path):
+    if not is_character(path):
         return poses
     body = open_body(path)
     return replace(poses, rules=body.rules, groups=body.groups)

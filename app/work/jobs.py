@@ -153,9 +153,9 @@ def _drag_once(model: PosableBody) -> None:
 
 def is_character(path: Path, _: Progress, __: CancelToken) -> bool:
     """Whether a file shows something that joints move, so that it opens as a body."""
-    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin
+    from lcollision_core.meshes.scene_files import is_character
 
-    return path.suffix.lower() in SCENE_SUFFIXES and has_skin(path)
+    return is_character(path)
 
 
 def prepare(model: PosableBody, _: Progress, __: CancelToken) -> PosableBody:

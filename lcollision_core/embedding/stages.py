@@ -35,6 +35,7 @@ from lcollision_core.embedding.seeding import (
     radius_of_overlap,
     vertex_areas,
 )
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
 
 _LOCALITY_START = 0.25
@@ -77,9 +78,7 @@ class BilevelTrainer:
         self._centred = centre_features(features, self._scaling, self._mean)
         self._ring = ring_average(self._topology)
         self._unscaling = build_decoder((), self._scaling, self._mean, self._topology)
-        self._sample = np.unique(
-            np.linspace(0, len(features) - 1, _SAMPLED_POSES).round().astype(np.int64)
-        )
+        self._sample = evenly_spaced(len(features), _SAMPLED_POSES)
 
     def train(self) -> Embedding:
         """Run both stages, or what is left of them; the codes are still the encoders' own.

@@ -14,6 +14,7 @@ from lcollision_core.contact.rules import near_pairs_estimate
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.learning.request import LearningRequest
 from lcollision_core.meshes import PoseSet, body_size, groups_by_kind, named_pair, with_named_groups
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
 
 _NEAR_EXCLUSIONS = (0.0, 0.02, 0.05, 0.1)
 """Normalised lengths that are tried on poses without a rig, the shortest first."""
@@ -54,7 +55,7 @@ def with_proposed_rules(
     rules = replace(poses.rules, rest_exclusion=rest, tolerated_depth=depth)
     if request.ignored == ():
         rules = replace(rules, ignored=())
-    chosen = np.unique(np.linspace(0, len(poses) - 1, _MOST_POSES).round().astype(int))
+    chosen = evenly_spaced(len(poses), _MOST_POSES)
     asked = poses.vertices[chosen]
     if request.near_exclusion is not None:
         rules = replace(rules, near_exclusion=request.near_exclusion)

@@ -12,7 +12,7 @@ from lcollision_core.characters import read_character
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, is_character
 from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
 from lcollision_core.model.known_characters import with_remembered
 
@@ -121,4 +121,4 @@ def gather_poses(
 
 def _has_rig(path: Path) -> bool:
     """Whether it is a file of a rigged character; what is missing is refused when it is read."""
-    return path.suffix.lower() in SCENE_SUFFIXES and path.is_file() and has_skin(path)
+    return path.is_file() and is_character(path)

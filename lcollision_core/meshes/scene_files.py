@@ -48,6 +48,11 @@ def has_skin(path: str | os.PathLike[str]) -> bool:
         return fbx.has_skin(file) if _is_fbx(path) else gltf.has_skin(file, Path(path))
 
 
+def is_character(path: str | os.PathLike[str]) -> bool:
+    """Whether a file of any kind shows something that joints move; see `has_skin`."""
+    return Path(path).suffix.lower() in SCENE_SUFFIXES and has_skin(path)
+
+
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     suffix = Path(path).suffix.lower()

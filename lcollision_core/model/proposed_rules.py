@@ -17,6 +17,7 @@ from lcollision_core.contact import (
 )
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import ContactRules
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.model.posable_body import PosableBody
 
 _MOST_POSES, _FEWEST_POSES = 40, 8
@@ -43,8 +44,7 @@ class ProposedRules:
 def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
     """Return (n, V, 3) poses of a body: some that it came with, or random ones of a bare rig."""
     latent = body.training_latent
-    chosen = np.unique(np.linspace(0, len(latent) - 1, _MOST_POSES).round().astype(int))
-    latent = latent[chosen].astype(np.float64)
+    latent = latent[evenly_spaced(len(latent), _MOST_POSES)].astype(np.float64)
     if len(latent) < _FEWEST_POSES and not body.is_trained:
         drawn = body.sample(_MOST_POSES, np.random.default_rng(0))
         latent = np.concatenate([latent, drawn])

@@ -19,6 +19,7 @@ from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import ContactRules, RigidTransform, part_groups
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect
 from lcollision_core.model.colours import domain_colours
@@ -196,9 +197,7 @@ class RigModel(PosableBody):
     @cached_property
     def free_latent(self) -> FloatArray:
         """(F, D) collision-free poses that the character came with, read-only."""
-        count = len(self.training_latent)
-        chosen = np.unique(np.linspace(0, count - 1, _MOST_FREE).round().astype(int))
-        poses = self.training_latent[chosen]
+        poses = self.training_latent[evenly_spaced(len(self.training_latent), _MOST_FREE)]
         return read_only(poses[self.exact_check().are_free(poses)])
 
     @cached_property

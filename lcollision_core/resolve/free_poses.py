@@ -7,6 +7,7 @@ from itertools import chain
 import numpy as np
 
 from lcollision_core.embedding import Embedding
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import ExactCheck
 
@@ -35,7 +36,7 @@ def find_free_poses(embedding: Embedding, check: ExactCheck) -> FloatArray:
         some thousand poses is free.
     """
     training = embedding.training_latent.astype(np.float64)
-    chosen = np.unique(np.linspace(0, len(training) - 1, MOST_POSES - 1).round().astype(int))
+    chosen = evenly_spaced(len(training), MOST_POSES - 1)
     sources = chain(
         [np.concatenate([np.zeros((1, embedding.latent_size)), training[chosen]])],
         (factor * training[chosen] for factor in _SHRINKINGS),
