@@ -89,7 +89,7 @@ class ContactsDialog(QDialog):
         self.total = self._note(_COUNTING)
         self._tint = QLabel(with_swatch(_TINT, UNCOUNTED_FACE))
         self._tint.setObjectName("caption")
-        self.kept = labelled("", "caption", wraps=True)
+        self.kept = self._note("")
         self._lay_out()
         self.at_rest.toggled.connect(self._on_edited)
         for field in (self.near, self.rest, self.tolerated):
@@ -138,10 +138,15 @@ class ContactsDialog(QDialog):
         return vbox(hbox(title, None, self.counts[name], field), self._note(why), spacing=TIGHT)
 
     def _note(self, text: str) -> QLabel:
-        note = labelled(text, "caption", wraps=True)
-        # A box asks for one line of it, however narrow.
-        note.setMinimumHeight(note.heightForWidth(_WIDTH - 2 * _BORDER))
+        note = labelled("", "caption", wraps=True)
+        self._write(note, text)
         return note
+
+    def _write(self, note: QLabel, text: str) -> None:
+        """Put a text into a note, and leave space for it."""
+        note.setText(text)
+        # A box asks for one line of it, however narrow.
+        note.setMinimumHeight(max(0, note.heightForWidth(_WIDTH - 2 * _BORDER)))
 
     def _ignored_part(self) -> QWidget:
         """Return the list of ignored pairs, with what adds to it and takes from it."""
@@ -229,13 +234,12 @@ class ContactsDialog(QDialog):
             box.addItems(names)
         self.second.setCurrentIndex(min(1, len(names) - 1))
         kept = self._where_kept()
-        self.kept.setText(kept)
-        self.kept.setMinimumHeight(self.kept.heightForWidth(_WIDTH - 2 * _BORDER))
+        self._write(self.kept, kept)
         self.kept.setVisible(bool(kept))
         self.restore.setVisible(not model.is_trained)
         for label in self.counts.values():
             label.setText("…")
-        self.total.setText(_COUNTING)
+        self._write(self.total, _COUNTING)
         self._document.count_contacts()
         self._on_edited()
 
@@ -248,7 +252,7 @@ class ContactsDialog(QDialog):
         said = f"At rest {counted(found.excluded.total, 'pair')} not counted, {left} counted."
         if found.n_counted:
             said += " While pairs count at rest no pose is free: widen a rule."
-        self.total.setText(said)
+        self._write(self.total, said)
 
     @Slot()
     def _on_edited(self) -> None:
@@ -271,7 +275,7 @@ class ContactsDialog(QDialog):
         try:
             return self.rules() != self._document.model.rules
         except ShapeError as error:
-            self.total.setText(with_capital(str(error)))
+            self._write(self.total, with_capital(str(error)))
             return False
 
     @Slot()
@@ -305,7 +309,7 @@ class ContactsDialog(QDialog):
                 share = "all" if least == 1.0 else f"{int(100 * least)} % or more"
                 kind.setText(0, f"{kind.text(0)}: in {share} of the poses")
         if not any(proposals.values()):
-            self.total.setText("No two groups touch in nearly every pose.")
+            self._write(self.total, "No two groups touch in nearly every pose.")
 
     def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QTreeWidgetItem:
         """Return the item of a pair, which is listed now if it was not."""
