@@ -191,7 +191,7 @@ class CharacterFile:
             whole = read_shown(self.document)
             kept = character_parts(whole)
             self.scene = scene = with_parts(whole, kept)
-            self.patch = GltfPatch(data, path)
+            self.patch = GltfPatch(self.document, path)
             self.mesh = join_parts(scene)
             self.rest = self.mesh.posed(scene.rest)[0]
             if not (
@@ -217,8 +217,8 @@ class CharacterFile:
         """The normals that the file stores for the vertices of each part, (n, 3)."""
         found: list[FloatArray | None] = []
         for _, shown, _ in self.parts:
-            mesh = self.document.description.meshes[shown.mesh]
-            number = mesh.primitives[shown.primitive].attributes.NORMAL
+            mesh = self.document.objects("meshes")[shown.mesh]
+            number = mesh["primitives"][shown.primitive]["attributes"].get("NORMAL")
             what = f"the normals of mesh {shown.mesh}"
             found.append(
                 None
@@ -413,7 +413,7 @@ class _Source:
         meshes = [
             number
             for number, mesh in enumerate(self.patch.description["meshes"])
-            if any("targets" in primitive for primitive in mesh["primitives"])
+            if any("targets" in primitive for primitive in mesh.get("primitives", ()))
         ]
         nodes = [number for number, node in enumerate(self._nodes) if node.get("mesh") in meshes]
         # VRM 0 names the mesh, VRM 1 its node.

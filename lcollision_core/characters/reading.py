@@ -40,6 +40,7 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
         mesh = join_parts(scene)
         rest = mesh.posed(scene.rest)[0]
         rig, notes = _rig(scene, mesh, rest)
+        lengths = {clip.name: float(np.ptp(clip.key_times)) for clip in scene.clips}
 
     def sample(clip: str, fps: float | None) -> ClipFrames:
         with one_sentence(path):
@@ -71,7 +72,7 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
         scene.metres,
         mesh.groups,
         rig,
-        {clip.name: float(np.ptp(clip.key_times)) for clip in scene.clips},
+        lengths,
         sample,
         mesh.notes + notes,
     )

@@ -10,6 +10,7 @@ import sys
 import threading
 import zipfile
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -188,7 +189,8 @@ def _clips(source: _FbxFile, held: dict[str, Any], parts: tuple[int, ...]) -> li
             )
         key_times = start + np.arange(int(n_steps) + 1) / fps
         moved = frozenset(held[f"moved {number}"].tolist())
-        clips.append(Clip(name, key_times, moved, _FbxClip(source, number, parts)))
+        sample = _FbxClip(source, number, parts)
+        clips.append(Clip(name, moved, partial(np.asarray, key_times), sample))
     return clips
 
 

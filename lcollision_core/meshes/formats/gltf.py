@@ -31,8 +31,8 @@ def read_scene(file: BinaryIO, path: Path) -> Scene:
 
 def has_skin(file: BinaryIO, path: Path) -> bool:
     """Whether a node of the file shows a mesh that a skin moves; for the rest as `read_scene`."""
-    nodes = GltfDocument(read_rest(file), path).description.nodes
-    return any(node.skin is not None and node.mesh is not None for node in nodes)
+    nodes = GltfDocument(read_rest(file), path).objects("nodes")
+    return any("skin" in node and "mesh" in node for node in nodes)
 
 
 def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:

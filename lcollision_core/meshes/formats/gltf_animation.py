@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.formats.gltf_document import GltfDocument, as_float, element, numbers
+from lcollision_core.json_values import quoted
+from lcollision_core.meshes.formats.gltf_document import (
+    GltfDocument,
+    as_float,
+    element,
+    numbers,
+    whole,
+)
 from lcollision_core.meshes.formats.scene import Clip, Part, ScenePoses
 from lcollision_core.meshes.formats.transforms import (
     compose,
@@ -74,35 +82,77 @@ class _Channel:
 
 @dataclass(frozen=True, eq=False)
 class _GltfClip:
-    """Samples an animation.
+    """Samples an animation, whose arrays are read when it is first asked.
 
     Attributes
     ----------
-    channels : at most one a node and property
-    stored : of each animated node its translation, rotation and scale where no channel drives them
+    document : the file
+    where : what a sentence calls the animation
+    driven : by node and property, the sampler and how many numbers it has for each key
     local : (n, 4, 4) array, the nodes as the file stores them
     parents, order : of the nodes
     part_nodes : of each part the node that shows it
     default_weights : of each part
     """
 
-    channels: tuple[_Channel, ...]
-    stored: dict[int, dict[str, FloatArray]]
+    document: GltfDocument
+    where: str
+    driven: dict[tuple[int, str], tuple[dict[str, Any], int]]
     local: FloatArray
     parents: npt.NDArray[np.int64]
     order: Sequence[int]
     part_nodes: tuple[int, ...]
     default_weights: tuple[FloatArray, ...]
 
+    @property
+    def moved(self) -> frozenset[int]:
+        """The nodes that it moves."""
+        return frozenset(node for node, path in self.driven if path != _WEIGHTS)
+
+    @cached_property
+    def _times(self) -> dict[int, FloatArray]:
+        """The (T,) times of the keys, by accessor: most channels share theirs."""
+        what = f"the times of {self.where}"
+        found: dict[int, FloatArray] = {}
+        for sampler, _ in self.driven.values():
+            last = len(self.document.objects("accessors")) - 1
+            index = whole(sampler.get("input"), f"the accessor of {what}", 0, last)
+            if index in found:
+                continue
+            times = as_float(self.document.array(index, what, ("SCALAR",))[:, 0])
+            if not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0.0).any():
+                raise MeshFileError.must_be(what, "finite and ascending", f"{len(times)} others")
+            found[index] = times
+        return found
+
+    def key_times(self) -> FloatArray:
+        """Return the (T,) times of all keys, ascending."""
+        return np.unique(np.concatenate(list(self._times.values())))
+
+    @cached_property
+    def _channels(self) -> tuple[_Channel, ...]:
+        return tuple(
+            _channel(
+                self.document, sampler, node, path, width, self._times[sampler["input"]], self.where
+            )
+            for (node, path), (sampler, width) in self.driven.items()
+        )
+
+    @cached_property
+    def _stored(self) -> dict[int, dict[str, FloatArray]]:
+        """Of each moved node its translation, rotation and scale as the file stores them."""
+        nodes = self.document.objects("nodes")
+        return {node: _stored(nodes[node], node) for node in self.moved}
+
     def __call__(self, times: FloatArray) -> ScenePoses:
         """Return the poses at (N,) times."""
         n = len(times)
         moved = {
             node: {path: np.tile(value, (n, 1)) for path, value in values.items()}
-            for node, values in self.stored.items()
+            for node, values in self._stored.items()
         }
         weights: dict[int, FloatArray] = {}
-        for channel in self.channels:
+        for channel in self._channels:
             if channel.path == _WEIGHTS:
                 weights[channel.node] = channel.at(times)
             else:
@@ -127,7 +177,7 @@ def read_clips(
     parts: Sequence[Part],
     default_weights: tuple[FloatArray, ...],
 ) -> tuple[Clip, ...]:
-    """Read the animations that move a node or weigh a morph target.
+    """Return the animations that move a node or weigh a morph target; their arrays are read later.
 
     Parameters
     ----------
@@ -139,11 +189,12 @@ def read_clips(
 
     Raises
     ------
-    MeshFileError : an animation is damaged.
+    MeshFileError : an animation names an unknown node or sampler. Arrays of a damaged animation
+        raise it when they are read.
     """
-    animations = document.description.animations
+    animations = document.objects("animations")
     names = numbered_where_equal(
-        str(one.name or f"animation {i}") for i, one in enumerate(animations)
+        str(one.get("name") or f"animation {i}") for i, one in enumerate(animations)
     )
     n_targets: dict[int, int] = {}
     for part in parts:
@@ -152,75 +203,73 @@ def read_clips(
     clips = []
     for name, animation in zip(names, animations, strict=True):
         where = f"animation {name!r}"
-        channels = _channels(document, animation, where, n_targets)
-        if not channels:
-            continue
-        stored = {
-            channel.node: _stored(document.description.nodes[channel.node], channel.node)
-            for channel in channels
-            if channel.path != _WEIGHTS
-        }
-        sample = _GltfClip(channels, stored, local, parents, order, part_nodes, default_weights)
-        key_times = np.unique(np.concatenate([channel.times for channel in channels]))
-        clips.append(Clip(name, key_times, frozenset(stored), sample))
+        driven = _driven(document, animation, where, n_targets)
+        if driven:
+            sample = _GltfClip(
+                document, where, driven, local, parents, order, part_nodes, default_weights
+            )
+            clips.append(Clip(name, sample.moved, sample.key_times, sample))
     return tuple(clips)
 
 
-def _stored(node: Any, number: int) -> dict[str, FloatArray]:
-    if node.matrix is not None:
-        stored = numbers(node.matrix, f"the matrix of node {number}", 16).reshape(4, 4).T
+def _stored(node: dict[str, Any], number: int) -> dict[str, FloatArray]:
+    if "matrix" in node:
+        stored = numbers(node["matrix"], f"the matrix of node {number}", 16).reshape(4, 4).T
         return dict(zip(_PATHS, decompose(stored), strict=True))
     return dict(zip(_PATHS, stored_transform(node, f"node {number}"), strict=True))
 
 
-def stored_transform(node: Any, where: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+def stored_transform(node: dict[str, Any], where: str) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the stored translation, rotation (x, y, z, w) and scale of a node."""
-    given = (node.translation, node.rotation, node.scale)
     absent = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [1.0, 1.0, 1.0])
     moved, turned, scaled = (
-        numbers(default if value is None else value, f"the {path} of {where}", len(default))
-        for value, default, path in zip(given, absent, _PATHS, strict=True)
+        numbers(node.get(path, default), f"the {path} of {where}", len(default))
+        for path, default in zip(_PATHS, absent, strict=True)
     )
     return moved, turned, scaled
 
 
-def _channels(
-    document: GltfDocument, animation: Any, where: str, n_targets: dict[int, int]
-) -> tuple[_Channel, ...]:
-    nodes = document.description.nodes
-    found: dict[tuple[int, str], _Channel] = {}
-    for channel in animation.channels or ():
-        target = channel.target
-        if target is None or target.node is None:
+def _driven(
+    document: GltfDocument, animation: dict[str, Any], where: str, n_targets: dict[int, int]
+) -> dict[tuple[int, str], tuple[dict[str, Any], int]]:
+    """Return `_GltfClip.driven`."""
+    nodes = document.objects("nodes")
+    found: dict[tuple[int, str], tuple[dict[str, Any], int]] = {}
+    for channel in animation.get("channels", ()):
+        target = channel.get("target", {})
+        if "node" not in target:
             continue  # Driven by an extension.
-        element(nodes, target.node, f"a node of {where}")
-        width = _PATHS.get(target.path, n_targets.get(target.node, 0))
-        if not width or (target.path not in _PATHS and target.path != _WEIGHTS):
-            continue  # Weights of nothing, or the property of an extension.
-        sampler = element(animation.samplers, channel.sampler, f"a sampler of {where}")
-        found[target.node, target.path] = _channel(
-            document, sampler, target.node, target.path, width, where
-        )
-    return tuple(found.values())
+        node, path = target["node"], target.get("path")
+        element(nodes, node, f"a node of {where}")
+        if path not in (*_PATHS, _WEIGHTS):
+            continue  # The property of an extension.
+        width = n_targets.get(node, 0) if path == _WEIGHTS else _PATHS[path]
+        if width:
+            samplers = animation.get("samplers")
+            sampler = element(samplers, channel.get("sampler"), f"a sampler of {where}")
+            found[node, path] = sampler, width
+    return found
 
 
 def _channel(
-    document: GltfDocument, sampler: Any, node: int, path: str, width: int, where: str
+    document: GltfDocument,
+    sampler: dict[str, Any],
+    node: int,
+    path: str,
+    width: int,
+    times: FloatArray,
+    where: str,
 ) -> _Channel:
-    interpolation = sampler.interpolation or "LINEAR"
+    interpolation = sampler.get("interpolation", "LINEAR")
     if interpolation not in ("STEP", "LINEAR", "CUBICSPLINE"):
         raise MeshFileError.must_be(
-            f"the interpolation of {where}", "STEP, LINEAR or CUBICSPLINE", interpolation
+            f"the interpolation of {where}", "STEP, LINEAR or CUBICSPLINE", quoted(interpolation)
         )
-    what = f"the times of {where}"
-    times = as_float(document.array(sampler.input, what, ("SCALAR",))[:, 0])
-    if not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0.0).any():
-        raise MeshFileError.must_be(what, "finite and ascending", f"{len(times)} others")
     what = f"the {path} values of {where}"
     types = {3: ("VEC3",), 4: ("VEC4",)}.get(width) if path in _PATHS else ("SCALAR",)
     per_key = 3 if interpolation == "CUBICSPLINE" else 1
     n_values = len(times) * per_key * (1 if path in _PATHS else width)
-    values = as_float(document.array(sampler.output, what, types or ("SCALAR",), n_values))
+    values = as_float(document.array(sampler.get("output"), what, types or ("SCALAR",), n_values))
     if not np.isfinite(values).all():
         raise MeshFileError("are not all finite", where=what)
     shape = (len(times), 3, width) if per_key == 3 else (len(times), width)

@@ -6,7 +6,7 @@ import base64
 import binascii
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
@@ -16,9 +16,6 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes.formats.polygons import MAX_FACES, MAX_FILE_BYTES
 from lcollision_core.regular_files import read_regular
-
-if TYPE_CHECKING:
-    from pygltflib import GLTF2
 
 MAX_NUMBERS = 1 << 27
 """The most numbers that are read of all arrays of a file together: 1 GiB as float64."""
@@ -33,10 +30,25 @@ _COMPRESSIONS = {
     "KHR_meshopt_compression": "meshopt",
 }
 
-_LISTS = (
-    *("accessors", "animations", "bufferViews", "buffers", "materials", "meshes", "nodes"),
-    *("scenes", "skins"),
-)
+_STRUCTURE: dict[str, Any] = {
+    "extensions": {},
+    "extensionsUsed": [str],
+    "extensionsRequired": [str],
+    "accessors": [{"sparse": {"indices": {}, "values": {}}}],
+    "animations": [{"channels": [{"target": {}}], "samplers": [{}]}],
+    "buffers": [{}],
+    "bufferViews": [{}],
+    "images": [{}],
+    "materials": [{}],
+    "meshes": [{"primitives": [{"attributes": {}, "targets": [{}]}], "weights": [float]}],
+    "nodes": [{"children": [int], "weights": [float], "extensions": {}}],
+    "scenes": [{"nodes": [int]}],
+    "skins": [{"joints": [int]}],
+}
+"""What is read of a description: objects by their keys, and lists of one kind."""
+
+_KINDS = {dict: "object", str: "text", int: "whole number", float: "number"}
+
 _FREE = ("extras", "extensions")
 """Keys whose values may be anything."""
 
@@ -56,8 +68,8 @@ class GltfDocument:
 
     Attributes
     ----------
-    description : of pygltflib; its values are those of the file, unchecked
-    node_weights : by the number of a node the weights of its morph targets, unchecked
+    description : the file's JSON, whose objects and lists are where glTF has them; single values
+        are unchecked, and a null is none
 
     Raises
     ------
@@ -66,25 +78,24 @@ class GltfDocument:
 
     def __init__(self, data: bytes, path: Path) -> None:
         # Before a mark the text would not begin with its brace.
-        text, self._blob = chunks(data.removeprefix(b"\xef\xbb\xbf"))
+        text, self._blob = _chunks(data.removeprefix(b"\xef\xbb\xbf"))
         self._path = path
         self._buffers: dict[int, bytes] = {}
         self._left = MAX_NUMBERS
-        self.description, values = _parsed(text)
-        # pygltflib leaves out the weights of nodes.
-        self.node_weights = {
-            number: node["weights"]
-            for number, node in enumerate(values.get("nodes") or ())
-            if node.get("weights") is not None
-        }
-        used = {*_texts(self.description.extensionsUsed)}
-        used |= {*_texts(self.description.extensionsRequired)}
+        self.description = _parsed(text)
+        used = {*self.description.get("extensionsUsed", ())}
+        used |= {*self.description.get("extensionsRequired", ())}
         for extension, name in _COMPRESSIONS.items():
             if extension in used:
                 raise MeshFileError(
                     f"its meshes are compressed by {name}, which is not read",
                     "export it without compression",
                 )
+
+    def objects(self, kind: str) -> list[dict[str, Any]]:
+        """Return a list of the description, such as "nodes"; empty where the file has none."""
+        found: list[dict[str, Any]] = self.description.get(kind, [])
+        return found
 
     def array(
         self, index: object, what: str, types: Sequence[str], count: int | None = None
@@ -106,55 +117,58 @@ class GltfDocument:
         ------
         MeshFileError : a number of the description is wrong, or points outside the data.
         """
-        accessor = element(self.description.accessors, index, f"accessor of {what}")
-        if accessor.type not in types:
-            raise MeshFileError.must_be(what, " or ".join(types), quoted(accessor.type))
-        n = whole(accessor.count, f"the count of {what}", 0, MAX_FACES * 3)
+        accessor = element(self.objects("accessors"), index, f"accessor of {what}")
+        kind: Any = accessor.get("type")
+        if kind not in types:
+            raise MeshFileError.must_be(what, " or ".join(types), quoted(kind))
+        n = whole(accessor.get("count"), f"the count of {what}", 0, MAX_FACES * 3)
         if count is not None and n != count:
             raise MeshFileError(f"have {n} values, {count} are needed", where=what)
-        dtype = _dtype(accessor.componentType, what)
-        width = _N_COMPONENTS[accessor.type]
+        dtype = _dtype(accessor.get("componentType"), what)
+        width = _N_COMPONENTS[kind]
         self._left -= n * width
         if self._left < 0:
             raise MeshFileError(
                 f"its arrays hold more than {MAX_NUMBERS} numbers", "decimate the meshes"
             )
-        if accessor.bufferView is None:
-            values = np.zeros((n, width), dtype)
+        if "bufferView" in accessor:
+            values = self._view(accessor, what, n, width, dtype)
         else:
-            values = self._view(accessor.bufferView, accessor.byteOffset, what, n, width, dtype)
-        if accessor.sparse is not None:
-            values = self._with_sparse(values.copy(), accessor.sparse, what)
-        if accessor.normalized and dtype.kind in "iu":
+            values = np.zeros((n, width), dtype)
+        if "sparse" in accessor:
+            values = self._with_sparse(values.copy(), accessor["sparse"], what)
+        if accessor.get("normalized") and dtype.kind in "iu":
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
         return values
 
-    def _with_sparse(self, values: npt.NDArray[Any], sparse: Any, what: str) -> npt.NDArray[Any]:
+    def _with_sparse(
+        self, values: npt.NDArray[Any], sparse: dict[str, Any], what: str
+    ) -> npt.NDArray[Any]:
         """Put the values that an accessor stores apart into their places."""
-        n = whole(sparse.count, f"the sparse count of {what}", 0, len(values))
-        if sparse.indices is None or sparse.values is None:
+        n = whole(sparse.get("count"), f"the sparse count of {what}", 0, len(values))
+        if not sparse.keys() >= {"indices", "values"}:
             raise MeshFileError("lack their sparse indices or values", where=what)
-        where, given = sparse.indices, sparse.values
-        dtype = _dtype(where.componentType, what)
-        places = self._view(where.bufferView, where.byteOffset, what, n, 1, dtype)[:, 0]
+        dtype = _dtype(sparse["indices"].get("componentType"), what)
+        places = self._view(sparse["indices"], what, n, 1, dtype)[:, 0]
         if n and not (dtype.kind == "u" and places.max() < len(values)):
             raise MeshFileError("are sparse at places that they do not have", where=what)
-        values[places] = self._view(
-            given.bufferView, given.byteOffset, what, n, values.shape[1], values.dtype
-        )
+        values[places] = self._view(sparse["values"], what, n, values.shape[1], values.dtype)
         return values
 
     def _view(
-        self, index: object, offset: object, what: str, n: int, width: int, dtype: np.dtype[Any]
+        self, stored: dict[str, Any], what: str, n: int, width: int, dtype: np.dtype[Any]
     ) -> npt.NDArray[Any]:
-        """Return (n, width) numbers of a buffer view, nothing copied."""
-        view = element(self.description.bufferViews, index, f"buffer view of {what}")
-        buffer = self._buffer(view.buffer, what)
-        start = whole(view.byteOffset or 0, f"the offset of {what}", 0, len(buffer))
-        length = whole(view.byteLength, f"the length of {what}", 0, len(buffer) - start)
-        inside = whole(offset or 0, f"the offset of {what}", 0, length)
+        """Return (n, width) numbers of the buffer view that an object names, nothing copied."""
+        view = element(
+            self.objects("bufferViews"), stored.get("bufferView"), f"buffer view of {what}"
+        )
+        buffer = self.buffer(view.get("buffer"), what)
+        start = whole(view.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
+        most = len(buffer) - start
+        length = whole(view.get("byteLength"), f"the length of {what}", 0, most)
+        inside = whole(stored.get("byteOffset", 0), f"the offset of {what}", 0, length)
         size = width * dtype.itemsize
-        stride = whole(view.byteStride or size, f"the stride of {what}", size, 1 << 16)
+        stride = whole(view.get("byteStride", size), f"the stride of {what}", size, 1 << 16)
         needed = (n - 1) * stride + size if n else 0
         if inside + needed > length:
             raise MeshFileError(
@@ -164,13 +178,25 @@ class GltfDocument:
         strides = (stride, dtype.itemsize)
         return np.ndarray((n, width), dtype, buffer if n else b"", at, strides)
 
-    def _buffer(self, index: object, what: str) -> bytes:
-        number = whole(index, f"the buffer of {what}", 0, len(self.description.buffers) - 1)
+    def buffer(self, index: object, what: str) -> bytes:
+        """Return the bytes of a buffer, which may be a file beside this one.
+
+        Parameters
+        ----------
+        index : its number in the file
+        what : what is in it, as in "the positions of mesh 3"
+
+        Raises
+        ------
+        MeshFileError : it is missing, too large, or not beside this file.
+        """
+        buffers = self.objects("buffers")
+        number = whole(index, f"the buffer of {what}", 0, len(buffers) - 1)
         if number not in self._buffers:
-            buffer = self.description.buffers[number]
-            if buffer.uri is not None:
+            buffer = buffers[number]
+            if "uri" in buffer:
                 held = sum(map(len, self._buffers.values()))
-                self._buffers[number] = resource(buffer.uri, self._path, MAX_FILE_BYTES - held)
+                self._buffers[number] = resource(buffer["uri"], self._path, MAX_FILE_BYTES - held)
             elif number == 0 and self._blob is not None:
                 self._buffers[number] = self._blob
             else:
@@ -216,11 +242,7 @@ def _dtype(code: object, what: str) -> np.dtype[Any]:
     return np.dtype(_DTYPES[code])
 
 
-def _texts(values: object) -> list[str]:
-    return [value for value in values if isinstance(value, str)] if isinstance(values, list) else []
-
-
-def chunks(data: bytes) -> tuple[bytes, bytes | None]:
+def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
     """Return the text and the binary part of a file."""
     if not data.startswith(_GLB_MAGIC):
         return data, None
@@ -237,37 +259,48 @@ def chunks(data: bytes) -> tuple[bytes, bytes | None]:
     return found[_JSON], found.get(_BINARY)
 
 
-def _parsed(text: bytes) -> tuple[GLTF2, dict[str, Any]]:
-    """Return the description, and the same as plain values."""
-    from pygltflib import GLTF2
-
+def _parsed(text: bytes) -> dict[str, Any]:
+    """Return a description with the structure of glTF."""
     try:
         values = parse_json(text)
-        if not isinstance(values, dict) or _has_empty_place(values):
-            raise ValueError("it is no object, or a list in it has an empty place")
-        description = GLTF2.gltf_from_json(text.decode("utf-8-sig"))
-    # On a damaged description pygltflib raises whatever its line at hand raises; nothing of ours
-    # runs here.
-    except Exception as error:
+    except ValueError as error:
         raise MeshFileError("it holds no readable glTF description") from error
-    for name in _LISTS:
-        if getattr(description, name) is None:
-            setattr(description, name, [])
-    return description, values
+    if b"null" in text:
+        _remove_nulls(values)
+    _require_kind(values, _STRUCTURE, "")
+    described: dict[str, Any] = values
+    return described
 
 
-def _has_empty_place(values: dict[str, Any]) -> bool:
-    """Whether a list of a document has a null in it; as a value of a key it says nothing."""
-    left: list[Any] = [values]
+def _remove_nulls(values: Any) -> None:
+    """Remove the keys of a description whose value is null: they say nothing."""
+    left = [values]
     while left:
         one = left.pop()
         if isinstance(one, dict):
-            left += [held for key, held in one.items() if key not in _FREE and held is not None]
+            for key in [key for key, held in one.items() if held is None]:
+                del one[key]
+            left += [held for key, held in one.items() if key not in _FREE]
         elif isinstance(one, list):
-            if None in one:
-                return True
-            left += [held for held in one if isinstance(held, dict | list)]
-    return False
+            left += one
+
+
+def _require_kind(value: Any, kind: Any, where: str) -> None:
+    """Refuse a value of a description that is of another kind than `_STRUCTURE` says."""
+    if isinstance(kind, list):
+        (each,) = kind
+        of = type(each) if isinstance(each, dict) else each
+        types = (int, float) if of is float else (of,)
+        if not isinstance(value, list) or not all(type(item) in types for item in value):
+            raise MeshFileError.must_be(where, f"a list of {_KINDS[of]}s", quoted(value))
+        for number, item in enumerate(value if isinstance(each, dict) and each else ()):
+            _require_kind(item, each, f"{where} {number}")
+        return
+    if not isinstance(value, dict):
+        raise MeshFileError.must_be(where or "its description", "an object", quoted(value))
+    for name, held in kind.items():
+        if name in value:
+            _require_kind(value[name], held, f"{name} of {where}" if where else name)
 
 
 def resource(uri: object, path: Path, most_bytes: int) -> bytes:

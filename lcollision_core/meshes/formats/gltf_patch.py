@@ -11,10 +11,11 @@ from typing import Any
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.json_values import parse_json, quoted
-from lcollision_core.meshes.formats.gltf_document import chunks, resource, whole
+from lcollision_core.json_values import quoted
+from lcollision_core.meshes.formats.gltf_document import GltfDocument, resource, whole
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 
+_CHANGED = ("nodes", "meshes", "scenes", "images", "extensions")
 _MOST_BYTES = (1 << 32) - 1
 _FLOAT = 5126
 _TYPES = ("SCALAR", "VEC2", "VEC3", "VEC4")
@@ -32,12 +33,13 @@ class GltfPatch:
 
     Parameters
     ----------
-    data : the file's bytes, which `GltfDocument` has read
-    path : where it is; buffers and images may lie beside it
+    document : the file
+    path : where it is; images may lie beside it
 
     Attributes
     ----------
-    description : the file's JSON, to be changed
+    description : the file's JSON, to be changed: its nodes, meshes, scenes and extensions in any
+        way, of its other lists only which objects are in them
     notes : sentences on what is not in the file
 
     Raises
@@ -45,27 +47,22 @@ class GltfPatch:
     MeshFileError : the file is damaged.
     """
 
-    def __init__(self, data: bytes, path: Path) -> None:
-        text, blob = chunks(data.removeprefix(b"\xef\xbb\xbf"))
-        self.description: dict[str, Any] = parse_json(text)
-        _require_structure(self.description)
+    def __init__(self, document: GltfDocument, path: Path) -> None:
+        self.description = _copied(document.description)
+        _require_complete(document)
         self._binary = bytearray()
-        starts = []
-        for number, buffer in enumerate(self.description.get("buffers", [])):
-            content = blob
-            if "uri" in buffer:
-                content = resource(buffer["uri"], path, MAX_FILE_BYTES - len(self._binary))
-            elif number or blob is None:
-                raise MeshFileError(f"it has no data for buffer {number}")
-            starts.append(self._append(content or b""))
-        for number, view in enumerate(self.description.get("bufferViews", [])):
-            what = f"the buffer of buffer view {number}"
-            start = starts[whole(view.get("buffer"), what, 0, len(starts) - 1)]
-            view["buffer"] = 0
-            if start:
-                view["byteOffset"] = view.get("byteOffset", 0) + start
+        starts = [
+            self._append(document.buffer(number, f"buffer {number}"))
+            for number in range(len(document.objects("buffers")))
+        ]
+        views = self.description.get("bufferViews", [])
+        for number, view in enumerate(views):
+            what = f"of buffer view {number}"
+            start = starts[whole(view.get("buffer"), f"the buffer {what}", 0, len(starts) - 1)]
+            offset = whole(view.get("byteOffset", 0), f"the offset {what}", 0, MAX_FILE_BYTES)
+            views[number] = {**view, "buffer": 0, "byteOffset": start + offset}
         if starts:
-            first = self.description["buffers"][0]
+            first = {**self.description["buffers"][0]}
             first.pop("uri", None)
             self.description["buffers"] = [first]
         self.notes: tuple[str, ...] = ()
@@ -75,7 +72,7 @@ class GltfPatch:
     def copy(self) -> GltfPatch:
         """Return the same, to be changed on its own."""
         other = copy(self)
-        other.description = deepcopy(self.description)
+        other.description = _copied(self.description)
         other._binary = self._binary.copy()
         return other
 
@@ -144,8 +141,8 @@ class GltfPatch:
         ------
         MeshFileError : it is larger than GLB files can be.
         """
-        buffers = self.description.setdefault("buffers", [{}])
-        buffers[0]["byteLength"] = len(self._binary)
+        first = self.description.get("buffers", [{}])[0]
+        self.description["buffers"] = [{**first, "byteLength": len(self._binary)}]
         text = json.dumps(self.description, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         size = 12 + 8 + len(text) + 8 + len(self._binary)
@@ -162,50 +159,27 @@ class GltfPatch:
         )
 
 
-_STRUCTURE: dict[str, dict[str, Any]] = {
-    "buffers": {},
-    "bufferViews": {},
-    "accessors": {},
-    "images": {},
-    "skins": {},
-    "scenes": {"nodes": int},
-    "nodes": {"children": int, "weights": float},
-    "meshes": {"weights": float, "primitives": {"targets": {}}},
-    "animations": {"channels": {}},
-}
-"""Lists that are changed, with what their objects' own lists hold: objects, or numbers."""
+def _copied(description: dict[str, Any]) -> dict[str, Any]:
+    """Copy a description as deeply as it is changed: most of a file may be its animations."""
+    return {
+        name: deepcopy(held) if name in _CHANGED else copy(held)
+        for name, held in description.items()
+    }
 
 
-def _require_structure(description: dict[str, Any]) -> None:
-    """Refuse lists that hold anything else: what reads the file passes over some that are changed.
+def _require_complete(document: GltfDocument) -> None:
+    """Refuse what reading passes over and writing needs.
 
     Raises
     ------
-    MeshFileError : one does.
+    MeshFileError : primitives without attributes, channels without target, or an unknown scene.
     """
-    _require_lists(description, _STRUCTURE, "the file")
-    whole(
-        description.get("scene", 0), "the scene", 0, max(len(description.get("scenes", ())) - 1, 0)
-    )
-    for number, mesh in enumerate(description.get("meshes", ())):
-        for primitive in mesh.get("primitives", ()):
-            if not isinstance(primitive.get("attributes"), dict):
-                raise MeshFileError.must_be(f"the attributes of mesh {number}", "an object", "none")
-    for number, animation in enumerate(description.get("animations", ())):
-        for channel in animation.get("channels", ()):
-            if not isinstance(channel.get("target"), dict):
-                raise MeshFileError.must_be(f"a target of animation {number}", "an object", "none")
-
-
-def _require_lists(held: dict[str, Any], lists: dict[str, Any], where: str) -> None:
-    for name, kind in lists.items():
-        if name not in held:
-            continue
-        what, items = f"{name} of {where}", held[name]
-        is_objects = isinstance(kind, dict)
-        types = (dict,) if is_objects else (int, float) if kind is float else (int,)
-        if not isinstance(items, list) or not all(type(item) in types for item in items):
-            expected = "a list of objects" if is_objects else "a list of numbers"
-            raise MeshFileError.must_be(what, expected, quoted(items))
-        for number, item in enumerate(items if is_objects else ()):
-            _require_lists(item, kind, f"{name} {number}")
+    for kind, one, held, name in (
+        ("meshes", "mesh", "primitives", "attributes"),
+        ("animations", "animation", "channels", "target"),
+    ):
+        for number, holder in enumerate(document.objects(kind)):
+            if not all(name in item for item in holder.get(held, ())):
+                raise MeshFileError(f"has {held} without {name}", where=f"{one} {number}")
+    last = max(len(document.objects("scenes")) - 1, 0)
+    whole(document.description.get("scene", 0), "the scene", 0, last)

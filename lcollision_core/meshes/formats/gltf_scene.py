@@ -49,15 +49,15 @@ def read_shown(document: GltfDocument) -> Scene:
     ------
     MeshFileError : the file is damaged, or shows no triangles.
     """
-    nodes = document.description.nodes
-    parents = _parents(document)
+    nodes = document.objects("nodes")
+    parents = _parents(nodes)
     order = parents_first(parents)
     local = _local_transforms(nodes)
     rest = global_transforms(local[None], parents, order)
     shown, notes = shown_primitives(document, parents)
     if not shown:
-        n_meshes = len(document.description.meshes)
-        if not n_meshes and document.description.animations:
+        n_meshes = len(document.objects("meshes"))
+        if not n_meshes and document.objects("animations"):
             raise MeshFileError(*NO_MESH)
         raise MeshFileError(f"it holds {n_meshes} meshes, none of which shows triangles")
     parts = tuple(_part(document, primitive, rest[0]) for primitive in shown)
@@ -67,7 +67,7 @@ def read_shown(document: GltfDocument) -> Scene:
     clips = read_clips(document, local, parents, order, parts, defaults)
     human = _human_bones(document)
     return Scene(
-        tuple(human.get(number, str(node.name or "")) for number, node in enumerate(nodes)),
+        tuple(human.get(number, str(node.get("name", ""))) for number, node in enumerate(nodes)),
         parents,
         ScenePoses(rest, tuple(weights[None] for weights in defaults)),
         parts,
@@ -87,26 +87,27 @@ def shown_primitives(
     They are in the order of the meshes, for each mesh of the nodes that show it, and for each node
     of its primitives: the order of a character's vertices.
     """
-    description = document.description
-    meshes = description.meshes
+    meshes = document.objects("meshes")
     visible = _visible(document, parents)
     showing = [
-        (whole(node.mesh, f"the mesh of node {i}", 0, len(meshes) - 1), i)
-        for i, node in enumerate(description.nodes)
-        if node.mesh is not None and i in visible
+        (whole(node["mesh"], f"the mesh of node {i}", 0, len(meshes) - 1), i)
+        for i, node in enumerate(document.objects("nodes"))
+        if "mesh" in node and i in visible
     ]
     shown: list[ShownPrimitive] = []
     n_vertices = n_others = 0
     for mesh, node in sorted(showing):
-        for number, primitive in enumerate(meshes[mesh].primitives or ()):
-            mode = _TRIANGLES if primitive.mode is None else primitive.mode
-            what = f"positions of mesh {mesh}"
-            position = getattr(primitive.attributes, "POSITION", None)
-            if mode not in (_TRIANGLES, _STRIP, _FAN) or position is None:
+        for number, primitive in enumerate(meshes[mesh].get("primitives", ())):
+            attributes = primitive.get("attributes", {})
+            is_shown = primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
+            if not is_shown or "POSITION" not in attributes:
                 n_others += 1
                 continue
-            count = element(description.accessors, position, f"the accessor of {what}").count
-            count = whole(count, f"the count of {what}", 0, MAX_FACES)
+            what = f"positions of mesh {mesh}"
+            accessor = element(
+                document.objects("accessors"), attributes["POSITION"], f"the accessor of {what}"
+            )
+            count = whole(accessor.get("count"), f"the count of {what}", 0, MAX_FACES)
             n_vertices += count
             require_plausible_count(n_vertices, "vertices")
             shown.append(ShownPrimitive(node, mesh, number, count))
@@ -122,7 +123,7 @@ def _human_bones(document: GltfDocument) -> dict[int, str]:
 
     By the extensions VRMC_vrm 1.0 and VRM 0.x; what they do not say as specified is left out.
     """
-    extensions = document.description.extensions or {}
+    extensions = document.description.get("extensions", {})
     for name in ("VRMC_vrm", "VRM"):
         humanoid = _member(extensions.get(name), "humanoid")
         held = _member(humanoid, "humanBones")
@@ -143,11 +144,10 @@ def _member(value: object, name: str) -> object:
     return value.get(name) if isinstance(value, dict) else None
 
 
-def _parents(document: GltfDocument) -> npt.NDArray[np.int64]:
-    nodes = document.description.nodes
+def _parents(nodes: list[dict[str, Any]]) -> npt.NDArray[np.int64]:
     parents = np.full(len(nodes), -1, dtype=np.int64)
     for number, node in enumerate(nodes):
-        for child in node.children or ():
+        for child in node.get("children", ()):
             index = whole(child, f"a child of node {number}", 0, len(nodes) - 1)
             if parents[index] >= 0:
                 raise MeshFileError(
@@ -159,12 +159,12 @@ def _parents(document: GltfDocument) -> npt.NDArray[np.int64]:
 
 def _visible(document: GltfDocument, parents: npt.NDArray[np.int64]) -> set[int]:
     """Return the nodes of the default scene; all where the file has no scene."""
-    description = document.description
-    if not description.scenes:
+    scenes = document.objects("scenes")
+    if not scenes:
         return set(range(len(parents)))
-    scene = element(description.scenes, description.scene or 0, "the scene")
-    n_nodes = len(parents)
-    roots = {whole(node, "a node of the scene", 0, n_nodes - 1) for node in scene.nodes or ()}
+    scene = element(scenes, document.description.get("scene", 0), "the scene")
+    last = len(parents) - 1
+    roots = {whole(node, "a node of the scene", 0, last) for node in scene.get("nodes", ())}
     found: set[int] = set()
     for node in parents_first(parents):
         if node in roots or parents[node] in found:
@@ -172,46 +172,46 @@ def _visible(document: GltfDocument, parents: npt.NDArray[np.int64]) -> set[int]
     return found
 
 
-def _local_transforms(nodes: list[Any]) -> FloatArray:
+def _local_transforms(nodes: list[dict[str, Any]]) -> FloatArray:
     local = np.tile(np.eye(4), (len(nodes), 1, 1))
     for number, node in enumerate(nodes):
         where = f"node {number}"
-        if node.matrix is not None:
+        if "matrix" in node:
             # Column by column.
-            local[number] = numbers(node.matrix, f"the matrix of {where}", 16).reshape(4, 4).T
+            local[number] = numbers(node["matrix"], f"the matrix of {where}", 16).reshape(4, 4).T
             local[number, 3] = 0.0, 0.0, 0.0, 1.0
-        elif (node.translation, node.rotation, node.scale) != (None, None, None):
+        elif not node.keys().isdisjoint(("translation", "rotation", "scale")):
             moved, turned, scaled = stored_transform(node, where)
             local[number] = compose(moved[None], turned[None], scaled[None])[0]
     return local
 
 
 def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Part:
-    description = document.description
-    mesh = description.meshes[shown.mesh]
-    primitive = mesh.primitives[shown.primitive]
-    node = description.nodes[shown.node]
+    mesh = document.objects("meshes")[shown.mesh]
+    primitive = mesh["primitives"][shown.primitive]
+    attributes = primitive["attributes"]
+    node = document.objects("nodes")[shown.node]
     where = f"mesh {shown.mesh}"
-    stored = document.array(primitive.attributes.POSITION, f"the positions of {where}", ("VEC3",))
+    stored = document.array(attributes["POSITION"], f"the positions of {where}", ("VEC3",))
     points = as_float(stored)
     n = len(points)
     bones, bind = np.array([shown.node]), np.eye(4)[None]
     bone_of, weights = np.zeros((n, 1), dtype=np.int32), np.ones((n, 1))
-    is_skinned = node.skin is not None and hasattr(primitive.attributes, "JOINTS_0")
-    is_skinned = is_skinned and primitive.attributes.JOINTS_0 is not None
+    is_skinned = "skin" in node and "JOINTS_0" in attributes
     if is_skinned:
-        bones, bind = _skin(document, node.skin)
-        bone_of, weights = _influences(document, primitive, where, n, len(bones))
+        bones, bind = _skin(document, node["skin"])
+        bone_of, weights = _influences(document, attributes, where, n, len(bones))
     faces = _faces(document, primitive, where, n)
     # Mirrored triangles are wound the other way.
     if is_mirrored(rest[bones] @ bind, bone_of, weights):
         faces = faces[:, [0, 2, 1]]
     materials: tuple[str, ...] = ()
-    if primitive.material is not None:
-        named = element(description.materials, primitive.material, "a material")
-        materials = (str(named.name or f"material {primitive.material}"),)
+    if "material" in primitive:
+        number = primitive["material"]
+        named = element(document.objects("materials"), number, "a material")
+        materials = (str(named.get("name") or f"material {number}"),)
     return Part(
-        str(mesh.name or node.name or where),
+        str(mesh.get("name") or node.get("name") or where),
         materials,
         np.zeros(len(faces), dtype=np.int64),
         shown.node,
@@ -228,20 +228,21 @@ def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Pa
 
 
 def _faces(
-    document: GltfDocument, primitive: Any, where: str, n_vertices: int
+    document: GltfDocument, primitive: dict[str, Any], where: str, n_vertices: int
 ) -> npt.NDArray[np.int64]:
     """Return the (F, 3) triangles of a primitive: a list, a strip or a fan."""
-    if primitive.indices is None:
+    if "indices" not in primitive:
         corners = np.arange(n_vertices)
     else:
-        stored = document.array(primitive.indices, f"the indices of {where}", ("SCALAR",))[:, 0]
+        stored = document.array(primitive["indices"], f"the indices of {where}", ("SCALAR",))[:, 0]
         if stored.dtype.kind != "u":
             raise MeshFileError.must_be(f"the indices of {where}", "whole numbers", stored.dtype)
         corners = stored.astype(np.int64)
     n = len(corners) - 2
-    if primitive.mode in (_STRIP, _FAN):
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode in (_STRIP, _FAN):
         step = np.arange(max(n, 0))
-        if primitive.mode == _FAN:
+        if mode == _FAN:
             picked = np.stack([step + 1, step + 2, np.zeros_like(step)], axis=1)
         else:
             # Every second triangle of a strip is wound the other way.
@@ -265,18 +266,17 @@ def _faces(
 
 
 def _skin(document: GltfDocument, index: object) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    description = document.description
-    skin = element(description.skins, index, "the skin")
-    n_nodes = len(description.nodes)
+    skin = element(document.objects("skins"), index, "the skin")
+    last = len(document.objects("nodes")) - 1
     what = f"a joint of skin {index}"
-    joints = [whole(joint, what, 0, n_nodes - 1) for joint in skin.joints or ()]
+    joints = [whole(joint, what, 0, last) for joint in skin.get("joints", ())]
     if not joints:
         raise MeshFileError("has no joints", where=f"skin {index}")
     bones = np.array(joints, dtype=np.int64)
-    if skin.inverseBindMatrices is None:
+    if "inverseBindMatrices" not in skin:
         return bones, np.tile(np.eye(4), (len(bones), 1, 1))
     what = f"the inverse bind matrices of skin {index}"
-    stored = document.array(skin.inverseBindMatrices, what, ("MAT4",))
+    stored = document.array(skin["inverseBindMatrices"], what, ("MAT4",))
     if len(stored) < len(bones):
         raise MeshFileError(f"have {len(stored)} values, {len(bones)} are needed", where=what)
     # Column by column.
@@ -287,20 +287,20 @@ def _skin(document: GltfDocument, index: object) -> tuple[npt.NDArray[np.int64],
 
 
 def _influences(
-    document: GltfDocument, primitive: Any, where: str, n: int, n_bones: int
+    document: GltfDocument, attributes: dict[str, Any], where: str, n: int, n_bones: int
 ) -> tuple[npt.NDArray[np.int32], FloatArray]:
     """Return the bones and the weights of n vertices, from all sets of four that are there."""
     joints: list[npt.NDArray[np.int64]] = []
     weights: list[FloatArray] = []
-    while getattr(primitive.attributes, f"JOINTS_{len(joints)}", None) is not None:
+    while f"JOINTS_{len(joints)}" in attributes:
         name = str(len(joints))
         what = f"the joints {name} of {where}"
-        stored = document.array(getattr(primitive.attributes, f"JOINTS_{name}"), what, ("VEC4",), n)
+        stored = document.array(attributes[f"JOINTS_{name}"], what, ("VEC4",), n)
         if stored.dtype.kind != "u":
             raise MeshFileError.must_be(what, "whole numbers", stored.dtype)
         joints.append(stored.astype(np.int64))
         what = f"the weights {name} of {where}"
-        given = getattr(primitive.attributes, f"WEIGHTS_{name}", None)
+        given = attributes.get(f"WEIGHTS_{name}")
         weights.append(as_float(document.array(given, what, ("VEC4",), n)))
     bone_of, shares = np.concatenate(joints, axis=1), np.concatenate(weights, axis=1)
     _require_finite(shares, f"the weights of {where}")
@@ -325,32 +325,28 @@ def _influences(
     return bone_of.astype(np.int32), shares / total[:, None]
 
 
-def _morphs(document: GltfDocument, primitive: Any, where: str, n: int) -> npt.NDArray[np.float32]:
-    deltas = []
-    for number, target in enumerate(primitive.targets or ()):
-        what = f"morph target {number} of {where}"
-        if not isinstance(target, dict):
-            raise MeshFileError.must_be(what, "an object", type(target).__name__)
-        if target.get("POSITION") is None:
-            deltas.append(np.zeros((n, 3), dtype=np.float32))
-        else:
-            stored = document.array(target["POSITION"], what, ("VEC3",), n)
-            deltas.append(as_float(stored).astype(np.float32))
-    stacked = np.stack(deltas) if deltas else np.empty((0, n, 3), dtype=np.float32)
-    _require_finite(stacked, f"the morph targets of {where}")
-    return stacked
+def _morphs(
+    document: GltfDocument, primitive: dict[str, Any], where: str, n: int
+) -> npt.NDArray[np.float32]:
+    targets = primitive.get("targets", ())
+    morphs = np.zeros((len(targets), n, 3), dtype=np.float32)
+    for number, target in enumerate(targets):
+        if "POSITION" in target:
+            what = f"morph target {number} of {where}"
+            morphs[number] = as_float(document.array(target["POSITION"], what, ("VEC3",), n))
+    _require_finite(morphs, f"the morph targets of {where}")
+    return morphs
 
 
 def _default_weights(document: GltfDocument, shown: ShownPrimitive, part: Part) -> FloatArray:
     """Return the (M,) weights of the morph targets that the file stores for a node's mesh."""
-    mesh = document.description.meshes[shown.mesh]
-    stored = document.node_weights.get(shown.node) or mesh.weights
+    mesh = document.objects("meshes")[shown.mesh]
+    stored = document.objects("nodes")[shown.node].get("weights") or mesh.get("weights")
     n = len(part.morphs)
     if not stored or not n:
         return np.zeros(n)
     # Primitives of a mesh may have fewer targets than others.
-    own = stored[:n] if isinstance(stored, list) else stored
-    return numbers(own, f"the weights of mesh {shown.mesh}", n)
+    return numbers(stored[:n], f"the weights of mesh {shown.mesh}", n)
 
 
 def _require_finite(values: npt.NDArray[Any], what: str) -> None:

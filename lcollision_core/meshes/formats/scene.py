@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -91,15 +92,25 @@ class Clip:
     Attributes
     ----------
     name : unique in the scene
-    key_times : (T,) float64 array, ascending, in seconds, T > 0
     moved : the nodes that it moves, without those that follow them
+    read_key_times : makes `key_times`, which may read the file's arrays
     sample : from (N,) times to the N poses then
     """
 
     name: str
-    key_times: FloatArray
     moved: frozenset[int]
+    read_key_times: Callable[[], FloatArray]
     sample: Callable[[FloatArray], ScenePoses]
+
+    @cached_property
+    def key_times(self) -> FloatArray:
+        """(T,) float64 array, ascending, in seconds, T > 0.
+
+        Raises
+        ------
+        MeshFileError : the animation is damaged; `sample` raises it too.
+        """
+        return self.read_key_times()
 
     def times(self, fps: float | None) -> FloatArray:
         """Return the times of its frames.

@@ -406,8 +406,12 @@ def test_a_source_that_changed_is_refused(character: Character, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("places", "value", "sentence"),
     [
-        (("nodes", 7, "children"), "", "children of nodes 7 must be a list of numbers, got ''"),
-        (("animations", 2, "channels", 0, "target"), None, "a target of animation 2 must be an"),
+        (("nodes", 7, "children"), "", "children of nodes 7 must be a list of whole numbers, got"),
+        (
+            ("animations", 2, "channels", 0, "target"),
+            None,
+            "animation 2 has channels without target",
+        ),
         (("bufferViews", 0, "buffer"), 7, "the buffer of buffer view 0 must be a whole number"),
     ],
 )

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from lcollision_core.characters import read_character
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes import read_mesh
+from lcollision_core.meshes import read_mesh, read_pose_set
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.scene_files import read_scene
 from tests.core.gltf_builder import GltfBuilder, arm, moved, rotation, split_corners, tube
@@ -125,7 +128,7 @@ def test_morph_targets_agree_with_vtk(tmp_path: Path) -> None:
     frames = _joined(path).posed(sample_clip(read_scene(path), "talk", None)[1])
     expected = vertices + deltas[0] + 0.25 * deltas[1] + [1.0, 2.0, 3.0]
     assert np.abs(frames[1] - expected).max() < 1e-6
-    # The weights of the node, of which pygltflib does not know, come before those of the mesh.
+    # The weights of the node come before those of the mesh.
     builder.description["nodes"][0]["weights"] = [0.0, 1.0]
     expected = vertices + deltas[1] + [1.0, 2.0, 3.0]
     path = builder.write(tmp_path / "m.gltf")
@@ -486,14 +489,45 @@ def test_arrays_named_a_thousand_times_are_refused_before_they_are_read(tmp_path
         read_scene(builder.write(tmp_path / "m.glb"))
 
 
-def test_times_that_go_back_are_refused(tmp_path: Path) -> None:
+def test_clips_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
     builder = arm()
-    builder.animation(
-        "back",
-        {"node": 1, "path": "translation", "times": [0.0, 2.0, 1.0], "values": np.zeros((3, 3))},
-    )
+    channel = {"node": 1, "path": "translation", "values": np.zeros((3, 3))}
+    builder.animation("back", channel | {"times": [0.0, 2.0, 1.0]})
+    builder.animation("cut", channel | {"times": [0.0, 1.0, 2.0]})
+    builder.description["accessors"][-1]["count"] = 1000
+    path = builder.write(tmp_path / "m.glb")
+    assert read_mesh(path).topology.n_faces == len(tube()[1])
+    wave, back, cut = read_scene(path).clips
+    assert wave.sample(np.array([0.5])).transforms.shape == (1, 5, 4, 4)
     with pytest.raises(MeshFileError, match="times of animation 'back' must be finite and asc"):
-        read_scene(builder.write(tmp_path / "m.glb"))
+        assert len(back.key_times)
+    with pytest.raises(MeshFileError, match="values of animation 'cut' have 1000 values, 3 are"):
+        cut.sample(np.array([0.5]))
+    with pytest.raises(MeshFileError, match=r"m\.glb cannot be read: the times of .*'back' must"):
+        read_pose_set(path)
+    with pytest.raises(MeshFileError, match=r"m\.glb cannot be read: the times of .*'back' must"):
+        read_character(path)
+
+
+def test_a_null_says_nothing_and_other_kinds_of_values_are_refused(tmp_path: Path) -> None:
+    builder = arm()
+    builder.description["nodes"][0] |= {"mesh": None, "weights": None, "extras": {"id": None}}
+    path = builder.write(tmp_path / "m.gltf")
+    assert len(read_scene(path).parts) == 1
+    for kind, wrong, said in (
+        ("nodes", [{}, 7], "nodes must be a list of objects"),
+        (
+            "skins",
+            [{"joints": [0.5]}],
+            "joints of skins 0 must be a list of whole numbers",
+        ),
+        ("meshes", [{"primitives": [{"attributes": []}]}], "must be an object, got []"),
+        ("scenes", {}, "scenes must be a list of objects, got {}"),
+        ("nodes", [None], "must be a list of objects, got [None]"),
+    ):
+        path.write_text(json.dumps(builder.description | {kind: wrong}))
+        with pytest.raises(MeshFileError, match=re.escape(said)):
+            read_scene(path)
 
 
 @pytest.mark.parametrize("name", ["mannequin-moves.glb", "xbot-moves.glb"])
