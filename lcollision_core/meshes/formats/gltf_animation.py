@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -34,25 +34,25 @@ _WEIGHTS = "weights"
 
 
 @dataclass(frozen=True, eq=False)
-class _Channel:
-    """Values of one property over time.
+class _Track:
+    """One property of C nodes that have the same key times.
 
     Attributes
     ----------
-    node, path : what it drives
+    nodes, path : what it drives
     interpolation : STEP, LINEAR or CUBICSPLINE
     times : (T,) float64 array, ascending
-    values : (T, k) float64 array, for CUBICSPLINE (T, 3, k): tangent in, value, tangent out
+    values : (T, C, k) float64 array, for CUBICSPLINE (T, 3, C, k): tangent in, value, tangent out
     """
 
-    node: int
+    nodes: tuple[int, ...]
     path: str
     interpolation: str
     times: FloatArray
     values: FloatArray
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Return the (N, k) values at (N,) times, the first before all keys, the last after."""
+        """Return the (N, C, k) values at (N,) times, the first before all keys, the last after."""
         before = np.searchsorted(self.times, times, side="right") - 1
         before = np.clip(before, 0, len(self.times) - 1)
         after = np.minimum(before + 1, len(self.times) - 1)
@@ -65,10 +65,10 @@ class _Channel:
         if self.interpolation == "LINEAR":
             start, end = self.values[before], self.values[after]
             if self.path == "rotation":
-                return slerp(start, end, share)
-            return start + share[:, None] * (end - start)
+                return slerp(start, end, share[:, None])
+            return start + share[:, None, None] * (end - start)
         # Hermite, with tangents per second: appendix C of the glTF 2.0 specification.
-        t, duration = share[:, None], step[:, None]
+        t, duration = share[:, None, None], step[:, None, None]
         start, leaving = self.values[before, 1], duration * self.values[before, 2]
         end, arriving = self.values[after, 1], duration * self.values[after, 0]
         curve: FloatArray = (
@@ -89,6 +89,7 @@ class _GltfClip:
     document : the file
     where : what a sentence calls the animation
     driven : by node and property, the sampler and how many numbers it has for each key
+    stored : from a node to its translation, rotation and scale in the file
     local : (n, 4, 4) array, the nodes as the file stores them
     parents, order : of the nodes
     part_nodes : of each part the node that shows it
@@ -98,6 +99,7 @@ class _GltfClip:
     document: GltfDocument
     where: str
     driven: dict[tuple[int, str], tuple[dict[str, Any], int]]
+    stored: Callable[[int], dict[str, FloatArray]]
     local: FloatArray
     parents: npt.NDArray[np.int64]
     order: Sequence[int]
@@ -111,18 +113,19 @@ class _GltfClip:
 
     @cached_property
     def _times(self) -> dict[int, FloatArray]:
-        """The (T,) times of the keys, by accessor: most channels share theirs."""
+        """The (T,) times of the keys, by accessor; equal ones are one array."""
         what = f"the times of {self.where}"
         found: dict[int, FloatArray] = {}
+        known: dict[bytes, FloatArray] = {}
+        last = len(self.document.objects("accessors")) - 1
         for sampler, _ in self.driven.values():
-            last = len(self.document.objects("accessors")) - 1
             index = whole(sampler.get("input"), f"the accessor of {what}", 0, last)
-            if index in found:
-                continue
-            times = as_float(self.document.array(index, what, ("SCALAR",))[:, 0])
+            if index not in found:
+                times = as_float(self.document.array(index, what, ("SCALAR",))[:, 0])
+                found[index] = known.setdefault(times.tobytes(), times)
+        for times in known.values():
             if not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0.0).any():
                 raise MeshFileError.must_be(what, "finite and ascending", f"{len(times)} others")
-            found[index] = times
         return found
 
     def key_times(self) -> FloatArray:
@@ -130,36 +133,60 @@ class _GltfClip:
         return np.unique(np.concatenate(list(self._times.values())))
 
     @cached_property
-    def _channels(self) -> tuple[_Channel, ...]:
-        return tuple(
-            _channel(
-                self.document, sampler, node, path, width, self._times[sampler["input"]], self.where
-            )
-            for (node, path), (sampler, width) in self.driven.items()
-        )
+    def _tracks(self) -> list[_Track]:
+        alike: dict[Any, tuple[FloatArray, list[int], list[npt.NDArray[Any]]]] = {}
+        for (node, path), (sampler, width) in self.driven.items():
+            interpolation = sampler.get("interpolation", "LINEAR")
+            if interpolation not in ("STEP", "LINEAR", "CUBICSPLINE"):
+                raise MeshFileError.must_be(
+                    f"the interpolation of {self.where}",
+                    "STEP, LINEAR or CUBICSPLINE",
+                    quoted(interpolation),
+                )
+            times = self._times[sampler["input"]]
+            kind, per_value = ("SCALAR", width) if path == _WEIGHTS else (f"VEC{width}", 1)
+            shape = (len(times), 3) if interpolation == "CUBICSPLINE" else (len(times),)
+            what = f"the {path} values of {self.where}"
+            count = int(np.prod(shape)) * per_value
+            values = self.document.array(sampler.get("output"), what, (kind,), count)
+            key = path, interpolation, id(times), width
+            _, nodes, stored = alike.setdefault(key, (times, [], []))
+            nodes.append(node)
+            stored.append(values.reshape(*shape, width))
+        return [
+            _Track(tuple(nodes), path, interpolation, times, self._checked(stored, path))
+            for (path, interpolation, _, _), (times, nodes, stored) in alike.items()
+        ]
 
-    @cached_property
-    def _stored(self) -> dict[int, dict[str, FloatArray]]:
-        """Of each moved node its translation, rotation and scale as the file stores them."""
-        nodes = self.document.objects("nodes")
-        return {node: _stored(nodes[node], node) for node in self.moved}
+    def _checked(self, stored: list[npt.NDArray[Any]], path: str) -> FloatArray:
+        """Put the values of the nodes of a track together, rotations of length 1."""
+        values = as_float(np.stack(stored, axis=-2))
+        if not np.isfinite(values).all():
+            raise MeshFileError("are not all finite", where=f"the {path} values of {self.where}")
+        if path == "rotation" and values.ndim == 3:
+            lengths = np.linalg.norm(values, axis=-1, keepdims=True)
+            values = values / np.where(lengths > 0.0, lengths, 1.0)
+        return values
 
     def __call__(self, times: FloatArray) -> ScenePoses:
         """Return the poses at (N,) times."""
-        n = len(times)
-        moved = {
-            node: {path: np.tile(value, (n, 1)) for path, value in values.items()}
-            for node, values in self._stored.items()
+        n, nodes = len(times), sorted(self.moved)
+        row = {node: number for number, node in enumerate(nodes)}
+        held = {
+            path: np.tile(
+                np.reshape([self.stored(node)[path] for node in nodes], (-1, k)), (n, 1, 1)
+            )
+            for path, k in _PATHS.items()
         }
         weights: dict[int, FloatArray] = {}
-        for channel in self._channels:
-            if channel.path == _WEIGHTS:
-                weights[channel.node] = channel.at(times)
+        for track in self._tracks:
+            values = track.at(times)
+            if track.path == _WEIGHTS:
+                weights |= {node: values[:, i] for i, node in enumerate(track.nodes)}
             else:
-                moved[channel.node][channel.path] = channel.at(times)
+                held[track.path][:, [row[node] for node in track.nodes]] = values
         local = np.tile(self.local, (n, 1, 1, 1))
-        for node, values in moved.items():
-            local[:, node] = compose(values["translation"], values["rotation"], values["scale"])
+        local[:, nodes] = compose(held["translation"], held["rotation"], held["scale"])
         transforms = global_transforms(local, self.parents, self.order)
         # Primitives of a mesh may have fewer targets than the first.
         of_parts = tuple(
@@ -200,13 +227,23 @@ def read_clips(
     for part in parts:
         n_targets[part.node] = max(len(part.morphs), n_targets.get(part.node, 0))
     part_nodes = tuple(part.node for part in parts)
+    nodes = document.objects("nodes")
+    stored = cache(lambda number: _stored(nodes[number], number))
     clips = []
     for name, animation in zip(names, animations, strict=True):
         where = f"animation {name!r}"
         driven = _driven(document, animation, where, n_targets)
         if driven:
             sample = _GltfClip(
-                document, where, driven, local, parents, order, part_nodes, default_weights
+                document,
+                where,
+                driven,
+                stored,
+                local,
+                parents,
+                order,
+                part_nodes,
+                default_weights,
             )
             clips.append(Clip(name, sample.moved, sample.key_times, sample))
     return tuple(clips)
@@ -249,32 +286,3 @@ def _driven(
             sampler = element(samplers, channel.get("sampler"), f"a sampler of {where}")
             found[node, path] = sampler, width
     return found
-
-
-def _channel(
-    document: GltfDocument,
-    sampler: dict[str, Any],
-    node: int,
-    path: str,
-    width: int,
-    times: FloatArray,
-    where: str,
-) -> _Channel:
-    interpolation = sampler.get("interpolation", "LINEAR")
-    if interpolation not in ("STEP", "LINEAR", "CUBICSPLINE"):
-        raise MeshFileError.must_be(
-            f"the interpolation of {where}", "STEP, LINEAR or CUBICSPLINE", quoted(interpolation)
-        )
-    what = f"the {path} values of {where}"
-    types = {3: ("VEC3",), 4: ("VEC4",)}.get(width) if path in _PATHS else ("SCALAR",)
-    per_key = 3 if interpolation == "CUBICSPLINE" else 1
-    n_values = len(times) * per_key * (1 if path in _PATHS else width)
-    values = as_float(document.array(sampler.get("output"), what, types or ("SCALAR",), n_values))
-    if not np.isfinite(values).all():
-        raise MeshFileError("are not all finite", where=what)
-    shape = (len(times), 3, width) if per_key == 3 else (len(times), width)
-    values = values.reshape(shape)
-    if path == "rotation" and interpolation != "CUBICSPLINE":
-        lengths = np.linalg.norm(values, axis=-1, keepdims=True)
-        values = values / np.where(lengths > 0.0, lengths, 1.0)
-    return _Channel(node, path, interpolation, times, values)

@@ -61,16 +61,16 @@ def decompose(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def slerp(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
-    """Interpolate (N, 4) unit quaternions along the shorter arc by (N,) shares of it."""
-    cosine = np.einsum("ni,ni->n", start, end)
-    end = np.where(cosine[:, None] < 0.0, -end, end)
+    """Interpolate (..., 4) unit quaternions along the shorter arc by (...) shares of it."""
+    cosine = np.einsum("...i,...i->...", start, end)
+    end = np.where(cosine[..., None] < 0.0, -end, end)
     cosine = np.minimum(np.abs(cosine), 1.0)
     angle = np.arccos(cosine)
     is_chord = cosine > _NEARLY_PARALLEL
     sine = np.where(is_chord, 1.0, np.sin(angle))
     at_start = np.where(is_chord, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
     at_end = np.where(is_chord, share, np.sin(share * angle) / sine)
-    result: FloatArray = at_start[:, None] * start + at_end[:, None] * end
+    result: FloatArray = at_start[..., None] * start + at_end[..., None] * end
     return result
 
 
