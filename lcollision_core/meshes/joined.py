@@ -274,7 +274,7 @@ def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
     result = [np.zeros((len(part.points), 2), dtype=np.int64) for part in parts]
     # The parts that one node shows share their weights.
     for node in {part.node for part in parts}:
-        shown = [i for i, part in enumerate(parts) if part.node == node and part.morphs.size]
+        shown = [i for i, part in enumerate(parts) if part.node == node and part.morphs.any()]
         n_targets = max((len(parts[i].morphs) for i in shown), default=0)
         rows, deltas = [], []
         for i in shown:

@@ -127,7 +127,7 @@ class GltfPatch:
             "count": len(stored),
             "type": _TYPES[stored.shape[1] - 1],
         }
-        if has_bounds:
+        if has_bounds and len(stored):
             accessor["min"] = stored.min(axis=0).tolist()
             accessor["max"] = stored.max(axis=0).tolist()
         accessors = self.description.setdefault("accessors", [])

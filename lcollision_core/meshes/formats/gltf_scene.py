@@ -98,16 +98,16 @@ def shown_primitives(
     n_vertices = n_others = 0
     for mesh, node in sorted(showing):
         for number, primitive in enumerate(meshes[mesh].get("primitives", ())):
-            attributes = primitive.get("attributes", {})
-            is_shown = primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
-            if not is_shown or "POSITION" not in attributes:
+            count = 0
+            is_of_triangles = primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
+            if is_of_triangles and "POSITION" in primitive.get("attributes", {}):
+                what = f"positions of mesh {mesh}"
+                index = primitive["attributes"]["POSITION"]
+                accessor = element(document.objects("accessors"), index, f"the accessor of {what}")
+                count = whole(accessor.get("count"), f"the count of {what}", 0, MAX_FACES)
+            if not count:
                 n_others += 1
                 continue
-            what = f"positions of mesh {mesh}"
-            accessor = element(
-                document.objects("accessors"), attributes["POSITION"], f"the accessor of {what}"
-            )
-            count = whole(accessor.get("count"), f"the count of {what}", 0, MAX_FACES)
             n_vertices += count
             require_plausible_count(n_vertices, "vertices")
             shown.append(ShownPrimitive(node, mesh, number, count))

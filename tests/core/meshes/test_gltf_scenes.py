@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lcollision_core.characters import read_character
+from lcollision_core.characters import read_character, write_character
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes import read_mesh, read_pose_set
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
@@ -487,6 +487,73 @@ def test_arrays_named_a_thousand_times_are_refused_before_they_are_read(tmp_path
         builder.add("nodes", mesh=mesh)
     with pytest.raises(MeshFileError, match="it holds 5000250 vertices, at most 5000000"):
         read_scene(builder.write(tmp_path / "m.glb"))
+
+
+def _zeros(builder: GltfBuilder, like: int) -> int:
+    """Add an accessor without data, as many numbers as another one has."""
+    accessor = builder.description["accessors"][like]
+    kept = ("componentType", "count", "type")
+    return builder.add("accessors", **{name: accessor[name] for name in kept})
+
+
+@pytest.mark.parametrize("n_zero", [0, 1, 2])
+def test_morph_targets_that_move_nothing_are_read(tmp_path: Path, n_zero: int) -> None:
+    builder = arm()
+    primitive = builder.description["meshes"][0]["primitives"][0]
+    zeros = _zeros(builder, primitive["attributes"]["POSITION"])
+    primitive["targets"] = [{}, {"NORMAL": zeros}, *[{"POSITION": zeros}] * n_zero]
+    path = builder.write(tmp_path / "m.glb")
+    part = read_scene(path).parts[0]
+    assert part.morphs.shape == (2 + n_zero, len(part.points), 3)
+    assert not part.morphs.any()
+    plain = arm().write(tmp_path / "plain.glb")
+    assert np.array_equal(read_mesh(path).vertices, read_mesh(plain).vertices)
+
+
+def test_accessors_without_data_are_zeros_with_sparse_values_on_top(tmp_path: Path) -> None:
+    builder = arm()
+    primitive = builder.description["meshes"][0]["primitives"][0]
+    attributes = primitive["attributes"]
+    target = _zeros(builder, attributes["POSITION"])
+    builder.description["accessors"][target]["sparse"] = {
+        "count": 2,
+        "indices": {"bufferView": builder.view(np.array([1, 5], "u2")), "componentType": 5123},
+        "values": {"bufferView": builder.view(np.array([[0, 0.5, 0], [0.25, 0, 0]], "f4"))},
+    }
+    primitive["targets"] = [{"POSITION": target}]
+    builder.description["meshes"][0]["weights"] = [1.0]
+    attributes["JOINTS_0"] = _zeros(builder, attributes["JOINTS_0"])
+    samplers = builder.description["animations"][0]["samplers"]
+    samplers[1]["output"] = _zeros(builder, samplers[1]["output"])
+    scene = read_scene(builder.write(tmp_path / "m.glb"))
+    (part,) = scene.parts
+    assert np.array_equal(np.flatnonzero(part.morphs[0].any(axis=1)), [1, 5])
+    assert part.morphs[0, 5].tolist() == [0.25, 0.0, 0.0]
+    assert not part.bone_of.any()
+    # The root's translation, at the origin in all of the clip.
+    assert not scene.clips[0].sample(np.array([0.0, 0.7])).transforms[:, 0, :3, 3].any()
+
+
+def test_zeros_as_weights_leave_vertices_to_the_first_joint(tmp_path: Path) -> None:
+    builder = arm()
+    attributes = builder.description["meshes"][0]["primitives"][0]["attributes"]
+    first = builder.description["accessors"][attributes["JOINTS_0"]]
+    attributes["WEIGHTS_0"] = _zeros(builder, attributes["WEIGHTS_0"])
+    (part,) = read_scene(builder.write(tmp_path / "m.glb")).parts
+    assert len(part.points) == first["count"]
+    assert not part.bone_of.any()
+    assert part.weights.sum() == len(part.points)
+
+
+def test_a_primitive_without_vertices_shows_nothing(tmp_path: Path) -> None:
+    builder = arm()
+    nothing = {"componentType": 5126, "count": 0, "type": "VEC3"}
+    primitives = builder.description["meshes"][0]["primitives"]
+    primitives.append({"attributes": {"POSITION": builder.add("accessors", **nothing)}})
+    character = read_character(builder.write(tmp_path / "m.glb"))
+    assert "1 part without triangles (points, lines) was left out" in character.notes
+    posed = write_character(tmp_path / "posed.glb", character, character.rest_vertices, "morph")
+    assert np.allclose(read_mesh(tmp_path / "posed.glb").vertices, posed.vertices, atol=1e-6)
 
 
 def test_clips_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
