@@ -19,6 +19,9 @@ _BENT = np.radians(6.0)
 _PARALLEL = 0.9
 """Cosine from which a bone points too much along a direction to be bent towards it."""
 
+_MIDDLE = 0.02
+"""Normalised: joints this near to the middle plane are on neither side."""
+
 _SHORT = 1e-6
 """Of the size of the rig: a bone of this length has no direction."""
 
@@ -46,6 +49,14 @@ class Role(Enum):
     SPINE = "spine|chest|torso|waist|abdomen|belly"
     OTHER = ""
     FACE = "$^"
+
+
+class Side(Enum):
+    """On which side of the body a joint is, as the body itself says it."""
+
+    LEFT = "left"
+    RIGHT = "right"
+    MIDDLE = ""
 
 
 _LIMITS: dict[Role, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
@@ -138,6 +149,23 @@ def _repeats(rig: Rig, roles: Sequence[Role]) -> npt.NDArray[np.bool_]:
             not is_shared or plain[joint] == plain[parent]
         )
     return repeats
+
+
+def joint_sides(rig: Rig, origins: FloatArray, left: FloatArray) -> tuple[Side, ...]:
+    """Tell on which side each of the rig's J joints is: that on which its limb leaves the trunk.
+
+    Parameters
+    ----------
+    origins : (J, 3) normalised places at rest
+    left : (3,) unit vector
+    """
+    middle = float(np.median(origins @ left))
+    sides: list[Side] = []
+    for parent, place in zip(rig.parents.tolist(), origins @ left - middle, strict=True):
+        own = Side.LEFT if place > _MIDDLE else Side.RIGHT if place < -_MIDDLE else Side.MIDDLE
+        above = sides[parent] if parent >= 0 else Side.MIDDLE
+        sides.append(own if above is Side.MIDDLE else above)
+    return tuple(sides)
 
 
 def bone_directions(rig: Rig, origins: FloatArray) -> FloatArray:

@@ -63,7 +63,7 @@ class RigPoseSpace:
     joint_of_code, axis_of_code : (D,) int64 arrays: the joint of the rig, and its axis: 0 bends,
         1 twists, 2 turns sideways; of the root's first six codes the axis is 0 to 5
     rig : of the character
-    roles : J of them, what each joint is by its name
+    roles, sides : J each: what each joint is, and on which side of the body
     origins : (J, 3) float64 array, where the joints are in the rest pose, normalised
     axes : (J, 3, 3) float64 array, the joints' axes in the rest pose, a column each
     part_of_joint : (J,) each joint's body part, an index from 0
@@ -147,9 +147,11 @@ class RigPoseSpace:
             upwards = int(np.abs(up).argmax())
             front = front_direction(self.rest_vertices * up[upwards], upwards) * up[upwards]
         self.front: FloatArray = front
+        left = np.cross(up, front)
+        self.sides = joint_roles.joint_sides(rig, self.origins, left)
         self.axes = joint_roles.joint_axes(rig, roles, self.origins, directions, up, front)
         self._least, self._most = joint_roles.joint_limits(rig, roles)
-        body = np.stack([np.cross(up, front), up, front], axis=1)
+        body = np.stack([left, up, front], axis=1)
         root = self._bones[0]
         middle = 0.5 * (self.rest_vertices.min(axis=0) + self.rest_vertices.max(axis=0))
         self._bone_origins = self.origins[self._bones]

@@ -415,3 +415,17 @@ def test_a_character_without_a_rig_is_refused_in_a_sentence() -> None:
     broken[1, 0, 0] = np.nan
     with pytest.raises(ShapeError, match="not finite"):
         space.codes_of_transforms(broken)
+
+
+def test_joints_are_on_the_side_of_the_body_on_which_their_limb_leaves_the_trunk() -> None:
+    body = rigged_body(scale=100.0)
+    names = rig_of(body).joint_names
+    expected = ["left" * name.startswith("Left") + "right" * name.startswith("Right")
+                for name in names]  # fmt: skip
+    assert [side.value for side in RigPoseSpace(body).sides] == expected
+    # A hand that rests on the other side is no other hand.
+    crossed = rig_of(body).rest.copy()
+    hand = names.index("LeftHandEnd")
+    crossed[hand, 0, 3] *= -1.0
+    space = RigPoseSpace(replace(body, rig=replace(rig_of(body), rest=crossed)))
+    assert space.sides[hand].value == "left"
