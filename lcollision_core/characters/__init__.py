@@ -1,5 +1,6 @@
 """Characters: files with meshes, a rig and clips, and posing by the rig."""
 
+from lcollision_core.characters.anatomy import ROLE_NAMES, joint_parts
 from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.characters.default_rules import default_rules
 from lcollision_core.characters.posed_gltf import (
@@ -8,10 +9,7 @@ from lcollision_core.characters.posed_gltf import (
     PosedFile,
     posed_gltf,
 )
-from lcollision_core.characters.reading import (
-    joint_parts,
-    read_character,
-)
+from lcollision_core.characters.reading import read_character
 from lcollision_core.characters.rig_space import RigPoseSpace
 from lcollision_core.characters.write import (
     PATCHED_SUFFIXES,

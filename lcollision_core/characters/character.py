@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -32,6 +32,7 @@ class Rig:
     weights : (V, I) float64 array >= 0, each row sums to 1
     points : (V, I, 3) float64 array: where each of these joints alone has the vertex in the rest
         pose; all the same where the rest pose is the bind pose
+    chosen : what the user says that joints are, by their names: of `anatomy.ROLE_NAMES`
     """
 
     joint_names: tuple[str, ...]
@@ -41,6 +42,7 @@ class Rig:
     joint_of: npt.NDArray[np.int32]
     weights: FloatArray
     points: FloatArray
+    chosen: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from enum import Enum
 
@@ -16,11 +17,14 @@ from lcollision_core.meshes.topology import FloatArray
 _BENT = np.radians(6.0)
 """A hinge whose bones lie at this angle at rest turns about their common normal."""
 
+_CLEARLY_BENT = np.radians(25.0)
+"""At this angle they do so whatever the front of the body says."""
+
 _PARALLEL = 0.9
 """Cosine from which a bone points too much along a direction to be bent towards it."""
 
 _MIDDLE = 0.02
-"""Normalised: joints this near to the middle plane are on neither side."""
+"""Of the skeleton's extent: joints this near to the middle plane are on neither side."""
 
 _SHORT = 1e-6
 """Of the size of the rig: a bone of this length has no direction."""
@@ -29,24 +33,25 @@ _SHORT = 1e-6
 class Role(Enum):
     """What a joint is in a body; values are patterns of its name in small letters and digits.
 
-    The first that is found counts. What has none and belongs to the head is of its face.
+    They are of English names, and of MMD's. The first that is found counts. What has none and
+    belongs to the head is of its face.
     """
 
-    TWIST = "twist|roll(?!er)|(shoulder|elbow|hip|knee)part[0-9]"
+    TWIST = "twist|roll(?!er)|(shoulder|elbow|hip|knee)part[0-9]|捩|キャンセル|肩[pc]"
     PALM = "palm|carpal"
-    THUMB = "thumb|^bip[0-9]*[lr]finger0"
-    FINGER = "finger|index|middle|(?<!sp)(?<!st)ring|pinky|pinkie|little"
-    TOE = "toe|(?<!eye)ball|metatarsal"
-    FOOT = "foot|ankle|paw|hoof"
-    HAND = "hand|wrist"
-    FOREARM = "forearm|lowerarm|lowarm|loarm|armlower|elbow"
-    SHOULDER = "shoulder|clavicle|collar|scapula"
-    UPPER_ARM = "arm(?!atu|or)|shldr"
-    THIGH = "thigh|upleg|upperleg|legupper"
-    SHIN = "shin|calf|knee|leg"
-    NECK = "neck"
-    HEAD = "(?<!fore)head|skull"
-    SPINE = "spine|chest|torso|waist|abdomen|belly"
+    THUMB = "thumb|^bip[0-9]*[lr]finger0|親指"
+    FINGER = "finger|index|middle|(?<!sp)(?<!st)ring|pinky|pinkie|little|[人中薬小][指差]"
+    TOE = "toe|(?<!eye)ball|metatarsal|つま先|爪先|足先|足指"
+    FOOT = "foot|ankle|paw|hoof|足首"
+    HAND = "hand|wrist|手首"
+    FOREARM = "forearm|lowerarm|lowarm|loarm|armlower|elbow|ひじ|肘"
+    SHOULDER = "shoulder|clavicle|collar|scapula|肩"
+    UPPER_ARM = "arm(?!atu|or)|shldr|腕"
+    THIGH = "thigh|upleg|upperleg|legupper|足(?!.*ik)"
+    SHIN = "shin|calf|knee|leg|ひざ|膝"
+    NECK = "neck|首"
+    HEAD = "(?<!fore)head|skull|頭"
+    SPINE = "spine|chest|torso|waist|abdomen|belly|上半身|胸"
     OTHER = ""
     FACE = "$^"
 
@@ -82,6 +87,15 @@ _LIMITS: dict[Role, tuple[tuple[float, float], tuple[float, float], tuple[float,
 rest poses differ, and a hinge hardly bends backwards."""
 
 
+_BONES = {
+    Role.UPPER_ARM: Role.FOREARM,
+    Role.FOREARM: Role.HAND,
+    Role.THIGH: Role.SHIN,
+    Role.SHIN: Role.FOOT,
+}
+"""What is at the far end of a limb's bone."""
+
+
 def joint_roles(rig: Rig) -> tuple[Role, ...]:
     """Tell what each of the rig's joints is.
 
@@ -92,7 +106,8 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
     is a piece of it, and twists; in its place it may be the same joint again, see `_repeats`.
     """
     plain = [
-        re.sub("[^a-z0-9]", "", re.split("[:|]", name)[-1].lower()) for name in rig.joint_names
+        re.sub(r"[\W_]", "", unicodedata.normalize("NFKC", re.split("[:|]", name)[-1]).lower())
+        for name in rig.joint_names
     ]
     named = [next(role for role in Role if re.search(role.value, name)) for name in plain]
     parts = part_names(rig.joint_names)
@@ -151,38 +166,55 @@ def _repeats(rig: Rig, roles: Sequence[Role]) -> npt.NDArray[np.bool_]:
     return repeats
 
 
-def joint_sides(rig: Rig, origins: FloatArray, left: FloatArray) -> tuple[Side, ...]:
+def joint_sides(rig: Rig, left: FloatArray) -> list[Side]:
     """Tell on which side each of the rig's J joints is: that on which its limb leaves the trunk.
 
     Parameters
     ----------
-    origins : (J, 3) normalised places at rest
     left : (3,) unit vector
     """
-    middle = float(np.median(origins @ left))
+    places = rig.rest[:, :3, 3] @ left
+    places = (places - np.median(places)) / float(np.ptp(rig.rest[:, :3, 3], axis=0).max() or 1.0)
     sides: list[Side] = []
-    for parent, place in zip(rig.parents.tolist(), origins @ left - middle, strict=True):
+    for parent, place in zip(rig.parents.tolist(), places, strict=True):
         own = Side.LEFT if place > _MIDDLE else Side.RIGHT if place < -_MIDDLE else Side.MIDDLE
         above = sides[parent] if parent >= 0 else Side.MIDDLE
         sides.append(own if above is Side.MIDDLE else above)
-    return tuple(sides)
+    return sides
 
 
-def bone_directions(rig: Rig, origins: FloatArray) -> FloatArray:
+def _next_in_limb(rig: Rig, roles: Sequence[Role]) -> dict[int, int]:
+    """Return for thighs, shins and both halves of arms the joint at their bones' other end."""
+    found: dict[int, int] = {}
+    for joint, role in enumerate(roles):
+        above = int(rig.parents[joint])
+        while above >= 0 and roles[above] is Role.TWIST:
+            above = int(rig.parents[above])
+        if above >= 0 and _BONES.get(roles[above]) is role:
+            found.setdefault(above, joint)
+    return found
+
+
+def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> FloatArray:
     """Return the unit vectors along which the joints' bones lie in the rest pose: (J, 3).
 
-    Towards the children's middle, else the middle of the vertices that the joint moves, else on
-    from the parent.
+    Towards the joint that follows in a limb, else the children's middle, else the middle of the
+    vertices that the joint moves, else on from the parent.
 
     Parameters
     ----------
     origins : (J, 3) of the joints
+    roles : of J joints
     """
     size = float(np.ptp(origins, axis=0).max()) + float(np.ptp(rig.points, axis=(0, 1)).max())
     directions = np.zeros_like(origins)
     heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
+    next_of = _next_in_limb(rig, roles)
     for joint, parent in enumerate(rig.parents):
-        ends = origins[rig.parents == joint] - origins[joint]
+        following = rig.parents == joint
+        if joint in next_of:
+            following = np.arange(len(origins)) == next_of[joint]
+        ends = origins[following] - origins[joint]
         ends = ends[np.linalg.norm(ends, axis=1) > _SHORT * size]
         led = np.flatnonzero(heaviest == joint)
         if len(ends):
@@ -244,6 +276,7 @@ def joint_axes(
     lies along the bone, the third turns it sideways.
     """
     middle = origins.mean(axis=0)
+    above = {hinge: joint for joint, hinge in _next_in_limb(rig, roles).items()}
     axes = np.empty((len(origins), 3, 3))
     for joint, (role, bone) in enumerate(zip(roles, directions, strict=True)):
         towards = front
@@ -258,8 +291,11 @@ def joint_axes(
             towards = up if abs(bone @ up) <= _PARALLEL else front
         bend = np.cross(bone, towards)
         if role in (Role.FOREARM, Role.SHIN):
-            normal = np.cross(directions[rig.parents[joint]], bone)
-            if np.linalg.norm(normal) > np.sin(_BENT):
+            normal = np.cross(directions[above.get(joint, rig.parents[joint])], bone)
+            angle = float(np.linalg.norm(normal))
+            # A hinge that is all but straight may be a little past it, or to a side.
+            is_sure = angle > np.sin(_CLEARLY_BENT)
+            if angle > np.sin(_BENT) and (is_sure or normal @ bend > 0.5 * angle):
                 bend = normal
         bend /= np.linalg.norm(bend)
         axes[joint] = np.stack([bend, bone, np.cross(bend, bone)], axis=1)

@@ -6,14 +6,12 @@ import os
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.formats.scene import Scene, parents_first
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.numbered_names import numbered_where_equal
-from lcollision_core.meshes.part_names import part_labels
 from lcollision_core.meshes.scene_files import one_sentence, read_scene
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.upright import guess_up
@@ -76,17 +74,6 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
         sample,
         mesh.notes + notes,
     )
-
-
-def joint_parts(rig: Rig) -> npt.NDArray[np.str_]:
-    """Return the human name of each vertex's body part, by the largest weight.
-
-    Returns
-    -------
-    (V,) array, as "Left forearm"; fingers and toes belong to hands and feet, and what no known name
-    tells is called after its joint
-    """
-    return part_labels(rig.joint_names, rig.parents, rig.joint_of, rig.weights)
 
 
 def _axis(up: int | str) -> int:

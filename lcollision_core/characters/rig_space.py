@@ -10,14 +10,14 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import joint_roles, rig_kernels
+from lcollision_core.characters import rig_kernels
+from lcollision_core.characters.anatomy import Anatomy, anatomy_of, rig_of
 from lcollision_core.characters.character import Character, Rig
-from lcollision_core.characters.joint_roles import Role
-from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.characters.joint_roles import Role, joint_limits
+from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.displacement import DisplacementMetrics
-from lcollision_core.meshes.part_names import joint_labels
 from lcollision_core.meshes.topology import FloatArray, IntArray, length_graph
-from lcollision_core.meshes.units import body_size, front_direction
+from lcollision_core.meshes.units import body_size
 
 ROOT_CODES = 6
 """Of the whole body: its shift along left, up and front, and its turn about them."""
@@ -53,7 +53,7 @@ class RigPoseSpace:
     Parameters
     ----------
     character : with a rig
-    parts : J names of body parts, by joint; by default `meshes.part_names.joint_labels`
+    parts : J names of body parts, by joint; by default `Anatomy.labels`
     frames : (N, J, 4, 4) global transforms of the joints in plausible poses, as `ClipFrames` has
         them: they widen the limits, and say what moves together
 
@@ -64,6 +64,7 @@ class RigPoseSpace:
         1 twists, 2 turns sideways; of the root's first six codes the axis is 0 to 5
     rig : of the character
     roles, sides : J each: what each joint is, and on which side of the body
+    anatomy : what these come from
     origins : (J, 3) float64 array, where the joints are in the rest pose, normalised
     axes : (J, 3, 3) float64 array, the joints' axes in the rest pose, a column each
     part_of_joint : (J,) each joint's body part, an index from 0
@@ -83,14 +84,11 @@ class RigPoseSpace:
         parts: Sequence[str] | None = None,
         frames: FloatArray | None = None,
     ) -> None:
-        rig = character.rig
-        if rig is None:
-            raise LCollisionError(
-                "has no joints to pose it by", "choose a rigged character", where=character.source
-            )
+        anatomy = anatomy_of(character)
+        rig = rig_of(character)
         n_joints = len(rig.parents)
         if parts is None:
-            parts = joint_labels(rig.joint_names, rig.parents)
+            parts = anatomy.labels
         if len(parts) != n_joints:
             raise ShapeError.must_be("body parts of a rig", f"{n_joints} names", len(parts))
         self.topology = character.topology
@@ -100,7 +98,7 @@ class RigPoseSpace:
         self.origins: FloatArray = rig.rest[:, :3, 3] / self.body_size
         self._set_bones(rig)
         self.up: FloatArray = character.up
-        self._set_axes(rig, character.up)
+        self._set_axes(rig, anatomy)
         self._set_influences(rig)
         self.low, self.high = self._set_codes(rig, parts)
         self._frame_codes = np.empty((0, len(self.low)))
@@ -139,19 +137,12 @@ class RigPoseSpace:
             carried = self._bone_of[parent] if parent >= 0 else (0 if root < 0 else -1)
             self._bone_of[joint] = number.get(joint, carried)
 
-    def _set_axes(self, rig: Rig, up: FloatArray) -> None:
-        self.roles = roles = joint_roles.joint_roles(rig)
-        directions = joint_roles.bone_directions(rig, rig.rest[:, :3, 3])
-        front = joint_roles.front_of(roles, self.origins, directions, up)
-        if front is None:
-            upwards = int(np.abs(up).argmax())
-            front = front_direction(self.rest_vertices * up[upwards], upwards) * up[upwards]
-        self.front: FloatArray = front
-        left = np.cross(up, front)
-        self.sides = joint_roles.joint_sides(rig, self.origins, left)
-        self.axes = joint_roles.joint_axes(rig, roles, self.origins, directions, up, front)
-        self._least, self._most = joint_roles.joint_limits(rig, roles)
-        body = np.stack([left, up, front], axis=1)
+    def _set_axes(self, rig: Rig, anatomy: Anatomy) -> None:
+        self.anatomy, up, front = anatomy, self.up, anatomy.front
+        self.roles, self.sides, self.front = anatomy.roles, anatomy.sides, front
+        self.axes: FloatArray = anatomy.axes.copy()
+        self._least, self._most = joint_limits(rig, self.roles)
+        body = np.stack([np.cross(up, front), up, front], axis=1)
         root = self._bones[0]
         middle = 0.5 * (self.rest_vertices.min(axis=0) + self.rest_vertices.max(axis=0))
         self._bone_origins = self.origins[self._bones]

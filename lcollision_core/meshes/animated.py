@@ -16,7 +16,7 @@ from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, rea
 from lcollision_core.meshes.formats.scene import MAX_FRAME_NUMBERS, Scene, parents_first
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
-from lcollision_core.meshes.part_names import part_labels
+from lcollision_core.meshes.part_names import joint_labels, part_labels
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, one_sentence, read_scene
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.meshes.units import body_size
@@ -141,7 +141,8 @@ def labels_of(scene: Scene, mesh: JoinedMesh) -> npt.NDArray[np.str_] | None:
     parents = scene.parents[order]
     names = [scene.node_names[node] for node in order]
     joint_of = rank[mesh.bones][mesh.bone_of].astype(np.int32)
-    return part_labels(names, np.where(parents < 0, -1, rank[parents]), joint_of, mesh.weights)
+    labels = joint_labels(names, np.where(parents < 0, -1, rank[parents]))
+    return part_labels(labels, joint_of, mesh.weights)
 
 
 def _read_cache(path: Path) -> AnimatedMesh:

@@ -91,7 +91,11 @@ def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
     return tuple(legs if has_four_legs else parts)
 
 
-def joint_labels(names: Sequence[str], parents: npt.NDArray[np.int64]) -> tuple[str, ...]:
+def joint_labels(
+    names: Sequence[str],
+    parents: npt.NDArray[np.int64],
+    parts: Sequence[str | None] | None = None,
+) -> tuple[str, ...]:
     """Name the body part of each joint.
 
     A joint whose name does not tell is part of what its parents are, and if they do not tell
@@ -102,12 +106,13 @@ def joint_labels(names: Sequence[str], parents: npt.NDArray[np.int64]) -> tuple[
     Parameters
     ----------
     names, parents : of J joints, parents before children
+    parts : J body parts, None of a joint that is of none; those of `part_names` by default
 
     Returns
     -------
     J printable names
     """
-    own = part_names(names)
+    own = part_names(names) if parts is None else parts
     labels: list[str] = []
     known: list[bool] = []
     for joint, (name, parent) in enumerate(zip(names, parents.tolist(), strict=True)):
@@ -126,23 +131,19 @@ def joint_labels(names: Sequence[str], parents: npt.NDArray[np.int64]) -> tuple[
 
 
 def part_labels(
-    names: Sequence[str],
-    parents: npt.NDArray[np.int64],
-    joint_of: npt.NDArray[np.int32],
-    weights: FloatArray,
+    labels: Sequence[str], joint_of: npt.NDArray[np.int32], weights: FloatArray
 ) -> npt.NDArray[np.str_]:
     """Name the body part of each vertex after the part whose joints have the most weight.
 
     Parameters
     ----------
-    names, parents : see `joint_labels`
+    labels : J names, as of `joint_labels`
     joint_of, weights : (V, I) arrays, as of a rig
 
     Returns
     -------
     (V,) array of printable strings
     """
-    labels = joint_labels(names, parents)
     parts, part_of_joint = np.unique(np.array(labels), return_inverse=True)
     share = np.zeros((len(joint_of), len(parts)))
     rows = np.arange(len(joint_of))

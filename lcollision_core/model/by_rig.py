@@ -8,7 +8,7 @@ import numpy as np
 
 from lcollision_core.characters import Character, joint_parts
 from lcollision_core.characters.random_poses import HumanDraws
-from lcollision_core.errors import LCollisionError, PoseSetError, ShapeError
+from lcollision_core.errors import PoseSetError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import ContactRules, PoseSet
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
@@ -117,10 +117,7 @@ def rest_pose_set(character: Character) -> PoseSet:
     LCollisionError : the character has no rig.
     PoseSetError : a face has no area.
     """
-    if character.rig is None:
-        raise LCollisionError(
-            "has no joints to pose it by", "choose a rigged character", where=character.source
-        )
+    labels = joint_parts(character)
     poses = PoseSet(
         character.rest_vertices[None],
         character.topology,
@@ -130,7 +127,7 @@ def rest_pose_set(character: Character) -> PoseSet:
         ContactRules(rest_exclusion=CHARACTER_REST_EXCLUSION),
         character.groups,
         int(np.abs(character.up).argmax()) if character.up_is_sure else None,
-        joint_parts(character.rig),
+        labels,
         metres=character.metres,
     )
     require_usable_reference(poses)

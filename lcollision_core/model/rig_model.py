@@ -87,7 +87,7 @@ class RigModel(PosableBody):
             poses,
         )
         self.character, self._space = character, space
-        self.own_card, self.notes = card, character.notes
+        self.own_card, self.notes = card, (*character.notes, *space.anatomy.notes)
         self.frame_rate = _frame_rate(character)
 
     @classmethod
@@ -126,7 +126,7 @@ class RigModel(PosableBody):
             licence="unknown",
             rules=default_rules(character),
             metres=character.metres,
-            groups=(*character.groups, *part_groups(character.topology, joint_parts(space.rig))),
+            groups=(*character.groups, *part_groups(character.topology, joint_parts(character))),
         )
         return cls(character, space, card, poses)
 
@@ -171,7 +171,7 @@ class RigModel(PosableBody):
         return digest_of(json.dumps(names), arrays)[:16]
 
     def _vertex_labels(self) -> npt.NDArray[np.str_]:
-        return joint_parts(self.space.rig)
+        return joint_parts(self.character)
 
     @property
     def is_trained(self) -> bool:

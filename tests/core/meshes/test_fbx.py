@@ -109,7 +109,7 @@ def test_a_character_of_fbx_has_its_rig_parts_and_clips(tmp_path: Path) -> None:
     # The bottom of the tube follows the mesh itself.
     assert rig.joint_names == ("Body", "Lower", "Upper")
     assert rig.parents.tolist() == [-1, -1, 1]
-    assert set(joint_parts(rig)) == {"Body", "Lower", "Upper"}
+    assert set(joint_parts(character)) == {"Body", "Lower", "Upper"}
     # The clip's own frames are at the rate of the file, 30 a second.
     frames = character.sample("wave", None)
     assert frames.transforms is not None

@@ -99,14 +99,14 @@ def test_labels_follow_the_largest_weight_of_a_part() -> None:
     joint_of = np.array([[0, 1, 2], [2, 0, 1], [3, 4, 5]], dtype=np.int32)
     weights = np.array([[0.3, 0.3, 0.4], [0.6, 0.2, 0.2], [0.3, 0.3, 0.4]])
     # The spring is part of the hips; the shares of a hand and its finger are summed.
-    labels = part_labels(names, parents, joint_of, weights)
+    labels = part_labels(joint_labels(names, parents), joint_of, weights)
     assert labels.tolist() == ["Hips", "Left tail", "Left hand"]
 
 
 def test_labels_are_printable_whatever_the_names() -> None:
     names = ("\n", "", "\x00\u202e", "日本")
     joints = np.arange(4, dtype=np.int32)[:, None]
-    labels = part_labels(names, np.full(4, -1), joints, np.ones((4, 1)))
+    labels = part_labels(joint_labels(names, np.full(4, -1)), joints, np.ones((4, 1)))
     assert labels.tolist() == ["Part", "Part", "Part", "日本"]
 
 

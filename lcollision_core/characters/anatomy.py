@@ -1,0 +1,252 @@
+"""What the joints of a rig are: by their names, by the skeleton, and by what the user says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.characters import joint_roles
+from lcollision_core.characters.character import Character, Rig
+from lcollision_core.characters.joint_roles import Role, Side
+from lcollision_core.characters.skeletons import FINGERS, TRUNK, Person, Skeleton
+from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes.part_names import joint_labels, part_labels, part_names
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.units import front_direction
+
+_SIDED = {
+    "collarbone": Role.SHOULDER,
+    "shoulder": Role.UPPER_ARM,
+    "elbow": Role.FOREARM,
+    "wrist": Role.HAND,
+    "thumb": Role.THUMB,
+    "finger": Role.FINGER,
+    "hip": Role.THIGH,
+    "knee": Role.SHIN,
+    "ankle": Role.FOOT,
+    "toes": Role.TOE,
+}
+_SINGLE = {
+    "spine": Role.SPINE,
+    "neck": Role.NECK,
+    "head": Role.HEAD,
+    "face": Role.FACE,
+    "twist": Role.TWIST,
+    "unknown": Role.OTHER,
+}
+ROLE_NAMES: Mapping[str, tuple[Role, Side]] = {
+    **{
+        f"{name}-{side.value}": (role, side)
+        for name, role in _SIDED.items()
+        for side in (Side.LEFT, Side.RIGHT)
+    },
+    **{name: (role, Side.MIDDLE) for name, role in _SINGLE.items()},
+}
+"""What a user can say that a joint is."""
+
+_PARTS = {
+    Role.SHOULDER: "shoulder",
+    Role.UPPER_ARM: "upper arm",
+    Role.FOREARM: "forearm",
+    **dict.fromkeys((Role.HAND, *FINGERS), "hand"),
+    Role.THIGH: "thigh",
+    Role.SHIN: "shin",
+    **dict.fromkeys((Role.FOOT, Role.TOE), "foot"),
+    Role.SPINE: "torso",
+    Role.NECK: "neck",
+    **dict.fromkeys((Role.HEAD, Role.FACE), "head"),
+}
+_LIMBS = frozenset(_PARTS) - {*TRUNK, Role.FACE}
+_BONES = frozenset((Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN))
+_ONE_OF_A_LIMB = _LIMBS - {Role.TOE, *FINGERS} | {Role.HEAD}
+
+_SAME_WAY = 0.9
+"""Cosine to which feet point to where the body faces."""
+
+_UNKNOWN = (
+    "its joints are not known as those of a person, so random poses turn them little; "
+    "say what they are in the menus of their sliders, or by domains --role"
+)
+_FOUR_LEGS = "it stands on four legs, so random poses turn its limbs little, and not as a person's"
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """What the J joints of a rig are, and where the body faces.
+
+    Attributes
+    ----------
+    roles, sides : of each joint
+    labels : J names of body parts
+    directions : (J, 3) unit vectors along the joints' bones at rest
+    front : (3,) level unit vector
+    axes : (J, 3, 3): see `joint_roles.joint_axes`
+    notes : sentences on what is not known
+    """
+
+    roles: tuple[Role, ...]
+    sides: tuple[Side, ...]
+    labels: tuple[str, ...]
+    front: FloatArray
+    axes: FloatArray
+    notes: tuple[str, ...]
+
+
+def anatomy_of(character: Character) -> Anatomy:
+    """Tell what the joints of a character's rig are.
+
+    Names and the skeleton confirm each other limb by limb: names that cannot follow each other
+    along a limb do not count there, and where the skeleton is no person's, names alone do.
+
+    Raises
+    ------
+    LCollisionError : the character has no rig.
+    """
+    rig, up = rig_of(character), character.up
+    chosen = {rig.joint_names.index(name): ROLE_NAMES[role] for name, role in rig.chosen.items()}
+    parts = part_names(rig.joint_names)
+    lefts = [
+        -1 if part.startswith("Right ") else int(part.startswith("Left "))
+        for part in (part or "" for part in parts)
+    ]
+    for joint, (_, side) in chosen.items():
+        lefts[joint] = {Side.LEFT: 1, Side.RIGHT: -1, Side.MIDDLE: 0}[side]
+    named = list(joint_roles.joint_roles(rig))
+    skeleton = Skeleton(rig, named, lefts, up)
+    person, notes = skeleton.person(), []
+    roles, by_name = _merged(named, person, skeleton)
+    directions = joint_roles.bone_directions(rig, rig.rest[:, :3, 3], roles)
+    front = joint_roles.front_of(roles, rig.rest[:, :3, 3], directions, up)
+    if person is not None and person.front is not None:
+        level = person.front - (person.front @ up) * up
+        length = float(np.linalg.norm(level))
+        if length > 0.5 and (front is None or front @ level < _SAME_WAY * length):
+            front = level / length
+    animal = skeleton.front_of_four_legs() if person is None else None
+    front = animal if front is None else front
+    if front is None:
+        upwards = int(np.abs(up).argmax())
+        front = front_direction(character.rest_vertices * up[upwards], upwards) * up[upwards]
+    if animal is not None:
+        roles = [Role.OTHER if role in _LIMBS else role for role in roles]
+        notes.append(_FOUR_LEGS)
+    for joint, (role, _) in chosen.items():
+        roles[joint] = role
+    if not notes and len(roles) > 1 and not _LIMBS.intersection(roles):
+        notes.append(_UNKNOWN)
+    own_up, own_front = (up, front)
+    if person is not None and person.front is not None and person.up @ up < 0.5:
+        # It lies, or another axis is up than the file says.
+        own_up, own_front = person.up, person.front
+    axes = joint_roles.joint_axes(
+        rig, tuple(roles), rig.rest[:, :3, 3], directions, own_up, own_front
+    )
+    sides = joint_roles.joint_sides(rig, np.cross(own_up, own_front))
+    for joint, (_, side) in chosen.items():
+        if side is not Side.MIDDLE:
+            sides[joint] = side
+    known = [
+        part if trusted and joint not in chosen else None
+        for joint, (part, trusted) in enumerate(zip(parts, by_name, strict=True))
+    ]
+    labels = joint_labels(
+        rig.joint_names,
+        rig.parents,
+        [part or _part(role, side) for part, role, side in zip(known, roles, sides, strict=True)],
+    )
+    return Anatomy(tuple(roles), tuple(sides), labels, front, axes, tuple(notes))
+
+
+def _part(role: Role, side: Side) -> str | None:
+    part = _PARTS.get(role)
+    return None if part is None else f"{side.value} {part}".strip().capitalize()
+
+
+def _merged(
+    named: Sequence[Role], person: Person | None, skeleton: Skeleton
+) -> tuple[list[Role], list[bool]]:
+    """Return the roles of names and skeleton together, and whether each joint's name counts."""
+    roles, trusted = list(named), [True] * len(named)
+    if person is None:
+        return roles, trusted
+    branches = [(list(skeleton.below(root)), order) for root, order in person.limbs.items()]
+    in_limbs = {joint for branch, _ in branches for joint in branch}
+    trunk = [joint for joint in sorted(person.roles) if joint not in in_limbs]
+    n_wrong = 0
+    for joints, order in (*branches, (trunk, (*TRUNK, Role.FACE))):
+        is_right, counted = _is_in_order(named, joints, order, person, skeleton)
+        n_wrong += not is_right
+        for joint in joints:
+            role = person.roles.get(joint, Role.OTHER)
+            if not is_right:
+                roles[joint], trusted[joint] = role, named[joint] is Role.OTHER
+            elif named[joint] is Role.OTHER and role is not Role.FACE:
+                roles[joint] = Role.OTHER if role in counted & _ONE_OF_A_LIMB else role
+    if n_wrong > len(branches) // 2:
+        # What names say elsewhere is as wrong.
+        for joint in set(range(len(named))) - in_limbs - set(trunk):
+            roles[joint], trusted[joint] = Role.OTHER, named[joint] is Role.OTHER
+    return roles, trusted
+
+
+def _is_in_order(
+    named: Sequence[Role],
+    joints: Sequence[int],
+    order: Sequence[Role],
+    person: Person,
+    skeleton: Skeleton,
+) -> tuple[bool, set[Role]]:
+    """Tell whether the names along a limb may be right, and which roles they name."""
+    told = [joint for joint in joints if named[joint] not in (Role.TWIST, Role.OTHER)]
+    counted = {named[joint] for joint in told}
+    if not counted <= set(order):
+        return False, counted
+    for joint in told:
+        above = next((one for one in skeleton.above(joint) if one in told), joint)
+        if order.index(named[above]) > order.index(named[joint]):
+            return False, counted
+    # A limb both of whose bones are named may be one that the skeleton is wrong about.
+    bones = _BONES.intersection(order)
+    if bones and bones <= counted:
+        return True, counted
+    # On a neck or a head hang no arms.
+    pairs = [(named[joint], person.roles[joint]) for joint in joints if joint in person.roles]
+    contradicts = any(
+        (name is not role and name in _ONE_OF_A_LIMB | {Role.TWIST} and role in _ONE_OF_A_LIMB)
+        or (name in (Role.NECK, Role.HEAD) and role is Role.SPINE)
+        for name, role in pairs
+    )
+    return not contradicts, counted
+
+
+def joint_parts(character: Character) -> npt.NDArray[np.str_]:
+    """Return the name of each vertex's body part, by the largest weight.
+
+    Returns
+    -------
+    (V,) array, as "Left forearm"; fingers and toes belong to hands and feet, and what is not known
+    is called after its joint
+
+    Raises
+    ------
+    LCollisionError : the character has no rig.
+    """
+    labels, rig = anatomy_of(character).labels, rig_of(character)
+    return part_labels(labels, rig.joint_of, rig.weights)
+
+
+def rig_of(character: Character) -> Rig:
+    """Return a character's rig.
+
+    Raises
+    ------
+    LCollisionError : it has none.
+    """
+    if character.rig is None:
+        raise LCollisionError(
+            "has no joints to pose it by", "choose a rigged character", where=character.source
+        )
+    return character.rig

@@ -1,0 +1,191 @@
+"""What joints are whatever they are called: by the skeleton, the names and the user together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.characters import Character, RigPoseSpace, read_character
+from lcollision_core.characters.joint_roles import Role
+from lcollision_core.characters.random_poses import HumanDraws, random_codes
+from tests.skeletons import HORSE, PERSON, SNAKE, character_from
+
+FloatArray = npt.NDArray[np.float64]
+
+CASES = Path(__file__).parents[4] / "shared" / "cases"
+
+GERMAN = {
+    "hips": "Becken",
+    "spine": "Wirbelsäule",
+    "chest": "Brustkorb",
+    "neck": "Hals",
+    "head": "Kopf",
+    "clavicle": "Schlüsselbein",
+    "upperarm": "Oberarm",
+    "forearm": "Unterarm",
+    "hand": "Hand",
+    "thigh": "Oberschenkel",
+    "shin": "Unterschenkel",
+    "foot": "Fuß",
+    "toe": "Zehen",
+}
+MMD = {
+    "hips": "下半身",
+    "spine": "上半身",
+    "chest": "上半身2",
+    "neck": "首",
+    "head": "頭",
+    "clavicle": "肩",
+    "upperarm": "腕",
+    "forearm": "ひじ",
+    "hand": "手首",
+    "thigh": "足",
+    "shin": "ひざ",
+    "foot": "足首",
+    "toe": "つま先",
+}
+_SHUFFLED = np.random.default_rng(3).permutation(list(PERSON)).tolist()
+
+
+def translated(words: dict[str, str], name: str, left: str, right: str) -> str:
+    side, _, part = name.rpartition(" ")
+    return {"L": left, "R": right, "": ""}[side] + words[part]
+
+
+NAMINGS = {
+    "numbers": lambda joint, _: f"Bone.{joint:03d}",
+    "nodes without names": lambda joint, _: f"node {joint}",
+    "German": lambda _, name: translated(GERMAN, name, "li_", "re_"),
+    "MMD": lambda _, name: translated(MMD, name, "左", "右"),
+    "shuffled": lambda joint, _: _SHUFFLED[joint],
+    "legs and arms exchanged": lambda _, name: (
+        name.replace("thigh", "x").replace("upperarm", "thigh").replace("x", "upperarm")
+    ),
+}
+
+
+def bends(space: RigPoseSpace, upper: str, lower: str, end: str) -> FloatArray:
+    """Return how far an end moves ahead, up and left, of bones' length, where its hinge turns.
+
+    The upper bone is where it is at rest; those of 80 random poses that bend by 3 degrees or more.
+    """
+    names = list(PERSON)
+    rest, moved = space.rig.rest, []
+    body = np.stack([space.front, space.up, np.cross(space.up, space.front)])
+    for side in "LR":
+        hip, knee, ankle = (names.index(f"{side} {name}") for name in (upper, lower, end))
+        before = rest[ankle, :3, 3] - rest[knee, :3, 3]
+        for codes in random_codes(space, 80, np.random.default_rng(0)):
+            turns = space.transforms(codes)[:, :3, :3] @ np.linalg.inv(rest[:, :3, :3])
+            after = turns[hip].T @ turns[knee] @ before
+            moved.append(body @ (after - before) / np.linalg.norm(before))
+    return np.array([way for way in moved if np.linalg.norm(way) > 0.05])
+
+
+@pytest.mark.parametrize("renamed", NAMINGS.values(), ids=NAMINGS)
+def test_a_person_has_its_limits_under_any_names(renamed) -> None:  # type: ignore[no-untyped-def]
+    english = RigPoseSpace(character_from(PERSON))
+    space = RigPoseSpace(character_from(PERSON, renamed))
+    assert space.roles == english.roles
+    assert space.sides == english.sides
+    assert space.anatomy.notes == ()
+    np.testing.assert_allclose(HumanDraws(space).limits, HumanDraws(english).limits, atol=1e-9)
+    np.testing.assert_allclose(space.axes, english.axes, atol=1e-9)
+    knees = bends(space, "thigh", "shin", "foot")
+    assert len(knees) > 60
+    assert (knees[:, 0] < 0.0).all()
+    assert np.abs(knees[:, 2]).max() < 0.1
+    elbows = bends(space, "upperarm", "forearm", "hand")
+    assert len(elbows) > 60
+    assert (elbows[:, 0] > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("turn", "up"),
+    [
+        pytest.param(Rotation.from_euler("x", 90, degrees=True), (0.0, 0.0, 1.0), id="z up"),
+        pytest.param(Rotation.from_euler("y", 90, degrees=True), (0.0, 1.0, 0.0), id="facing x"),
+        pytest.param(Rotation.from_euler("y", 215, degrees=True), (0.0, 1.0, 0.0), id="askew"),
+        pytest.param(Rotation.from_euler("z", 90, degrees=True), (-1.0, 0.0, 0.0), id="-x up"),
+    ],
+)
+def test_it_does_not_matter_how_a_body_stands(turn: Rotation, up: tuple[float, ...]) -> None:
+    matrix = turn.as_matrix()
+    space = RigPoseSpace(character_from(PERSON, NAMINGS["numbers"], matrix, up))
+    np.testing.assert_allclose(space.front, matrix @ [0.0, 0.0, 1.0], atol=1e-9)
+    assert space.roles == RigPoseSpace(character_from(PERSON)).roles
+    assert (bends(space, "thigh", "shin", "foot")[:, 0] < 0.0).all()
+
+
+def test_knees_that_lie_behind_at_rest_still_bend_backwards() -> None:
+    place = {side: (sign * 0.1, 0.52, -0.04) for side, sign in (("L", 1.0), ("R", -1.0))}
+    joints = {**PERSON, **{f"{side} shin": (f"{side} thigh", place[side]) for side in place}}
+    knees = bends(RigPoseSpace(character_from(joints)), "thigh", "shin", "foot")
+    assert (knees[:, 0] < 0.05).all()
+    assert knees[:, 0].min() < -0.5
+
+
+def test_twists_ends_and_targets_do_not_hide_a_limb() -> None:
+    joints = dict(PERSON)
+    for side, sign in (("L", 1.0), ("R", -1.0)):
+        joints[f"{side} a"] = (f"{side} thigh", (0.1 * sign, 0.7, 0.0))
+        joints[f"{side} b"] = (f"{side} forearm", (0.6 * sign, 1.42, 0.0))
+        joints[f"{side} end"] = (f"{side} toe", (0.1 * sign, 0.01, 0.15))
+    joints["sword"] = ("R hand", (-0.75, 1.42, 0.9))
+    joints = {"root": ("", (0.0, 0.0, 0.0)), **joints, "hips": ("root", (0.0, 1.0, 0.0))}
+    space = RigPoseSpace(character_from(joints, NAMINGS["numbers"]))
+    roles = dict(zip(joints, space.roles, strict=True))
+    english = RigPoseSpace(character_from(PERSON))
+    assert [roles[name] for name in PERSON] == list(english.roles)
+    assert {roles["L a"], roles["R b"]} == {Role.TWIST}
+    assert (roles["L end"], roles["sword"]) == (Role.TOE, Role.OTHER)
+
+
+@pytest.mark.parametrize("renamed", [lambda _, name: name, NAMINGS["numbers"]])
+def test_an_animal_has_no_knees_of_a_person(renamed) -> None:  # type: ignore[no-untyped-def]
+    space = RigPoseSpace(character_from(HORSE, renamed))
+    (note,) = space.anatomy.notes
+    assert "four legs" in note
+    legs = [joint for joint, name in enumerate(HORSE) if name[0] in "LR"]
+    assert np.abs(HumanDraws(space).limits[legs]).max() < np.radians(31.0)
+    np.testing.assert_allclose(space.front, [0.0, 0.0, 1.0], atol=0.1)
+
+
+def test_what_is_not_known_is_said_and_turns_little() -> None:
+    space = RigPoseSpace(character_from(SNAKE))
+    (note,) = space.anatomy.notes
+    assert "not known" in note
+    assert np.abs(HumanDraws(space).limits).max() < np.radians(31.0)
+
+
+def test_what_the_user_says_counts() -> None:
+    character = character_from(SNAKE, NAMINGS["numbers"])
+    assert character.rig is not None
+    chosen = {"Bone.003": "hip-left", "Bone.004": "knee-left"}
+    said = replace(character, rig=replace(character.rig, chosen=chosen))
+    space = RigPoseSpace(said)
+    assert space.roles[3:5] == (Role.THIGH, Role.SHIN)
+    assert [space.sides[joint].value for joint in (3, 4)] == ["left", "left"]
+    assert space.part_names[space.part_of_joint[4]] == "Left shin"
+    # A joint of a person that is none of it after all.
+    person = character_from(PERSON)
+    assert person.rig is not None
+    person = replace(person, rig=replace(person.rig, chosen={"L shin": "unknown"}))
+    assert RigPoseSpace(person).roles[list(PERSON).index("L shin")] is Role.OTHER
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="needs the shared cases")
+def test_one_body_with_two_namings_has_the_same_limits() -> None:
+    spaces = [RigPoseSpace(_read(name)) for name in ("english", "mmd")]
+    assert spaces[0].roles == spaces[1].roles
+    limits = [HumanDraws(space).limits for space in spaces]
+    np.testing.assert_array_equal(limits[0], limits[1])
+
+
+def _read(name: str) -> Character:
+    return read_character(CASES / f"{name}.glb")
