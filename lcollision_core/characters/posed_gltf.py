@@ -223,7 +223,10 @@ class CharacterFile:
             found.append(
                 None
                 if number is None
-                else as_float(self.document.array(number, what, ("VEC3",), shown.n_vertices))
+                else np.tile(
+                    as_float(self.document.array(number, what, ("VEC3",), shown.n_vertices)),
+                    (shown.n_instances, 1),
+                )
             )
         return found
 
@@ -521,6 +524,12 @@ class _Source:
         """Return the mesh of a node, after copying it where other nodes show it too."""
         meshes: list[dict[str, Any]] = self.patch.description["meshes"]
         node = self._nodes[shown.node]
+        if shown.n_instances > 1:
+            raise MeshFileError(
+                f"its node {node.get('name', shown.node)} shows a mesh {shown.n_instances} times, "
+                "which cannot be given as many shapes",
+                f"choose {CharacterForm.JOINTS}, or a file of meshes",
+            )
         if sum(other.get("mesh") == node["mesh"] for other in self._nodes) > 1:
             meshes.append(deepcopy(meshes[node["mesh"]]))
             node["mesh"] = len(meshes) - 1

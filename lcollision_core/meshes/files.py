@@ -150,13 +150,14 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
 def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
     """Return the rest pose of a scene, in the vertex order of a topology where that fits."""
     part = scene.parts[0]
-    is_plain = len(scene.parts) == 1 and not part.is_skinned and not part.morphs.size
+    is_plain = len(scene.parts) == len(part.bones) == 1 and not part.is_skinned
+    is_plain = is_plain and not part.morphs.size
     notes: tuple[str, ...] = ()
     # A node may move float32 vertices far away, where the product keeps their digits.
     is_single = False
     if is_plain:
         vertices, faces, notes = part.points, part.faces, scene.notes
-        transform = scene.rest.transforms[0, part.node]
+        transform = scene.rest.transforms[0, part.node] @ part.bind[0]
         is_single = part.is_single and np.array_equal(transform, np.eye(4))
         if not is_single:
             # A coordinate that is not finite is refused with all others.

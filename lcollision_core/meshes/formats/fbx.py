@@ -35,6 +35,7 @@ from lcollision_core.meshes.formats.scene import (
     Scene,
     ScenePoses,
     is_mirrored,
+    left_out_note,
 )
 from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.topology import FloatArray
@@ -64,7 +65,9 @@ def read_scene(file: BinaryIO, cancel: CancelToken | None = None) -> Scene:
     """
     source = _FbxFile(read_rest(file), cancel)
     held = source.asked()
-    notes: list[str] = []
+    unseen = held["unseen"].tolist()
+    why = "left out, as its file hides it or shows a finer level of detail"
+    notes = [left_out_note(why, unseen)] if unseen else []
     shown = held["shown"].tolist()
     numbers, parts = [], []
     for number, node in enumerate(shown):

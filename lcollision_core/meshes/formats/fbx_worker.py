@@ -75,6 +75,7 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
         "metres": np.array(settings.unit_meters),
         "fps": np.array(settings.frames_per_second),
         "shown": np.array([node.typed_id for node, _ in shown], dtype=np.int64),
+        "unseen": np.array(_unseen(nodes, shown), dtype=np.str_),
     }
     for number, (node, mesh) in enumerate(shown):
         part = _part(node, mesh, most_elements)
@@ -101,6 +102,14 @@ def _shown(nodes: list[Any]) -> Iterator[tuple[Any, Any]]:
             if levels.index(node.typed_id) > 0:
                 continue
         yield node, mesh
+
+
+def _unseen(nodes: list[Any], shown: list[tuple[Any, Any]]) -> list[str]:
+    """Return the names of the nodes with a mesh that are not shown."""
+    seen = {node.typed_id for node, _ in shown}
+    return [
+        node.name for node in nodes if _kept(node.mesh) is not None and node.typed_id not in seen
+    ]
 
 
 def _clips(scene: Any) -> Iterator[tuple[Any, set[int]]]:
@@ -195,13 +204,13 @@ def _weights(mesh: Any) -> np.ndarray:
 def _sampled(scene: Any, clip: int, times: list[float]) -> dict[str, np.ndarray]:
     stack, _ = list(_clips(scene))[clip]
     animation = _kept(stack.anim)
+    shown = [node.typed_id for node, _ in _shown(list(_items(scene.nodes)))]
     transforms, weights = [], []
     for time in times:
         posed = _kept(ufbx.evaluate_scene(scene, animation, time))
         nodes = list(_items(posed.nodes))
         transforms.append(np.stack([_matrix(node.node_to_world) for node in nodes]))
-        shown = [mesh for node in nodes if (mesh := _kept(node.mesh)) is not None]
-        weights.append([_weights(mesh) for mesh in shown])
+        weights.append([_weights(_kept(nodes[number].mesh)) for number in shown])
         posed.free()
     found = {"transforms": np.stack(transforms)}
     for number in range(len(weights[0])):

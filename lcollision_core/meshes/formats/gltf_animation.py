@@ -19,6 +19,7 @@ from lcollision_core.meshes.formats.gltf_document import (
     numbers,
     whole,
 )
+from lcollision_core.meshes.formats.gltf_extensions import pointed_node
 from lcollision_core.meshes.formats.scene import Clip, Part, ScenePoses
 from lcollision_core.meshes.formats.transforms import (
     compose,
@@ -274,9 +275,10 @@ def _driven(
     found: dict[tuple[int, str], tuple[dict[str, Any], int]] = {}
     for channel in animation.get("channels", ()):
         target = channel.get("target", {})
-        if "node" not in target:
+        pointed = pointed_node(target)
+        if pointed is None and "node" not in target:
             continue  # Driven by an extension.
-        node, path = target["node"], target.get("path")
+        node, path = pointed or (target["node"], target.get("path"))
         element(nodes, node, f"a node of {where}")
         if path not in (*_PATHS, _WEIGHTS):
             continue  # The property of an extension.

@@ -24,11 +24,13 @@ _GLB_MAGIC = b"glTF"
 _JSON, _BINARY = b"JSON", b"BIN\0"
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _N_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_COMPRESSIONS = {
-    "KHR_draco_mesh_compression": "Draco",
+DRACO = "KHR_draco_mesh_compression"
+COMPRESSIONS = {
+    DRACO: "Draco",
     "EXT_meshopt_compression": "meshopt",
     "KHR_meshopt_compression": "meshopt",
 }
+"""What compresses meshes, by the name of the extension."""
 
 _STRUCTURE: dict[str, Any] = {
     "extensions": {},
@@ -36,11 +38,13 @@ _STRUCTURE: dict[str, Any] = {
     "extensionsRequired": [str],
     "accessors": [{"sparse": {"indices": {}, "values": {}}}],
     "animations": [{"channels": [{"target": {}}], "samplers": [{}]}],
-    "buffers": [{}],
+    "buffers": [{"extensions": {}}],
     "bufferViews": [{}],
     "images": [{}],
     "materials": [{}],
-    "meshes": [{"primitives": [{"attributes": {}, "targets": [{}]}], "weights": [float]}],
+    "meshes": [
+        {"primitives": [{"attributes": {}, "extensions": {}, "targets": [{}]}], "weights": [float]}
+    ],
     "nodes": [{"children": [int], "weights": [float], "extensions": {}}],
     "scenes": [{"nodes": [int]}],
     "skins": [{"joints": [int]}],
@@ -73,7 +77,7 @@ class GltfDocument:
 
     Raises
     ------
-    MeshFileError : it is truncated, no glTF, or compressed.
+    MeshFileError : it is truncated, or no glTF.
     """
 
     def __init__(self, data: bytes, path: Path) -> None:
@@ -83,14 +87,6 @@ class GltfDocument:
         self._buffers: dict[int, bytes] = {}
         self._left = MAX_NUMBERS
         self.description = _parsed(text)
-        used = {*self.description.get("extensionsUsed", ())}
-        used |= {*self.description.get("extensionsRequired", ())}
-        for extension, name in _COMPRESSIONS.items():
-            if extension in used:
-                raise MeshFileError(
-                    f"its meshes are compressed by {name}, which is not read",
-                    "export it without compression",
-                )
 
     def objects(self, kind: str) -> list[dict[str, Any]]:
         """Return a list of the description, such as "nodes"; empty where the file has none."""
@@ -200,8 +196,18 @@ class GltfDocument:
             elif number == 0 and self._blob is not None:
                 self._buffers[number] = self._blob
             else:
+                for name in COMPRESSIONS.keys() & buffer.get("extensions", {}).keys():
+                    raise compressed(name)
                 raise MeshFileError(f"it has no data for {what}")
         return self._buffers[number]
+
+
+def compressed(extension: str) -> MeshFileError:
+    """Return the error for data that an extension compresses and nothing else holds."""
+    return MeshFileError(
+        f"its meshes are compressed by {COMPRESSIONS[extension]}, which is not read",
+        "export it without compression",
+    )
 
 
 def as_float(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.formats.gltf_document import GltfDocument, resource, whole
+from lcollision_core.meshes.formats.gltf_extensions import without_compression
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 
 _CHANGED = ("nodes", "meshes", "scenes", "images", "extensions")
@@ -49,6 +50,7 @@ class GltfPatch:
 
     def __init__(self, document: GltfDocument, path: Path) -> None:
         self.description = _copied(document.description)
+        without_compression(self.description)
         _require_complete(document)
         self._binary = bytearray()
         starts = [

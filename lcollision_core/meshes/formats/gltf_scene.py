@@ -11,11 +11,19 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.gltf_animation import read_clips, stored_transform
 from lcollision_core.meshes.formats.gltf_document import (
+    DRACO,
     GltfDocument,
     as_float,
+    compressed,
     element,
     numbers,
     whole,
+)
+from lcollision_core.meshes.formats.gltf_extensions import (
+    instances,
+    left_out_nodes,
+    notes_on_extensions,
+    require_readable,
 )
 from lcollision_core.meshes.formats.polygons import MAX_FACES, require_plausible_count
 from lcollision_core.meshes.formats.scene import (
@@ -34,12 +42,13 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 @dataclass(frozen=True)
 class ShownPrimitive:
-    """A primitive that a node shows: numbers in the file, and the number of vertices."""
+    """A primitive that a node shows: numbers in the file, and how many there are."""
 
     node: int
     mesh: int
     primitive: int
     n_vertices: int
+    n_instances: int = 1
 
 
 def read_shown(document: GltfDocument) -> Scene:
@@ -47,8 +56,9 @@ def read_shown(document: GltfDocument) -> Scene:
 
     Raises
     ------
-    MeshFileError : the file is damaged, or shows no triangles.
+    MeshFileError : the file is damaged, needs an unknown extension, or shows no triangles.
     """
+    require_readable(document)
     nodes = document.objects("nodes")
     parents = _parents(nodes)
     order = parents_first(parents)
@@ -59,7 +69,8 @@ def read_shown(document: GltfDocument) -> Scene:
         n_meshes = len(document.objects("meshes"))
         if not n_meshes and document.objects("animations"):
             raise MeshFileError(*NO_MESH)
-        raise MeshFileError(f"it holds {n_meshes} meshes, none of which shows triangles")
+        what = f"it holds {n_meshes} meshes, none of which shows triangles"
+        raise MeshFileError(f"{what} ({notes[0]})" if notes else what)
     parts = tuple(_part(document, primitive, rest[0]) for primitive in shown)
     defaults = tuple(
         _default_weights(document, one, part) for one, part in zip(shown, parts, strict=True)
@@ -88,7 +99,8 @@ def shown_primitives(
     of its primitives: the order of a character's vertices.
     """
     meshes = document.objects("meshes")
-    visible = _visible(document, parents)
+    left_out, notes = left_out_nodes(document, parents)
+    visible = _visible(document, parents) - left_out
     showing = [
         (whole(node["mesh"], f"the mesh of node {i}", 0, len(meshes) - 1), i)
         for i, node in enumerate(document.objects("nodes"))
@@ -97,6 +109,8 @@ def shown_primitives(
     shown: list[ShownPrimitive] = []
     n_vertices = n_others = 0
     for mesh, node in sorted(showing):
+        placed = instances(document, node)
+        n_instances = 1 if placed is None else len(placed)
         for number, primitive in enumerate(meshes[mesh].get("primitives", ())):
             count = 0
             is_of_triangles = primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
@@ -105,17 +119,16 @@ def shown_primitives(
                 index = primitive["attributes"]["POSITION"]
                 accessor = element(document.objects("accessors"), index, f"the accessor of {what}")
                 count = whole(accessor.get("count"), f"the count of {what}", 0, MAX_FACES)
-            if not count:
+            if not count * n_instances:
                 n_others += 1
                 continue
-            n_vertices += count
+            n_vertices += count * n_instances
             require_plausible_count(n_vertices, "vertices")
-            shown.append(ShownPrimitive(node, mesh, number, count))
-    if not n_others:
-        return shown, ()
-    others = "1 part" if n_others == 1 else f"{n_others} parts"
-    was = "was" if n_others == 1 else "were"
-    return shown, (f"{others} without triangles (points, lines) {was} left out",)
+            shown.append(ShownPrimitive(node, mesh, number, count, n_instances))
+    if n_others:
+        were = "1 part {} was" if n_others == 1 else f"{n_others} parts {{}} were"
+        notes.append(f"{were.format('without triangles (points, lines)')} left out")
+    return shown, (*notes, *notes_on_extensions(document))
 
 
 def _human_bones(document: GltfDocument) -> dict[int, str]:
@@ -192,6 +205,8 @@ def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Pa
     attributes = primitive["attributes"]
     node = document.objects("nodes")[shown.node]
     where = f"mesh {shown.mesh}"
+    if DRACO in primitive.get("extensions", ()) and not _has_data(document, attributes):
+        raise compressed(DRACO)
     stored = document.array(attributes["POSITION"], f"the positions of {where}", ("VEC3",))
     points = as_float(stored)
     n = len(points)
@@ -202,9 +217,23 @@ def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Pa
         bones, bind = _skin(document, node["skin"])
         bone_of, weights = _influences(document, attributes, where, n, len(bones))
     faces = _faces(document, primitive, where, n)
+    morphs = _morphs(document, primitive, where, n)
     # Mirrored triangles are wound the other way.
-    if is_mirrored(rest[bones] @ bind, bone_of, weights):
-        faces = faces[:, [0, 2, 1]]
+    turned = faces[:, [0, 2, 1]]
+    placed = None if is_skinned else instances(document, shown.node)
+    if placed is None:
+        faces = turned if is_mirrored(rest[bones] @ bind, bone_of, weights) else faces
+    else:
+        faces = np.concatenate(
+            [
+                number * n + (turned if is_mirrored(one[None], bone_of, weights) else faces)
+                for number, one in enumerate(rest[bones] @ placed)
+            ]
+        )
+        bones, bind = np.repeat(bones, len(placed)), placed
+        points, morphs = np.tile(points, (len(placed), 1)), np.tile(morphs, (1, len(placed), 1))
+        bone_of = np.repeat(np.arange(len(placed), dtype=np.int32), n)[:, None]
+        weights = np.ones((len(points), 1))
     materials: tuple[str, ...] = ()
     if "material" in primitive:
         number = primitive["material"]
@@ -222,8 +251,17 @@ def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Pa
         bone_of,
         weights,
         is_skinned,
-        _morphs(document, primitive, where, n),
+        morphs,
         is_single=stored.dtype == np.float32,
+    )
+
+
+def _has_data(document: GltfDocument, attributes: dict[str, Any]) -> bool:
+    """Whether the accessors of a primitive's attributes point to data."""
+    accessors = document.objects("accessors")
+    return all(
+        not {"bufferView", "sparse"}.isdisjoint(element(accessors, index, f"an accessor ({name})"))
+        for name, index in attributes.items()
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -213,9 +213,7 @@ def with_parts(scene: Scene, kept: Sequence[int]) -> Scene:
         return replace(clip, sample=lambda times: of_kept(clip.sample(times)))
 
     others = [part.mesh for number, part in enumerate(scene.parts) if number not in kept]
-    names = list(dict.fromkeys(others))
-    more = f" and {len(names) - _NAMED} more meshes" if len(names) > _NAMED else ""
-    note = f"left out, as no joint carries it: {', '.join(names[:_NAMED])}{more}"
+    note = left_out_note("left out, as no joint carries it", others)
     return replace(
         scene,
         parts=tuple(scene.parts[number] for number in kept),
@@ -223,6 +221,13 @@ def with_parts(scene: Scene, kept: Sequence[int]) -> Scene:
         clips=tuple(map(clip_of_kept, scene.clips)),
         notes=(*scene.notes, note),
     )
+
+
+def left_out_note(what: str, names: Iterable[str]) -> str:
+    """Return a sentence that names what something is true of, some of them where they are many."""
+    different = list(dict.fromkeys(names))
+    more = f" and {len(different) - _NAMED} more" if len(different) > _NAMED else ""
+    return f"{what}: {', '.join(different[:_NAMED])}{more}"
 
 
 def parents_first(parents: npt.NDArray[np.int64]) -> list[int]:

@@ -174,6 +174,10 @@ def test_without_ufbx_a_sentence_says_what_to_install(
 def test_hidden_meshes_lower_levels_of_detail_and_scenery_are_left_out(tmp_path: Path) -> None:
     scene = read_scene(arm_fbx(tmp_path / "a.fbx", others=["Floor", "hidden floor"]))
     assert [part.mesh for part in scene.parts] == ["Tube"]
-    assert scene.notes == ("left out, as no joint carries it: Floor",)
+    why = "left out, as its file hides it or shows a finer level of detail"
+    assert scene.notes == (f"{why}: hidden floor", "left out, as no joint carries it: Floor")
     path = arm_fbx(tmp_path / "levels.fbx", others=["level 0", "level 1", "level 2"])
-    assert read_scene(path).notes == ("left out, as no joint carries it: level 0",)
+    assert read_scene(path).notes == (
+        f"{why}: level 1, level 2",
+        "left out, as no joint carries it: level 0",
+    )
