@@ -104,15 +104,16 @@ def character_from(
     moved = np.eye(4)
     moved[:3, :3] = np.eye(3) if turn is None else turn
     vertices = vertices @ moved[:3, :3].T
-    joint_of = np.repeat(np.arange(len(names), dtype=np.int32), _N_ROUND * _N_ALONG)[:, None]
+    joint_of = np.zeros((len(vertices), 3), dtype=np.int32)
+    joint_of[:, 0] = np.repeat(np.arange(len(names)), _N_ROUND * _N_ALONG)
     rig = Rig(
         joint_names=tuple(renamed(joint, name) for joint, name in enumerate(names)),
         parents=parents,
         rest=moved @ rest,
         nodes=np.arange(len(names)),
         joint_of=joint_of,
-        weights=np.ones(joint_of.shape),
-        points=vertices[:, None],
+        weights=np.tile([1.0, 0.0, 0.0], (len(vertices), 1)),
+        points=np.repeat(vertices[:, None], 3, axis=1),
     )
     topology = Topology(np.concatenate(faces).astype(np.int32), len(vertices))
     return character_of("made", topology, vertices, rig, list(up), 0)

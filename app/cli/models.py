@@ -110,9 +110,18 @@ def domains(
         list[str] | None,
         typer.Option("--name", metavar="K=NAME", help="Call domain K (from 1) NAME."),
     ] = None,
+    roles: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--role",
+            metavar="JOINT=ROLE",
+            help="Say what a character's joint is, such as knee-left; auto takes that back.",
+        ),
+    ] = None,
 ) -> None:
-    """List the domains of a model or a character, or rename them."""
-    from lcollision_core.model import open_body
+    """List the domains of a model or a character, rename them, or say what its joints are."""
+    from lcollision_core.characters import role_name
+    from lcollision_core.model import RigModel, open_body, remember_roles
 
     renamings: dict[int, str] = {}
     for request in names or []:
@@ -123,9 +132,27 @@ def domains(
             )
         renamings[int(number) - 1] = name
     body = open_body(model_name)
+    chosen: dict[str, str | None] = {}
+    for request in roles or []:
+        joint, _, role = request.rpartition("=")
+        chosen[joint] = None if role == "auto" else role
+    if chosen and not isinstance(body, RigModel):
+        raise LCollisionError(
+            "has no joints", "give --role with a rigged character", where=body.name
+        )
+    if isinstance(body, RigModel) and chosen:
+        remember_roles(body, chosen)
+        body = open_body(model_name)
     if renamings:
         body = changed_body(model_name, body, lambda held: held.edit_domains(renamings))
     _print_domains(describe(body))
+    if isinstance(body, RigModel):
+        tell("Joints:")
+        space = body.space
+        for joint, own, side in zip(space.rig.joint_names, space.roles, space.sides, strict=True):
+            tell(f"  {joint}: {role_name(own, side)}")
+    for remark in body.notes:
+        note(remark)
 
 
 def upright(

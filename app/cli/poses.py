@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.console import progress_bar, tell
+from app.cli.console import note, progress_bar, tell
 from app.cli.inputs import MeshesArgument, PosesArgument, ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -128,6 +128,8 @@ def sample(
 
     destination = require_output(output, ".json")
     model = open_body(model_name)
+    for remark in model.notes:
+        note(remark)
     with progress_bar("Drawing poses") as progress:
         latent = sample_poses(model, count, seed, colliding, progress)
     width = len(str(count))

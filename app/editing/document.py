@@ -288,6 +288,11 @@ class PoseDocument(LiveEditing):
         work = partial(jobs.turn_upright, self.model, self.model_file)
         self._bring(f"Turning {self.model.name}", work, self._on_model)
 
+    def say_role(self, joint: str, role: str | None) -> None:
+        """Say what a character's joint is, None for what its rig tells, and open it again."""
+        work = partial(jobs.say_role, self.model, self.model_file, joint, role)
+        self._bring(f"Opening {self.model.name}", work, self._on_model)
+
     def look_into(
         self,
         path: Path,

@@ -33,6 +33,7 @@ class BodyMenus(QObject):
     actions : the window's, by key
     view_menus : what the menu of the body shows beneath: ways to colour it, camera views
     edit_parts : opens the dialog of the body parts, of one part and what of it is to be changed
+    say_role : says what a joint of a character is, by the joint's name
     attempt : does something and shows what a user can fix of what goes wrong
     """
 
@@ -45,13 +46,14 @@ class BodyMenus(QObject):
         actions: Mapping[str, QAction],
         view_menus: Iterable[QMenu],
         edit_parts: Callable[[int, str], None],
+        say_role: Callable[[str, str | None], None],
         attempt: Callable[[Callable[[], object]], object],
     ) -> None:
         super().__init__(window)
         self._window, self._document = window, document
         self._viewport, self._sliders, self._actions = viewport, sliders, actions
         self._view_menus = tuple(view_menus)
-        self._edit_parts, self._attempt = edit_parts, attempt
+        self._edit_parts, self._say_role, self._attempt = edit_parts, say_role, attempt
         viewport.menu_wanted.connect(self.open_on_body)
 
     @Slot(object, object, QPoint)
@@ -136,9 +138,38 @@ class BodyMenus(QObject):
             for text, what in ((f"Re&name {name}…", "name"), (f"&Colour of {name}…", "colour")):
                 edit = self._add(menu, text, self._edit_parts, domain, what)
                 edit.setEnabled(actions["parts"].isEnabled())
+        self._add_roles(menu, domain, code)
         menu.addAction(actions["parts"])
         menu.addSeparator()
         menu.addActions([actions["unlock"], actions["mirror"]])
+
+    def _add_roles(self, menu: QMenu, domain: int | None, code: int | None) -> None:
+        """Offer to say what a character's joint is: that of a slider, or the only one of a part."""
+        from lcollision_core.characters import ROLE_NAMES, role_name
+        from lcollision_core.model import RigModel
+
+        model = self._document.model
+        if not isinstance(model, RigModel):
+            return
+        codes = model.latent_space.groups[0 if domain is None else 1 + domain].codes
+        own = slice(code, code + 1) if code is not None else codes
+        joints = {joint for joint in model.space.joint_of_code[own].tolist() if joint >= 0}
+        if domain is None or len(joints) != 1:
+            return
+        joint = joints.pop()
+        name = model.space.rig.joint_names[joint]
+        now = role_name(model.space.roles[joint], model.space.sides[joint])
+        roles = menu.addMenu(f"{menu_text(name)} &is")
+        known = self._add(roles, "As its rig says", self._say_role, name, None)
+        known.setEnabled(name in model.space.rig.chosen)
+        roles.addSeparator()
+        for role in ROLE_NAMES:
+            words, _, side = role.partition("-")
+            entry = self._add(
+                roles, f"{side} {words}".strip().capitalize(), self._say_role, name, role
+            )
+            entry.setCheckable(True)
+            entry.setChecked(role == now)
 
     def _add_mirror(self, menu: QMenu, domain: int) -> None:
         """Offer to mirror a body part, where there is one like it on the other side."""

@@ -180,6 +180,11 @@ class FileActions(QObject):
         if self.may_lose_changes():
             self._document.turn_upright()
 
+    def say_role(self, joint: str, role: str | None) -> None:
+        """Say what a character's joint is, which opens it again with other sliders."""
+        if self.may_lose_changes():
+            self._document.say_role(joint, role)
+
     def open_path(self, path: Path) -> None:
         """Open a file as what its extension says: poses, a model, a character, or a mesh.
 

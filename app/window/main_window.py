@@ -168,6 +168,7 @@ class MainWindow(QMainWindow):
             act,
             (views.shading_menu, views.camera_menu),
             self._edits.edit_parts,
+            self.files.say_role,
             self.attempt,
         )
         WindowShortcuts(self)

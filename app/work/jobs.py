@@ -406,6 +406,22 @@ def change_rules(
     return OpenedModel(changed, model_file)
 
 
+def say_role(
+    model: PosableBody,
+    model_file: str,
+    joint: str,
+    role: str | None,
+    progress: Progress,
+    cancel: CancelToken,
+) -> OpenedModel:
+    """Keep what the user says that a character's joint is, and open the character again."""
+    from lcollision_core.model import RigModel, remember_roles
+
+    if isinstance(model, RigModel):
+        remember_roles(model, {joint: role})
+    return open_model(model_file, progress, cancel)
+
+
 def turn_upright(
     model: PosableBody, model_file: str, progress: Progress, cancel: CancelToken
 ) -> OpenedModel:

@@ -1,6 +1,6 @@
 """Characters: files with meshes, a rig and clips, and posing by the rig."""
 
-from lcollision_core.characters.anatomy import ROLE_NAMES, joint_parts
+from lcollision_core.characters.anatomy import ROLE_NAMES, joint_parts, role_name
 from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.characters.default_rules import default_rules
 from lcollision_core.characters.posed_gltf import (

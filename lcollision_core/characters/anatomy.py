@@ -22,6 +22,7 @@ _SIDED = {
     "shoulder": Role.UPPER_ARM,
     "elbow": Role.FOREARM,
     "wrist": Role.HAND,
+    "palm": Role.PALM,
     "thumb": Role.THUMB,
     "finger": Role.FINGER,
     "hip": Role.THIGH,
@@ -46,6 +47,19 @@ ROLE_NAMES: Mapping[str, tuple[Role, Side]] = {
     **{name: (role, Side.MIDDLE) for name, role in _SINGLE.items()},
 }
 """What a user can say that a joint is."""
+
+
+def role_name(role: Role, side: Side) -> str:
+    """Return which of `ROLE_NAMES` a joint is; "unknown" also of a limb's that is on no side."""
+    return next(
+        (
+            name
+            for name, (one, own) in ROLE_NAMES.items()
+            if one is role and own in (side, Side.MIDDLE)
+        ),
+        "unknown",
+    )
+
 
 _PARTS = {
     Role.SHOULDER: "shoulder",
@@ -145,9 +159,10 @@ def anatomy_of(character: Character) -> Anatomy:
         rig, tuple(roles), rig.rest[:, :3, 3], directions, own_up, own_front
     )
     sides = joint_roles.joint_sides(rig, np.cross(own_up, own_front))
-    for joint, (_, side) in chosen.items():
-        if side is not Side.MIDDLE:
-            sides[joint] = side
+    for joint, left in enumerate(lefts):
+        # Without a trunk in the middle names say more than places.
+        if left and (person is None or joint in chosen):
+            sides[joint] = Side.LEFT if left > 0 else Side.RIGHT
     known = [
         part if trusted and joint not in chosen else None
         for joint, (part, trusted) in enumerate(zip(parts, by_name, strict=True))

@@ -14,6 +14,7 @@ from lcollision_core.model.export import (
 from lcollision_core.model.known_characters import (
     remember_choices,
     remember_file,
+    remember_roles,
     remember_up,
 )
 from lcollision_core.model.latent_space import LatentGroup, LatentSpace

@@ -104,6 +104,7 @@ def poses_by_rig(
     return replace(
         rest,
         vertices=np.concatenate([rest.vertices, body.decode(codes)]),
+        notes=(*rest.notes, *body.space.anatomy.notes),
         names=(*rest.names, *(f"rig {number}" for number in range(1, n_poses + 1))),
         provenance={"by_rig": provenance},
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ class KnownCharacter:
     file : where it was last opened from
     rules, domain_names, domain_colours, domain_order : see `ModelCard`
     up_axis : 0, 1 or 2, where the file is wrong about it
+    roles : pairs of a joint's name and what it is, of `characters.ROLE_NAMES`
     """
 
     file: str
@@ -44,6 +45,7 @@ class KnownCharacter:
     domain_colours: tuple[str, ...] | None = None
     domain_order: tuple[int, ...] | None = None
     up_axis: int | None = None
+    roles: tuple[tuple[str, str], ...] | None = None
 
 
 def user_characters_folder() -> Path:
@@ -99,7 +101,7 @@ def find_character(fingerprint: str) -> ListedModel | None:
 
 
 def open_character(path: str | os.PathLike[str], up: int | None = None) -> RigModel:
-    """Read a character, with the axis, the rules and the body parts that the user chose for it.
+    """Read a character, with the axis, joints, rules and body parts that the user chose for it.
 
     Its notes say so, or why what is remembered does not apply.
 
@@ -118,9 +120,15 @@ def open_character(path: str | os.PathLike[str], up: int | None = None) -> RigMo
         known = known_character(model.fingerprint) if up is None else None
         if known is not None and known.up_axis is not None:
             model = RigModel.of(read_character(path, known.up_axis))
+            known = known_character(model.fingerprint)
+        known = known or known_character(model.fingerprint)
+        if known is not None and known.roles is not None:
+            model = model.with_roles(dict(known.roles))
     except (ModelFileError, ShapeError):
         # It is damaged, as `with_remembered` says.
         pass
+    except LCollisionError as error:
+        model = model.noted(f"what you chose for its joints is left out: {error.headline}")
     return with_remembered(model)
 
 
@@ -178,6 +186,29 @@ def remember_up(file: str | os.PathLike[str], up: int) -> None:
     _change(own, lambda known: replace(known, up_axis=chosen))
 
 
+def remember_roles(model: RigModel, roles: Mapping[str, str | None]) -> None:
+    """Keep what the user says that joints of a character are, also of those named before.
+
+    Its codes are others then, so it counts as another character, which keeps the contact rules.
+
+    Parameters
+    ----------
+    roles : of joints by their names; None for what names and skeleton say
+
+    Raises
+    ------
+    LCollisionError : the rig has no such joint, or there is no such role.
+    ModelFileError : it cannot be kept.
+    """
+    chosen = {**model.space.rig.chosen, **roles}
+    held = {name: role for name, role in chosen.items() if role is not None}
+    changed, own = model.with_roles(held), model.with_roles({})
+    pairs = tuple(held.items()) or None
+    _change(own, lambda known: replace(known, roles=pairs))
+    if model.rules_are_chosen and known_character(changed.fingerprint) is None:
+        _change(changed, lambda known: replace(known, rules=model.rules))
+
+
 def remember_choices(model: RigModel) -> None:
     """Keep what the rules and body parts of a character differ in from those of its file.
 
@@ -210,7 +241,7 @@ def _change(model: RigModel, change: Callable[[KnownCharacter], KnownCharacter])
             }
             if known.rules is not None:
                 document["rules"] = known.rules.to_json()
-            held = {name: getattr(known, name) for name in (*_PARTS, "up_axis")}
+            held = {name: getattr(known, name) for name in (*_PARTS, "up_axis", "roles")}
             document |= {name: value for name, value in held.items() if value is not None}
             with atomic_write(path) as file:
                 file.write(json.dumps(document, indent=1).encode() + b"\n")

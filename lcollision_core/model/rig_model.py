@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from lcollision_core.characters import Character, RigPoseSpace, default_rules, joint_parts
+from lcollision_core.characters import (
+    ROLE_NAMES,
+    Character,
+    RigPoseSpace,
+    default_rules,
+    joint_parts,
+)
 from lcollision_core.characters.random_poses import random_codes
 from lcollision_core.characters.rig_space import ROOT_CODES
 from lcollision_core.embedding.fitting import LatentFit
@@ -129,6 +135,29 @@ class RigModel(PosableBody):
             groups=(*character.groups, *part_groups(character.topology, joint_parts(character))),
         )
         return cls(character, space, card, poses)
+
+    def with_roles(self, chosen: Mapping[str, str]) -> RigModel:
+        """Return the character with joints that are what the user says, and its own rules.
+
+        Parameters
+        ----------
+        chosen : one of `characters.ROLE_NAMES` for each joint by its name
+
+        Raises
+        ------
+        LCollisionError : the rig has no such joint, or there is no such role.
+        """
+        rig = self.space.rig
+        for name, role in chosen.items():
+            if name not in rig.joint_names:
+                raise LCollisionError(
+                    f"has no joint {name!r}", "domains lists its joints", where=self.name
+                )
+            if role not in ROLE_NAMES:
+                raise LCollisionError(
+                    "is not known", f"choose one of {', '.join(ROLE_NAMES)}", where=f"role {role!r}"
+                )
+        return RigModel.of(replace(self.character, rig=replace(rig, chosen=dict(chosen))))
 
     def noted(self, sentence: str) -> RigModel:
         """Return the same body with a further note."""

@@ -256,3 +256,24 @@ def test_poses_of_a_character_whose_file_is_another_s_by_now_are_refused(
     assert document.model is editor_model
     for dialog in window.findChildren(FailureDialog):
         dialog.close()
+
+
+def test_a_joint_is_what_the_menu_of_its_slider_says(
+    qtbot: QtBot, window: MainWindow, arm_file: Path
+) -> None:
+    model = dropped(qtbot, window, arm_file)
+    document = window.document
+    code = int(np.flatnonzero(model.space.joint_of_code[6:] == 1)[0]) + 6
+    domain = model.code_effects[code].domain
+    menu = window._body_menus.part_menu(domain, code)
+    (roles,) = (a.menu() for a in menu.actions() if a.text().endswith("&is"))
+    texts = {action.text(): action for action in roles.actions()}
+    assert [text for text, action in texts.items() if action.isChecked()] == ["Left elbow"]
+    assert not texts["As its rig says"].isEnabled()
+    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+        texts["Right knee"].trigger()
+    changed = document.model
+    assert isinstance(changed, RigModel)
+    assert (changed.space.roles[1].name, changed.space.sides[1].value) == ("SHIN", "right")
+    assert open_body(arm_file).fingerprint == changed.fingerprint
+    menu.close()

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.errors import ModelFileError
+from lcollision_core.characters.joint_roles import Role
+from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.meshes import ContactRules
 from lcollision_core.model import (
     NamedPose,
@@ -18,6 +19,7 @@ from lcollision_core.model import (
     read_poses,
     remember_choices,
     remember_file,
+    remember_roles,
     write_poses,
 )
 from lcollision_core.model.known_characters import find_character, user_characters_folder
@@ -72,6 +74,22 @@ def test_what_is_chosen_comes_back_with_the_character_and_defaults_too(path: Pat
     assert path.read_bytes() == content
     (kept,) = user_characters_folder().iterdir()
     assert kept.name == f"{plain.fingerprint}.json"
+
+
+def test_what_the_user_says_of_a_joint_comes_back_and_keeps_the_rules(path: Path) -> None:
+    before = chosen(path)
+    joint = before.space.rig.joint_names[-1]
+    remember_roles(before, {joint: "knee-left"})
+    again = opened(path)
+    assert again.space.roles[-1] is Role.SHIN
+    assert again.fingerprint != before.fingerprint
+    assert again.rules == before.rules
+    with pytest.raises(LCollisionError, match="no joint 'nose'"):
+        remember_roles(again, {"nose": "head"})
+    with pytest.raises(LCollisionError, match="role 'fin' is not known"):
+        remember_roles(again, {joint: "fin"})
+    remember_roles(again, {joint: None})
+    assert opened(path).fingerprint == before.fingerprint
 
 
 def test_another_rig_gets_nothing_of_it(path: Path) -> None:

@@ -1,0 +1,32 @@
+"""What commands say of joints that are not known, and how the user says what they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.app.support import Lcollision
+from tests.rigged_shapes import write_gltf
+from tests.skeletons import SNAKE, character_from
+
+
+@pytest.fixture(autouse=True)
+def _own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+
+
+def test_unknown_joints_are_said_and_can_be_named(lcollision: Lcollision, tmp_path: Path) -> None:
+    path = write_gltf(character_from(SNAKE, up=(0.0, 0.0, 1.0)), tmp_path / "snake.glb")
+    result = lcollision("sample", path, "-n", 1, "-o", tmp_path / "poses.json")
+    assert "its joints are not known as those of a person" in result.stderr
+    result = lcollision("domains", path, "--role", "link 3=hip-left", "--role", "link 4=knee-left")
+    assert "  link 4: knee-left\n" in result.stdout
+    assert "not known" not in result.stderr
+    assert "  link 4: knee-left\n" in lcollision("domains", path).stdout
+    lcollision("domains", path, "--role", "link 4=auto")
+    assert "  link 4: unknown\n" in lcollision("domains", path).stdout
+    for wrong in ("link 3=fin", "fin=head"):
+        result = lcollision("domains", path, "--role", wrong)
+        assert result.exit_code == 2
+        assert "fin" in result.stderr
