@@ -391,7 +391,9 @@ class Viewport(QWidget):
             if self.shading is not Shading.EXACT:
                 exact = None
             scene.crossing.show(None if exact is None else exact.pairs)
-            scene.uncounted.show(None if exact is None else exact.excluded_pairs)
+            # While the pose is dragged, those of the pose before stay.
+            if exact is None or exact.excluded is not None:
+                scene.uncounted.show(None if exact is None else exact.excluded_pairs)
         if self.mouse is not None:
             self.mouse.mark(scene, frame.vertices)
         scene.marks.show_contacts(frame.contacts)

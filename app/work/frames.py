@@ -52,7 +52,8 @@ class ExactVerdict:
     request_id : of the frame that was checked
     pairs : (P, 2) int32 array, read-only, the colliding faces, the smaller first
     excluded_pairs : (Q, 2) int32 array, read-only, colliding faces that the contact rules leave out
-    excluded : how many of them each rule leaves out
+    excluded : how many of them each rule leaves out; None of a pose that is dragged, as only pairs
+        that count are looked for until it rests
     energy : of the whole pose, in normalised lengths squared
     vertex_energy : (V,) float64 array, read-only, in normalised lengths squared
     colliding : whether there is a pair that counts
@@ -61,19 +62,21 @@ class ExactVerdict:
     request_id: int
     pairs: npt.NDArray[np.int32]
     excluded_pairs: npt.NDArray[np.int32]
-    excluded: RuleCounts
+    excluded: RuleCounts | None
     energy: float
     vertex_energy: FloatArray
     colliding: bool
 
     @classmethod
-    def of(cls, found: SelfCollisions, request_id: int) -> ExactVerdict:
+    def of(
+        cls, found: SelfCollisions, request_id: int, *, counted_only: bool = False
+    ) -> ExactVerdict:
         """Keep what was found of a frame."""
         return cls(
             request_id=request_id,
             pairs=_frozen(found.pairs),
             excluded_pairs=_frozen(found.excluded_pairs),
-            excluded=found.excluded,
+            excluded=None if counted_only else found.excluded,
             energy=found.energy,
             vertex_energy=_frozen(found.vertex_energy),
             colliding=found.colliding,
@@ -172,7 +175,8 @@ class FrameEvaluator:
     ) -> LiveFrame:
         verdict = None
         if found is not None:
-            verdict = ExactVerdict.of(found, request_id)
+            counted_only = not self.model.rules.exclude_nothing
+            verdict = ExactVerdict.of(found, request_id, counted_only=counted_only)
         elif self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS:
             verdict = self._checked(vertices, request_id)
         predicts = self.predicts and self.model.has_predictor

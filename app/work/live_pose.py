@@ -316,7 +316,7 @@ class LivePose(QObject):
         frame = answer.value if isinstance(answer.value, LiveFrame) else None
         if frame is not None and (is_of_drag or request is self._unanswered):
             self._unanswered, self._unchecked, self._shown_id = None, None, frame.request_id
-            if frame.verdict is None and request is not None:
+            if request is not None and (frame.verdict is None or frame.verdict.excluded is None):
                 self._unchecked = VerdictRequest(frame.request_id, request.model, frame)
                 self._rested.start()
         is_late = is_of_drag and self._next is not None

@@ -66,13 +66,37 @@ class Exclusions(NamedTuple):
     squared_tolerance: float
 
 
+class UncountedNodes(NamedTuple):
+    """Pairs of nodes of a `FaceTree` below which no pair of faces can count.
+
+    Either the two faces share a vertex or a contact rule excludes them, whatever the pose. Nodes of
+    one level have a table: inner nodes of one depth, and all leaves.
+
+    Attributes
+    ----------
+    level : (n,) int32, the table of each node
+    number : (n,) int32, its row and column in it
+    start : (levels,) int64, the first byte of each table
+    stride : (levels,) int64, the bytes of a row
+    bits : (m,) uint8, eight columns a byte, the lowest bit first; (0,) where nothing is known
+    """
+
+    level: IntArray
+    number: IntArray
+    start: npt.NDArray[np.int64]
+    stride: npt.NDArray[np.int64]
+    bits: npt.NDArray[np.uint8]
+
+
 class PoseWork(NamedTuple):
     """The workspace of one pose, kept between poses.
 
     Attributes
     ----------
     middle : (3,) float64, the middle of the pose's bounding box, in its unit
-    triangles : (S, 3, 3) float64, corners in normalised length about that middle
+    vertices : (V, 3) float64, in normalised length about that middle
+    rounded : (V, 3) float32, the same
+    pair : (2, 3, 3) float64, the corners of two triangles
     boxes : (6 S,) float32, leaf by leaf the lower x of its slots, lower y, lower z, upper x, ...
     node_boxes : (n, 6) float32, lower x, y, z, upper x, y, z
     stack : (depth bound, 2) int32, pairs of nodes still to be visited
@@ -80,7 +104,9 @@ class PoseWork(NamedTuple):
     """
 
     middle: npt.NDArray[np.float64]
-    triangles: npt.NDArray[np.float64]
+    vertices: npt.NDArray[np.float64]
+    rounded: npt.NDArray[np.float32]
+    pair: npt.NDArray[np.float64]
     boxes: npt.NDArray[np.float32]
     node_boxes: npt.NDArray[np.float32]
     stack: IntArray

@@ -12,7 +12,7 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork
+from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork, UncountedNodes
 from lcollision_core.contact.kernels import (
     COINCIDENT,
     COUNTED,
@@ -24,6 +24,7 @@ from lcollision_core.contact.kernels import (
 )
 from lcollision_core.contact.rules import exclusions_of, require_room, rules_of, with_ignored
 from lcollision_core.contact.tree import allocate_work, build_tree
+from lcollision_core.contact.uncounted import NOTHING_KNOWN, UncountedTables
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress
 from lcollision_core.meshes.contact_rules import N_RULES, STRICT, ContactRules, RuleCounts
@@ -65,7 +66,8 @@ class SelfCollisions:
     penetration_depth : (P,) float64, PD of each pair, > 1e-9
     excluded_pairs, excluded_depth : (Q, 2) and (Q,), the same of the pairs that a contact rule
         excludes: they count neither for the verdict nor for the energy
-    excluded_rule : (Q,) uint8, by which rule: 1 for the first of `RuleCounts` and so on
+    excluded_rule : (Q,) uint8, by which rule: 1 for the first of `RuleCounts` and so on; Q is 0
+        where only pairs that count were asked for
     vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
     """
 
@@ -208,10 +210,11 @@ class CollisionDetector:
         if not 1.0 / MAX_BODY_SIZE <= self.body_size <= MAX_BODY_SIZE:
             needed = f"{1.0 / MAX_BODY_SIZE:.0e} to {MAX_BODY_SIZE:.0e}"
             raise ShapeError.must_be("the body size", needed, f"{self.body_size:.1e}", "scale it")
-        self._tree: FaceTree = build_tree(vertices, topology.faces)
+        self._tree: FaceTree = build_tree(vertices, topology.faces, topology.vertex_components[1])
         self._exclusions = self._exclusions_of(vertices, STRICT, ())
         if not rules.exclude_nothing:
             self._exclusions = self._exclusions_of(vertices, rules, groups)
+        self._uncounted = UncountedTables(self._tree, self._exclusions)
         self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()
 
     def with_rules(
@@ -225,11 +228,12 @@ class CollisionDetector:
         lengths = (rules.near_exclusion, rules.rest_exclusion)
         if lengths != (held.near_exclusion, held.rest_exclusion):
             return CollisionDetector(self.topology, self._reference, rules, groups)
-        other = copy(self)
+        other, exclusions = copy(self), with_ignored(self._exclusions, rules, groups)
         vars(other).update(
             rules=rules,
             groups=tuple(groups),
-            _exclusions=with_ignored(self._exclusions, rules, groups),
+            _exclusions=exclusions,
+            _uncounted=UncountedTables(self._tree, exclusions),
             # Searchers keep the exclusions.
             _idle=queue.LifoQueue(),
         )
@@ -247,23 +251,27 @@ class CollisionDetector:
         """
         return rules_of(self._exclusions, pairs, penetration_depth)
 
-    def detect(self, vertices: npt.ArrayLike, *, unit: float = 1.0) -> SelfCollisions:
+    def detect(
+        self, vertices: npt.ArrayLike, *, unit: float = 1.0, counted_only: bool = False
+    ) -> SelfCollisions:
         """Find all colliding pairs of one pose.
 
         Parameters
         ----------
         vertices : (V, 3) array
         unit : of `vertices`, in units of the reference: 0.001 for millimetres where that has metres
+        counted_only : whether to leave out the pairs that a contact rule excludes, which is faster
 
         Raises
         ------
         ShapeError : another shape, or a vertex that is not finite or absurdly far away.
         """
         pose = self._checked(vertices, (self.topology.n_vertices, 3))
+        uncounted = self._uncounted.nodes() if counted_only else NOTHING_KNOWN
         vertex_energy = np.zeros(self.topology.n_vertices)
         parts: list[tuple[IntArray, FloatArray, npt.NDArray[np.uint8]]] = []
         with self._searcher() as searcher:
-            for n_found in searcher.search(pose, unit=unit):
+            for n_found in searcher.search(pose, unit=unit, uncounted=uncounted):
                 found = searcher.found
                 add_vertex_energy(self._tree, found, n_found, vertex_energy)
                 pairs = np.sort(self._tree.slot_face[found.slots[:n_found]], axis=1)
@@ -273,12 +281,14 @@ class CollisionDetector:
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         pairs, depth, rule = pairs[order], depth[order], rule[order]
         counts = rule == COUNTED
+        # Without all of them, which are found depends on how far the tables are.
+        excluded = np.zeros(len(rule), dtype=np.bool_) if counted_only else ~counts
         return SelfCollisions(
             pairs=pairs[counts],
             penetration_depth=depth[counts],
-            excluded_pairs=pairs[~counts],
-            excluded_depth=depth[~counts],
-            excluded_rule=rule[~counts],
+            excluded_pairs=pairs[excluded],
+            excluded_depth=depth[excluded],
+            excluded_rule=rule[excluded],
             vertex_energy=vertex_energy,
         )
 
@@ -383,9 +393,12 @@ class CollisionDetector:
         """
         poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
         colliding = np.zeros(len(poses), dtype=np.bool_)
+        uncounted = self._uncounted.nodes()
 
         def search(searcher: _Searcher, pose: int) -> None:
-            for n_found in searcher.search(poses[pose], first_only=True, number=pose, unit=unit):
+            for n_found in searcher.search(
+                poses[pose], first_only=True, number=pose, unit=unit, uncounted=uncounted
+            ):
                 # The search ends where a pair counts, so the last ones found tell.
                 colliding[pose] = (searcher.found.rule[:n_found] == COUNTED).any()
 
@@ -469,7 +482,7 @@ class _Searcher:
         self._exclusions = exclusions
         self._body_size = body_size
         self._scale = 1.0 / body_size
-        self._work: PoseWork = allocate_work(tree)
+        self._work: PoseWork = allocate_work(tree, topology.n_vertices)
         self._pose = np.empty((topology.n_vertices, 3))
         self._unused = topology.unused_vertices
         self._used = topology.faces[0, 0]
@@ -488,11 +501,12 @@ class _Searcher:
         number: int | None = None,
         unit: float = 1.0,
         with_coincident: bool = False,
+        uncounted: UncountedNodes = NOTHING_KNOWN,
     ) -> Iterator[int]:
         """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
 
         `number` is the pose's index in its batch, for the error message; `unit` is as of
-        `CollisionDetector.detect`; `with_coincident` is as of `search_pose`.
+        `CollisionDetector.detect`; the others are as of `search_pose`.
         """
         np.copyto(self._pose, pose)
         self._pose[self._unused] = self._pose[self._used]
@@ -505,6 +519,7 @@ class _Searcher:
                 DEPTH_TOLERANCE,
                 self._tree,
                 self._exclusions,
+                uncounted,
                 self._work,
                 first_only,
                 self.found,

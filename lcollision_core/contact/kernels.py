@@ -17,7 +17,7 @@ import numpy.typing as npt
 from numba import njit, uint64
 
 from lcollision_core.compiled import compiled
-from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork
+from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork, UncountedNodes
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -162,7 +162,7 @@ def _refit(pose, scale, tree, work):
     Coordinates are taken from the middle of the pose's bounding box, so that a pose far from
     the origin loses no precision to its distance.
     """
-    middle = work.middle
+    middle, vertices, rounded = work.middle, work.vertices, work.rounded
     for c in range(3):
         low = np.inf
         high = -np.inf
@@ -173,6 +173,10 @@ def _refit(pose, scale, tree, work):
             low = min(low, pose[v, c])
             high = max(high, pose[v, c])
         middle[c] = 0.5 * (low + high)
+    for v in range(len(pose)):
+        for c in range(3):
+            vertices[v, c] = (pose[v, c] - middle[c]) * scale
+            rounded[v, c] = np.float32(vertices[v, c])
 
     boxes = work.boxes
     for slot in range(len(tree.slot_face)):
@@ -187,14 +191,9 @@ def _refit(pose, scale, tree, work):
                 boxes[base + c * LEAF_SIZE] = np.inf
                 boxes[base + (3 + c) * LEAF_SIZE] = -np.inf
                 continue
-            p = (pose[first, c] - middle[c]) * scale
-            q = (pose[second, c] - middle[c]) * scale
-            r = (pose[third, c] - middle[c]) * scale
-            work.triangles[slot, 0, c] = p
-            work.triangles[slot, 1, c] = q
-            work.triangles[slot, 2, c] = r
-            boxes[base + c * LEAF_SIZE] = np.float32(min(p, min(q, r)))
-            boxes[base + (3 + c) * LEAF_SIZE] = np.float32(max(p, max(q, r)))
+            p, q, r = rounded[first, c], rounded[second, c], rounded[third, c]
+            boxes[base + c * LEAF_SIZE] = min(p, min(q, r))
+            boxes[base + (3 + c) * LEAF_SIZE] = max(p, max(q, r))
 
     node_boxes = work.node_boxes
     for node in range(len(tree.left) - 1, -1, -1):
@@ -222,6 +221,17 @@ def _push(stack, n_waiting, a, b):
     stack[n_waiting, 0] = a
     stack[n_waiting, 1] = b
     return n_waiting + 1
+
+
+@njit(inline="always", error_model="numpy")
+def _is_uncounted(uncounted, a, b):
+    """Whether a table has two nodes, and says that no pair of faces below them can count."""
+    level = uncounted.level[a]
+    if level != uncounted.level[b]:
+        return False
+    column = uncounted.number[b]
+    row = uncounted.start[level] + uncounted.number[a] * uncounted.stride[level]
+    return (uncounted.bits[row + (column >> 3)] >> (column & 7)) & 1 != 0
 
 
 @njit(inline="always", error_model="numpy")
@@ -361,11 +371,22 @@ def _coincide(triangles, a, b, tolerance):
     return True
 
 
+@njit(inline="always", error_model="numpy")
+def _gather(corners, vertices, slot, pair, side):
+    """Copy the corners of the face in a slot to one side of a pair."""
+    base = slot // LEAF_SIZE * 3 * LEAF_SIZE + slot % LEAF_SIZE
+    for k in range(3):
+        v = corners[base + k * LEAF_SIZE]
+        for c in range(3):
+            pair[side, k, c] = vertices[v, c]
+
+
 @compiled
 def _search_leaves(
     corners,
     boxes,
-    triangles,
+    vertices,
+    pair,
     leaf_a,
     leaf_b,
     box_b,
@@ -420,10 +441,10 @@ def _search_leaves(
             if _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1) == 0:
                 continue
             slot_b = leaf_b * LEAF_SIZE + j
-            squared_depth = _pair_depth_squared(triangles, slot_a, slot_b, tolerance)
-            if squared_depth == 0.0 and not (
-                with_coincident and _coincide(triangles, slot_a, slot_b, tolerance)
-            ):
+            _gather(corners, vertices, slot_a, pair, 0)
+            _gather(corners, vertices, slot_b, pair, 1)
+            squared_depth = _pair_depth_squared(pair, 0, 1, tolerance)
+            if squared_depth == 0.0 and not (with_coincident and _coincide(pair, 0, 1, tolerance)):
                 continue
             slots[n_found, 0] = slot_a
             slots[n_found, 1] = slot_b
@@ -451,6 +472,7 @@ def search_pose(
     tolerance: float,
     tree: FaceTree,
     exclusions: Exclusions,
+    uncounted: UncountedNodes,
     work: PoseWork,
     first_only: bool,
     found: Found,
@@ -467,7 +489,8 @@ def search_pose(
     pose : (V, 3) float64 array
     scale : factor from the pose's unit to normalised length
     tolerance : depth in normalised length up to which two faces touch rather than penetrate
-    tree, exclusions, work : of one topology; `work` is overwritten
+    tree, exclusions, uncounted, work : of one topology; `work` is overwritten. Pairs of faces below
+        nodes that are `uncounted` are not found.
     first_only : end the search at the first leaves that have a pair that counts
     found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
     with_coincident : whether pairs that lie on each other are found too, with depth 0
@@ -484,6 +507,7 @@ def search_pose(
     boxes = work.node_boxes
     stack = work.stack
     fraction = work.fraction
+    skips = len(uncounted.bits) > 0
     # Not a plain 0: the search of leaves would be compiled twice for it.
     n_found: int = int(np.int64(0))
     if n_waiting == 0:
@@ -495,6 +519,8 @@ def search_pose(
         n_waiting -= 1
         a = stack[n_waiting, 0]
         b = stack[n_waiting, 1]
+        if skips and _is_uncounted(uncounted, a, b):
+            continue
         if tree.leaf[a] >= 0 and tree.leaf[b] >= 0:
             if n_found + LEAF_SIZE * LEAF_SIZE > len(found.slots):
                 return n_found, n_waiting + 1
@@ -502,7 +528,8 @@ def search_pose(
             n_found = _search_leaves(
                 tree.corners,
                 work.boxes,
-                work.triangles,
+                work.vertices,
+                work.pair,
                 tree.leaf[a],
                 tree.leaf[b],
                 boxes[b],

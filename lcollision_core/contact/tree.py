@@ -9,17 +9,24 @@ from lcollision_core.compiled import compiled
 from lcollision_core.contact.arrays import FaceTree, PoseWork
 from lcollision_core.contact.kernels import LEAF_SIZE
 
+_APART = 1e3
+"""Factor by which the centroids of components are drawn apart, against those within them."""
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 
 
-def build_tree(vertices: FloatArray, faces: IntArray) -> FaceTree:
+def build_tree(vertices: FloatArray, faces: IntArray, component: IntArray) -> FaceTree:
     """Build the tree by median splits of the face centroids along their longest extent.
+
+    Components are split from each other first, by their own centroids, as shells that cover each
+    other move apart.
 
     Parameters
     ----------
     vertices : (V, 3) float64 array, a typical pose (the reference)
     faces : (F, 3) int32 array
+    component : (V,) int32 array, the connected component of each vertex
 
     Returns
     -------
@@ -28,7 +35,12 @@ def build_tree(vertices: FloatArray, faces: IntArray) -> FaceTree:
     n_leaves = -(-len(faces) // LEAF_SIZE)
     order = np.arange(len(faces), dtype=np.int32)
     left, right, leaf, size = (np.empty(2 * n_leaves - 1, dtype=np.int32) for _ in range(4))
-    _split_faces(vertices[faces].mean(axis=1), LEAF_SIZE, order, left, right, leaf, size)
+    centroids, of_face = vertices[faces].mean(axis=1), component[faces[:, 0]]
+    if of_face.max() > of_face.min():
+        of_component = [np.bincount(of_face, centroids[:, c]) for c in range(3)]
+        n_faces = np.maximum(np.bincount(of_face), 1)
+        centroids = centroids + _APART * (np.stack(of_component) / n_faces).T[of_face]
+    _split_faces(centroids, LEAF_SIZE, order, left, right, leaf, size)
     slot_face = np.full(n_leaves * LEAF_SIZE, -1, dtype=np.int32)
     slot_face[: len(faces)] = order
     corners = np.full((n_leaves * LEAF_SIZE, 3), -1, dtype=np.int32)
@@ -126,7 +138,7 @@ def _split_faces(
         n_waiting += 2
 
 
-def allocate_work(tree: FaceTree) -> PoseWork:
+def allocate_work(tree: FaceTree, n_vertices: int) -> PoseWork:
     """Make the arrays that one thread needs to search poses with a tree."""
     n_slots = len(tree.slot_face)
     n_nodes = len(tree.left)
@@ -134,7 +146,9 @@ def allocate_work(tree: FaceTree) -> PoseWork:
     levels = int(np.ceil(np.log2(n_slots // LEAF_SIZE))) + 1
     return PoseWork(
         middle=np.empty(3),
-        triangles=np.zeros((n_slots, 3, 3)),
+        vertices=np.empty((n_vertices, 3)),
+        rounded=np.empty((n_vertices, 3), dtype=np.float32),
+        pair=np.empty((2, 3, 3)),
         boxes=np.empty(6 * n_slots, dtype=np.float32),
         node_boxes=np.empty((n_nodes, 6), dtype=np.float32),
         stack=np.empty((4 * levels + 4, 2), dtype=np.int32),

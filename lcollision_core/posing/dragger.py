@@ -84,8 +84,8 @@ class DragStep:
     latent : (D,) float64 array, read-only
     vertices : (V, 3) float32 array, read-only, in the data's unit, in the model's frame
     miss : what is left to the target: normalised length, radians of a twist
-    found : the exact check of these vertices where they are exported to; None of a drag that is
-        not solid
+    found : the exact check of these vertices where they are exported to, without excluded pairs;
+        None of a drag that is not solid
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
         the pose from going on
     settled : whether the same target would lead no further

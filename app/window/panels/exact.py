@@ -84,7 +84,8 @@ class ExactCard(Card):
 
     def _say(self, verdict: ExactVerdict) -> None:
         document = self._document
-        frame, left_out = document.frame, verdict.excluded.total
+        frame, excluded = document.frame, verdict.excluded
+        left_out = excluded is None or excluded.total > 0
         is_held = frame is not None and len(frame.contacts) > 0
         headline = "Colliding (checked)" if verdict.colliding else "No collisions (checked)"
         said, tips = [], []
@@ -100,8 +101,12 @@ class ExactCard(Card):
         else:
             said.append(f"No {'other ' if left_out else ''}triangle crosses another")
         if left_out:
-            said.append(f"{counted(left_out, 'pair')} of triangles not counted")
-            sentence = document.model.rules.sentence(verdict.excluded)
+            if excluded is None:
+                said.append("Without the pairs of triangles that are not counted")
+                sentence = f"{document.model.rules.described()} are not counted"
+            else:
+                said.append(f"{counted(excluded.total, 'pair')} of triangles not counted")
+                sentence = document.model.rules.sentence(excluded)
             tips.insert(0, f"{headline}; {sentence}: see Edit > Contacts")
         if is_held and verdict.colliding:
             # Why a drag goes no further.

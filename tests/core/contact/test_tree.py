@@ -23,7 +23,7 @@ from tests.core.shapes import Mesh, box, interlocked_tori, join, soup
 )
 def test_a_tree_holds_every_face_once(mesh: Mesh) -> None:
     check_mesh(mesh)
-    built = build_tree(mesh.vertices, mesh.topology.faces)
+    built = build_tree(mesh.vertices, mesh.topology.faces, mesh.topology.vertex_components[1])
     slots = built.slot_face[built.slot_face >= 0]
     assert sorted(slots.tolist()) == list(range(mesh.topology.n_faces))
     inner = built.leaf < 0
