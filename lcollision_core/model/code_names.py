@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,23 @@ _AIMLESS = 0.5
 _OWN = 0.25
 """Of the largest domain's motion: a domain that moves as much is what its own code moves."""
 _TINY = 1e-12
+
+_REGIONS = (
+    (r"\b(thumb|index|middle|ring|pinky|pinkie|little)\b", "finger"),
+    (r"\bfinger", "hand"),
+    (r"\btoes?\b", "foot"),
+    (r"clavicle|collar|scapula", "shoulder"),
+    (r"shoulder|forearm|\bhand|wrist", "arm"),
+    (r"forearm", "elbow"),
+    (r"\bhand", "wrist"),
+    (r"thigh|shin|calf|knee|\bfoot|\bfeet|ankle", "leg"),
+    (r"thigh", "hip"),
+    (r"shin|calf", "knee"),
+    (r"\bfoot|\bfeet", "ankle"),
+    (r"spine|torso|chest|belly|abdomen|waist|neck", "spine trunk"),
+    (r"\b(face|eyes?|jaw|chin|brow|tongue)\b", "head"),
+)
+"""Words by which people look for what is called otherwise; each may lead to the next."""
 
 _WAYS = (("up", "down"), ("forward", "back"), ("left", "right"))
 _ASIDE = 2
@@ -121,6 +139,21 @@ def code_names(
             for effect in effects[len(names) : len(names) + size]
         )
     return tuple(names)
+
+
+def with_regions(name: str) -> str:
+    """Return a name in small letters, with the general words for its region of the body.
+
+    Examples
+    --------
+    >>> with_regions("Ring 1 bend")
+    'ring 1 bend finger hand arm wrist'
+    """
+    words = name.casefold()
+    for pattern, region in _REGIONS:
+        if re.search(pattern, words):
+            words += f" {region}"
+    return words
 
 
 def _effect(

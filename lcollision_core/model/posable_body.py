@@ -25,7 +25,7 @@ from lcollision_core.meshes import (
     with_named_groups,
 )
 from lcollision_core.model.card import ModelCard
-from lcollision_core.model.code_names import CodeEffect, code_names
+from lcollision_core.model.code_names import CodeEffect, code_names, with_regions
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.latent_space import WHOLE_BODY, LatentGroup, LatentSpace
 from lcollision_core.model.matching import checked_mesh, require_same_faces
@@ -385,7 +385,7 @@ class PosableBody(ABC):
         """
         other = copy(self)
         other.card, other.name = card, name or self.name
-        for cached in ("latent_space", "code_names"):
+        for cached in ("latent_space", "code_names", "code_words"):
             other.__dict__.pop(cached, None)
         return other
 
@@ -472,6 +472,20 @@ class PosableBody(ABC):
     def code_names(self) -> tuple[str, ...]:
         """D names of the codes by effect, unique within each group: "left thigh forward"."""
         return code_names(self.code_effects, self.domain_names, self.pose_space.group_sizes)
+
+    @cached_property
+    def code_words(self) -> tuple[str, ...]:
+        """D texts in small letters in which people look for a code: all that it may be called."""
+        words = [
+            # By its number in the group as well.
+            with_regions(f"{group.name} {own} {group.full_name(index)}")
+            for group in self.latent_space.groups
+            for index, own in enumerate(self.code_names[group.codes])
+        ]
+        if not any("finger" in text for text in words):
+            # These move with the hand.
+            words = [f"{text} finger thumb" if "hand" in text else text for text in words]
+        return tuple(words)
 
     @cached_property
     def detector(self) -> CollisionDetector:

@@ -27,7 +27,7 @@ from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import ContactRules, RigidTransform, part_groups
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.model.card import ModelCard
-from lcollision_core.model.code_names import CodeEffect
+from lcollision_core.model.code_names import CodeEffect, with_regions
 from lcollision_core.model.colours import domain_colours
 from lcollision_core.model.latent_space import WHOLE_BODY, LatentSpace
 from lcollision_core.model.mirror import PoseMirror, Symmetry
@@ -35,7 +35,7 @@ from lcollision_core.model.naming import MAX_NAME_LENGTH, MAX_POSE_NAME_LENGTH, 
 from lcollision_core.model.posable_body import PosableBody, read_only
 from lcollision_core.model.rig_fit import fit_rig
 from lcollision_core.model.rig_mirror import RigMirror, find_joint_partners
-from lcollision_core.model.rig_names import motion_names
+from lcollision_core.model.rig_names import motion_names, side_of
 from lcollision_core.model_file import digest_of
 
 if TYPE_CHECKING:
@@ -341,6 +341,22 @@ class RigModel(PosableBody):
             name
             for start, end in zip((0, *ends[:-1]), ends, strict=True)
             for name in unique_names(names[start:end])
+        )
+
+    @cached_property
+    def code_words(self) -> tuple[str, ...]:
+        """Also by what the joints are and on which side, in whatever language they are named."""
+        left = np.cross(self.space.up, self.space.front)
+        places = (self.space.origins - self.space.origins.mean(axis=0)) @ left
+        kinds = [
+            f"{role.name.lower().replace('_', ' ')} {side_of(place)}"
+            for role, place in zip(self.space.roles, places, strict=True)
+        ]
+        return tuple(
+            words if joint < 0 else with_regions(f"{words} {kinds[joint]}")
+            for words, joint in zip(
+                super().code_words, self.space.joint_of_code.tolist(), strict=True
+            )
         )
 
 

@@ -22,7 +22,8 @@ def motion_names(space: RigPoseSpace) -> list[str]:
     """Name the motion that raising each code makes: D names.
 
     Hinges bend. Of other joints the far end goes up, down, forward, back, or, away from the middle
-    of the body, out and in. Where a body part has several joints their names come first.
+    of the body, out and in. Where a body part has several joints their names come first, without
+    what the part's own name says.
     """
     names, words = list(_WHOLE_BODY), [_words(name) for name in space.rig.joint_names]
     ends = np.cumsum(space.group_sizes)
@@ -33,8 +34,9 @@ def motion_names(space: RigPoseSpace) -> list[str]:
             motion = _motion(space, code)
             if several:
                 own = [word for word in words[joint] if word not in _words(part)]
-                label = " ".join(own if any(map(str.isalpha, own)) else words[joint])
-                motion = f"{label} {motion}".strip()
+                if own and not any(map(str.isalpha, own)):
+                    own.insert(0, "joint")
+                motion = " ".join((*own, motion))
             names.append(motion)
     return names
 
@@ -42,7 +44,10 @@ def motion_names(space: RigPoseSpace) -> list[str]:
 def _words(name: str) -> list[str]:
     """Return a joint's name in words, without its prefix: "left", "hand", "index", "1"."""
     last = re.split("[:|]", name)[-1]
-    return [word.lower() for word in re.findall("[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+", last)]
+    return [
+        word.lower()
+        for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+|[^\W\da-zA-Z_]+", last)
+    ]
 
 
 def _motion(space: RigPoseSpace, code: int) -> str:
@@ -54,5 +59,10 @@ def _motion(space: RigPoseSpace, code: int) -> str:
     left = np.cross(space.up, space.front)
     way = np.cross(space.axes[joint][:, axis], space.axes[joint][:, 1])
     place = float(left @ (space.origins[joint] - space.origins.mean(axis=0)))
-    side = np.sign(place) if abs(place) > _MIDDLE else 0.0
-    return way_in_words(np.array([way @ space.up, way @ space.front, way @ left]), float(side))
+    side = {"left": 1.0, "right": -1.0}.get(side_of(place), 0.0)
+    return way_in_words(np.array([way @ space.up, way @ space.front, way @ left]), side)
+
+
+def side_of(place: float) -> str:
+    """Name the side of the body, "" in the middle, by the normalised way to its left."""
+    return ("left" if place > 0.0 else "right") if abs(place) > _MIDDLE else ""

@@ -355,3 +355,61 @@ def test_a_character_file_is_opened_as_a_body(tmp_path: Path) -> None:
     np.testing.assert_allclose(body.decode(codes), frames.vertices, atol=1e-5)
     rest = made.rest_vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
     np.testing.assert_allclose(body.reference, rest[np.argsort(body.character.joined)], atol=1e-6)
+
+
+def tube_of(*names: str) -> RigModel:
+    tube = rigged_tube(len(names))
+    assert tube.rig is not None
+    return RigModel.of(replace(tube, rig=replace(tube.rig, joint_names=names)))
+
+
+def test_below_a_parts_name_its_codes_do_not_repeat_it() -> None:
+    hand = tube_of("rig:Hips", "rig:LeftHand", "rig:LeftHandThumb1", "rig:LeftHandIndex1")
+    (codes,) = [g.codes for g in hand.latent_space.groups if g.name == "Left hand"]
+    names = hand.code_names[codes]
+    assert [name for name in names if "hand" in name or "left" in name] == []
+    assert {"thumb 1 bend", "thumb 1 sideways", "index 1 bend"} < set(names)
+    # What a number alone tells apart keeps it, and so does a name in any letters.
+    tail = tube_of("Hips", "Tail", "Tail2", "Schw\u00e4nzchen\u5c3e", "Tail3")
+    labels = {name.rsplit(" ", 1)[0] for name in tail.code_names[6:]}
+    assert "joint 2" in labels or "tail 2" in labels
+    assert any("\u5c3e" in label or "nzchen" in label for label in labels | set(tail.domain_names))
+
+
+def test_general_words_find_the_codes_of_their_region(model: RigModel) -> None:
+    hand = tube_of("Hips", "LeftForeArm", "LeftHand", "LeftHandRing1", "LeftHandRing2")
+
+    def found(body: RigModel, words: str) -> set[str]:
+        numbers = body.space.joint_of_code.tolist()
+        return {
+            body.space.rig.joint_names[joint]
+            for joint, text in zip(numbers, body.code_words, strict=True)
+            if joint >= 0 and all(word in text for word in words.split())
+        }
+
+    fingers = {"LeftHandRing1", "LeftHandRing2"}
+    assert found(hand, "finger") == fingers
+    assert found(hand, "hand") == {"LeftHand", *fingers}
+    assert found(hand, "arm") == {"LeftForeArm", "LeftHand", *fingers}
+    assert found(hand, "wrist") >= {"LeftHand"}
+    assert found(hand, "string") == found(hand, "leg") == set()
+    sides = {"Left": found(model, "left leg"), "Right": found(model, "right leg")}
+    for side, joints in sides.items():
+        assert joints >= {f"{side}UpLeg", f"{side}Leg", f"{side}Foot"}
+        assert all(joint.startswith(side) for joint in joints)
+    assert found(model, "spine") >= {"Spine"}
+    assert found(model, "elbow") == {"LeftForeArm", "RightForeArm"}
+    # A hand without fingers is found by them.
+    assert found(model, "finger") == found(model, "hand")
+
+
+def test_a_region_is_found_in_a_rig_whose_names_are_no_words(model: RigModel) -> None:
+    rig = model.space.rig
+    numbers = replace(rig, joint_names=tuple(f"J{n:03}" for n in range(len(rig.parents))))
+    codes = RigModel.of(replace(model.character, rig=numbers))
+    sides = [text.split()[-1] for text in codes.code_words[6:]]
+    places = codes.space.origins[codes.space.joint_of_code[6:]]
+    left = np.cross(codes.space.up, codes.space.front)
+    assert {"left", "right"} <= set(sides)
+    for side, place in zip(sides, places @ left, strict=True):
+        assert side not in ("left", "right") or (side == "left") == (place > 0.0)
