@@ -23,10 +23,11 @@ from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.regular_files import require_regular
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """The version that `write_model_file` stores; older ones are read, later ones are refused.
 
-Since version 2 the embedding's section has the latent box.
+Since version 2 the embedding's section has the latent box, since version 3 the card's rules may
+leave out pairs about joints.
 """
 
 MAX_FILE_BYTES = 4 * 2**30

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Mapping
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,7 @@ class IndependentRules:
     touching_at_rest : pairs of its faces
     rules : as in JSON
     groups : faces by name
+    joints : of each joint, the faces about it
     """
 
     def __init__(
@@ -75,7 +77,9 @@ class IndependentRules:
         touching_at_rest: Iterable[tuple[int, int]],
         rules: Mapping[str, Any],
         groups: Mapping[str, set[int]],
+        joints: Iterable[set[int]] = (),
     ) -> None:
+        self._joints = list(joints) if rules["joint_exclusion"] else []
         self._rest, self._corners, self._groups = rest, faces.tolist(), groups
         size = float(np.ptp(rest[np.unique(faces)], axis=0).max())
         self._near, self._tolerated = (
@@ -95,6 +99,8 @@ class IndependentRules:
         for a, b in touching_at_rest:
             self._touched.setdefault(a, set()).add(b)
             self._touched.setdefault(b, set()).add(a)
+        self._patches = rules["touching"]
+        self._patch_radius = rules["touching_radius"] * size
         self._around: dict[tuple[int, float], set[int]] = {}
 
     def excluding(self, pairs: Mapping[tuple[int, int], float]) -> dict[tuple[int, int], str]:
@@ -116,7 +122,15 @@ class IndependentRules:
             first, second = self._groups[one], self._groups[two]
             if (a in first and b in second) or (b in first and a in second):
                 return "ignored"
-        return "tolerated" if depth <= self._tolerated else None
+        if depth <= self._tolerated:
+            return "tolerated"
+        if any(a in about and b in about for about in self._joints):
+            return "joint"
+        for one, two in self._patches:
+            first, second = (self._faces_around(face, self._patch_radius) for face in (one, two))
+            if (a in first and b in second) or (b in first and a in second):
+                return "touching"
+        return None
 
     def _is_of_rest(self, a: int, b: int, radius: float) -> bool:
         """Whether a face near a touches one near b at rest."""
@@ -144,6 +158,69 @@ class IndependentRules:
         found = set().union(*(self._faces_of[vertex] for vertex in reached))
         self._around[face, radius] = found
         return found
+
+
+def faces_about_joints(
+    rest: Array,
+    faces: npt.NDArray[np.int64],
+    parents: list[int],
+    places: Array,
+    main_joint: list[int],
+) -> list[set[int]]:
+    """Return the faces about each joint and between two that branch, by the glossary's text.
+
+    For rigs without twist joints, whose joints that move nothing stand for no other.
+    """
+    size = float(np.ptp(rest[np.unique(faces)], axis=0).max())
+    owner = [
+        main_joint[b] if main_joint[b] == main_joint[c] else main_joint[a] for a, b, c in faces
+    ]
+    middle = rest[faces].mean(axis=1)
+    of_joint = {j: [f for f, own in enumerate(owner) if own == j] for j in sorted(set(owner))}
+
+    def next_up(joint: int) -> int:
+        above = parents[joint]
+        return above if above < 0 or above in of_joint else next_up(above)
+
+    def radius(own: list[int], start: Array, end: Array) -> float:
+        length = float(np.linalg.norm(end - start))
+        way = (end - start) / length if length else np.zeros(3)
+        along = [float(np.dot(middle[f] - start, way)) for f in own]
+        away = [
+            float(np.linalg.norm(middle[f] - start - s * way))
+            for f, s in zip(own, along, strict=True)
+        ]
+        near = [d for d, s in zip(away, along, strict=True) if abs(s) <= length / 3.0]
+        return float(np.percentile(near or away, 75.0))
+
+    def near(joint: int, others: Iterable[int], limit: float) -> set[int]:
+        return {
+            f
+            for j in others
+            for f in of_joint[j]
+            if float(np.linalg.norm(middle[f] - places[joint])) <= limit
+        }
+
+    thickness: dict[int, float] = {}
+    found = []
+    for joint, own in of_joint.items():
+        parent = next_up(joint)
+        if parent < 0:
+            continue
+        below = [places[j] for j in of_joint if next_up(j) == joint]
+        end = np.mean(below, axis=0) if below else middle[own].mean(axis=0)
+        start = places[joint]
+        thinner = min(radius(own, start, end), radius(of_joint[parent], start, places[parent]))
+        thickness[joint] = min(2.0 * thinner, 0.1 * size)
+        chain = [joint]
+        while len(chain) < 4 and next_up(chain[-1]) >= 0:
+            chain.append(next_up(chain[-1]))
+        found.append(near(joint, chain, thickness[joint]))
+    for one, other in combinations(thickness, 2):
+        if next_up(one) == next_up(other):
+            both = [near(j, (one, other), 0.8 * thickness[j]) for j in (one, other)]
+            found.append(both[0] & both[1])
+    return [about for about in found if len(about) > 1]
 
 
 def _pierces(start: Array, stop: Array, triangle: Array) -> npt.NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import note
+from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -55,6 +56,14 @@ IgnoreOption = Annotated[
         "components, as in 'component 1:component 2', of which 1 has most faces. May be repeated.",
     ),
 ]
+JointExclusionOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--joint-exclusion/--no-joint-exclusion",
+        help="Do not count pairs of parts that a joint links where both faces are within the "
+        "limb's thickness of it. On by default for a character with joints.",
+    ),
+]
 ToleratedDepthOption = Annotated[
     float | None,
     typer.Option(min=0.0, max=1.0, metavar="D", help="Do not count pairs up to D body sizes deep."),
@@ -69,6 +78,7 @@ class RuleOptions:
     rest_exclusion: float | None = None
     ignore: Sequence[str] | None = None
     tolerated_depth: float | None = None
+    joint_exclusion: bool | None = None
 
     def applied(
         self,
@@ -91,7 +101,7 @@ class RuleOptions:
         from lcollision_core.meshes import groups_by_kind, with_named_groups
 
         kinds = groups_by_kind(groups, topology, vertex_labels) if self.ignore else {}
-        names = {group.name for kind in (groups, *kinds.values()) for group in kind}
+        names = {group.name for kind in kinds.values() for group in kind}
         changed = self._changed(rules, names)
         return changed, with_named_groups(groups, kinds, changed.ignored)
 
@@ -100,9 +110,13 @@ class RuleOptions:
 
         Raises
         ------
-        LCollisionError : an ignored pair is not two names of its groups, or a predictor depends on
-            its rules.
+        LCollisionError : an ignored pair is not two names of its groups, it has no joints to leave
+            out pairs at, or a predictor depends on its rules.
         """
+        if self.joint_exclusion and not body.has_joints:
+            what = "has no joints that its contact rules could leave out pairs at"
+            next_step = "leave out --joint-exclusion, or learn it again from a rigged character"
+            raise LCollisionError(what, next_step, where=body.name)
         groups = body.groups_by_kind.values() if self.ignore else ()
         rules = self._changed(body.rules, {group.name for kind in groups for group in kind})
         return body if rules == body.rules else body.with_rules(rules)
@@ -110,12 +124,13 @@ class RuleOptions:
     def _changed(self, rules: ContactRules, names: Collection[str]) -> ContactRules:
         from lcollision_core.meshes import named_pair
 
-        lengths = {
+        options = {
             "near_exclusion": self.near_exclusion,
             "rest_exclusion": self.rest_exclusion,
+            "joint_exclusion": self.joint_exclusion,
             "tolerated_depth": self.tolerated_depth,
         }
-        chosen: dict[str, Any] = {name: to for name, to in lengths.items() if to is not None}
+        chosen: dict[str, Any] = {name: to for name, to in options.items() if to is not None}
         pairs = (named_pair(entry, names) for entry in self.ignore or ())
         return replace(rules, **chosen, ignored=tuple(dict.fromkeys((*rules.ignored, *pairs))))
 
@@ -146,6 +161,8 @@ def excluded_at_rest(body: PosableBody) -> dict[str, int]:
 _RULES = {
     "near": "near along the surface",
     "rest": "touching at rest",
+    "joint": "at joints",
+    "touching": "at places that nearly always touch",
     "ignored": "of ignored groups",
     "tolerated": "not deeper than tolerated",
 }

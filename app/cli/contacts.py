@@ -9,6 +9,7 @@ import typer
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import (
     IgnoreOption,
+    JointExclusionOption,
     NearExclusionOption,
     RestExclusionOption,
     RuleOptions,
@@ -28,6 +29,7 @@ def contacts(
     model_name: ModelArgument,
     near_exclusion: NearExclusionOption = None,
     rest_exclusion: RestExclusionOption = None,
+    joint_exclusion: JointExclusionOption = None,
     ignore: IgnoreOption = None,
     tolerated_depth: ToleratedDepthOption = None,
     ignore_proposed: Annotated[
@@ -52,7 +54,8 @@ def contacts(
 
     before = open_body(model_name)
     body = before.with_rules(before.own_rules) if defaults else before
-    body = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth).applied_to(body)
+    options = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth, joint_exclusion)
+    body = options.applied_to(body)
     proposed = None
     if not body.has_predictor:
         with progress_bar("Looking for pairs in contact") as progress:

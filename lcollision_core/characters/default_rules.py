@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from lcollision_core.characters.character import Character
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.rules import near_pairs_estimate
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
+from lcollision_core.meshes.face_groups import FaceGroup
 
 NEAR_EXCLUSIONS = (0.1, 0.05, 0.02)
 """Normalised lengths within which the skin of a rig folds at its bent joints, the first that fits.
@@ -23,12 +26,16 @@ _MOST_TOUCHING = 50_000
 """Pairs at rest beyond which only these are left out, and not the places about them."""
 
 
-def default_rules(character: Character) -> ContactRules:
+def default_rules(character: Character, groups: Sequence[FaceGroup] = ()) -> ContactRules:
     """Return rules by which the rest pose of a character is free.
 
     Pairs that touch at rest, and places within 0.02 along the surface of them, do not count. Of the
     X Bot's joints turned half way to their limits one at a time, all collide when only the pairs
     are left out, 30 % when places within 0.01 are, and 27 % with 0.02 and with 0.03.
+
+    Parameters
+    ----------
+    groups : of the character; where there are joints among them, pairs about these do not count
 
     Raises
     ------
@@ -47,5 +54,7 @@ def default_rules(character: Character) -> ContactRules:
         )
         near = next(fitting, 0.0)
     return ContactRules(
-        near_exclusion=near, rest_exclusion=CHARACTER_REST_EXCLUSION if few else 0.0
+        near_exclusion=near,
+        rest_exclusion=CHARACTER_REST_EXCLUSION if few else 0.0,
+        joint_exclusion=any(group.about_joint for group in groups),
     )

@@ -40,8 +40,11 @@ class Exclusions(NamedTuple):
     Two faces are near each other at rest where a corner of one is a corner of the other or near it:
     the vertices near vertex v and after it are ``near[near_start[v]:near_start[v + 1]]``. What
     touches at rest is listed by faces: those of face f with faces after it are
-    ``face[start[f]:start[f + 1]]``. Lists are ascending, and all of one kind may be missing. Pairs
-    of groups are kept by region, as two groups relate too many faces for a list.
+    ``face[start[f]:start[f + 1]]``. Pairs of groups are kept by region, as two groups relate too
+    many faces for a list. The joints about which face f lies are
+    ``joint[joint_start[f]:joint_start[f + 1]]``: two faces about one joint do not count. What
+    nearly always touches is listed as what touches at rest. Lists are ascending, and all of one
+    kind may be missing.
 
     Attributes
     ----------
@@ -54,6 +57,10 @@ class Exclusions(NamedTuple):
         where no groups are ignored
     ignored : (R, R) bool, symmetric, which pairs of regions are ignored
     squared_tolerance : of the tolerated depth, in normalised length squared
+    joint_start : (F + 1,) or (1,) int64
+    joint : (k,) int32, joints by number
+    touching_start : (F + 1,) or (1,) int64
+    touching : (t,) int32, face indices
     """
 
     corners: IntArray
@@ -64,6 +71,10 @@ class Exclusions(NamedTuple):
     region: IntArray
     ignored: npt.NDArray[np.bool_]
     squared_tolerance: float
+    joint_start: npt.NDArray[np.int64]
+    joint: IntArray
+    touching_start: npt.NDArray[np.int64]
+    touching: IntArray
 
 
 class UncountedNodes(NamedTuple):

@@ -22,7 +22,7 @@ from lcollision_core.contact.kernels import (
     add_vertex_energy,
     search_pose,
 )
-from lcollision_core.contact.rules import exclusions_of, require_room, rules_of, with_ignored
+from lcollision_core.contact.rules import exclusions_of, require_room, rules_of, with_other_rules
 from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.contact.uncounted import NOTHING_KNOWN, UncountedTables
 from lcollision_core.errors import ShapeError
@@ -113,7 +113,7 @@ class BatchCollisions:
     Attributes
     ----------
     n_pairs : (B,) int64, colliding pairs
-    n_excluded : (B, 4) int64, pairs that each rule excludes, in the order of `RuleCounts`
+    n_excluded : (B, R) int64, pairs that each rule excludes, in the order of `RuleCounts`
     vertex_energy : (B, V) float64, PDe of Algorithm 1 in normalised length squared
     """
 
@@ -203,7 +203,7 @@ class CollisionDetector:
             vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
             raise ShapeError("is not finite", where=f"vertex {vertex} of the reference")
         self.topology = topology
-        self.rules, self.groups, self._reference = rules, tuple(groups), vertices
+        self.rules, self.groups, self.reference = rules, tuple(groups), vertices
         self.body_size = body_size(vertices, topology)
         if self.body_size == 0.0:
             raise ShapeError("all vertices are in one point", "give it a mesh with an extent")
@@ -227,8 +227,11 @@ class CollisionDetector:
         held = self.rules
         lengths = (rules.near_exclusion, rules.rest_exclusion)
         if lengths != (held.near_exclusion, held.rest_exclusion):
-            return CollisionDetector(self.topology, self._reference, rules, groups)
-        other, exclusions = copy(self), with_ignored(self._exclusions, rules, groups)
+            return CollisionDetector(self.topology, self.reference, rules, groups)
+        other = copy(self)
+        exclusions = with_other_rules(
+            self._exclusions, rules, self.topology, self.reference, self.body_size, groups
+        )
         vars(other).update(
             rules=rules,
             groups=tuple(groups),

@@ -38,7 +38,7 @@ products of coordinates stay far from overflow."""
 SMALL_SINE_SQUARED = 1e-6
 """Below this squared sine of their angle, two edges' cross product is corrected for rounding."""
 
-COUNTED, NEAR, REST, IGNORED, TOLERATED, COINCIDENT = range(6)
+COUNTED, NEAR, REST, IGNORED, TOLERATED, JOINT, TOUCHING, COINCIDENT = range(8)
 """Of a pair of faces: that it counts; the rule by which it does not, in the order of
 `RuleCounts`; that its faces lie on each other, which is no collision."""
 
@@ -288,6 +288,20 @@ def _is_listed(start, entry, number, wanted):
 
 
 @compiled
+def _have_common(start, entry, a, b):
+    """Whether lists a and b, both short and ascending, have an entry in common."""
+    i, j = start[a], start[b]
+    while i < start[a + 1] and j < start[b + 1]:
+        if entry[i] == entry[j]:
+            return True
+        if entry[i] < entry[j]:
+            i += 1
+        else:
+            j += 1
+    return False
+
+
+@compiled
 def _rule_of(face_a, face_b, squared_depth, exclusions):
     """Return the first rule by which two faces do not count, or `COUNTED`; depth 0 coincides."""
     if squared_depth == 0.0:
@@ -307,6 +321,14 @@ def _rule_of(face_a, face_b, squared_depth, exclusions):
         return np.uint8(IGNORED)
     if squared_depth <= exclusions.squared_tolerance:
         return np.uint8(TOLERATED)
+    if len(exclusions.joint_start) > 1 and _have_common(
+        exclusions.joint_start, exclusions.joint, first, second
+    ):
+        return np.uint8(JOINT)
+    if len(exclusions.touching_start) > 1 and _is_listed(
+        exclusions.touching_start, exclusions.touching, first, second
+    ):
+        return np.uint8(TOUCHING)
     return np.uint8(COUNTED)
 
 

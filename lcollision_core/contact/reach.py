@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +56,12 @@ class Lists(NamedTuple):
 def no_lists(n: int) -> Lists:
     """Return n empty lists."""
     return Lists(np.zeros(n + 1, dtype=np.int64), np.empty(0, dtype=np.int32))
+
+
+def lists_of(members: Sequence[npt.NDArray[np.integer]], n: int) -> Lists:
+    """List for each of n things which of some sets of them it is in, by number."""
+    which = np.repeat(np.arange(len(members)), [len(some) for some in members])
+    return _table(np.concatenate(members), which, n, len(members))
 
 
 class TouchingFaces(NamedTuple):

@@ -11,16 +11,19 @@ import numpy.typing as npt
 from lcollision_core.contact.arrays import Exclusions
 from lcollision_core.contact.kernels import find_rules
 from lcollision_core.contact.reach import (
+    Lists,
+    Surface,
     faces_within,
     later_faces,
     later_vertices,
+    lists_of,
     no_lists,
     surface_of,
     touching_faces,
 )
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.contact_rules import ContactRules
-from lcollision_core.meshes.face_groups import FaceGroup, require_groups
+from lcollision_core.meshes.face_groups import FaceGroup, require_groups, without_joints
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 Pairs = npt.NDArray[np.integer]
@@ -33,7 +36,7 @@ _MAX_REGIONS = 4096
 _SAMPLED = 200
 """Faces whose neighbourhoods are measured for an estimate of all."""
 
-_NEAR, _REST = "near exclusion", "rest exclusion"
+_NEAR, _REST, _TOUCHING = "near exclusion", "rest exclusion", "touching radius"
 
 
 def exclusions_of(
@@ -51,49 +54,78 @@ def exclusions_of(
     reference : (V, 3) float64 array, the rest pose
     body_size : in its unit
     touching : (n, 2) pairs of faces that touch at rest, used where there is a rest exclusion
-    groups : what the names of ignored pairs mean; groups of one name are one
+    groups : what the names of ignored pairs mean, of which those of one name are one, and the
+        faces about each joint
 
     Raises
     ------
     ShapeError : a group of an ignored pair is unknown, a group has faces that the mesh has not, or
         too many pairs are excluded.
     """
-    surface, near, by_touch = surface_of(topology, reference), no_lists(0), no_lists(0)
+    surface, near, by_rest = surface_of(topology, reference), no_lists(0), no_lists(0)
     if rules.near_exclusion > 0.0:
         distance = rules.near_exclusion * body_size
         near = later_vertices(surface, distance, partial(require_room, rule=_NEAR))
-    if rules.rest_exclusion is not None and len(touching):
-        distance = rules.rest_exclusion * body_size
-        require = partial(require_room, rule=_REST)
-        by_touch = later_faces(touching_faces(surface, touching, distance, require), require)
+    if rules.rest_exclusion is not None:
+        by_rest = _about(surface, touching, rules.rest_exclusion * body_size, _REST)
+    none = no_lists(0)
     listed = Exclusions(
         corners=topology.faces,
         near_start=near.start,
         near=near.entry,
-        start=by_touch.start,
-        face=by_touch.entry,
+        start=by_rest.start,
+        face=by_rest.entry,
         region=np.empty(0, dtype=np.int32),
         ignored=np.zeros((0, 0), dtype=np.bool_),
         squared_tolerance=0.0,
+        joint_start=none.start,
+        joint=none.entry,
+        touching_start=none.start,
+        touching=none.entry,
     )
-    return with_ignored(listed, rules, groups)
+    return with_other_rules(listed, rules, topology, reference, body_size, groups)
 
 
-def with_ignored(
-    exclusions: Exclusions, rules: ContactRules, groups: Sequence[FaceGroup]
+def with_other_rules(
+    exclusions: Exclusions,
+    rules: ContactRules,
+    topology: Topology,
+    reference: FloatArray,
+    body_size: float,
+    groups: Sequence[FaceGroup] = (),
 ) -> Exclusions:
-    """Return exclusions with other ignored pairs and tolerated depth, and the same lists.
+    """Return exclusions with the same lists of what is near and what touches at rest.
 
-    Raises
-    ------
-    ShapeError : see `exclusions_of`.
+    Parameters and errors are those of `exclusions_of`.
     """
-    n_faces = len(exclusions.corners)
+    n_faces = topology.n_faces
     require_groups(rules, groups, n_faces)
-    region, ignored = _regions(rules.ignored, groups, n_faces)
+    region, ignored = _regions(rules.ignored, without_joints(groups), n_faces)
+    joints = [group.faces for group in groups if group.about_joint and rules.joint_exclusion]
+    by_joint = lists_of(joints, n_faces) if joints else no_lists(0)
+    pairs = np.array(rules.touching, dtype=np.int64).reshape(-1, 2)
+    if len(pairs) and pairs.max() >= n_faces:
+        whose = "of faces of this mesh"
+        raise ShapeError.must_be("the pairs that nearly always touch", whose, int(pairs.max()))
+    radius = rules.touching_radius * body_size
+    by_touch = _about(surface_of(topology, reference), pairs, radius, _TOUCHING)
     return exclusions._replace(
-        region=region, ignored=ignored, squared_tolerance=rules.tolerated_depth**2
+        region=region,
+        ignored=ignored,
+        squared_tolerance=rules.tolerated_depth**2,
+        joint_start=by_joint.start,
+        joint=by_joint.entry,
+        touching_start=by_touch.start,
+        touching=by_touch.entry,
     )
+
+
+def _about(surface: Surface, pairs: Pairs, distance: float, rule: str) -> Lists:
+    """List for each face those after it that are near what touches something near it."""
+    if not len(pairs):
+        return no_lists(0)
+    require = partial(require_room, rule=rule)
+    return later_faces(touching_faces(surface, pairs, distance, require), require)
 
 
 def rules_of(

@@ -63,7 +63,7 @@ def with_proposed_rules(
         near = _near_exclusion(poses, rules, chosen, cancel)
         rules = replace(rules, near_exclusion=near)
     kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
-    names = {group.name for kind in (poses.groups, *kinds.values()) for group in kind}
+    names = {group.name for kind in kinds.values() for group in kind}
 
     def ignoring(pairs: Iterable[GroupPair]) -> PoseSet:
         ignored = tuple(dict.fromkeys((*rules.ignored, *pairs)))

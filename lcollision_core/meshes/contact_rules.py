@@ -19,6 +19,12 @@ from lcollision_core.json_values import from_json
 CHARACTER_REST_EXCLUSION = 0.02
 """Normalised length: the rest exclusion of characters, by measurement on some of them."""
 
+TOUCHING_RADIUS = 0.02
+"""Normalised length: the radius of patches that a proposal leaves out."""
+
+MAX_TOUCHING = 4000
+"""The most pairs of patches that touch in nearly every pose."""
+
 MAX_IGNORED = 1000
 """The most pairs of groups that are ignored."""
 
@@ -36,12 +42,16 @@ class RuleCounts:
     rest : pairs at places that touch at rest
     ignored : pairs of groups that are ignored
     tolerated : pairs no deeper than the tolerated depth
+    joint : pairs about a joint that links what they are of
+    touching : pairs at patches that touch in nearly every pose
     """
 
     near: int = 0
     rest: int = 0
     ignored: int = 0
     tolerated: int = 0
+    joint: int = 0
+    touching: int = 0
 
     @classmethod
     def of(cls, rule: npt.NDArray[np.integer]) -> RuleCounts:
@@ -51,7 +61,7 @@ class RuleCounts:
     @property
     def total(self) -> int:
         """The number of colliding pairs that do not count."""
-        return self.near + self.rest + self.ignored + self.tolerated
+        return sum(self.to_json().values())
 
     def to_json(self) -> dict[str, int]:
         """Return the numbers by the names of the rules."""
@@ -78,6 +88,12 @@ class ContactRules:
         count
     tolerated_depth : pairs with a penetration depth up to this do not count; deeper ones count with
         all of it
+    joint_exclusion : whether pairs do not count of which both faces lie about one joint, as the
+        groups of a rig say: see `FaceGroup.about_joint`
+    touching : pairs of faces in the middle of patches that touch in nearly every pose; pairs of
+        faces do not count of which one is within the touching radius of one of such a pair and the
+        other within it of the other
+    touching_radius : of these patches
 
     Raises
     ------
@@ -88,17 +104,27 @@ class ContactRules:
     rest_exclusion: float | None = None
     ignored: tuple[tuple[str, str], ...] = ()
     tolerated_depth: float = 0.0
+    joint_exclusion: bool = False
+    touching: tuple[tuple[int, int], ...] = ()
+    touching_radius: float = 0.0
 
     def __post_init__(self) -> None:
         for what, length in (
             ("the near exclusion", self.near_exclusion),
             ("the rest exclusion", self.rest_exclusion),
             ("the tolerated depth", self.tolerated_depth),
+            ("the touching radius", self.touching_radius),
         ):
             if length is not None and not 0.0 <= length < math.inf:
                 raise ShapeError.must_be(what, "0 or more, and finite", length)
         if len(self.ignored) > MAX_IGNORED:
             raise ShapeError.must_be("ignored pairs", f"at most {MAX_IGNORED}", len(self.ignored))
+        if len(self.touching) > MAX_TOUCHING:
+            raise ShapeError.must_be(
+                "touching pairs", f"at most {MAX_TOUCHING}", len(self.touching)
+            )
+        if any(len(pair) != 2 or min(pair) < 0 for pair in self.touching):
+            raise ShapeError("must be two faces by number", where="a touching pair")
         for pair in self.ignored:
             if len(pair) != 2 or not all(map(_is_name, pair)):
                 raise ShapeError.must_be(
@@ -112,7 +138,8 @@ class ContactRules:
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values for `from_json`."""
-        return asdict(self) | {"ignored": [list(pair) for pair in self.ignored]}
+        pairs = {name: [list(pair) for pair in getattr(self, name)] for name in _PAIRS}
+        return asdict(self) | pairs
 
     @classmethod
     def from_json(cls, values: Any) -> ContactRules:
@@ -139,6 +166,9 @@ class ContactRules:
             self.rest_exclusion is not None and f"pairs that touch at rest{around}",
             groups and f"pairs of {groups}{f' and {more} more' if more > 0 else ''}",
             self.tolerated_depth and f"pairs not deeper than {self.tolerated_depth:g}",
+            self.joint_exclusion and "pairs at a joint that links their parts",
+            self.touching
+            and f"pairs at {len(self.touching)} places that touch in nearly every pose",
         )
         return ", ".join(what for what in said if what)
 
@@ -155,6 +185,8 @@ class ContactRules:
                 (counts.rest, f"that {'touches' if counts.rest == 1 else 'touch'} at rest"),
                 (counts.ignored, f"of {groups}"),
                 (counts.tolerated, f"not deeper than {self.tolerated_depth:g}"),
+                (counts.joint, f"at {'a joint' if counts.joint == 1 else 'joints'}"),
+                (counts.touching, "at places that nearly always touch"),
             )
             if number
         ]
@@ -172,6 +204,9 @@ def pair_in_words(pair: tuple[str, str]) -> str:
 
 STRICT = ContactRules()
 """All colliding pairs count."""
+
+_PAIRS = ("ignored", "touching")
+"""Fields that are pairs."""
 
 _NAMED_PAIRS = 3
 """Most pairs of groups that a sentence names one by one."""

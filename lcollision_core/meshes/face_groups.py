@@ -32,10 +32,18 @@ class FaceGroup:
     ----------
     name : as in the file
     faces : (n,) int64 array, ascending, indices from 0
+    about_joint : whether they are those about the joint of this name, of the parts that it links.
+        Such groups serve the joint exclusion alone: no ignored pair names them.
     """
 
     name: str
     faces: npt.NDArray[np.int64]
+    about_joint: bool = False
+
+
+def without_joints(groups: Iterable[FaceGroup]) -> tuple[FaceGroup, ...]:
+    """Return the groups that people name."""
+    return tuple(group for group in groups if not group.about_joint)
 
 
 def component_groups(topology: Topology) -> tuple[FaceGroup, ...]:
@@ -84,7 +92,11 @@ def groups_by_kind(
     parts = () if vertex_labels is None else part_groups(topology, vertex_labels)
     computed = (parts, component_groups(topology))
     known = {(group.name, group.faces.tobytes()) for kind in computed for group in kind}
-    own = tuple(group for group in groups if (group.name, group.faces.tobytes()) not in known)
+    own = tuple(
+        group
+        for group in without_joints(groups)
+        if (group.name, group.faces.tobytes()) not in known
+    )
     taken = {group.name for group in own}
     others = (tuple(group for group in kind if group.name not in taken) for kind in computed)
     return dict(zip(GROUP_KINDS, (own, *others), strict=True))
@@ -103,7 +115,8 @@ def with_named_groups(
     kinds : all groups by kind: see `groups_by_kind`
     ignored : pairs of names
     """
-    wanted = {name for pair in ignored for name in pair} - {group.name for group in groups}
+    named = {group.name for group in without_joints(groups)}
+    wanted = {name for pair in ignored for name in pair} - named
     return (*groups, *(one for kind in kinds.values() for one in kind if one.name in wanted))
 
 
@@ -139,8 +152,10 @@ def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: in
     ------
     ShapeError : saying which.
     """
-    if len(groups) > MAX_GROUPS:
-        raise ShapeError.must_be("the groups of faces", f"at most {MAX_GROUPS}", len(groups))
+    named = without_joints(groups)
+    for what, n in (("groups of faces", len(named)), ("joints", len(groups) - len(named))):
+        if n > MAX_GROUPS:
+            raise ShapeError.must_be(f"the {what}", f"at most {MAX_GROUPS}", n)
     for group in groups:
         where = f"the group {group.name[:80]!r}"
         if not 0 < len(group.name) <= MAX_NAME_LENGTH or not group.name.isprintable():
@@ -152,7 +167,7 @@ def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: in
         if len(faces) and not 0 <= faces[0] <= faces[-1] < n_faces:
             outside = faces[0] if faces[0] < 0 else faces[-1]
             raise ShapeError.must_be(where, f"of faces from 0 to {n_faces - 1}", int(outside))
-    known = dict.fromkeys(group.name for group in groups)
+    known = dict.fromkeys(group.name for group in named)
     for name in (name for pair in rules.ignored for name in pair):
         if name not in known:
             listed = ", ".join(map(repr, list(known)[:8])) or "none: the mesh has no groups"
@@ -160,12 +175,17 @@ def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: in
 
 
 def ignored_faces_digest(rules: ContactRules, groups: Iterable[FaceGroup]) -> str:
-    """Return a digest of the groups that the rules ignore pairs of; empty if they ignore none."""
+    """Return a digest of the groups that the rules leave out pairs of; empty if there are none."""
     names = {name for pair in rules.ignored for name in pair}
-    if not names:
+    used = [
+        group
+        for group in groups
+        if (rules.joint_exclusion if group.about_joint else group.name in names)
+    ]
+    if not used:
         return ""
     digest = hashlib.sha256()
-    for group in sorted((group for group in groups if group.name in names), key=lambda g: g.name):
+    for group in sorted(used, key=lambda group: (group.about_joint, group.name)):
         digest.update(f"{group.name}\n{len(group.faces)}\n".encode())
         digest.update(group.faces.astype("<i8").tobytes())
     return digest.hexdigest()

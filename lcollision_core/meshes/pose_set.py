@@ -42,8 +42,8 @@ from lcollision_core.meshes.stored_rules import (
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.upright import UpGuess, guess_up
 
-FORMAT_VERSION = 1
-"""The version that `write_pose_set` stores; later ones are refused."""
+FORMAT_VERSION = 2
+"""The latest version that is read; sets without a joint exclusion are of version 1."""
 
 _MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
 _EXTRA_ARRAYS = (
@@ -579,7 +579,7 @@ def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
     if Path(path).suffix.lower() != ".npz":
         raise MeshFileError.unwritable(path, "a pose set is an .npz file", "rename it")
     arrays: dict[str, npt.NDArray[Any]] = {
-        "format_version": np.array(FORMAT_VERSION),
+        "format_version": np.array(FORMAT_VERSION if pose_set.rules.joint_exclusion else 1),
         "vertices": pose_set.vertices,
         "faces": pose_set.faces,
         "names": np.array(pose_set.names, dtype=np.str_),

@@ -23,7 +23,7 @@ from lcollision_core.meshes.face_groups import (
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
-RULE_ARRAYS = ("rules", "group_names", "group_runs", "group_ends")
+RULE_ARRAYS = ("rules", "group_names", "group_runs", "group_ends", "groups_about_joints")
 
 _MAX_RULES_LENGTH = 2_000_000
 _MAX_PROVENANCE_LENGTH = 2_000_000
@@ -63,7 +63,8 @@ def groups_to_arrays(groups: Sequence[FaceGroup]) -> dict[str, npt.NDArray[Any]]
     if not groups:
         return {}
     runs = [faces_to_runs(group.faces) for group in groups]
-    return {
+    about_joint = np.array([group.about_joint for group in groups])
+    return ({"groups_about_joints": about_joint} if about_joint.any() else {}) | {
         "group_names": np.array([group.name for group in groups]),
         "group_runs": np.concatenate(runs),
         "group_ends": np.cumsum([len(some) for some in runs]),
@@ -79,21 +80,30 @@ def groups_from_arrays(arrays: Arrays, n_faces: int) -> tuple[FaceGroup, ...]:
     """
     if "group_names" not in arrays:
         return ()
-    names, runs, ends = (arrays.get(name, np.empty(0)) for name in RULE_ARRAYS[1:])
-    if names.dtype.kind != "U" or names.ndim != 1 or len(names) > MAX_GROUPS:
-        expected = f"at most {MAX_GROUPS} strings"
+    names, runs, ends = (arrays.get(name, np.empty(0)) for name in RULE_ARRAYS[1:4])
+    if names.dtype.kind != "U" or names.ndim != 1 or len(names) > 2 * MAX_GROUPS:
+        expected = f"at most {2 * MAX_GROUPS} strings"
         raise MeshFileError.must_be("group_names", expected, f"{names.dtype} {names.shape}")
     for name, array in (("group_runs", runs), ("group_ends", ends)):
         if array.dtype.kind != "i" or array.ndim != 1:
             expected = "a list of whole numbers"
             raise MeshFileError.must_be(name, expected, f"{array.dtype} {array.shape}")
+    about_joint = arrays.get(RULE_ARRAYS[4], np.zeros(len(names), dtype=np.bool_))
+    if about_joint.dtype != np.bool_ or about_joint.shape != names.shape:
+        expected = "true or false for each group"
+        got = f"{about_joint.dtype} {about_joint.shape}"
+        raise MeshFileError.must_be(RULE_ARRAYS[4], expected, got)
     starts = np.concatenate([[0], ends[:-1]])
     if len(ends) != len(names) or (ends < starts).any() or ends[-1:].tolist() != [len(runs)]:
         raise MeshFileError("do not fit together", where="group_names, group_runs and group_ends")
     return tuple(
-        FaceGroup(name, runs_to_faces(runs[start:end], n_faces))
-        for name, start, end in zip(
-            texts_of(names, "group_names", MAX_NAME_LENGTH), starts, ends, strict=True
+        FaceGroup(name, runs_to_faces(runs[start:end], n_faces), about)
+        for name, start, end, about in zip(
+            texts_of(names, "group_names", MAX_NAME_LENGTH),
+            starts,
+            ends,
+            about_joint.tolist(),
+            strict=True,
         )
     )
 

@@ -27,6 +27,7 @@ _ADVICE = "train or copy the model again"
 class _StoredGroup:
     name: str
     runs: tuple[int, ...]
+    about_joint: bool = False
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,7 @@ class ModelCard:
         if self.groups:
             values["groups"] = [
                 {"name": group.name, "runs": faces_to_runs(group.faces).tolist()}
+                | ({"about_joint": True} if group.about_joint else {})
                 for group in self.groups
             ]
         return values
@@ -144,7 +146,11 @@ class ModelCard:
         try:
             stored = from_json(_StoredRules, metadata, "card")
             groups = tuple(
-                FaceGroup(group.name, runs_to_faces(np.array(group.runs, dtype=np.int64), n_faces))
+                FaceGroup(
+                    group.name,
+                    runs_to_faces(np.array(group.runs, dtype=np.int64), n_faces),
+                    group.about_joint,
+                )
                 for group in stored.groups
             )
             rules = replace(stored.rules, near_exclusion=stored.near_exclusion)

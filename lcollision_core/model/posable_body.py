@@ -542,6 +542,11 @@ class PosableBody(ABC):
         """Named groups of faces, of which the rules may ignore pairs."""
         return self.card.groups
 
+    @property
+    def has_joints(self) -> bool:
+        """Whether the rules may leave out pairs at joints."""
+        return any(group.about_joint for group in self.groups)
+
     @cached_property
     def groups_by_kind(self) -> dict[str, tuple[FaceGroup, ...]]:
         """All groups that rules may ignore pairs of, by each of `GROUP_KINDS`."""

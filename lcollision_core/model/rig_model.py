@@ -17,6 +17,7 @@ from lcollision_core.characters import (
     Character,
     RigPoseSpace,
     default_rules,
+    joint_groups,
     joint_parts,
 )
 from lcollision_core.characters.random_poses import random_codes
@@ -121,6 +122,8 @@ class RigModel(PosableBody):
         if transforms is not None:
             poses = np.concatenate([poses, space.codes_of_transforms(transforms)])
         printable = ("".join(filter(str.isprintable, name)) for name in space.part_names)
+        parts_of_faces = part_groups(character.topology, joint_parts(character))
+        groups = (*character.groups, *parts_of_faces, *joint_groups(character))
         shown = [name.strip()[:MAX_NAME_LENGTH] or "part" for name in printable]
         card = ModelCard(
             height=space.body_size,
@@ -130,9 +133,9 @@ class RigModel(PosableBody):
             pose_names=tuple(name[:MAX_POSE_NAME_LENGTH] for name in names[: len(poses)]),
             source=character.source.name,
             licence="unknown",
-            rules=default_rules(character),
+            rules=default_rules(character, groups),
             metres=character.metres,
-            groups=(*character.groups, *part_groups(character.topology, joint_parts(character))),
+            groups=groups,
         )
         return cls(character, space, card, poses)
 

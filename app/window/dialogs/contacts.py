@@ -64,7 +64,7 @@ class ContactsDialog(QDialog):
     Attributes
     ----------
     near, rest, tolerated : fields, in per cent of the body size
-    at_rest : whether there is a rest exclusion
+    at_rest, at_joints : whether there are a rest exclusion and a joint exclusion
     ignored : pairs of groups by kind of group, ticked where they are ignored
     first, second, add, propose : what adds to these
     apply, restore : buttons; the latter brings back the rules that a character starts with
@@ -79,11 +79,12 @@ class ContactsDialog(QDialog):
         self.setFixedWidth(_WIDTH)
         self._document = document
         self.near, self.rest, self.tolerated = (self._field(name) for name in _MOST)
-        self.at_rest = QCheckBox("Touching at rest")
+        self.at_rest, self.at_joints = QCheckBox("Touching at rest"), QCheckBox("Creases at joints")
         bold = self.at_rest.font()
         bold.setBold(True)
-        self.at_rest.setFont(bold)
-        self.counts = {name: labelled("", "caption") for name in _MOST | {"ignored": 0.0}}
+        for box in (self.at_rest, self.at_joints):
+            box.setFont(bold)
+        self.counts = {name: labelled("", "caption") for name in (*_MOST, "joint", "ignored")}
         for label in self.counts.values():
             label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         self.total = self._note(_COUNTING)
@@ -91,7 +92,8 @@ class ContactsDialog(QDialog):
         self._tint.setObjectName("caption")
         self.kept = self._note("")
         self._lay_out()
-        self.at_rest.toggled.connect(self._on_edited)
+        for box in (self.at_rest, self.at_joints):
+            box.toggled.connect(self._on_edited)
         for field in (self.near, self.rest, self.tolerated):
             field.valueChanged.connect(self._on_edited)
         document.model_changed.connect(self._on_model)
@@ -123,6 +125,13 @@ class ContactsDialog(QDialog):
                 "near to them along the surface",
             ),
             self._row(tolerated, "tolerated", self.tolerated, "Pairs no deeper, for soft bodies"),
+            self._row(
+                self.at_joints,
+                "joint",
+                None,
+                "Elbows, armour: pairs of what a joint links, both within the limb's thickness of "
+                "it",
+            ),
             self._ignored_part(),
             self.total,
             self._tint,
@@ -133,9 +142,10 @@ class ContactsDialog(QDialog):
         self.setLayout(page)
         self.apply.setDefault(True)
 
-    def _row(self, title: QWidget, name: str, field: NumberBox, why: str) -> QVBoxLayout:
-        """Return a rule: what it is called, its count and its length, and why it is there."""
-        return vbox(hbox(title, None, self.counts[name], field), self._note(why), spacing=TIGHT)
+    def _row(self, title: QWidget, name: str, field: NumberBox | None, why: str) -> QVBoxLayout:
+        """Return a rule: what it is called, its count and any length, and why it is there."""
+        shown = [self.counts[name]] if field is None else [self.counts[name], field]
+        return vbox(hbox(title, None, *shown), self._note(why), spacing=TIGHT)
 
     def _note(self, text: str) -> QLabel:
         note = labelled("", "caption", wraps=True)
@@ -199,6 +209,7 @@ class ContactsDialog(QDialog):
             _length(self.rest, held.rest_exclusion) if self.at_rest.isChecked() else None,
             tuple(pair for pair, item in self._pairs.items() if item.checkState(0) is _CHECKED),
             _length(self.tolerated, held.tolerated_depth),
+            self.at_joints.isChecked(),
         )
 
     def _where_kept(self) -> str:
@@ -215,10 +226,13 @@ class ContactsDialog(QDialog):
 
     @Slot()
     def _on_model(self) -> None:
+        from lcollision_core.meshes.face_groups import without_joints
+
         model = self._document.model
         rules = model.rules
         self.near.setValue(_PERCENT * rules.near_exclusion)
         self.at_rest.setChecked(rules.rest_exclusion is not None)
+        self.at_joints.setChecked(rules.joint_exclusion)
         rest = rules.rest_exclusion
         self.rest.setValue(_DEFAULT_REST if rest is None else _PERCENT * rest)
         self.tolerated.setValue(_PERCENT * rules.tolerated_depth)
@@ -228,7 +242,7 @@ class ContactsDialog(QDialog):
         for pair in rules.ignored:
             self._list(pair, _CHECKED)
         self._name_kinds()
-        names = list(dict.fromkeys(group.name for group in model.groups))
+        names = list(dict.fromkeys(group.name for group in without_joints(model.groups)))
         for box in (self.first, self.second):
             box.clear()
             box.addItems(names)
@@ -262,6 +276,9 @@ class ContactsDialog(QDialog):
         for widget in always:
             widget.setEnabled(can_change)
         self.rest.setEnabled(can_change and self.at_rest.isChecked())
+        self.at_joints.setEnabled(can_change and model.has_joints)
+        tip = "" if model.has_joints else "For rigged characters, and models learned from them"
+        self.at_joints.setToolTip(tip)
         several = can_change and self.first.count() > 1
         for choice in (self.first, self.second, self.add):
             choice.setEnabled(several)

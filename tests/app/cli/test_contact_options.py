@@ -20,7 +20,7 @@ from lcollision_core.meshes import (
 from lcollision_core.model import PoseModel
 from tests.app.support import Lcollision
 
-NONE = {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0}
+NONE = {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0, "joint": 0, "touching": 0}
 
 
 @pytest.fixture

@@ -58,7 +58,14 @@ def test_report_of_a_good_set(
         "near_exclusion": 0.0,
         "rules": ContactRules().to_json(),
         "proposed_ignored": [],
-        "excluded_at_rest": {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0},
+        "excluded_at_rest": {
+            "near": 0,
+            "rest": 0,
+            "ignored": 0,
+            "tolerated": 0,
+            "joint": 0,
+            "touching": 0,
+        },
     }
     assert "1 pose intersects itself" in lcollision("dataset", "check", path).stdout
 

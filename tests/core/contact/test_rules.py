@@ -19,11 +19,12 @@ from lcollision_core.contact import (
 from lcollision_core.contact import rules as rules_module
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import FaceGroup, Topology
+from lcollision_core.meshes.face_groups import without_joints
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import Mesh, grid, join, soup
 from tests.independent_check import IndependentRules
 
-RULES = ("near", "rest", "ignored", "tolerated")
+RULES = ("near", "rest", "ignored", "tolerated", "joint", "touching")
 
 FLOOR = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
 BLADE = [[1, 1, -1], [1, 1, 1], [2, 1, 1]]
@@ -40,11 +41,12 @@ def check_by_the_text(
     colliding = all_pairs(pose, rest.faces, DEPTH_TOLERANCE * size)
     at_rest = all_pairs(rest.vertices, rest.faces, DEPTH_TOLERANCE * size).pairs
     named: dict[str, set[int]] = {}
-    for group in groups:
+    for group in without_joints(groups):
         named.setdefault(group.name, set()).update(group.faces.tolist())
     depth_of = dict(zip(map(tuple, colliding.pairs.tolist()), colliding.depth, strict=True))
     touching = map(tuple, at_rest.tolist())
-    applied = IndependentRules(rest.vertices, rest.faces, touching, rules.to_json(), named)
+    joints = [set(group.faces.tolist()) for group in groups if group.about_joint]
+    applied = IndependentRules(rest.vertices, rest.faces, touching, rules.to_json(), named, joints)
     excluded = applied.excluding(depth_of)
 
     found = detector.detect(pose)
@@ -72,8 +74,8 @@ def ruled_meshes(draw: st.DrawFn) -> tuple[Mesh, np.ndarray, ContactRules, tuple
     rest = Mesh(mesh.vertices + rng.normal(scale=0.06, size=mesh.vertices.shape), mesh.faces)
     pose = rest.vertices + rng.normal(scale=0.25, size=rest.vertices.shape)
     groups = tuple(
-        FaceGroup(name, np.flatnonzero(rng.uniform(size=len(mesh.faces)) < 0.4))
-        for name in ("a", "b", "c", "b")
+        FaceGroup(name, np.flatnonzero(rng.uniform(size=len(mesh.faces)) < 0.4), about_joint)
+        for name, about_joint in (*((n, False) for n in "abcb"), *((n, True) for n in "abb"))
     )
     names = st.sampled_from(["a", "b", "c"])
     rules = ContactRules(
@@ -81,6 +83,9 @@ def ruled_meshes(draw: st.DrawFn) -> tuple[Mesh, np.ndarray, ContactRules, tuple
         rest_exclusion=draw(st.sampled_from([None, 0.0, 0.03, 0.31])),
         ignored=tuple(draw(st.lists(st.tuples(names, names), max_size=2))),
         tolerated_depth=draw(st.sampled_from([0.0, 0.02])),
+        joint_exclusion=draw(st.booleans()),
+        touching=tuple(map(tuple, rng.integers(len(mesh.faces), size=(3, 2)).tolist())),
+        touching_radius=draw(st.sampled_from([0.0, 0.05, 0.31])),
     )
     return rest, pose, rules, groups
 
@@ -100,8 +105,10 @@ def test_each_rule_is_the_first_for_some_pair() -> None:
     rest = Mesh(mesh.vertices + rng.normal(scale=0.05, size=mesh.vertices.shape), mesh.faces)
     pose = rest.vertices + rng.normal(scale=0.1, size=rest.vertices.shape)
     even = FaceGroup("even", np.arange(0, len(mesh.faces), 2))
-    rules = ContactRules(0.2, 0.05, (("even", "even"),), 0.01)
-    found = check_by_the_text(rest, pose, rules, (even,))
+    elbow = FaceGroup("elbow", np.arange(10, len(mesh.faces), 3), about_joint=True)
+    touching = ((88, 51), (81, 32), (45, 30))
+    rules = ContactRules(0.2, 0.05, (("even", "even"),), 0.01, True, touching, 0.3)
+    found = check_by_the_text(rest, pose, rules, (even, elbow))
     assert found.colliding
     assert min(found.excluded.to_json().values()) > 0
     without = CollisionDetector(rest.topology, rest.vertices).detect(pose)

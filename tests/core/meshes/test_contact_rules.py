@@ -11,7 +11,9 @@ import pytest
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import ContactRules, RuleCounts
 
-ALL = ContactRules(0.05, 0.0, (("Hair", "Body"), ("Belt", "Belt")), 1e-4)
+ALL = ContactRules(
+    0.05, 0.0, (("Hair", "Body"), ("Belt", "Belt")), 1e-4, True, ((3, 0), (5, 9)), 0.02
+)
 
 
 @pytest.mark.parametrize("rules", [ContactRules(), ALL, ContactRules(rest_exclusion=0.02)])
@@ -32,6 +34,8 @@ def test_what_a_file_lacks_is_off() -> None:
         ({"rest_exclusion": float("nan")}, "the rest exclusion must be 0 or more"),
         ({"tolerated_depth": float("inf")}, "the tolerated depth must be 0 or more"),
         ({"ignored": (("Hair",),)}, "an ignored pair must be two names of groups"),
+        ({"touching": ((3, -1),)}, "a touching pair must be two faces by number"),
+        ({"touching_radius": -1.0}, "the touching radius must be 0 or more"),
         ({"ignored": (("Hair", " "),)}, "an ignored pair must be two names of groups"),
     ],
 )
@@ -55,9 +59,10 @@ def test_damaged_json_is_refused_in_a_sentence(values: Any) -> None:
         (RuleCounts(rest=434), "434 pairs that touch at rest are not counted"),
         (RuleCounts(rest=1), "1 pair that touches at rest is not counted"),
         (
-            RuleCounts(2, 3, 4, 5),
+            RuleCounts(2, 3, 4, 5, 6, 7),
             "2 pairs within 0.05 along the surface, 3 pairs that touch at rest, 4 pairs of Hair "
-            "and Body or Belt with itself and 5 pairs not deeper than 0.0001 are not counted",
+            "and Body or Belt with itself, 5 pairs not deeper than 0.0001, 6 pairs at joints and 7 "
+            "pairs at places that nearly always touch are not counted",
         ),
     ],
 )

@@ -12,13 +12,14 @@ import pytest
 
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes.face_groups import without_joints
 from lcollision_core.model import PosableBody, RigModel, open_body, propose_rules, sample_poses
 from lcollision_core.model.pose_file import NamedPose, read_poses, write_poses
 from lcollision_core.posing import DragOptions, Pin, Twist, make_grip
 from lcollision_core.resolve import PoseResolver, ResolveOptions, Step
 from tests.core.gltf_builder import arm, rotation
 from tests.core.shapes import random_rotation
-from tests.independent_check import IndependentRules, crossing_pairs
+from tests.independent_check import IndependentRules, crossing_pairs, faces_about_joints
 from tests.rigged_shapes import rigged_body, rigged_tube, write_gltf
 
 FloatArray = npt.NDArray[np.float64]
@@ -167,9 +168,15 @@ def assert_resolved(model: RigModel, poses: FloatArray) -> set[Step]:
     # Without depths no pair is tolerated; by the rules none is anyway.
     assert model.rules.tolerated_depth == 0.0
     named: dict[str, set[int]] = {}
-    for group in model.groups:
+    for group in without_joints(model.groups):
         named.setdefault(group.name, set()).update(group.faces.tolist())
-    applied = IndependentRules(model.reference, faces, touching, model.rules.to_json(), named)
+    rig = model.space.rig
+    main = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
+    joints = faces_about_joints(
+        model.reference, faces, rig.parents.tolist(), rig.rest[:, :3, 3], main.tolist()
+    )
+    rules = model.rules.to_json()
+    applied = IndependentRules(model.reference, faces, touching, rules, named, joints)
 
     def counted(vertices: npt.NDArray[np.floating]) -> list[tuple[int, int]]:
         crossing = crossing_pairs(vertices.astype(np.float64), faces)
@@ -199,11 +206,8 @@ def test_colliding_poses_of_a_real_character_are_resolved(characters: Path, name
     assert isinstance(body, RigModel)
     n_poses = int(os.environ.get("LCOLLISION_POSES", "1"))
     assert_resolved(body, sample_poses(body, n_poses, seed=1, colliding=True))
-    proposed = propose_rules(body)
-    assert (proposed is not None) == (name == "xbot")
-    if proposed is not None:
-        other = body.with_rules(proposed.rules)
-        assert_resolved(other, sample_poses(other, n_poses, seed=1, colliding=True))
+    # Most frames of their clips are free, or collide for more than being made of shells.
+    assert propose_rules(body) is None
 
 
 def test_a_motion_is_resolved_frame_by_frame(model: RigModel) -> None:
