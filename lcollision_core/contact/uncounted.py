@@ -68,9 +68,9 @@ class UncountedTables:
 
     def _are_worthwhile(self) -> bool:
         exclusions, n_leaves = self._exclusions, len(self._tree.slot_face) // LEAF_SIZE
-        n_listed = len(exclusions.near) + len(exclusions.face)
+        n_listed = len(exclusions.near) + len(exclusions.face) + len(exclusions.touching)
         return (
-            n_listed + len(exclusions.region) > 0
+            n_listed + len(exclusions.region) + len(exclusions.joint) > 0
             and n_listed <= MOST_LISTED
             and n_leaves**2 // 6 <= MOST_BYTES
         )
@@ -106,12 +106,13 @@ def make_uncounted(
     bits = np.zeros(size @ stride, dtype=np.uint8)
     made = UncountedNodes(level, number, start, stride, bits)
     near = _both_ways(exclusions.near_start, exclusions.near)
-    touching = _both_ways(exclusions.start, exclusions.face)
+    rest = _both_ways(exclusions.start, exclusions.face)
+    touching = _both_ways(exclusions.touching_start, exclusions.touching)
     for first in range(0, int(size[leaves]), _LEAVES_AT_ONCE):
         if not goes_on():
             return None
         stop = min(first + _LEAVES_AT_ONCE, int(size[leaves]))
-        _fill_leaves(tree, exclusions, near, touching, first, stop, made)
+        _fill_leaves(tree, exclusions, near, rest, touching, first, stop, made)
     for nodes in reversed(inner):
         _fill_inner(tree, nodes, made)
     return made
@@ -148,10 +149,18 @@ def _mark(start: npt.NDArray[np.int64], entry: IntArray, of: int, mask, bit) -> 
 
 
 @compiled
+def _mark_both_ways(lists: _BothWays, of: int, mask, bit) -> None:  # type: ignore[no-untyped-def]
+    if len(lists.start) > 1:
+        _mark(lists.start, lists.entry, of, mask, bit)
+        _mark(lists.start_before, lists.entry_before, of, mask, bit)
+
+
+@compiled
 def _fill_leaves(  # type: ignore[no-untyped-def]
     tree: FaceTree,
     exclusions: Exclusions,
     near: _BothWays,
+    rest: _BothWays,
     touching: _BothWays,
     first: int,
     stop: int,
@@ -159,13 +168,15 @@ def _fill_leaves(  # type: ignore[no-untyped-def]
 ) -> None:
     """Fill in the table of the leaves for those from `first` to `stop` with themselves and later.
 
-    Bit i of a vertex, face or region says that no face that has it, is it or is of it counts with
-    face i of the leaf at hand.
+    Bit i of a vertex, face, region or joint says that no face that has it, is it, is of it or lies
+    about it counts with face i of the leaf at hand.
     """
     corners, region = exclusions.corners, exclusions.region
     of_vertex = np.empty(corners.max() + 1, dtype=np.uint8)
     of_face = np.empty(len(corners), dtype=np.uint8)
     of_region = np.empty(len(exclusions.ignored), dtype=np.uint8)
+    joint_start, joint = exclusions.joint_start, exclusions.joint
+    of_joint = np.empty(joint.max() + 1 if len(joint) else 0, dtype=np.uint8)
     n_leaves = len(tree.slot_face) // LEAF_SIZE
     level = made.level[len(tree.left) - 1]
     table, stride = made.start[level], made.stride[level]
@@ -173,6 +184,7 @@ def _fill_leaves(  # type: ignore[no-untyped-def]
         of_vertex[:] = 0
         of_face[:] = 0
         of_region[:] = 0
+        of_joint[:] = 0
         of_all = np.uint8(0)
         for i in range(LEAF_SIZE):
             bit = np.uint8(1 << i)
@@ -183,12 +195,11 @@ def _fill_leaves(  # type: ignore[no-untyped-def]
             for c in range(3):
                 v = corners[face, c]
                 of_vertex[v] |= bit
-                if len(near.start) > 1:
-                    _mark(near.start, near.entry, v, of_vertex, bit)
-                    _mark(near.start_before, near.entry_before, v, of_vertex, bit)
-            if len(touching.start) > 1:
-                _mark(touching.start, touching.entry, face, of_face, bit)
-                _mark(touching.start_before, touching.entry_before, face, of_face, bit)
+                _mark_both_ways(near, v, of_vertex, bit)
+            _mark_both_ways(rest, face, of_face, bit)
+            _mark_both_ways(touching, face, of_face, bit)
+            if len(joint) > 0:
+                _mark(joint_start, joint, face, of_joint, bit)
             if len(region) > 0:
                 for r in range(len(of_region)):
                     if exclusions.ignored[region[face], r]:
@@ -204,6 +215,9 @@ def _fill_leaves(  # type: ignore[no-untyped-def]
                     mask |= of_vertex[corners[face, c]]
                 if len(region) > 0:
                     mask |= of_region[region[face]]
+                if len(joint) > 0:
+                    for k in range(joint_start[face], joint_start[face + 1]):
+                        mask |= of_joint[joint[k]]
                 if mask != _ALL:
                     counts = True
                     break

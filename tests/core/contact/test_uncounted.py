@@ -16,7 +16,17 @@ RULES = {
     "near": ContactRules(near_exclusion=0.2),
     "rest": ContactRules(rest_exclusion=0.5),
     "ignored": ContactRules(ignored=(("ball", "sheet"), ("sheet", "sheet"))),
-    "all": ContactRules(0.1, 0.05, ignored=(("ball", "ball"),), tolerated_depth=0.02),
+    "joints": ContactRules(joint_exclusion=True),
+    "touching": ContactRules(touching=((0, 30), (7, 240)), touching_radius=0.5),
+    "all": ContactRules(
+        0.1,
+        0.05,
+        (("ball", "ball"),),
+        0.02,
+        joint_exclusion=True,
+        touching=((7, 240),),
+        touching_radius=0.1,
+    ),
 }
 
 
@@ -30,6 +40,8 @@ def _bodies(rules: ContactRules) -> tuple[CollisionDetector, np.ndarray]:
     groups = (
         FaceGroup("sheet", np.arange(n_sheet)),
         FaceGroup("ball", np.arange(n_sheet, n_sheet + len(ball.faces))),
+        FaceGroup("elbow", np.arange(10, 90), about_joint=True),
+        FaceGroup("wrist", np.arange(70, n_sheet + 40), about_joint=True),
     )
     noise = rng.normal(scale=0.08, size=(12, *rest.vertices.shape))
     return CollisionDetector(rest.topology, rest.vertices, rules, groups), rest.vertices + noise
