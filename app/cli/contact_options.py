@@ -145,7 +145,9 @@ def note_rules(body: PosableBody) -> None:
 
 def rules_sentence(rules: ContactRules, at_rest: dict[str, int]) -> str:
     """Write what is not counted, and how many pairs each rule excludes at rest."""
-    said = ", ".join(f"{number} {_RULES[rule]}" for rule, number in at_rest.items() if number)
+    from lcollision_core.meshes import RuleCounts
+
+    said = RuleCounts(**at_rest).described()
     return f"not counted are {rules.described()}; at rest that is {said or 'no pair'}"
 
 
@@ -156,16 +158,6 @@ def excluded_at_rest(body: PosableBody) -> dict[str, int]:
     if body.rules.exclude_nothing:
         return RuleCounts().to_json()
     return body.detector.detect(body.reference).excluded.to_json()
-
-
-_RULES = {
-    "near": "near along the surface",
-    "rest": "touching at rest",
-    "joint": "at joints",
-    "touching": "at places that nearly always touch",
-    "ignored": "of ignored groups",
-    "tolerated": "not deeper than tolerated",
-}
 
 
 def rules_json(body: PosableBody) -> dict[str, Any]:

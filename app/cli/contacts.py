@@ -36,7 +36,7 @@ def contacts(
         bool,
         typer.Option(
             "--ignore-proposed",
-            help="Do not count the pairs of groups that touch in nearly every pose.",
+            help="Do not count patches that touch in nearly every pose, and what is near to both.",
         ),
     ] = False,
     defaults: Annotated[
@@ -50,6 +50,7 @@ def contacts(
     Options add to the rules that apply, and are kept: of a character in your data folder, where the
     editor finds them too; of a model without a predictor in its file.
     """
+    from lcollision_core.meshes.contact_rules import pair_in_words
     from lcollision_core.model import open_body, propose_rules
 
     before = open_body(model_name)
@@ -72,12 +73,13 @@ def contacts(
     sentence = rules_sentence(body.rules, excluded_at_rest(body))
     tell(f"{body.name}: {'every pair counts' if body.rules.exclude_nothing else sentence}")
     if proposed is not None:
-        new = len(proposed.rules.ignored) - len(body.rules.ignored)
         tell(
             f"  {proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, "
-            f"{proposed.n_colliding_then or 'none'} without {counted(new, 'pair')} of groups that "
-            "touch in nearly all of them; --ignore-proposed leaves these out"
+            f"{proposed.n_colliding_then or 'none'} without {counted(len(proposed.new), 'place')} "
+            "that touch in nearly all of them; --ignore-proposed leaves these out:"
         )
+        for pair, number in proposed.places.items():
+            tell(f"    {pair_in_words(pair)}: {counted(number, 'place')}")
 
 
 def _proposed_json(proposed: ProposedRules | None) -> dict[str, Any] | None:
@@ -85,6 +87,7 @@ def _proposed_json(proposed: ProposedRules | None) -> dict[str, Any] | None:
         return None
     return {
         "rules": proposed.rules.to_json(),
+        "places": [{"groups": list(pair), "n": n} for pair, n in proposed.places.items()],
         "poses": proposed.n_poses,
         "colliding": proposed.n_colliding,
         "colliding_then": proposed.n_colliding_then,

@@ -47,9 +47,9 @@ class FaceHighlight:
             actor.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(*offset)
             actor.SetVisibility(False)
 
-    def show(self, pairs: npt.NDArray[np.int32] | None) -> None:
-        """Draw the faces of (P, 2) pairs, None for no face."""
-        chosen = np.unique(pairs) if pairs is not None else ()
+    def show(self, faces: npt.NDArray[np.integer] | None) -> None:
+        """Draw faces, given by number in an array of any shape, None for no face."""
+        chosen = np.unique(faces) if faces is not None else ()
         if len(chosen):
             self._polydata.SetPolys(pv.CellArray.from_regular_cells(self._faces[chosen]))
         self._set_visible(len(chosen) > 0)

@@ -13,7 +13,7 @@ from app.view.highlight import FaceHighlight
 from app.view.marks import Marks
 from app.view.outline import Outline, PartShape
 from app.view.patch import Patch
-from app.view.shading import COLLIDING_FACE, UNCOUNTED_FACE
+from app.view.shading import COLLIDING_FACE, NAMED_FACE, UNCOUNTED_FACE
 from app.view.surface import Surface, actor_of
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ class Scene:
     Attributes
     ----------
     crossing, uncounted : the faces that intersect another, and those of pairs that do not count
+    named : the faces of what a list names
     """
 
     def __init__(self, plotter: pv.BasePlotter, model: PosableBody, theme: Theme) -> None:
@@ -62,6 +63,7 @@ class Scene:
 
         self.uncounted = FaceHighlight(self.surface, model.faces, UNCOUNTED_FACE, 1)
         self.crossing = FaceHighlight(self.surface, model.faces, COLLIDING_FACE, 2)
+        self.named = FaceHighlight(self.surface, model.faces, NAMED_FACE, 3)
 
         disc = pv.Disc(
             inner=0.0,
@@ -74,8 +76,8 @@ class Scene:
         self._lift = 2e-3 * model.body_size
         for actor in (
             *(self._floor, self._shadow, self.body),
-            *(self.uncounted.nearer, self.crossing.nearer, self._ghost_actor),
-            *(self.uncounted.through, self.crossing.through),
+            *(self.uncounted.nearer, self.crossing.nearer, self.named.nearer, self._ghost_actor),
+            *(self.uncounted.through, self.crossing.through, self.named.through),
         ):
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)

@@ -26,6 +26,9 @@ COLLIDING_FACE = "#e0191f"
 UNCOUNTED_FACE = "#8a3fd1"
 """Faces that intersect another where the contact rules do not count it, in both themes."""
 
+NAMED_FACE = "#00a3b4"
+"""Faces of what a list names, in both themes."""
+
 CONTACT = "#ffb000"
 """Marks of where contact holds the body, in both themes."""
 

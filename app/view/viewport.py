@@ -208,6 +208,12 @@ class Viewport(QWidget):
 
     # The camera.
 
+    def point_out(self, faces: npt.NDArray[np.integer] | None) -> None:
+        """Tint faces, given by number, that a list names; None for none."""
+        if self.scene is not None:
+            self.scene.named.show(faces)
+            self._redraw()
+
     def set_camera(self, name: str, animated: bool = True) -> None:
         """Look at the whole pose from a side.
 

@@ -44,6 +44,7 @@ class ContactActions(QObject):
         dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         before = self._viewport.shading
         self._viewport.set_shading(Shading.EXACT)
+        dialog.faces_named.connect(self._viewport.point_out)
         dialog.finished.connect(lambda _: self._end(before))
         dialog.show()
         # Over the sliders: beside it stay the body and what the check says of it.
@@ -52,5 +53,6 @@ class ContactActions(QObject):
 
     def _end(self, before: Shading) -> None:
         """Colour the body as before, unless the user has chosen another shading meanwhile."""
+        self._viewport.point_out(None)
         if self._viewport.shading is Shading.EXACT:
             self._viewport.set_shading(before)

@@ -308,6 +308,7 @@ class MainWindow(QMainWindow):
         document = self.document
         for panel in (self.sliders, self.collision):
             panel.domain_hovered.connect(self.viewport.highlight_domain)
+        self.collision.faces_named.connect(self.viewport.point_out)
         for rows in (self.sliders, self.collision.prediction):
             rows.menu_wanted.connect(self._body_menus.open_on_part)
         self.viewport.domain_hovered.connect(self.sliders.light_domain)

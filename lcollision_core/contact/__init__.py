@@ -16,11 +16,9 @@ from lcollision_core.contact.detector import (
 )
 from lcollision_core.contact.energy import domain_energy
 from lcollision_core.contact.propose import (
-    LEAST_GAIN,
-    MOSTLY,
     GroupPair,
     ProposedPair,
     propose_by_kind,
-    propose_ignored,
+    touching_patches,
 )
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts

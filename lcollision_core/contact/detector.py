@@ -242,6 +242,11 @@ class CollisionDetector:
         )
         return other
 
+    def touching_faces(self) -> IntArray:
+        """Return the faces at the patches that the rules say to touch in nearly every pose."""
+        start, entry = self._exclusions.touching_start, self._exclusions.touching
+        return np.union1d(np.flatnonzero(np.diff(start)), entry).astype(np.int32)
+
     def rules_of(
         self, pairs: npt.NDArray[np.integer], penetration_depth: FloatArray
     ) -> npt.NDArray[np.uint8]:

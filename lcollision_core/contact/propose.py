@@ -1,9 +1,10 @@
-"""Which pairs of groups of faces to ignore, by how often they are in contact."""
+"""Which contacts not to count, by how often they are there: patches, and pairs of groups."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -11,18 +12,17 @@ from scipy import sparse
 
 from lcollision_core.contact.detector import CollisionDetector
 from lcollision_core.contact.kernels import NEAR
+from lcollision_core.contact.reach import Lists, faces_within, surface_of
+from lcollision_core.contact.rules import require_room
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes.contact_rules import MAX_IGNORED, STRICT
-from lcollision_core.meshes.face_groups import GROUP_KINDS, MAX_GROUPS, FaceGroup, require_groups
+from lcollision_core.meshes.contact_rules import MAX_TOUCHING, STRICT
+from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, require_groups
 
 NEARLY_ALWAYS = 0.95
 """Share of the poses from which contact says nothing about a pose."""
 
-MOSTLY = 0.5
-"""Share of the poses from which a body of shells collides by being made of shells."""
-
-LEAST_GAIN = 0.25
-"""Share of the poses that ignored pairs must free: what collides by its pose does so without."""
+_SEARCHED_SHARE = 0.5
+"""Of the radius of a patch, how far apart the middles of the patches that are looked at lie."""
 
 GroupPair = tuple[str, str]
 
@@ -41,67 +41,117 @@ class ProposedPair:
     share: float
 
 
-def propose_ignored(
-    detector_without: Callable[[Sequence[GroupPair]], CollisionDetector],
+def touching_patches(
+    detector: CollisionDetector,
     poses: npt.ArrayLike,
-    kinds: Mapping[str, Sequence[FaceGroup]],
+    radius: float,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
-) -> tuple[GroupPair, ...]:
-    """Choose pairs of groups to ignore so that poses collide for what they are, not by the mesh.
+) -> tuple[tuple[int, int], ...]:
+    """Find patches of the surface that touch in nearly every pose, whatever the pose is.
 
-    Pairs of components that collide in nearly every pose, or of body parts where the mesh is in one
-    piece. Where shells make up the body and most poses still collide, also the pairs within each
-    body part, and of body parts that touch in nearly every pose, at rest too, if that frees many:
-    links and neighbouring links, which robots' set-up assistants never test either.
+    Such as a belt's and a jacket's. A patch is what lies within a radius of a face, so that never a
+    whole part is left out against another.
 
     Parameters
     ----------
-    detector_without : makes a detector that ignores further pairs
-    poses, kinds, progress, cancel : see `propose_by_kind`
+    detector : of the poses; pairs that its rules exclude are not looked at
+    poses : (N, V, 3) array, N > 0
+    radius : normalised, of a patch
+    progress : called with (poses looked at, poses in all)
+    cancel : polled between poses
 
     Returns
     -------
-    pairs : in the order found, none where nothing collides nearly always; no more than rules may
-        ignore
+    pairs of faces in the middle of two patches, for `ContactRules.touching`: those that say most
+    of the pairs seen, so few as to say all of these that lie at such patches
 
     Raises
     ------
-    ShapeError, CancelledError : see `propose_by_kind`.
+    ShapeError : the poses do not fit the detector.
+    CancelledError : `cancel` was set.
     """
-    _, parts, components = GROUP_KINDS
+    found: list[npt.NDArray[np.int32]] = []
+    vertices = np.asarray(poses)
+    for done, pose in enumerate(vertices):
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        found.append(detector.detect(pose).pairs)
+        progress(done + 1, len(vertices))
+    seen, places = np.unique(np.concatenate(found), axis=0, return_inverse=True)
+    if not len(seen):
+        return ()
+    middles, near = _patches(detector, np.unique(seen), radius)
+    of_first, of_second = near[seen[:, 0]], near[seen[:, 1]]
+    n_poses_of = sparse.csr_matrix(2 * (len(middles),), dtype=np.int32)
+    ends = np.cumsum([len(pairs) for pairs in found])
+    for rows in np.split(places.ravel(), ends[:-1]):
+        one_way = of_first[rows].T @ of_second[rows]
+        n_poses_of += ((one_way + one_way.T) > 0).astype(np.int32)
+    often = sparse.triu(n_poses_of >= NEARLY_ALWAYS * len(vertices)).tocoo()
+    return _covering(
+        of_first.tocsc(), of_second.tocsc(), np.stack([often.row, often.col], axis=1), middles
+    )
 
-    def pairs_of(kind: str, detector: CollisionDetector, *, counted_only: bool) -> list[GroupPair]:
-        found = propose_by_kind(
-            detector,
-            poses,
-            {kind: kinds[kind]},
-            counted_only=counted_only,
-            progress=progress,
-            cancel=cancel,
-        )
-        return [pair.groups for pair in found[kind]]
 
-    in_pieces = len(kinds[components]) > 1
-    kind = components if in_pieces else parts
-    detector = detector_without(())
-    most = MAX_IGNORED - len(detector.rules.ignored)
-    pairs = pairs_of(kind, detector, counted_only=True)[:most]
-    if not in_pieces or not kinds[parts]:
-        return tuple(pairs)
+def _patches(
+    detector: CollisionDetector, faces: npt.NDArray[np.int32], radius: float
+) -> tuple[npt.NDArray[np.int32], sparse.csr_matrix]:
+    """Cover some faces by patches: their middle faces, and (F, n) which faces are in which."""
+    surface = surface_of(detector.topology, detector.reference)
+    require = partial(require_room, rule="touching radius")
 
-    def share(detector: CollisionDetector) -> float:
-        return float(np.mean(detector.are_colliding(poses, cancel=cancel)))
+    def within(some: npt.NDArray[np.int32], share: float) -> Lists:
+        return faces_within(surface, some, share * radius * detector.body_size, require)
 
-    detector = detector_without(pairs)
-    colliding = share(detector)
-    if colliding > MOSTLY:
-        links = [(part.name, part.name) for part in kinds[parts]]
-        links += pairs_of(parts, detector, counted_only=False)
-        links = [*pairs, *links][:most]
-        if colliding - share(detector_without(links)) >= LEAST_GAIN:
-            pairs = links
-    return tuple(pairs)
+    close, chosen = within(faces, _SEARCHED_SHARE), []
+    is_covered = np.zeros(detector.topology.n_faces, dtype=np.bool_)
+    for place, face in enumerate(faces.tolist()):
+        if not is_covered[face]:
+            is_covered[close.entry[close.start[place] : close.start[place + 1]]] = True
+            chosen.append(face)
+    middles = np.array(chosen, dtype=np.int32)
+    lists = within(middles, 1.0)
+    shape = (len(middles), detector.topology.n_faces)
+    ones = np.ones(len(lists.entry), dtype=np.int32)
+    return middles, sparse.csr_matrix((ones, lists.entry, lists.start), shape=shape).T.tocsr()
+
+
+def _covering(
+    of_first: sparse.csc_matrix,
+    of_second: sparse.csc_matrix,
+    patches: npt.NDArray[np.integer],
+    middles: npt.NDArray[np.int32],
+) -> tuple[tuple[int, int], ...]:
+    """Choose of (n, 2) pairs of patches a few that cover what all of them do, the largest first.
+
+    Parameters
+    ----------
+    of_first, of_second : (P, n) in which patches the two faces of each pair that was seen lie
+    """
+    covered = []
+    for a, b in patches.tolist():
+        ways = ((a, b), (b, a))
+        rows = [np.intersect1d(*_rows(of_first, i, of_second, j)) for i, j in ways]
+        covered.append(np.union1d(*rows))
+    is_covered = np.zeros(of_first.shape[0], dtype=np.bool_)
+    chosen = []
+    for place in sorted(range(len(covered)), key=lambda place: -len(covered[place])):
+        if not is_covered[covered[place]].all():
+            is_covered[covered[place]] = True
+            a, b = sorted(middles[patches[place]].tolist())
+            chosen.append((a, b))
+    return tuple(chosen[:MAX_TOUCHING])
+
+
+def _rows(
+    of_first: sparse.csc_matrix, i: int, of_second: sparse.csc_matrix, j: int
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """Return the rows of a column of each of two matrices."""
+    return (
+        of_first.indices[of_first.indptr[i] : of_first.indptr[i + 1]],
+        of_second.indices[of_second.indptr[j] : of_second.indptr[j + 1]],
+    )
 
 
 def propose_by_kind(
@@ -109,8 +159,6 @@ def propose_by_kind(
     poses: npt.ArrayLike,
     kinds: Mapping[str, Sequence[FaceGroup]],
     least_share: float = NEARLY_ALWAYS,
-    *,
-    counted_only: bool = False,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> dict[str, tuple[ProposedPair, ...]]:
@@ -128,8 +176,6 @@ def propose_by_kind(
     kinds : groups by kind, see `groups_by_kind`, of which the first `MAX_GROUPS` are looked at; of
         equal ones the first is proposed
     least_share : of the poses, above 0
-    counted_only : whether excluded pairs do not count here either, so that what is proposed is what
-        the rules still call a collision in nearly every pose
     progress : called with (poses looked at, poses in all)
     cancel : polled between poses
 
@@ -149,7 +195,7 @@ def propose_by_kind(
             cancel.raise_if_cancelled()
         found = detector.detect(pose)
         excluded = found.excluded_pairs[found.excluded_rule != NEAR]
-        pairs = found.pairs if counted_only else np.concatenate([found.pairs, excluded])
+        pairs = np.concatenate([found.pairs, excluded])
         for tally in tallies.values():
             tally.add(pairs)
         progress(done + 1, len(vertices))

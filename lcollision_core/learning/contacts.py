@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters.default_rules import MOST_NEAR_PAIRS
-from lcollision_core.contact import CollisionDetector, ContactRules, GroupPair, propose_ignored
+from lcollision_core.contact import CollisionDetector, ContactRules, touching_patches
 from lcollision_core.contact.rules import near_pairs_estimate
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.learning.request import LearningRequest
 from lcollision_core.meshes import PoseSet, body_size, groups_by_kind, named_pair, with_named_groups
+from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 
 _NEAR_EXCLUSIONS = (0.0, 0.02, 0.05, 0.1)
@@ -35,7 +36,7 @@ def with_proposed_rules(
     """Give poses the contact rules that a request asks for, and propose what it leaves open.
 
     The near exclusion of poses that say none is the shortest by which few of them collide, or the
-    shortest that is about as good as any. The pairs that `propose_ignored` finds are ignored.
+    shortest that is about as good as any. Patches that touch in nearly every pose do not count.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ def with_proposed_rules(
     kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
     names = {group.name for kind in kinds.values() for group in kind}
 
-    def ignoring(pairs: Iterable[GroupPair]) -> PoseSet:
+    def ignoring(pairs: Iterable[tuple[str, str]]) -> PoseSet:
         ignored = tuple(dict.fromkeys((*rules.ignored, *pairs)))
         groups = with_named_groups(poses.groups, kinds, ignored)
         return replace(poses, rules=replace(rules, ignored=ignored), groups=groups)
@@ -73,14 +74,12 @@ def with_proposed_rules(
     if request.ignored == ():
         return ignoring(())
     chosen_pairs = [named_pair(entry, names) for entry in request.ignored or ()]
-    detector = _detector(ignoring(chosen_pairs))
-
-    def detector_without(pairs: Iterable[GroupPair]) -> CollisionDetector:
-        others = ignoring([*chosen_pairs, *pairs])
-        return detector.with_rules(others.rules, others.groups)
-
-    pairs = propose_ignored(detector_without, asked, kinds, progress, cancel)
-    return ignoring([*chosen_pairs, *pairs])
+    ruled = ignoring(chosen_pairs)
+    touching = touching_patches(_detector(ruled), asked, TOUCHING_RADIUS, progress, cancel)
+    if not touching:
+        return ruled
+    rules = replace(ruled.rules, touching=touching, touching_radius=TOUCHING_RADIUS)
+    return replace(ruled, rules=rules)
 
 
 def _detector(poses: PoseSet) -> CollisionDetector:

@@ -67,6 +67,10 @@ class RuleCounts:
         """Return the numbers by the names of the rules."""
         return asdict(self)
 
+    def described(self) -> str:
+        """Say what is not counted, as in "3 touching at rest, 40 at joints"."""
+        return ", ".join(f"{n} {_SHORTLY[name]}" for name, n in self.to_json().items() if n)
+
 
 N_RULES = len(fields(RuleCounts))
 
@@ -172,6 +176,18 @@ class ContactRules:
         )
         return ", ".join(what for what in said if what)
 
+    def in_short(self) -> str:
+        """Say by which rules pairs are not counted, as in "touching at rest, at joints"."""
+        applies = {
+            "near": self.near_exclusion > 0.0,
+            "rest": self.rest_exclusion is not None,
+            "ignored": self.ignored,
+            "tolerated": self.tolerated_depth > 0.0,
+            "joint": self.joint_exclusion,
+            "touching": self.touching,
+        }
+        return ", ".join(_SHORTLY[name] for name, does in applies.items() if does)
+
     def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
         """Say how many pairs are not counted, and by which rules; empty if there are none."""
         counts = counts if isinstance(counts, RuleCounts) else RuleCounts(**counts)
@@ -204,6 +220,15 @@ def pair_in_words(pair: tuple[str, str]) -> str:
 
 STRICT = ContactRules()
 """All colliding pairs count."""
+
+_SHORTLY = {
+    "near": "near along the surface",
+    "rest": "touching at rest",
+    "ignored": "of ignored groups",
+    "tolerated": "not deeper than tolerated",
+    "joint": "at joints",
+    "touching": "at places that nearly always touch",
+}
 
 _PAIRS = ("ignored", "touching")
 """Fields that are pairs."""

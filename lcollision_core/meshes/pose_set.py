@@ -43,7 +43,7 @@ from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.upright import UpGuess, guess_up
 
 FORMAT_VERSION = 2
-"""The latest version that is read; sets without a joint exclusion are of version 1."""
+"""The latest version that is read; sets without joints or touching patches are of version 1."""
 
 _MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
 _EXTRA_ARRAYS = (
@@ -578,8 +578,9 @@ def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
     """
     if Path(path).suffix.lower() != ".npz":
         raise MeshFileError.unwritable(path, "a pose set is an .npz file", "rename it")
+    needs_latest = pose_set.rules.joint_exclusion or pose_set.rules.touching
     arrays: dict[str, npt.NDArray[Any]] = {
-        "format_version": np.array(FORMAT_VERSION if pose_set.rules.joint_exclusion else 1),
+        "format_version": np.array(FORMAT_VERSION if needs_latest else 1),
         "vertices": pose_set.vertices,
         "faces": pose_set.faces,
         "names": np.array(pose_set.names, dtype=np.str_),

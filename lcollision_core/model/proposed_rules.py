@@ -2,40 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
-from lcollision_core.contact import (
-    LEAST_GAIN,
-    MOSTLY,
-    CollisionDetector,
-    GroupPair,
-    propose_ignored,
-)
+from lcollision_core.contact import touching_patches
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import ContactRules
+from lcollision_core.meshes import GROUP_KINDS, ContactRules
+from lcollision_core.meshes.contact_rules import MAX_TOUCHING, TOUCHING_RADIUS
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.model.posable_body import PosableBody
 
 _MOST_POSES, _FEWEST_POSES = 40, 8
 """Of a body's poses, evenly spaced, that are looked at, and how many say enough."""
 
+_MOSTLY = 0.5
+"""Share of the poses from which a body collides by how it is made."""
 
-@dataclass(frozen=True)
+_LEAST_GAIN = 0.25
+"""Share of the poses that a proposal must free: what collides by its pose does so without it."""
+
+FacePair = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
 class ProposedRules:
     """Rules by which more of a body's poses are free.
 
     Attributes
     ----------
-    rules : those that apply, with further pairs of groups to ignore
+    rules : those that apply, with further patches that touch in nearly every pose
+    new : the pairs of faces in their middles
+    faces : (n,) int32, all faces at these patches
+    places : how many of these there are by names of what touches, the most first
     n_poses : poses that were looked at
     n_colliding, n_colliding_then : of these, by the rules that apply and by the proposed ones
     """
 
     rules: ContactRules
+    new: tuple[FacePair, ...]
+    faces: npt.NDArray[np.int32]
+    places: dict[tuple[str, str], int]
     n_poses: int
     n_colliding: int
     n_colliding_then: int
@@ -54,12 +65,14 @@ def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
 def propose_rules(
     body: PosableBody, progress: Progress = no_progress, cancel: CancelToken | None = None
 ) -> ProposedRules | None:
-    """Propose pairs of groups to ignore where most poses of a body collide.
+    """Propose patches not to count where most poses of a body collide.
+
+    They touch in nearly every pose. What touches so on one side does not count on the other either.
 
     Parameters
     ----------
     body : not one with a predictor, which depends on its rules
-    progress : called with (poses looked at, poses in all), for each of up to two kinds of group
+    progress : called with (poses looked at, poses in all)
     cancel : polled between poses
 
     Returns
@@ -70,23 +83,62 @@ def propose_rules(
     ------
     CancelledError : `cancel` was set.
     """
-    poses = typical_poses(body)
-
-    def n_colliding(detector: CollisionDetector) -> int:
-        return int(detector.are_colliding(poses, cancel=cancel).sum())
-
-    before = n_colliding(body.detector)
-    if before <= MOSTLY * len(poses):
+    poses, rules = typical_poses(body), body.rules
+    before = int(body.detector.are_colliding(poses, cancel=cancel).sum())
+    if before <= _MOSTLY * len(poses):
         return None
-
-    def ignoring(pairs: Sequence[GroupPair]) -> PosableBody:
-        return body.with_rules(replace(body.rules, ignored=(*body.rules.ignored, *pairs)))
-
-    pairs = propose_ignored(
-        lambda others: ignoring(others).detector, poses, body.groups_by_kind, progress, cancel
-    )
-    other = ignoring(pairs)
-    after = n_colliding(other.detector)
-    if before - after < LEAST_GAIN * len(poses):
+    # What applies already has a radius of its own.
+    radius = rules.touching_radius if rules.touching else TOUCHING_RADIUS
+    found = touching_patches(body.detector, poses, radius, progress, cancel)
+    new = tuple(dict.fromkeys((*found, *mirrored(body, found))))[
+        : MAX_TOUCHING - len(rules.touching)
+    ]
+    if not new:
         return None
-    return ProposedRules(other.rules, len(poses), before, after)
+    proposed = replace(rules, touching=(*rules.touching, *new), touching_radius=radius)
+    other = body.with_rules(proposed)
+    after = int(other.detector.are_colliding(poses, cancel=cancel).sum())
+    if before - after < _LEAST_GAIN * len(poses):
+        return None
+    faces, places = other.detector.touching_faces(), places_of(body, new)
+    return ProposedRules(proposed, new, faces, places, len(poses), before, after)
+
+
+def mirrored(body: PosableBody, pairs: Iterable[FacePair]) -> list[FacePair]:
+    """Return the mirror images of pairs of faces, where the body has two sides that are alike.
+
+    A face's image is the one whose middle is nearest to its mirrored own, within a patch's radius.
+    """
+    symmetry = body.symmetry
+    if symmetry is None:
+        return []
+    middles = body.reference[body.faces].mean(axis=1)
+    image = middles.copy()
+    image[:, symmetry.axis] = 2.0 * symmetry.offset - image[:, symmetry.axis]
+    away, partner = cKDTree(middles).query(image)
+    is_there = away <= TOUCHING_RADIUS * body.body_size
+    return [
+        (int(min(partner[a], partner[b])), int(max(partner[a], partner[b])))
+        for a, b in pairs
+        if is_there[a] and is_there[b]
+    ]
+
+
+def places_of(body: PosableBody, pairs: Iterable[FacePair]) -> dict[tuple[str, str], int]:
+    """Count pairs of faces by the body parts that they are of, or else by meshes or components.
+
+    The first of these kinds by which the two differ names a pair, as of an arm and its bracer.
+    """
+    own, parts, components = (body.groups_by_kind[kind] for kind in GROUP_KINDS)
+    names = []
+    for groups in (parts, own, components):
+        name = np.full(body.topology.n_faces, "", dtype=object)
+        for group in groups:
+            name[group.faces] = group.name
+        names.append(name)
+    counts: Counter[tuple[str, str]] = Counter()
+    for a, b in pairs:
+        known = [(name[a], name[b]) for name in names if name[a] and name[b]]
+        first, second = next((pair for pair in known if pair[0] != pair[1]), known[0])
+        counts[min(first, second), max(first, second)] += 1
+    return dict(counts.most_common())

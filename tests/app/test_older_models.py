@@ -33,7 +33,7 @@ def test_a_model_of_version_1_resolves_to_the_same_result(
     models = [PoseModel.load(path) for path in (old, new)]
     models[0].save(again)
     assert again.read_bytes() == new.read_bytes()
-    assert rb"format_version\":2" in again.read_bytes()
+    assert rb"format_version\":3" in again.read_bytes()
     assert models[0].fingerprint == models[1].fingerprint
     assert np.array_equal(models[0].latent_space.low, 1.2 * models[0].training_latent.min(axis=0))
     (pose,) = sample_poses(models[0], 1, seed=0, colliding=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QSize, Qt, Slot
+import numpy as np
+from PySide6.QtCore import QSize, Qt, Signal, Slot
 from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.work.jobs import ContactsAtRest
     from lcollision_core.contact import ContactRules, ProposedPair
+    from lcollision_core.meshes import FaceGroup
 
 _WIDTH, _BORDER = 400, WIDE + 4
 _COUNTING = "Counting pairs at rest…"
@@ -71,7 +73,14 @@ class ContactsDialog(QDialog):
     total : says how many pairs count at rest
     kept : says where changes are kept, or why nothing can be changed
     counts : labels of the counts by rule, as the fields of `RuleCounts` are called
+    always : whether places that touch in nearly every pose do not count
+
+    Signals
+    -------
+    faces_named : faces by number of the groups that the list or the choice below it names
     """
+
+    faces_named = Signal(object)
 
     def __init__(self, document: PoseDocument, parent: QWidget) -> None:
         super().__init__(parent)
@@ -80,11 +89,13 @@ class ContactsDialog(QDialog):
         self._document = document
         self.near, self.rest, self.tolerated = (self._field(name) for name in _MOST)
         self.at_rest, self.at_joints = QCheckBox("Touching at rest"), QCheckBox("Creases at joints")
+        self.always = QCheckBox("Always touching")
         bold = self.at_rest.font()
         bold.setBold(True)
-        for box in (self.at_rest, self.at_joints):
+        for box in (self.at_rest, self.at_joints, self.always):
             box.setFont(bold)
-        self.counts = {name: labelled("", "caption") for name in (*_MOST, "joint", "ignored")}
+        names = (*_MOST, "joint", "touching", "ignored")
+        self.counts = {name: labelled("", "caption") for name in names}
         for label in self.counts.values():
             label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         self.total = self._note(_COUNTING)
@@ -92,7 +103,7 @@ class ContactsDialog(QDialog):
         self._tint.setObjectName("caption")
         self.kept = self._note("")
         self._lay_out()
-        for box in (self.at_rest, self.at_joints):
+        for box in (self.at_rest, self.at_joints, self.always):
             box.toggled.connect(self._on_edited)
         for field in (self.near, self.rest, self.tolerated):
             field.valueChanged.connect(self._on_edited)
@@ -100,6 +111,7 @@ class ContactsDialog(QDialog):
         document.busy_changed.connect(self._on_edited)
         document.contacts_counted.connect(self._on_counted)
         document.pairs_proposed.connect(self._on_proposed)
+        document.rules_proposed.connect(self._on_edited)
         self._on_model()
 
     def _lay_out(self) -> None:
@@ -125,13 +137,8 @@ class ContactsDialog(QDialog):
                 "near to them along the surface",
             ),
             self._row(tolerated, "tolerated", self.tolerated, "Pairs no deeper, for soft bodies"),
-            self._row(
-                self.at_joints,
-                "joint",
-                None,
-                "Elbows, armour: pairs of what a joint links, both within the limb's thickness of "
-                "it",
-            ),
+            hbox(self.at_joints, None, self.counts["joint"]),
+            hbox(self.always, None, self.counts["touching"]),
             self._ignored_part(),
             self.total,
             self._tint,
@@ -142,10 +149,9 @@ class ContactsDialog(QDialog):
         self.setLayout(page)
         self.apply.setDefault(True)
 
-    def _row(self, title: QWidget, name: str, field: NumberBox | None, why: str) -> QVBoxLayout:
-        """Return a rule: what it is called, its count and any length, and why it is there."""
-        shown = [self.counts[name]] if field is None else [self.counts[name], field]
-        return vbox(hbox(title, None, *shown), self._note(why), spacing=TIGHT)
+    def _row(self, title: QWidget, name: str, field: NumberBox, why: str) -> QVBoxLayout:
+        """Return a rule: what it is called, its count and its length, and why it is there."""
+        return vbox(hbox(title, None, self.counts[name], field), self._note(why), spacing=TIGHT)
 
     def _note(self, text: str) -> QLabel:
         note = labelled("", "caption", wraps=True)
@@ -180,6 +186,9 @@ class ContactsDialog(QDialog):
         )
         for button in (self.add, self.propose):
             button.setAutoDefault(False)
+        for box in (self.first, self.second):
+            box.textActivated.connect(self._name_choice)
+        self.ignored.currentItemChanged.connect(self._name_item)
         self.add.clicked.connect(self._add_pair)
         self.propose.clicked.connect(self._document.propose_pairs)
         self.ignored.itemChanged.connect(self._on_edited)
@@ -210,7 +219,15 @@ class ContactsDialog(QDialog):
             tuple(pair for pair, item in self._pairs.items() if item.checkState(0) is _CHECKED),
             _length(self.tolerated, held.tolerated_depth),
             self.at_joints.isChecked(),
+            *(self._patches() if self.always.isChecked() else ((), 0.0)),
         )
+
+    def _patches(self) -> tuple[tuple[tuple[int, int], ...], float]:
+        """Return the patches that touch in nearly every pose, by the rules or as proposed."""
+        proposed, rules = self._document.proposed_rules, self._document.model.rules
+        if not rules.touching and proposed is not None:
+            rules = proposed.rules
+        return rules.touching, rules.touching_radius
 
     def _where_kept(self) -> str:
         """Say where changes are kept, or why there can be none; empty where they are in a file."""
@@ -233,6 +250,7 @@ class ContactsDialog(QDialog):
         self.near.setValue(_PERCENT * rules.near_exclusion)
         self.at_rest.setChecked(rules.rest_exclusion is not None)
         self.at_joints.setChecked(rules.joint_exclusion)
+        self.always.setChecked(bool(rules.touching))
         rest = rules.rest_exclusion
         self.rest.setValue(_DEFAULT_REST if rest is None else _PERCENT * rest)
         self.tolerated.setValue(_PERCENT * rules.tolerated_depth)
@@ -277,8 +295,14 @@ class ContactsDialog(QDialog):
             widget.setEnabled(can_change)
         self.rest.setEnabled(can_change and self.at_rest.isChecked())
         self.at_joints.setEnabled(can_change and model.has_joints)
-        tip = "" if model.has_joints else "For rigged characters, and models learned from them"
+        tip = "Pairs of parts that a joint links, both within the limb's thickness of it"
+        if not model.has_joints:
+            tip = "For rigged characters, and models learned from them"
         self.at_joints.setToolTip(tip)
+        found = len(self._patches()[0])
+        self.always.setEnabled(can_change and found > 0)
+        tip = f"{counted(found, 'place')} found that touch in nearly every pose, and what is near"
+        self.always.setToolTip(tip if found else "No place is known to touch in nearly every pose")
         several = can_change and self.first.count() > 1
         for choice in (self.first, self.second, self.add):
             choice.setEnabled(several)
@@ -327,6 +351,32 @@ class ContactsDialog(QDialog):
                 kind.setText(0, f"{kind.text(0)}: in {share} of the poses")
         if not any(proposals.values()):
             self._write(self.total, "No two groups touch in nearly every pose.")
+            return
+        size = {group.name: len(group.faces) for group in self._groups()}
+
+        def left_out(kind: str) -> int:
+            return sum(size[pair.groups[0]] * size[pair.groups[1]] for pair in proposals[kind])
+
+        least = min((kind for kind in proposals if proposals[kind]), key=left_out)
+        begin = f"Begin with {least}, which leaves out least; what is selected is tinted."
+        self._write(self.total, begin)
+
+    def _groups(self) -> list[FaceGroup]:
+        return [group for kind in self._document.model.groups_by_kind.values() for group in kind]
+
+    def _name(self, *names: str) -> None:
+        """Have the faces of groups of these names tinted in the view."""
+        faces = [group.faces for group in self._groups() if group.name in names]
+        self.faces_named.emit(np.concatenate(faces) if faces else None)
+
+    @Slot()
+    def _name_choice(self) -> None:
+        self._name(self.first.currentText(), self.second.currentText())
+
+    @Slot(QTreeWidgetItem)
+    def _name_item(self, item: QTreeWidgetItem | None) -> None:
+        pairs = [pair for pair, own in self._pairs.items() if item in (own, own.parent())]
+        self._name(*(name for pair in pairs for name in pair))
 
     def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QTreeWidgetItem:
         """Return the item of a pair, which is listed now if it was not."""

@@ -28,6 +28,7 @@ class CollisionPanel(QWidget):
     Signals
     -------
     domain_hovered : int or None, the domain of the row that the pointer is on
+    faces_named : faces by number that are to be seen in the view, or None
 
     Parameters
     ----------
@@ -37,6 +38,7 @@ class CollisionPanel(QWidget):
     """
 
     domain_hovered = Signal(object)
+    faces_named = Signal(object)
 
     def __init__(
         self,
@@ -58,6 +60,7 @@ class CollisionPanel(QWidget):
         self._area = scrolling(page)
         headline = vbox(self.exact, margins=(NORMAL, TIGHT, NORMAL, 0))
         self.setLayout(vbox(headline, self._area))
+        self.proposal.faces_named.connect(self.faces_named)
         self.prediction.domain_hovered.connect(self.domain_hovered)
         document.outcome_changed.connect(self._on_outcome)
 

@@ -67,7 +67,7 @@ class ExactCard(Card):
         self.details.setText("Updates when the pose stops moving")
         if has_model:
             # What does not count is reported on a separate line.
-            lines = 1 if self._document.model.rules.exclude_nothing else 2
+            lines = 1 if self._document.model.rules.exclude_nothing else 3
             self.details.setMinimumHeight(lines * self.details.fontMetrics().lineSpacing())
         self._on_exact()
 
@@ -101,12 +101,12 @@ class ExactCard(Card):
         else:
             said.append(f"No {'other ' if left_out else ''}triangle crosses another")
         if left_out:
+            rules = document.model.rules
             if excluded is None:
-                said.append("Without the pairs of triangles that are not counted")
-                sentence = f"{document.model.rules.described()} are not counted"
+                what, sentence = rules.in_short(), f"{rules.described()} are not counted"
             else:
-                said.append(f"{counted(excluded.total, 'pair')} of triangles not counted")
-                sentence = document.model.rules.sentence(excluded)
+                what, sentence = excluded.described(), rules.sentence(excluded)
+            said.append(f"Pairs not counted: {what}")
             tips.insert(0, f"{headline}; {sentence}: see Edit > Contacts")
         if is_held and verdict.colliding:
             # Why a drag goes no further.

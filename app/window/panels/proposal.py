@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Slot
+from PySide6.QtCore import Signal, Slot
 from PySide6.QtWidgets import QPushButton
 
-from app.window.widgets import Card, hbox, labelled, plain_tip
+from app.window.widgets import Card, hbox, labelled
 from app.wording import counted
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
 
-_LISTED = 20
-"""Most pairs that the tool tip lists."""
+_LISTED = 12
+"""Most pairs of names that are listed."""
 
 
 class ProposalCard(Card):
-    """Offers to ignore the groups that touch in nearly every pose; hidden where none do.
+    """Offers to leave out places that touch in nearly every pose; hidden where there are none.
+
+    They are listed and tinted in the view before they can be left out.
 
     Parameters
     ----------
@@ -26,21 +28,31 @@ class ProposalCard(Card):
 
     Attributes
     ----------
-    text : what they would change
-    ignore, dismiss : buttons
+    text, listed : what they would change, and where the places are
+    show_them, ignore, dismiss : buttons
+
+    Signals
+    -------
+    faces_named : faces by number to be tinted in the view, or None
     """
+
+    faces_named = Signal(object)
 
     def __init__(self, document: PoseDocument) -> None:
         super().__init__()
         self._document = document
-        self.text = labelled("", "caption", wraps=True)
-        self.ignore, self.dismiss = QPushButton("Ignore them"), QPushButton("Not now")
+        self.text, self.listed = (labelled("", "caption", wraps=True) for _ in range(2))
+        self.show_them, self.ignore = QPushButton("Show them"), QPushButton("Ignore them")
+        self.dismiss = QPushButton("Not now")
+        self.show_them.clicked.connect(self._on_show)
         self.ignore.clicked.connect(self._apply)
-        self.dismiss.clicked.connect(self.hide)
-        self.dismiss.setToolTip("Edit > Contacts proposes them again")
-        self.column.addWidget(labelled("Parts that always touch", "title"))
+        self.ignore.setToolTip("Don't count crossings at the tinted places; all others still count")
+        self.dismiss.clicked.connect(self._end)
+        self.dismiss.setToolTip("Edit > Contacts has them too")
+        self.column.addWidget(labelled("Places that always touch", "title"))
         self.column.addWidget(self.text)
-        self.column.addLayout(hbox(self.ignore, self.dismiss, None))
+        self.column.addWidget(self.listed)
+        self.column.addLayout(hbox(self.show_them, self.ignore, self.dismiss, None))
         for changed in (document.rules_proposed, document.model_changed):
             changed.connect(self._show_proposed)
         document.busy_changed.connect(lambda: self.ignore.setEnabled(not document.changing_model))
@@ -48,27 +60,44 @@ class ProposalCard(Card):
 
     @Slot()
     def _show_proposed(self) -> None:
-        from lcollision_core.meshes.contact_rules import pair_in_words
-
         proposed = self._document.proposed_rules
-        self.setVisible(proposed is not None)
+        self._end()
         if proposed is None:
             return
-        held = self._document.model.rules.ignored
-        new = [pair for pair in proposed.rules.ignored if pair not in held]
+        self.show()
         then = proposed.n_colliding_then
         self.text.setText(
             f"{proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, as the same "
-            f"parts touch in nearly all of them. With {counted(len(new), 'such pair')} not "
-            f"counted, {then or 'none'} would."
+            f"places touch in nearly all of them. With {counted(len(proposed.new), 'such place')} "
+            f"not counted, {then or 'none'} would."
         )
-        listed = map(pair_in_words, new[:_LISTED])
-        more = [f"and {len(new) - _LISTED} more"] if len(new) > _LISTED else []
-        self.ignore.setToolTip(plain_tip("\n".join(["Don't count contacts of", *listed, *more])))
+        for widget, shown in ((self.show_them, True), (self.ignore, False), (self.listed, False)):
+            widget.setVisible(shown)
+
+    @Slot()
+    def _on_show(self) -> None:
+        """List the places and have them tinted; now they can be left out."""
+        from lcollision_core.meshes.contact_rules import pair_in_words
+
+        proposed = self._document.proposed_rules
+        if proposed is None:
+            return
+        places = proposed.places.items()
+        lines = [f"{pair_in_words(pair)}: {counted(n, 'place')}" for pair, n in places]
+        more = [f"and {len(lines) - _LISTED} more"] if len(lines) > _LISTED else []
+        self.listed.setText("\n".join([*lines[:_LISTED], *more]))
+        for widget, shown in ((self.show_them, False), (self.ignore, True), (self.listed, True)):
+            widget.setVisible(shown)
+        self.faces_named.emit(proposed.faces)
+
+    @Slot()
+    def _end(self) -> None:
+        self.hide()
+        self.faces_named.emit(None)
 
     @Slot()
     def _apply(self) -> None:
         proposed = self._document.proposed_rules
         if proposed is not None:
-            self.hide()
+            self._end()
             self._document.set_rules(proposed.rules)

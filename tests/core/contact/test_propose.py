@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from lcollision_core.contact import (
     ContactRules,
     ProposedPair,
     propose_by_kind,
-    propose_ignored,
+    touching_patches,
 )
 from lcollision_core.errors import CancelledError, ShapeError
 from lcollision_core.jobs import CancelToken
@@ -23,9 +21,9 @@ from lcollision_core.meshes import (
     groups_by_kind,
     part_groups,
 )
-from lcollision_core.meshes.contact_rules import MAX_IGNORED
 from lcollision_core.meshes.face_groups import MAX_GROUPS
-from tests.core.shapes import Mesh, soup, strip
+from tests.core.shapes import Mesh, join, soup, strip
+from tests.independent_check import IndependentRules
 
 FLOOR = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
 BLADE = [[1, 1, -1], [1, 1, 1], [2, 1, 1]]
@@ -68,14 +66,6 @@ def test_what_is_excluded_at_rest_or_ignored_is_in_contact_too() -> None:
     for rules in (ContactRules(rest_exclusion=0.0), ContactRules(ignored=(("post", "floor"),))):
         found = proposed(detector(rules), poses(), GROUPS)
         assert [proposal.groups for proposal in found] == [("floor", "post")]
-
-
-def test_of_what_counts_alone_nothing_excluded_is_proposed() -> None:
-    groups = {"all": GROUPS}
-    strict = propose_by_kind(detector(), poses(), groups, counted_only=True)["all"]
-    assert [proposal.groups for proposal in strict] == [("floor", "post")]
-    rules = ContactRules(rest_exclusion=0.0)
-    assert propose_by_kind(detector(rules), poses(), groups, counted_only=True) == {"all": ()}
 
 
 def test_folds_of_the_skin_are_no_contact() -> None:
@@ -151,50 +141,52 @@ def test_of_very_many_groups_the_first_are_looked_at() -> None:
     assert found["meshes"] == (ProposedPair(("floor", "post"), 1.0),)
 
 
-def chosen(poses: np.ndarray, kinds: dict[str, tuple[FaceGroup, ...]]) -> set[tuple[str, str]]:
-    """Return what is ignored of poses; a detector of them knows the groups of all kinds."""
-    groups = tuple(group for kind in kinds.values() for group in kind)
-    strict = CollisionDetector(MESH.topology, MESH.vertices, ContactRules(), groups)
-    pairs = propose_ignored(
-        lambda others: strict.with_rules(ContactRules(ignored=tuple(others)), groups), poses, kinds
+def sliding(n_poses: int, n_touching: int) -> tuple[Mesh, np.ndarray]:
+    """Return a band over a plate, and poses in some of which its middle dips into the plate."""
+    plate, band = strip([[x, 0.0] for x in range(21)]), strip([[x + 0.1, 0.3] for x in range(21)])
+    mesh = join(plate, band)
+    poses = np.stack([mesh.vertices] * n_poses)
+    of_band = np.arange(len(plate.vertices), len(mesh.vertices))
+    dipping = of_band[np.abs(mesh.vertices[of_band, 0] - 10.0) < 1.5]
+    poses[:n_touching, dipping, 2] -= 0.6
+    return mesh, poses
+
+
+def test_patches_that_touch_in_nearly_every_pose_are_found_and_nothing_else() -> None:
+    mesh, poses = sliding(20, 19)
+    detector = CollisionDetector(mesh.topology, mesh.vertices)
+    # Once, far from there, the band dips elsewhere.
+    poses[3, 42 + 2 * 3 : 42 + 2 * 5, 2] -= 0.6
+    pairs = touching_patches(detector, poses, 0.1)
+    assert 0 < len(pairs) < 6
+    middle = mesh.vertices[mesh.faces][:, :, 0].mean(axis=1)
+    assert (np.abs(middle[np.array(pairs)] - 10.0) < 4.0).all()
+    rules = ContactRules(touching=pairs, touching_radius=0.1)
+    ruled = detector.with_rules(rules)
+    assert ruled.are_colliding(poses).tolist() == [pose == 3 for pose in range(20)]
+    # Each patch is in contact in 19 poses of 20, by an independent reading of what lies in it.
+    applied = IndependentRules(
+        mesh.vertices, mesh.faces, [], rules.to_json() | {"touching_radius": 0.1}, {}
     )
-    return set(pairs)
+    for pair in pairs:
+        one, two = (applied._faces_around(face, applied._patch_radius) for face in pair)
+        in_contact = [
+            any((a in one and b in two) or (b in one and a in two) for a, b in found.pairs.tolist())
+            for found in map(detector.detect, poses)
+        ]
+        assert sum(in_contact) == 19
+    # Less often is not nearly always; what a rule excludes already is not found again.
+    assert touching_patches(detector, sliding(20, 18)[1], 0.1) == ()
+    assert touching_patches(ruled, np.delete(poses, 3, axis=0), 0.1) == ()
+    with pytest.raises(ShapeError, match="must be of faces of this mesh, got 500"):
+        detector.with_rules(ContactRules(touching=((0, 500),)))
 
 
-def test_shells_that_always_touch_are_ignored_and_links_where_most_poses_still_collide() -> None:
-    meshes, parts, pieces = GROUP_KINDS
-    components = component_groups(MESH.topology)
-    of_face = {int(group.faces[0]): group.name for group in components}
-    links = (FaceGroup("arm", np.array([0, 1])), FaceGroup("hand", np.array([2])))
-    kinds = {meshes: (), parts: links, pieces: components}
-    always = (of_face[0], of_face[2])
-    # The blade, which is of the arm too, is in the floor in 8 poses of 10: by being an arm.
-    by_parts = {("arm", "arm"), ("hand", "hand"), ("arm", "hand")}
-    assert chosen(poses(), kinds) == {always} | by_parts
-    # It is in the floor in 2 of 5: most poses are free without the pair that always touches.
-    mostly_free = np.concatenate([poses()[:3], poses()[:2], poses()[:2], poses()[2:3]])
-    assert chosen(mostly_free, kinds) == {always}
-    assert chosen(poses()[:2], kinds) == {always}
-    out_of_floor = poses()[:2].copy()
-    out_of_floor[:, 6:9] += [0.0, 0.0, 5.0]
-    assert chosen(out_of_floor, kinds) == set()
-
-
-def test_parts_of_one_piece_are_compared_with_each_other() -> None:
-    meshes, parts, pieces = GROUP_KINDS
-    whole = FaceGroup("component 1", np.arange(3))
-    kinds = {meshes: (), parts: (FLOOR_GROUP, POST_GROUP), pieces: (whole,)}
-    assert chosen(poses(), kinds) == {("floor", "post")}
-
-
-def test_no_more_pairs_are_chosen_than_rules_may_ignore() -> None:
-    meshes, parts, pieces = GROUP_KINDS
-    kinds = {meshes: (), parts: (), pieces: component_groups(MESH.topology)}
-    names = [f"group {n}" for n in range(50)]
-    full = ContactRules(ignored=tuple(combinations(names, 2))[:MAX_IGNORED])
-    groups = [FaceGroup(name, np.array([0])) for name in names]
-    crowded = CollisionDetector(MESH.topology, MESH.vertices, full, groups)
-    assert propose_ignored(lambda _: crowded, poses(), kinds) == ()
+def test_looking_for_patches_is_cancelled() -> None:
+    cancel = CancelToken()
+    cancel.cancel()
+    with pytest.raises(CancelledError):
+        touching_patches(detector(), poses(), 0.1, cancel=cancel)
 
 
 def test_a_detector_by_other_rules_finds_what_a_new_one_does() -> None:
@@ -204,6 +196,7 @@ def test_a_detector_by_other_rules_finds_what_a_new_one_does() -> None:
         ContactRules(tolerated_depth=0.3),
         ContactRules(rest_exclusion=0.0),
         ContactRules(near_exclusion=0.2),
+        ContactRules(touching=((0, 2),)),
     ):
         other, new = strict.with_rules(rules, GROUPS), detector(rules)
         assert other.rules == rules

@@ -61,15 +61,15 @@ def test_folds_of_most_poses_are_not_counted() -> None:
     assert fixed.rules == ContactRules()
 
 
-def test_components_that_always_collide_are_ignored_unless_the_request_says_which() -> None:
+def test_places_that_always_touch_are_left_out_and_groups_where_the_request_says_so() -> None:
     poses = two_tubes()
     assert colliding_share(poses) == 1.0
     proposed = with_proposed_rules(poses, REQUEST)
-    assert proposed.rules.ignored == (("component 1", "component 2"),)
-    assert {group.name for group in proposed.groups} == {"component 1", "component 2"}
+    assert proposed.rules.ignored == ()
+    assert proposed.rules.touching
     assert colliding_share(proposed) == 0.0
     none = with_proposed_rules(poses, replace(REQUEST, ignored=(), near_exclusion=0.0))
-    assert none.rules.ignored == ()
+    assert (none.rules.ignored, none.rules.touching) == ((), ())
     named = replace(REQUEST, ignored=("component 2:component 1",))
     assert with_proposed_rules(poses, named).rules.ignored == (("component 2", "component 1"),)
     with pytest.raises(LCollisionError, match=r"names 'hat', which is no group"):

@@ -71,6 +71,15 @@ def test_sentences_name_the_rules(counts: RuleCounts, sentence: str) -> None:
     assert ALL.sentence(counts.to_json()) == sentence
 
 
+def test_what_is_not_looked_at_is_said_in_short() -> None:
+    assert RuleCounts().described() == ContactRules().in_short() == ""
+    assert RuleCounts(rest=3, joint=40).described() == "3 touching at rest, 40 at joints"
+    assert ContactRules(0.1, 0.02, joint_exclusion=True).in_short() == (
+        "near along the surface, touching at rest, at joints"
+    )
+    assert ALL.in_short().count(", ") == 5
+
+
 def test_many_ignored_pairs_are_said_in_short() -> None:
     rules = ContactRules(ignored=tuple(("Hair", str(n)) for n in range(9)))
     said = rules.sentence(RuleCounts(ignored=7))

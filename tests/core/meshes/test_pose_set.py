@@ -373,7 +373,7 @@ def _with_nan() -> np.ndarray:
         ({"vertices": _poses(2), "faces": FACES, "up_axis": np.array(3)}, "0, 1 or 2, got 3"),
         ({"vertices": _poses(2), "faces": FACES, "near_exclusion": np.array(-1.0)}, "got -1"),
         ({"vertices": _poses(2), "faces": FACES, "near_exclusion": np.ones(2)}, "one number"),
-        ({"vertices": _poses(2), "faces": FACES, "format_version": np.array(2)}, "version 2"),
+        ({"vertices": _poses(2), "faces": FACES, "format_version": np.array(3)}, "version 3"),
         (
             {"vertices": _poses(2), "faces": FACES, "vertex_labels": np.array(["a", "b", " ", ""])},
             r"printable and not blank, got ' ' for vertex 2 \(from 0\)",

@@ -112,6 +112,28 @@ def test_pairs_of_groups_are_ignored_and_counted_again(
     dialog.close()
 
 
+def test_joints_count_by_a_tick_and_the_groups_that_are_chosen_are_tinted(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    document, dialog = window.document, dialog_of(qtbot, window)
+    assert body.has_joints
+    assert not dialog.at_joints.isChecked()
+    assert not dialog.always.isEnabled()
+    dialog.at_joints.setChecked(True)
+    QTest.mouseClick(dialog.apply, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    assert document.model.rules == ContactRules(joint_exclusion=True)
+    assert dialog.counts["joint"].text().endswith("at rest")
+    scene = window.viewport.scene
+    assert scene is not None
+    dialog.first.textActivated.emit(dialog.first.currentText())
+    chosen = {dialog.first.currentText(), dialog.second.currentText()}
+    groups = [g for groups in body.groups_by_kind.values() for g in groups if g.name in chosen]
+    assert scene.named.n_faces == len(np.unique(np.concatenate([g.faces for g in groups]))) > 0
+    dialog.close()
+    assert scene.named.n_faces == 0
+
+
 def test_rules_that_a_predictor_was_trained_by_stay(qtbot: QtBot, window: MainWindow) -> None:
     dialog = dialog_of(qtbot, window)
     fields = (dialog.near, dialog.at_rest, dialog.rest, dialog.tolerated, dialog.add, dialog.apply)
@@ -165,6 +187,22 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     ]
     assert dialog.rules() == body.rules
     assert not any(kind.isExpanded() for kind in kinds)
+    # It is said which to begin with, and what a row names is tinted.
+    size = {g.name: len(g.faces) for groups in body.groups_by_kind.values() for g in groups}
+    left_out = {
+        kind: sum(size[pair.groups[0]] * size[pair.groups[1]] for pair in pairs)
+        for kind, pairs in expected.items()
+        if pairs
+    }
+    assert dialog.total.text().startswith(f"Begin with {min(left_out, key=left_out.__getitem__)}")
+    scene = window.viewport.scene
+    assert scene is not None
+    item = kinds[0].child(0)
+    dialog.ignored.setCurrentItem(item)
+    named = next(iter(dialog._pairs))
+    assert scene.named.n_faces == sum(size[name] for name in named)
+    dialog.ignored.setCurrentItem(None)
+    assert scene.named.n_faces == 0
     components = next(kind for text, kind in shown.items() if text.startswith("Components"))
     components.setCheckState(0, Qt.CheckState.Checked)
     ignored = tuple(pair.groups for pair in expected["components"])
@@ -223,20 +261,33 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     assert proposed is not None
     assert card.isVisible()
     assert card.text.text().startswith(f"{proposed.n_colliding} of {proposed.n_poses} poses")
-    assert "1 such pair" in card.text.text()
-    ((first, second),) = proposed.rules.ignored
-    assert f"{first} and {second}" in card.ignore.toolTip()
+    assert f"{len(proposed.new)} such places not counted" in card.text.text()
+    # They are listed and tinted before they can be left out.
+    scene = window.viewport.scene
+    assert scene is not None
+    assert not card.ignore.isVisible()
+    assert scene.named.n_faces == 0
+    QTest.mouseClick(card.show_them, LEFT)
+    assert scene.named.n_faces == len(proposed.faces) > 0
+    ((first, second), n), *_ = proposed.places.items()
+    assert f"{first} and {second}: {n} place" in card.listed.text()
+    assert card.ignore.isVisible()
+    rest(qtbot, window)
     take_picture(window, "proposal")
     QTest.mouseClick(card.dismiss, LEFT)
     assert card.isHidden()
+    assert scene.named.n_faces == 0
     document.rules_proposed.emit()
+    QTest.mouseClick(card.show_them, LEFT)
     QTest.mouseClick(card.ignore, LEFT)
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
     rest(qtbot, window)
     assert document.model.rules == proposed.rules
     assert card.isHidden()
     assert document.exact is not None
-    assert not document.exact.colliding
+    assert document.exact.excluded.touching > 0
+    told = window.collision.exact.details.text()
+    assert f"{document.exact.excluded.touching} at places that nearly always touch" in told
     # What the user has chosen is not questioned, nor is what has nothing to offer.
     document.set_model(document.model)
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
