@@ -56,7 +56,10 @@ class UnfinishedPoses:
     def stop(self) -> None:
         """Write what is done, and say how to go on."""
         if self.finished and self._write():
-            note(f"stopped; {self.path} has {self._told}, run the same command again to go on")
+            again = "run the same command again to go on"
+            if len(self.finished) == self._total:
+                again = "run the command again when they can be written"
+            note(f"stopped; {self.path} has {self._told}, {again}")
 
     def _write(self) -> bool:
         """Write, or report once why not: a full disk neither ends the command nor hides errors."""

@@ -50,6 +50,8 @@ _IDENTITY = np.eye(4)
 _PARTS = ("translation", "rotation", "scale")
 _DEFAULTS = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0))
 
+_OTHER_FORM = "write a point cache (.pc2), or each pose in a file of its own"
+
 _CLIP = "poses"
 """The name of the clip that poses become."""
 
@@ -110,27 +112,42 @@ def posed_gltf(
     Raises
     ------
     ShapeError : another shape, or `transforms` are missing.
-    MeshFileError : the source cannot be read or has changed, or cannot hold the pose in this form.
+    MeshFileError : the source cannot be read or has changed, or the file would be too large.
+
+    Notes
+    -----
+    A form that cannot hold the pose, as where the matrix of a joint's node shears, becomes MESH,
+    which holds any; the notes say so.
     """
     if vertices.shape != character.rest_vertices.shape:
         expected = f"of shape {character.rest_vertices.shape}"
         raise ShapeError.must_be(f"vertices of {character.name}", expected, vertices.shape)
+    if form is CharacterForm.JOINTS and (character.rig is None or transforms is None):
+        raise ShapeError.must_be("a pose in joints", "of a rig, with transforms", "none")
     file = file or CharacterFile(character)
-    with one_sentence(character.source):
+    pose = np.asarray(vertices, dtype=np.float64)
+    notes: list[str] = []
+    with one_sentence(character.source, "cannot be written with this pose"):
         source = _Source(file)
-        pose = np.asarray(vertices, dtype=np.float64)
-        if form is CharacterForm.JOINTS:
-            if character.rig is None or transforms is None:
-                raise ShapeError.must_be("a pose in joints", "of a rig, with transforms", "none")
-            stored = source.turn_joints(character.rig, transforms)
-        elif form is CharacterForm.MESH:
+        try:
+            if (
+                form is CharacterForm.JOINTS
+                and character.rig is not None
+                and transforms is not None
+            ):
+                stored = source.turn_joints(character.rig, transforms)
+            elif form is CharacterForm.MORPH:
+                stored = source.add_morph(pose)
+            else:
+                stored = source.bake(pose)
+            source.require_near(stored, pose)
+        except _NotHeldError as error:
+            source = _Source(file)
             stored = source.bake(pose)
-        else:
-            stored = source.add_morph(pose)
-        source.require_near(stored, pose, form)
+            notes.append(f"{error.what}, so it is written as a static mesh")
         clips = source.drop_clips()
         data = source.patch.encoded()
-    notes = [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
+    notes += [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
     return PosedFile(data, stored, (*source.patch.notes, *notes))
 
 
@@ -152,7 +169,7 @@ def animated_gltf(
 
     Raises
     ------
-    ShapeError, MeshFileError : as of `posed_gltf`.
+    ShapeError, MeshFileError : as of `posed_gltf`, and where the joints cannot hold a frame.
     """
     shape = (len(transforms), *character.rest_vertices.shape)
     if not shape[0] or vertices.shape != shape or character.rig is None:
@@ -160,15 +177,19 @@ def animated_gltf(
             f"frames of {character.name}", f"of a rig, of shape {shape}", vertices.shape
         )
     file = CharacterFile(character)
-    with one_sentence(character.source):
+    with one_sentence(character.source, "cannot be written with these poses"):
         source = _Source(file)
         clips = source.drop_clips()
         frames = source.animate(character.rig, transforms, fps)
         for stored, wanted in zip(frames, vertices, strict=True):
-            source.require_near(stored, wanted, CharacterForm.JOINTS)
+            source.require_near(stored, wanted)
         data = source.patch.encoded()
     notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in clips))
     return tuple(PosedFile(data, stored, notes) for stored in frames)
+
+
+class _NotHeldError(MeshFileError):
+    """A form of a character's file cannot hold a pose."""
 
 
 class CharacterFile:
@@ -216,18 +237,19 @@ class CharacterFile:
     def stored_normals(self) -> list[FloatArray | None]:
         """The normals that the file stores for the vertices of each part, (n, 3)."""
         found: list[FloatArray | None] = []
-        for _, shown, _ in self.parts:
-            mesh = self.document.objects("meshes")[shown.mesh]
-            number = mesh["primitives"][shown.primitive]["attributes"].get("NORMAL")
-            what = f"the normals of mesh {shown.mesh}"
-            found.append(
-                None
-                if number is None
-                else np.tile(
-                    as_float(self.document.array(number, what, ("VEC3",), shown.n_vertices)),
-                    (shown.n_instances, 1),
+        with one_sentence(self.character.source):
+            for _, shown, _ in self.parts:
+                mesh = self.document.objects("meshes")[shown.mesh]
+                number = mesh["primitives"][shown.primitive]["attributes"].get("NORMAL")
+                what = f"the normals of mesh {shown.mesh}"
+                found.append(
+                    None
+                    if number is None
+                    else np.tile(
+                        as_float(self.document.array(number, what, ("VEC3",), shown.n_vertices)),
+                        (shown.n_instances, 1),
+                    )
                 )
-            )
         return found
 
     def normals(self, vertices: FloatArray) -> FloatArray:
@@ -273,17 +295,14 @@ class _Source:
         self._scene, self._rest, self._joined = file.scene, file.rest, character.joined
         self._parts = file.parts
 
-    def require_near(
-        self, stored: FloatArray, wanted: npt.NDArray[Any], form: CharacterForm
-    ) -> None:
+    def require_near(self, stored: FloatArray, wanted: npt.NDArray[Any]) -> None:
         """Refuse a form whose vertices are not those that were asked for."""
         error = float(np.abs(stored - wanted).max()) / self.size
         if not error <= _LARGEST_ERROR:
-            raise MeshFileError(
-                f"cannot hold this pose in its {form}: vertices would be off by {error:.2g} of "
-                "the body size",
-                f"choose {CharacterForm.MESH}",
-                where="it",
+            raise _NotHeldError(
+                "its joints cannot hold this pose (vertices would be off by "
+                f"{error:.2g} of the body size)",
+                _OTHER_FORM,
             )
 
     def turn_joints(self, rig: Rig, transforms: FloatArray) -> FloatArray:
@@ -307,14 +326,16 @@ class _Source:
         where the vertices come in each frame
         """
         keys: dict[int, list[FloatArray]] = {}
-        for number in rig.nodes.tolist():
-            stored_parts = _stored_parts(self._nodes[number])
-            keys[number] = [np.tile(part, (len(transforms), 1)) for part in stored_parts]
         frames = []
         for frame, pose in enumerate(transforms):
 
             def hold(number: int, local: FloatArray, frame: int = frame) -> FloatArray:
-                held = _held(self._nodes[number], local)
+                node = self._nodes[number]
+                if number not in keys:
+                    keys[number] = [
+                        np.tile(part, (len(transforms), 1)) for part in _stored_parts(node)
+                    ]
+                held = _held(node, local)
                 for key, part in zip(keys[number], held, strict=True):
                     key[frame] = part
                 return compose(*held)
@@ -360,16 +381,21 @@ class _Source:
         if transforms.shape != rig.rest.shape or not np.isfinite(transforms).all():
             raise ShapeError.must_be("transforms", f"of shape {rig.rest.shape}", transforms.shape)
         parents, rest = self._scene.parents, self._scene.rest.transforms[0]
-        wanted = dict(zip(rig.nodes.tolist(), transforms, strict=True))
-        placed = rest.copy()
+        joints = set(rig.nodes.tolist())
+        wanted, placed = rest.copy(), rest.copy()
+        wanted[rig.nodes] = transforms
         for number in parents_first(parents):
-            # The parent as the file will have it, so that rounding does not add up.
-            above = placed[parents[number]] if parents[number] >= 0 else _IDENTITY
-            local = self._file.locals[number]
-            if number in wanted:
-                new = _relative(above, wanted[number])
+            parent, local = int(parents[number]), self._file.locals[number]
+            above, wanted_above = (
+                (placed[parent], wanted[parent]) if parent >= 0 else (_IDENTITY, _IDENTITY)
+            )
+            if number in joints:
+                new = _relative(wanted_above, wanted[number])
                 if np.abs(new - local).max() > _SAME_TRANSFORM * np.abs(new).max():
-                    local = hold(number, new)
+                    # From the parent as the file will have it, so that rounding does not add up.
+                    local = hold(number, _relative(above, wanted[number]))
+            else:
+                wanted[number] = wanted_above @ local
             placed[number] = above @ local
         poses = ScenePoses(placed[None], self._scene.rest.weights)
         posed: FloatArray = self._file.mesh.posed(poses)[0]
@@ -448,9 +474,8 @@ class _Source:
             try:
                 own = np.linalg.solve(turns[:, :, :3], wanted[:, :, None])[:, :, 0]
             except np.linalg.LinAlgError as error:
-                raise MeshFileError(
-                    "its joints flatten vertices at rest, which no morph target undoes",
-                    f"choose {CharacterForm.MESH}",
+                raise _NotHeldError(
+                    "its joints flatten vertices at rest, which no morph target undoes"
                 ) from error
             deltas = (own - base).astype(np.float32)
             stored[self._joined[rows]] = _moved(turns, base + deltas)
@@ -575,8 +600,8 @@ def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
     try:
         return np.linalg.solve(above, transform).astype(np.float64)
     except np.linalg.LinAlgError as error:
-        raise MeshFileError(
-            "a joint hangs on a node that is scaled to nothing", f"choose {CharacterForm.MESH}"
+        raise _NotHeldError(
+            "a joint hangs on a node that is scaled to nothing", _OTHER_FORM
         ) from error
 
 
@@ -605,11 +630,13 @@ def _held(node: dict[str, Any], local: FloatArray) -> tuple[FloatArray, FloatArr
     A translation or a scale that stays, as where a joint only turns, is the one of the node.
     """
     old_translation, _, old_scale = _stored_parts(node)
-    translation, rotation, scale = decompose(local)
+    # The axes that the node reflects, where it reflects some.
+    signs = np.where(old_scale < 0.0, -1.0, 1.0)
+    translation, rotation, scale = decompose(local * np.append(signs, 1.0))
     return (
         _kept(old_translation, translation),
         rotation.astype(np.float32).astype(np.float64),
-        _kept(old_scale, scale),
+        _kept(old_scale, signs * scale),
     )
 
 

@@ -16,6 +16,9 @@ from lcollision_core.meshes.scene_files import one_sentence, read_scene
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.upright import guess_up
 
+_EVEN = 1e-6
+"""By which scales along different axes may differ and are rounding."""
+
 
 def read_character(path: str | os.PathLike[str], up: int | str | None = None) -> Character:
     """Read the meshes, the rig and the clips of a file.
@@ -123,7 +126,21 @@ def _rig(
         joint_of_bone[mesh.bone_of].astype(np.int32),
         mesh.weights,
         at_rest,
+        stretch=_stretch(scene, order),
     ), notes
+
+
+def _stretch(scene: Scene, order: list[int]) -> FloatArray | None:
+    """Return `Rig.stretch` of the nodes that are joints."""
+    above = np.broadcast_to(np.eye(3), (len(order), 3, 3)).copy()
+    for number, node in enumerate(order):
+        if scene.parents[node] >= 0 and node not in scene.unscaled:
+            above[number] = scene.rest.transforms[0, scene.parents[node], :3, :3]
+    axes, sizes, _ = np.linalg.svd(above)
+    sizes /= sizes[:, :1]
+    is_even = sizes[:, 2] > 1.0 - _EVEN
+    sizes[is_even], axes[is_even] = 1.0, np.eye(3)
+    return None if is_even.all() else (axes * sizes[:, None]) @ np.swapaxes(axes, 1, 2)
 
 
 def _is_regular(transform: FloatArray) -> bool:

@@ -1,9 +1,11 @@
 """The loops of posing by a rig: joints to vertices, and derivatives back.
 
 Joint b turns by exp(w_b) in its own axes X_b about its rest place o_b, and its parent carries it:
-D_b = D_parent o (x -> o_b + X_b exp(w_b) X_b^T (x - o_b)). D_0 shifts besides. A vertex is the
-weighted mean of D_b points over its influences. Parents come before children; b counts the joints
-that have codes.
+D_b = D_parent o (x -> o_b + X_b exp(w_b) X_b^-1 (x - o_b)). D_0 shifts besides. X_b is orthonormal
+unless what is above the joint is scaled unevenly: there it is P_b times an orthonormal frame, so
+that the joint's own transform, relative to its parent's, still only turns, and P_b shears as in
+every engine; see `Rig.stretch`. A vertex is the weighted mean of D_b points over its influences.
+Parents come before children; b counts the joints that have codes.
 """
 
 from __future__ import annotations
@@ -50,6 +52,7 @@ def joint_motions(
     shift: FloatArray,
     parents: npt.NDArray[np.int64],
     axes: FloatArray,
+    inverses: FloatArray,
     origins: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return each joint's motion D_b from the rest pose, and how its turn moves the world.
@@ -59,31 +62,43 @@ def joint_motions(
     turns : (J, 3) rotation vectors w_b in the joints' axes
     shift : (3,) of joint 0
     parents : (J,), -1 for joint 0 alone
-    axes : (J, 3, 3) orthonormal X_b, an axis a column
+    axes, inverses : (J, 3, 3) X_b, an axis a column, and X_b^-1
     origins : (J, 3) o_b
 
     Returns
     -------
-    rotations, translations : (J, 3, 3) and (J, 3) of D_b
-    pivots : (J, 3) the posed places of the joints
-    slopes : (J, 3, 3), column i: the posed rotation vector by entry i of w_b
+    linear, translations : (J, 3, 3) and (J, 3) of D_b
+    pivots : (J, 3) q_b, the posed places of the joints
+    generators : (J, 3, 3, 3) K_b,i: what D_b carries to p moves by K_b,i (p - q_b) with entry i
+        of w_b
     """
     n_joints = len(turns)
-    rotations, slopes = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3, 3))
+    linear, generators = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3, 3, 3))
+    inverted = np.empty((n_joints, 3, 3))
     translations, pivots = np.empty((n_joints, 3)), np.empty((n_joints, 3))
     for joint in range(n_joints):
         turn, slope = _exponential(turns[joint])
         parent = parents[joint]
         if parent < 0:
-            before = axes[joint].copy()
+            before, back = axes[joint].copy(), inverses[joint].copy()
             pivots[joint] = origins[joint] + shift
         else:
-            before = rotations[parent] @ axes[joint]
-            pivots[joint] = rotations[parent] @ origins[joint] + translations[parent]
-        rotations[joint] = before @ turn @ axes[joint].T
-        translations[joint] = pivots[joint] - rotations[joint] @ origins[joint]
-        slopes[joint] = before @ slope
-    return rotations, translations, pivots, slopes
+            before, back = linear[parent] @ axes[joint], inverses[joint] @ inverted[parent]
+            pivots[joint] = linear[parent] @ origins[joint] + translations[parent]
+        linear[joint] = before @ turn @ inverses[joint]
+        inverted[joint] = axes[joint] @ turn.T @ back
+        translations[joint] = pivots[joint] - linear[joint] @ origins[joint]
+        for row in range(3):
+            for column in range(3):
+                # B [e_k]x B^-1 for the axes k, of which column i of the slope is a sum.
+                a = before[row, 2] * back[1, column] - before[row, 1] * back[2, column]
+                b = before[row, 0] * back[2, column] - before[row, 2] * back[0, column]
+                c = before[row, 1] * back[0, column] - before[row, 0] * back[1, column]
+                for entry in range(3):
+                    generators[joint, entry, row, column] = (
+                        slope[0, entry] * a + slope[1, entry] * b + slope[2, entry] * c
+                    )
+    return linear, translations, pivots, generators
 
 
 @compiled
@@ -92,7 +107,7 @@ def skin(
     joints: IntArray,
     weights: FloatArray,
     points: FloatArray,
-    rotations: FloatArray,
+    linear: FloatArray,
     translations: FloatArray,
 ) -> FloatArray:
     """Return the (V, 3) vertices of joints' motions.
@@ -101,7 +116,7 @@ def skin(
     ----------
     first : (V + 1,) where each vertex's influences begin
     joints, weights, points : (M,), (M,) and (M, 3), the influences
-    rotations, translations : (J, 3, 3) and (J, 3)
+    linear, translations : (J, 3, 3) and (J, 3)
     """
     vertices = np.zeros((len(first) - 1, 3))
     for vertex in range(len(vertices)):
@@ -109,17 +124,17 @@ def skin(
             joint, weight, point = joints[influence], weights[influence], points[influence]
             for row in range(3):
                 vertices[vertex, row] += weight * (
-                    rotations[joint, row, 0] * point[0]
-                    + rotations[joint, row, 1] * point[1]
-                    + rotations[joint, row, 2] * point[2]
+                    linear[joint, row, 0] * point[0]
+                    + linear[joint, row, 1] * point[1]
+                    + linear[joint, row, 2] * point[2]
                     + translations[joint, row]
                 )
     return vertices
 
 
 @compiled
-def _posed(rotation: FloatArray, translation: FloatArray, point: FloatArray, row: int) -> float:
-    along = rotation[row, 0] * point[0] + rotation[row, 1] * point[1] + rotation[row, 2] * point[2]
+def _posed(linear: FloatArray, translation: FloatArray, point: FloatArray, row: int) -> float:
+    along = linear[row, 0] * point[0] + linear[row, 1] * point[1] + linear[row, 2] * point[2]
     return float(along + translation[row])
 
 
@@ -131,10 +146,10 @@ def pull_back_moments(
     weights: FloatArray,
     points: FloatArray,
     parents: npt.NDArray[np.int64],
-    rotations: FloatArray,
+    linear: FloatArray,
     translations: FloatArray,
     pivots: FloatArray,
-    slopes: FloatArray,
+    generators: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Turn derivatives by the vertices into those by the joints' turns and the shift.
 
@@ -150,13 +165,13 @@ def pull_back_moments(
     Notes
     -----
     With g the derivative by a vertex and p where one joint has it, the moments about the origin
-    A = sum w p x g and the forces B = sum w g of the joints below b give the derivative by the
-    posed rotation vector of b, A - q_b x B, at its pivot q_b.
+    A = sum w g p^T and the forces F = sum w g of the joints below b give the derivative by entry i
+    of w_b, the sum of K_b,i * (A - F q_b^T), entry by entry.
     """
     n_rows, n_joints = len(by_vertices), len(parents)
-    by_turns, by_shift = np.empty((n_rows, n_joints, 3)), np.empty((n_rows, 3))
+    by_turns, by_shift = np.zeros((n_rows, n_joints, 3)), np.empty((n_rows, 3))
     for row in range(n_rows):
-        moments, forces = np.zeros((n_joints, 3)), np.zeros((n_joints, 3))
+        moments, forces = np.zeros((n_joints, 3, 3)), np.zeros((n_joints, 3))
         for vertex in range(by_vertices.shape[1]):
             x, y, z = by_vertices[row, vertex]
             # Rows of patches and contacts are zero at most vertices.
@@ -164,13 +179,11 @@ def pull_back_moments(
                 continue
             for influence in range(first[vertex], first[vertex + 1]):
                 joint, weight, point = joints[influence], weights[influence], points[influence]
-                rotation, translation = rotations[joint], translations[joint]
-                a = _posed(rotation, translation, point, 0)
-                b = _posed(rotation, translation, point, 1)
-                c = _posed(rotation, translation, point, 2)
-                moments[joint, 0] += weight * (b * z - c * y)
-                moments[joint, 1] += weight * (c * x - a * z)
-                moments[joint, 2] += weight * (a * y - b * x)
+                for axis in range(3):
+                    held = weight * _posed(linear[joint], translations[joint], point, axis)
+                    moments[joint, 0, axis] += x * held
+                    moments[joint, 1, axis] += y * held
+                    moments[joint, 2, axis] += z * held
                 forces[joint, 0] += weight * x
                 forces[joint, 1] += weight * y
                 forces[joint, 2] += weight * z
@@ -178,8 +191,11 @@ def pull_back_moments(
             if joint > 0:
                 moments[parents[joint]] += moments[joint]
                 forces[parents[joint]] += forces[joint]
-            torque = moments[joint] - _cross_matrix(pivots[joint]) @ forces[joint]
-            by_turns[row, joint] = slopes[joint].T @ torque
+            for axis in range(3):
+                for other in range(3):
+                    about = moments[joint, axis, other] - forces[joint, axis] * pivots[joint, other]
+                    for entry in range(3):
+                        by_turns[row, joint, entry] += generators[joint, entry, axis, other] * about
         by_shift[row] = forces[0]
     return by_turns, by_shift
 
@@ -192,10 +208,10 @@ def tangents(
     weights: FloatArray,
     points: FloatArray,
     parents: npt.NDArray[np.int64],
-    rotations: FloatArray,
+    linear: FloatArray,
     translations: FloatArray,
     pivots: FloatArray,
-    slopes: FloatArray,
+    generators: FloatArray,
 ) -> FloatArray:
     """Return how (n,) chosen vertices move with the joints' turns: (J, 3, n, 3).
 
@@ -210,11 +226,10 @@ def tangents(
         for influence in range(first[vertex], first[vertex + 1]):
             weight, joint = weights[influence], joints[influence]
             point = points[influence]
-            posed = rotations[joint] @ point + translations[joint]
+            posed = linear[joint] @ point + translations[joint]
             while joint >= 0:
-                turned = -_cross_matrix(posed - pivots[joint]) @ slopes[joint]
+                arm = weight * (posed - pivots[joint])
                 for entry in range(3):
-                    for row in range(3):
-                        moved[joint, entry, place, row] += weight * turned[row, entry]
+                    moved[joint, entry, place] += generators[joint, entry] @ arm
                 joint = parents[joint]
     return moved

@@ -142,7 +142,7 @@ class RigPoseSpace:
         self.roles, self.sides, self.front = anatomy.roles, anatomy.sides, front
         self.axes: FloatArray = anatomy.axes.copy()
         self._least, self._most = joint_limits(rig, self.roles)
-        body = np.stack([np.cross(up, front), up, front], axis=1)
+        self._body = body = np.stack([np.cross(up, front), up, front], axis=1)
         root = self._bones[0]
         middle = 0.5 * (self.rest_vertices.min(axis=0) + self.rest_vertices.max(axis=0))
         self._bone_origins = self.origins[self._bones]
@@ -152,6 +152,12 @@ class RigPoseSpace:
             self._bone_origins[0] = middle
         else:
             self.axes[root] = body
+        if rig.stretch is not None:
+            # A root that is no joint turns as what hangs on it can.
+            stretch = rig.stretch[self._bones]
+            stretch[0] = rig.stretch[self._bones[0 if root >= 0 else 1]]
+            self._bone_axes = stretch @ self._bone_axes
+        self._bone_inverses = np.linalg.inv(self._bone_axes)
 
     def _set_influences(self, rig: Rig) -> None:
         counts = rig.weights > 0.0
@@ -333,9 +339,10 @@ class RigPoseSpace:
         numbers[self._place] = codes
         return rig_kernels.joint_motions(
             numbers[3:].reshape(-1, 3),
-            self._bone_axes[0] @ numbers[:3],
+            self._body @ numbers[:3],
             self._parents,
             self._bone_axes,
+            self._bone_inverses,
             self._bone_origins,
         )
 
@@ -346,8 +353,8 @@ class RigPoseSpace:
         return self._first, self._joints, self._weights, self._points
 
     def _decoded(self, codes: FloatArray) -> FloatArray:
-        rotations, translations, _, _ = self._motions(codes)
-        return rig_kernels.skin(*self._influences, rotations, translations)
+        linear, translations, _, _ = self._motions(codes)
+        return rig_kernels.skin(*self._influences, linear, translations)
 
     def decode(self, codes: FloatArray) -> FloatArray:
         """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
@@ -362,7 +369,7 @@ class RigPoseSpace:
             *self._motions(codes),
         )
         by_numbers = np.concatenate(
-            [by_shift @ self._bone_axes[0], by_turns.reshape(len(by_shift), 3 * len(self._bones))],
+            [by_shift @ self._body, by_turns.reshape(len(by_shift), 3 * len(self._bones))],
             axis=1,
         )
         by_codes: FloatArray = by_numbers[:, self._place]
@@ -373,7 +380,7 @@ class RigPoseSpace:
         turned = rig_kernels.tangents(
             chosen, *self._influences, self._parents, *self._motions(codes)
         )
-        shifted = np.broadcast_to(self._bone_axes[0].T[:, None], (3, len(chosen), 3))
+        shifted = np.broadcast_to(self._body.T[:, None], (3, len(chosen), 3))
         moved = np.concatenate([shifted, turned.reshape(-1, len(chosen), 3)])
         by_codes: FloatArray = moved[self._place]
         return by_codes
@@ -401,10 +408,10 @@ class RigPoseSpace:
 
     def transforms(self, codes: FloatArray) -> FloatArray:
         """Return the joints' global transforms of a (D,) pose: (J, 4, 4), as `Rig.rest`."""
-        rotations, translations, _, _ = self._motions(np.asarray(codes, dtype=np.float64))
+        linear, translations, _, _ = self._motions(np.asarray(codes, dtype=np.float64))
         moved = np.broadcast_to(np.eye(4), (self.n_joints, 4, 4)).copy()
         carried = self._bone_of >= 0
-        moved[carried, :3, :3] = rotations[self._bone_of[carried]]
+        moved[carried, :3, :3] = linear[self._bone_of[carried]]
         moved[carried, :3, 3] = translations[self._bone_of[carried]] * self.body_size
         return moved @ self.rig.rest
 
@@ -432,22 +439,23 @@ class RigPoseSpace:
         numbers = np.zeros((len(poses), 3 + 3 * len(self._bones)))
         kept = np.zeros(numbers.shape[1], dtype=np.bool_)
         kept[self._place] = True
-        rotations = np.empty((len(poses), len(self._bones), 3, 3))
+        linear = np.empty((len(poses), len(self._bones), 3, 3))
         for bone, joint in enumerate(self._bones.tolist()):
             parent, axes = self._parents[bone], self._bone_axes[bone]
-            before = axes if parent < 0 else rotations[:, parent] @ axes
+            before = axes if parent < 0 else linear[:, parent] @ axes
             # A root that is no joint stays.
-            wanted = _nearest_rotations(moved[:, joint, :3, :3]) if joint >= 0 else np.eye(3)
-            local = np.swapaxes(before, -1, -2) @ wanted @ axes
+            wanted = moved[:, joint, :3, :3] if joint >= 0 else np.eye(3)[None]
+            local = _nearest_rotations(np.linalg.inv(before) @ wanted @ axes)
             places = slice(3 + 3 * bone, 6 + 3 * bone)
-            turn = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec()
-            numbers[:, places] = np.where(kept[places], turn, 0.0)
+            numbers[:, places] = np.where(
+                kept[places], Rotation.from_matrix(local).as_rotvec(), 0.0
+            )
             turned = Rotation.from_rotvec(numbers[:, places]).as_matrix()
-            rotations[:, bone] = before @ turned @ axes.T
+            linear[:, bone] = before @ turned @ self._bone_inverses[bone]
         if self._bones[0] >= 0:
             origin = self._bone_origins[0]
             place = moved[:, self._bones[0]] @ np.append(origin * self.body_size, 1.0)
-            numbers[:, :3] = (place[:, :3] / self.body_size - origin) @ self._bone_axes[0]
+            numbers[:, :3] = (place[:, :3] / self.body_size - origin) @ self._body
         codes: FloatArray = numbers[:, self._place]
         return codes if given.ndim == 4 else codes[0]
 

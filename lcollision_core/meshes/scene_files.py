@@ -78,8 +78,8 @@ def _is_fbx(path: str | os.PathLike[str]) -> bool:
 
 
 @contextmanager
-def one_sentence(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn what goes wrong while a file is read into one sentence that names it.
+def one_sentence(path: str | os.PathLike[str], what: str = "cannot be read") -> Iterator[None]:
+    """Turn what goes wrong while a file is read, or `what` says, into one sentence that names it.
 
     Raises
     ------
@@ -100,4 +100,4 @@ def one_sentence(path: str | os.PathLike[str]) -> Iterator[None]:
                 "it needs more memory than there is", "decimate the mesh"
             ) from error
     except (MeshFileError, PoseSetError) as error:
-        raise MeshFileError.unreadable(path, error, "export the mesh again") from error
+        raise MeshFileError.because(path, what, error, "export the mesh again") from error

@@ -193,6 +193,8 @@ class RigModel(PosableBody):
             "origins": space.origins,
             "axes": space.axes,
         }
+        if rig.stretch is not None:
+            measures["stretch"] = rig.stretch
         # Not to depend on how a machine rounds.
         arrays: dict[str, npt.NDArray[Any]] = {
             name: np.round(values / _SAME).astype(np.int64) for name, values in measures.items()

@@ -92,6 +92,7 @@ def read_scene(file: BinaryIO, cancel: CancelToken | None = None) -> Scene:
         up=None if up == _UNKNOWN_AXIS else (1.0 - 2.0 * (up % 2)) * np.eye(3)[up // 2],
         metres=metres if 0.0 < metres < np.inf else 0.01,
         notes=tuple(dict.fromkeys(notes)),
+        unscaled=frozenset(np.flatnonzero(held["unscaled"]).tolist()),
     )
 
 

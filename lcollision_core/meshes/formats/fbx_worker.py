@@ -71,6 +71,7 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
             [-1 if one is None else one.typed_id for one in parents], dtype=np.int64
         ),
         "transforms": np.stack([_matrix(node.node_to_world) for node in nodes]),
+        "unscaled": np.array([node.inherit_mode != ufbx.InheritMode.NORMAL for node in nodes]),
         "up": np.array(int(settings.axes.up)),
         "metres": np.array(settings.unit_meters),
         "fps": np.array(settings.frames_per_second),

@@ -165,6 +165,7 @@ class Scene:
     up : (3,) float64 array, a signed unit axis; None where the file does not say it
     metres : length of the file's unit
     notes : sentences on what was left out
+    unscaled : nodes that their parents' scale does not reach, as by Maya's segment scale compensate
     """
 
     node_names: tuple[str, ...]
@@ -175,6 +176,7 @@ class Scene:
     up: FloatArray | None
     metres: float
     notes: tuple[str, ...] = ()
+    unscaled: frozenset[int] = frozenset()
 
 
 def character_parts(scene: Scene) -> list[int]:

@@ -41,8 +41,17 @@ def a_few(character: Character, n: int, seed: int) -> FloatArray:
     return by_vertices
 
 
+def unevenly_scaled() -> Character:
+    """Return the body as it is where what is above each joint is scaled unevenly at rest."""
+    body = rigged_body()
+    halves = 0.2 * np.random.default_rng(5).normal(size=(len(rig_of(body).parents), 3, 3))
+    stretch = np.eye(3) + halves @ np.swapaxes(halves, 1, 2)
+    return replace(body, rig=replace(rig_of(body), stretch=stretch))
+
+
 CHARACTERS = {
     "tube": rigged_tube(),
+    "uneven": unevenly_scaled(),
     "long chain": rigged_tube(n_joints=6, scale=170.0, differs=True),
     "one joint": rigged_tube(n_joints=1),
     "body": rigged_body(scale=100.0),

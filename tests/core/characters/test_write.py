@@ -18,10 +18,11 @@ from lcollision_core.characters import (
     RigPoseSpace,
     read_character,
     write_character,
+    write_character_clip,
 )
 from lcollision_core.errors import MeshFileError, ShapeError
 from tests.core.character_file import PNG, described, figure, vectors
-from tests.core.gltf_builder import GltfBuilder, split_corners, tube
+from tests.core.gltf_builder import GltfBuilder, rotation, split_corners, tube
 
 SIZE = 3.0
 FORMS = list(CharacterForm)
@@ -376,9 +377,12 @@ def test_what_cannot_be_written_is_said_in_one_sentence(
         write_character(path, character, vertices, "joints")
     with pytest.raises(ShapeError, match="vertices of figure"):
         write_character(path, character, vertices[1:], "mesh")
+    assert not path.exists()
     detailed = vertices + np.random.default_rng(2).normal(0.0, 0.01, vertices.shape)
-    with pytest.raises(MeshFileError, match=r"figure\.glb .*in its joints: .*choose mesh"):
-        write_character(path, character, detailed, "joints", transforms)
+    posed = write_character(path, character, detailed, "joints", transforms)
+    assert "written as a static mesh" in posed.notes[0]
+    assert np.abs(posed.vertices - detailed).max() < 1e-6
+    path.unlink()
     figure().write(Path(character.source)).write_bytes(b"glTF")
     with pytest.raises(MeshFileError, match=r"figure\.glb cannot be read"):
         write_character(path, character, vertices, "mesh")
@@ -430,3 +434,94 @@ def test_damage_that_reading_passes_over_is_one_sentence(
             write_character(tmp_path / "posed.glb", character, character.rest_vertices, form)
         assert sentence in str(caught.value)
     assert not (tmp_path / "posed.glb").exists()
+
+
+def _shaped(**transforms: Any) -> GltfBuilder:
+    """Build the figure, some of its nodes scaled, or placed by a matrix, in the rest pose."""
+    builder = figure()
+    nodes = builder.description["nodes"]
+    for number in (1, 2, 3):
+        # Not along the axes of what is above.
+        nodes[number]["rotation"] = rotation(number % 3, 0.7)
+    for node in nodes:
+        node |= transforms.get(node["name"], {})
+        if "matrix" in node:
+            for name in ("translation", "rotation", "scale"):
+                node.pop(name, None)
+    return builder
+
+
+UNEVEN = [1.05, 1.0, 1.0]
+MATRIX = np.diag([2.0, 1.0, 0.5, 1.0])
+MATRIX[:3, 3] = [0.0, 0.0, -100.0]
+SCALED: dict[str, dict[str, Any]] = {
+    "root": {"LeftArm": {"scale": UNEVEN}},
+    "middle": {"LeftForeArm": {"scale": UNEVEN}},
+    "leaf": {"LeftHand": {"scale": UNEVEN}},
+    "above the root": {"Armature": {"scale": [0.01, 0.02, 0.01]}},
+    "several": {"LeftArm": {"scale": [1.3, 1.0, 0.8]}, "LeftForeArm": {"scale": [0.5, 1.5, 1.0]}},
+    "reflected": {"LeftArm": {"scale": [1.0, -1.4, 1.0]}, "LeftForeArm": {"scale": [1, 1, -0.7]}},
+    "by a matrix": {"LeftForeArm": {"matrix": MATRIX.T.reshape(-1).tolist()}},
+}
+
+
+@pytest.mark.parametrize("scaled", SCALED.values(), ids=SCALED)
+def test_joints_of_a_rig_that_is_scaled_unevenly_hold_its_poses(
+    scaled: dict[str, Any], tmp_path: Path
+) -> None:
+    character = read_character(_shaped(**scaled).write(tmp_path / "figure.glb"))
+    path = tmp_path / "posed.glb"
+    vertices, posed = _written(character, CharacterForm.JOINTS, path)
+    size = float(np.ptp(character.rest_vertices, axis=0).max())
+    assert np.abs(vertices - character.rest_vertices).max() > 0.05 * size
+    assert not any("static mesh" in note for note in posed.notes)
+    assert np.abs(posed.vertices - vertices).max() < 1e-5 * size
+    again = read_character(path)
+    assert np.abs(again.rest_vertices - posed.vertices).max() < 1e-12 * size
+    seen, in_file = _vtk_vertices(path), again.rest_vertices[again.joined]
+    assert _distance_to_nearest(seen, in_file) < 1e-5 * size
+    assert _distance_to_nearest(in_file, seen) < 1e-5 * size
+    before, after = described(Path(character.source))[0], described(path)[0]
+    for old, new in zip(before["nodes"], after["nodes"], strict=True):
+        assert new.get("scale") == old.get("scale") or "matrix" in old
+
+
+def test_a_clip_of_a_rig_that_is_scaled_unevenly_is_held_by_its_joints(tmp_path: Path) -> None:
+    character = read_character(_shaped(**SCALED["several"]).write(tmp_path / "figure.glb"))
+    space, path = _space(character), tmp_path / "clip.glb"
+    codes = np.random.default_rng(3).uniform(-0.5, 0.5, (3, len(space.low)))
+    vertices = space.decode(codes) * space.body_size
+    transforms = np.stack([space.transforms(one) for one in codes])
+    frames = write_character_clip(path, character, vertices, transforms, fps=10.0)
+    again = read_character(path).sample("poses", None).vertices
+    for wanted, frame, held in zip(vertices, frames, again, strict=True):
+        assert np.abs(frame.vertices - wanted).max() < 1e-5 * space.body_size
+        assert np.abs(held - frame.vertices).max() < 1e-6 * space.body_size
+
+
+def test_what_joints_cannot_hold_is_written_as_a_mesh_and_said(tmp_path: Path) -> None:
+    sheared = np.eye(4)
+    sheared[0, 1], sheared[2, 3] = 0.5, -100.0
+    builder = _shaped(LeftForeArm={"matrix": sheared.T.reshape(-1).tolist()})
+    character = read_character(builder.write(tmp_path / "figure.glb"))
+    path = tmp_path / "posed.glb"
+    vertices, posed = _written(character, CharacterForm.JOINTS, path)
+    assert "its joints cannot hold this pose (vertices would be off by 0." in posed.notes[0]
+    assert posed.notes[0].endswith("of the body size), so it is written as a static mesh")
+    assert np.array_equal(posed.vertices, vertices)
+    again = read_character(path)
+    assert again.rig is None
+    in_file = again.rest_vertices[again.joined]
+    assert np.abs(in_file - vertices[character.joined]).max() < 1e-6
+    # A joint above it can turn.
+    space = _space(character)
+    codes = np.where(space.joint_of_code == 0, 0.3, 0.0)
+    turned = space.decode(codes[None])[0] * space.body_size
+    posed = write_character(path, character, turned, "joints", space.transforms(codes))
+    assert read_character(path).rig is not None
+    assert np.abs(posed.vertices - turned).max() < 1e-5 * space.body_size
+    # A clip has no other form.
+    transforms = np.stack([_pose(character)[1]] * 2)
+    sentence = r"figure\.glb cannot be written with these poses: its joints .*; write a point cache"
+    with pytest.raises(MeshFileError, match=sentence):
+        write_character_clip(path, character, np.stack([vertices] * 2), transforms)
