@@ -191,6 +191,36 @@ def test_a_character_s_own_file_comes_back(lcollision: Lcollision, tmp_path: Pat
     }
 
 
+@pytest.mark.parametrize("sheared", [False, True], ids=["scaled unevenly", "sheared"])
+def test_a_pose_is_written_in_whatever_form_can_hold_it(
+    lcollision: Lcollision, tmp_path: Path, sheared: bool
+) -> None:
+    builder = figure()
+    nodes = builder.description["nodes"]
+    nodes[1]["scale"] = [1.05, 1.0, 1.0]
+    if sheared:
+        held = [1.0, 0.0, 0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -100.0, 1.0]
+        nodes[2] = {"name": "LeftForeArm", "children": [3], "matrix": held}
+    own, out = builder.write(tmp_path / "figure.glb"), tmp_path / "posed.glb"
+    model = open_body(own)
+    latent = np.full(model.latent_size, 0.2)
+    write_poses(tmp_path / "poses.json", model, [NamedPose("bow", latent)])
+    done = lcollision("decode", own, tmp_path / "poses.json", "-o", out)
+    assert done.exit_code == 0, done.output
+    assert ("so it is written as a static mesh" in done.stderr) == sheared
+    posed = read_character(out)
+    assert (posed.rig is None) == sheared
+    expected = model.decode(latent)[_joined(own)]
+    assert np.abs(posed.rest_vertices[posed.joined] - expected).max() < 1e-5
+    # Frames of a clip have no other form: what is done stays.
+    words = ("resolve", own, tmp_path / "poses.json", "-o", tmp_path / "run.glb", "--form", "clip")
+    done = lcollision(*words)
+    assert (done.exit_code == 2) == sheared
+    if sheared:
+        assert "figure.glb cannot be written with these poses: its joints cannot" in done.stderr
+        assert "has 1 of 1 pose, run the command again when they can be written" in done.stderr
+
+
 def test_poses_of_a_character_become_a_clip_of_its_file(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:
