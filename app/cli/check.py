@@ -12,6 +12,7 @@ from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_b
 from app.cli.contact_options import (
     IgnoreOption,
     NearExclusionOption,
+    NoRulesOption,
     RestExclusionOption,
     RestOption,
     RuleOptions,
@@ -22,7 +23,11 @@ from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from lcollision_core.meshes import Mesh
+    from lcollision_core.model import RigModel
 
 _NO_OPTIONS = RuleOptions()
 
@@ -38,10 +43,13 @@ def check(
     rest_exclusion: RestExclusionOption = None,
     ignore: IgnoreOption = None,
     tolerated_depth: ToleratedDepthOption = None,
+    no_rules: NoRulesOption = False,
 ) -> None:
     """Find the exact self-collisions of any triangle mesh.
 
-    Exits with 0 when all meshes are free of them, with 1 when one is not.
+    A pose of a character that was exported from here, or that was opened before, is checked by
+    that character's contact rules. Exits with 0 when all meshes are free of them, with 1 when one
+    is not.
     """
     from lcollision_core.meshes import read_mesh
     from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
@@ -56,7 +64,7 @@ def check(
     failed = False
     for path in expanded(meshes):
         try:
-            report = check_mesh(path, options, rest_mesh)
+            report = check_mesh(path, options, rest_mesh, no_rules=no_rules)
         except LCollisionError as error:
             note(str(error))
             failed = True
@@ -73,7 +81,11 @@ def check(
 
 
 def check_mesh(
-    path: Path, options: RuleOptions = _NO_OPTIONS, rest: Mesh | None = None
+    path: Path,
+    options: RuleOptions = _NO_OPTIONS,
+    rest: Mesh | None = None,
+    *,
+    no_rules: bool = False,
 ) -> dict[str, Any]:
     """Check one file; the keys are those of ``lcollision check --json``."""
     from lcollision_core.contact import STRICT, CollisionDetector
@@ -88,12 +100,18 @@ def check_mesh(
         )
     for remark in (*mesh.notes, *audit_mesh(mesh.topology, mesh.vertices)):
         note(f"{path}: {remark}")
+    known = None if no_rules or rest is not None else _known(path, mesh)
     try:
-        rules, groups = options.applied(STRICT, (), mesh.topology)
-        reference = mesh.vertices if rest is None else rest.vertices
-        detector = CollisionDetector(mesh.topology, reference, rules, groups)
+        if known is not None:
+            body, vertices = options.applied_to(known[0]), known[1]
+            rules, detector, topology = body.rules, body.detector, body.topology
+        else:
+            vertices, topology = mesh.vertices, mesh.topology
+            rules, groups = options.applied(STRICT, (), topology)
+            reference = vertices if rest is None else rest.vertices
+            detector = CollisionDetector(topology, reference, rules, groups)
         with progress_bar("Finding self-collisions") as progress:
-            found = detector.summarise(mesh.vertices, n_deepest=_DEEPEST, progress=progress)
+            found = detector.summarise(vertices, n_deepest=_DEEPEST, progress=progress)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
     if found.n_coincident_pairs:
@@ -101,13 +119,14 @@ def check_mesh(
         note(f"{path}: {pairs} exactly on each other; touching is no collision")
     return {
         "file": str(path),
-        "vertices": mesh.topology.n_vertices,
-        "faces": mesh.topology.n_faces,
-        "watertight": mesh.topology.is_watertight,
+        "vertices": topology.n_vertices,
+        "faces": topology.n_faces,
+        "watertight": topology.is_watertight,
         "pairs": found.n_pairs,
         "near_pairs": found.excluded.near,
         "excluded_pairs": found.excluded.to_json(),
         "rules": rules.to_json(),
+        "rules_of": None if known is None else known[0].name,
         "coincident_pairs": found.n_coincident_pairs,
         "deepest": [
             {"faces": faces, "depth": depth}
@@ -119,6 +138,17 @@ def check_mesh(
         "colliding": found.colliding,
         "seconds": time.perf_counter() - start,
     }
+
+
+def _known(path: Path, mesh: Mesh) -> tuple[RigModel, npt.NDArray[np.float64]] | None:
+    """Return the character of a mesh file, with its rules, and the pose; None for none."""
+    from lcollision_core.model import character_of_mesh
+
+    try:
+        return character_of_mesh(path, mesh)
+    except LCollisionError as error:
+        note(f"{error}; all pairs are counted")
+        return None
 
 
 def _sentence(report: dict[str, Any]) -> str:
@@ -133,6 +163,8 @@ def _sentence(report: dict[str, Any]) -> str:
         verdict = "no collisions"
     if not_counted := ContactRules.from_json(report["rules"]).sentence(report["excluded_pairs"]):
         verdict += f"; {not_counted}"
+    if report["rules_of"] is not None:
+        verdict += f", by the contact rules of {report['rules_of']} (--no-rules counts all pairs)"
     return (
         f"{report['file']}: {verdict} "
         f"({counted(report['vertices'], 'vertex', 'vertices')}, "

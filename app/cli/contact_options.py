@@ -68,6 +68,9 @@ ToleratedDepthOption = Annotated[
     float | None,
     typer.Option(min=0.0, max=1.0, metavar="D", help="Do not count pairs up to D body sizes deep."),
 ]
+NoRulesOption = Annotated[
+    bool, typer.Option("--no-rules", help="Count all pairs, whatever rules its character has.")
+]
 
 
 @dataclass(frozen=True)

@@ -335,6 +335,7 @@ def write_result(
         with atomic_files(path) as unfinished:
             in_folder = write([unfinished / name for name in names])
         _tell_written(path, len(poses), n_replaced, in_folder)
+        _remember(model, output)
         return [WrittenFile(path / name, mesh) for name, mesh in zip(names, in_folder, strict=True)]
     with locked(path):
         n_replaced = int(path.exists())
@@ -366,9 +367,21 @@ def write_result(
         else:
             meshes = write([path])
     _tell_written(path, len(poses), n_replaced, meshes)
+    _remember(model, output)
     if output.form == "poses":
         return [WrittenFile(path)] * len(poses)
     return [WrittenFile(path, mesh) for mesh in meshes]
+
+
+def _remember(model: PosableBody, output: Output) -> None:
+    """Keep where a character is whose meshes were written, so that `check` knows them."""
+    from lcollision_core.model import RigModel, remember_file
+
+    if isinstance(model, RigModel) and output.form != "poses":
+        try:
+            remember_file(model, model.character.source)
+        except LCollisionError as error:
+            note(str(error))
 
 
 def _tell_written(

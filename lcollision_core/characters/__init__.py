@@ -4,6 +4,7 @@ from lcollision_core.characters.anatomy import ROLE_NAMES, joint_parts, role_nam
 from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.characters.default_rules import default_rules
 from lcollision_core.characters.joint_groups import joint_groups
+from lcollision_core.characters.own_files import read_own_file
 from lcollision_core.characters.posed_gltf import (
     CharacterFile,
     CharacterForm,

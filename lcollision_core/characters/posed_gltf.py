@@ -14,7 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters.character import Character, Rig
+from lcollision_core.characters.own_files import sign
 from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.meshes.contact_rules import STRICT, ContactRules
 from lcollision_core.meshes.formats.gltf_document import GltfDocument, as_float
 from lcollision_core.meshes.formats.gltf_patch import VERTEX_DATA, GltfPatch
 from lcollision_core.meshes.formats.gltf_scene import ShownPrimitive, read_shown, shown_primitives
@@ -90,6 +92,7 @@ def posed_gltf(
     form: CharacterForm,
     transforms: FloatArray | None = None,
     file: CharacterFile | None = None,
+    rules: ContactRules = STRICT,
 ) -> PosedFile:
     """Put a pose into the character's own .glb, .gltf or .vrm file.
 
@@ -104,6 +107,7 @@ def posed_gltf(
     form : how the file holds the pose
     transforms : (J, 4, 4) global transforms of the joints, for the form of joints
     file : the character's, where it is read already
+    rules : the character's, which the file keeps: see `read_own_file`
 
     Returns
     -------
@@ -146,13 +150,17 @@ def posed_gltf(
             stored = source.bake(pose)
             notes.append(f"{error.what}, so it is written as a static mesh")
         clips = source.drop_clips()
-        data = source.patch.encoded()
+        data = source.signed(rules)
     notes += [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
     return PosedFile(data, stored, (*source.patch.notes, *notes))
 
 
 def animated_gltf(
-    character: Character, vertices: npt.NDArray[Any], transforms: FloatArray, fps: float
+    character: Character,
+    vertices: npt.NDArray[Any],
+    transforms: FloatArray,
+    fps: float,
+    rules: ContactRules = STRICT,
 ) -> tuple[PosedFile, ...]:
     """Put poses into the character's own file as a clip of its joints, which it opens with.
 
@@ -162,6 +170,7 @@ def animated_gltf(
     vertices : (N, V, 3) finite array, in its frame and unit
     transforms : (N, J, 4, 4) global transforms of the joints
     fps : frames a second
+    rules : as of `posed_gltf`
 
     Returns
     -------
@@ -183,7 +192,7 @@ def animated_gltf(
         frames = source.animate(character.rig, transforms, fps)
         for stored, wanted in zip(frames, vertices, strict=True):
             source.require_near(stored, wanted)
-        data = source.patch.encoded()
+        data = source.signed(rules)
     notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in clips))
     return tuple(PosedFile(data, stored, notes) for stored in frames)
 
@@ -294,6 +303,14 @@ class _Source:
         self._nodes: list[dict[str, Any]] = self.patch.description["nodes"]
         self._scene, self._rest, self._joined = file.scene, file.rest, character.joined
         self._parts = file.parts
+        self._shown_by = [part.node for part, _, _ in file.parts]
+
+    def signed(self, rules: ContactRules) -> bytes:
+        """Return the bytes of the file, which says what it was made of; see `own_files`."""
+        character, source = self._file.character, self._file.patch.description
+        if character.rig is not None:
+            sign(self.patch, source, character.name, self._shown_by, rules)
+        return self.patch.encoded()
 
     def require_near(self, stored: FloatArray, wanted: npt.NDArray[Any]) -> None:
         """Refuse a form whose vertices are not those that were asked for."""
@@ -580,7 +597,9 @@ class _Source:
         }:
             # Others hang on this one.
             self._nodes.append({"name": node.get("name", "mesh"), "mesh": node.pop("mesh")})
-            number = len(self._nodes) - 1
+            new = len(self._nodes) - 1
+            self._shown_by = [new if one == number else one for one in self._shown_by]
+            number = new
         else:
             for name in ("translation", "rotation", "scale", "matrix"):
                 node.pop(name, None)

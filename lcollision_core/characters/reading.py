@@ -35,8 +35,22 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
     MissingExtraError : the extra `fbx`, which reads FBX, is not installed.
     ShapeError : `up` is no axis.
     """
-    axis = None if up is None else _axis(up)
-    scene = read_scene(path)
+    return character_of(read_scene(path), Path(path), None if up is None else _axis(up))
+
+
+def character_of(scene: Scene, path: Path, axis: int | None = None) -> Character:
+    """Make a character of what a file shows.
+
+    Parameters
+    ----------
+    scene : without scenery
+    path : of the file
+    axis : 0, 1 or 2, the up axis where the file is wrong about it
+
+    Raises
+    ------
+    MeshFileError : it is damaged.
+    """
     with one_sentence(path):
         mesh = join_parts(scene)
         rest = mesh.posed(scene.rest)[0]
@@ -61,10 +75,9 @@ def read_character(path: str | os.PathLike[str], up: int | str | None = None) ->
     elif up_direction is None:
         guess = guess_up(mesh.topology, rest[None])
         up_direction, is_sure = np.eye(3)[guess.axis], guess.is_sure
-    source = Path(path)
     return Character(
-        source.stem,
-        source,
+        path.stem,
+        path,
         mesh.topology,
         rest,
         mesh.joined,

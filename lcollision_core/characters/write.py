@@ -18,6 +18,7 @@ from lcollision_core.characters.posed_gltf import (
 )
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.contact_rules import STRICT, ContactRules
 from lcollision_core.meshes.topology import FloatArray
 
 PATCHED_SUFFIXES = (".glb", ".gltf", ".vrm")
@@ -33,13 +34,14 @@ def write_character(
     form: CharacterForm | str,
     transforms: FloatArray | None = None,
     file: CharacterFile | None = None,
+    rules: ContactRules = STRICT,
 ) -> PosedFile:
     """Write a character's file with a pose in it, whole or not at all: see `posed_gltf`.
 
     Parameters
     ----------
     path : a .glb file, or a .vrm file for a character of one
-    character, vertices, form, transforms, file : as of `posed_gltf`
+    character, vertices, form, transforms, file, rules : as of `posed_gltf`
 
     Returns
     -------
@@ -51,7 +53,7 @@ def write_character(
     ShapeError : as of `posed_gltf`.
     """
     _require_written(path, character)
-    posed = posed_gltf(character, vertices, CharacterForm(form), transforms, file)
+    posed = posed_gltf(character, vertices, CharacterForm(form), transforms, file, rules)
     with atomic_write(path) as out:
         out.write(posed.data)
     return posed
@@ -63,13 +65,14 @@ def write_character_clip(
     vertices: npt.NDArray[Any],
     transforms: FloatArray,
     fps: float = 30.0,
+    rules: ContactRules = STRICT,
 ) -> tuple[PosedFile, ...]:
     """Write a character's file with a clip of N poses, whole or not at all: see `animated_gltf`.
 
     Parameters
     ----------
     path : as of `write_character`
-    character, vertices, transforms, fps : as of `animated_gltf`
+    character, vertices, transforms, fps, rules : as of `animated_gltf`
 
     Returns
     -------
@@ -80,7 +83,7 @@ def write_character_clip(
     MeshFileError, ShapeError : as of `write_character`.
     """
     _require_written(path, character)
-    frames = animated_gltf(character, vertices, transforms, fps)
+    frames = animated_gltf(character, vertices, transforms, fps, rules)
     with atomic_write(path) as file:
         file.write(frames[0].data)
     return frames

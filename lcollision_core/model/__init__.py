@@ -12,6 +12,7 @@ from lcollision_core.model.export import (
     export_scale,
 )
 from lcollision_core.model.known_characters import (
+    character_of_mesh,
     remember_choices,
     remember_file,
     remember_roles,

@@ -5,6 +5,7 @@ One JSON file for each rig, in the user's data folder.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -13,17 +14,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lcollision_core.characters import read_character
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.characters import PATCHED_SUFFIXES, read_character, read_own_file
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError, ShapeError
 from lcollision_core.json_values import from_json, parse_json, quoted
-from lcollision_core.meshes import ContactRules, locked
+from lcollision_core.meshes import ContactRules, Mesh, Topology, locked
 from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin
 from lcollision_core.model.model_store import ListedModel
 from lcollision_core.model.rig_model import RigModel
 from lcollision_core.regular_files import read_regular
 
+FloatArray = npt.NDArray[np.float64]
+
 _FORMAT, _VERSION = "lcollision-character", 1
 _MAX_BYTES = 10_000_000
+_LIKE_REST = 0.2
+"""By how much the edges of poses may be longer or shorter than at rest, all together."""
+
 _PARTS = ("domain_names", "domain_colours", "domain_order")
 
 
@@ -37,6 +47,7 @@ class KnownCharacter:
     rules, domain_names, domain_colours, domain_order : see `ModelCard`
     up_axis : 0, 1 or 2, where the file is wrong about it
     roles : pairs of a joint's name and what it is, of `characters.ROLE_NAMES`
+    mesh : a digest of its faces, by which meshes of its poses are known
     """
 
     file: str
@@ -46,6 +57,7 @@ class KnownCharacter:
     domain_order: tuple[int, ...] | None = None
     up_axis: int | None = None
     roles: tuple[tuple[str, str], ...] | None = None
+    mesh: str | None = None
 
 
 def user_characters_folder() -> Path:
@@ -100,7 +112,9 @@ def find_character(fingerprint: str) -> ListedModel | None:
     return ListedModel(Path(known.file).stem, Path(known.file), bundled=False)
 
 
-def open_character(path: str | os.PathLike[str], up: int | None = None) -> RigModel:
+def open_character(
+    path: str | os.PathLike[str], up: int | None = None, *, clips: bool = True
+) -> RigModel:
     """Read a character, with the axis, joints, rules and body parts that the user chose for it.
 
     Its notes say so, or why what is remembered does not apply.
@@ -109,17 +123,23 @@ def open_character(path: str | os.PathLike[str], up: int | None = None) -> RigMo
     ----------
     path : its file
     up : the axis that is up now, whatever was chosen
+    clips : whether their frames are wanted, which take long
 
     Raises
     ------
     MeshFileError : see `read_character`.
     LCollisionError : the character has no rig.
     """
-    model = RigModel.of(read_character(path, up))
+
+    def read(axis: int | None) -> RigModel:
+        character = read_character(path, axis)
+        return RigModel.of(character if clips else replace(character, clips={}))
+
+    model = read(up)
     try:
         known = known_character(model.fingerprint) if up is None else None
         if known is not None and known.up_axis is not None:
-            model = RigModel.of(read_character(path, known.up_axis))
+            model = read(known.up_axis)
             known = known_character(model.fingerprint)
         known = known or known_character(model.fingerprint)
         if known is not None and known.roles is not None:
@@ -151,6 +171,56 @@ def with_remembered(model: RigModel) -> RigModel:
         )
     except LCollisionError as error:
         return model.noted(f"what you chose for it is left out: {error.headline}")
+
+
+def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigModel, FloatArray] | None:
+    """Return the character that a mesh file has a pose of, with its rules, and that pose.
+
+    That is a file that a character was written to, with the rules that it had; a character's own
+    file that was opened before, or a mesh of the same faces in the same order as one that was.
+
+    Parameters
+    ----------
+    path : of the file
+    mesh : that it holds
+
+    Returns
+    -------
+    body : the character; None for a mesh of another or of none
+    vertices : (V, 3) float64 array, in its unit
+
+    Raises
+    ------
+    MeshFileError : what the file says of its character is damaged, or changed since.
+    LCollisionError : the character, which was opened before, cannot be opened now.
+    """
+    suffix = path.suffix.lower()
+    own = read_own_file(path) if suffix in PATCHED_SUFFIXES else None
+    if own is not None:
+        character, vertices, rules = own
+        return RigModel.of(character).with_rules(rules), vertices
+    if suffix in SCENE_SUFFIXES and has_skin(path):
+        body = open_character(path, clips=False)
+        if known_character(body.fingerprint) is not None and mesh.topology == body.topology:
+            return body, mesh.vertices
+    digest = _digest(mesh.topology)
+    for file in sorted(user_characters_folder().glob("*.json")):
+        known = known_character(file.stem)
+        if known is not None and known.mesh == digest and Path(known.file).is_file():
+            body = open_character(known.file, clips=False)
+            if body.topology == mesh.topology:
+                return body, mesh.vertices * _unit_of(mesh.vertices, body)
+    return None
+
+
+def _unit_of(vertices: FloatArray, body: RigModel) -> float:
+    """Return the unit of a pose in that of a body, of units a power of ten where it nearly is."""
+    ratio = float(
+        body.topology.edge_lengths(body.reference).sum()
+        / body.topology.edge_lengths(vertices).sum()
+    )
+    power = float(10.0 ** np.round(np.log10(ratio)))
+    return power if abs(ratio / power - 1.0) < _LIKE_REST else ratio
 
 
 def remember_file(model: RigModel, file: str | os.PathLike[str]) -> None:
@@ -232,6 +302,7 @@ def _change(model: RigModel, change: Callable[[KnownCharacter], KnownCharacter])
         with locked(path):
             before = known_character(model.fingerprint)
             known = change(before or KnownCharacter(str(model.character.source)))
+            known = replace(known, mesh=_digest(model.topology))
             if known == before:
                 return
             document: dict[str, Any] = {
@@ -241,7 +312,7 @@ def _change(model: RigModel, change: Callable[[KnownCharacter], KnownCharacter])
             }
             if known.rules is not None:
                 document["rules"] = known.rules.to_json()
-            held = {name: getattr(known, name) for name in (*_PARTS, "up_axis", "roles")}
+            held = {name: getattr(known, name) for name in (*_PARTS, "up_axis", "roles", "mesh")}
             document |= {name: value for name, value in held.items() if value is not None}
             with atomic_write(path) as file:
                 file.write(json.dumps(document, indent=1).encode() + b"\n")
@@ -249,6 +320,11 @@ def _change(model: RigModel, change: Callable[[KnownCharacter], KnownCharacter])
         raise ModelFileError.because(
             f"what is remembered of {model.name}", "cannot be kept", error, "try again"
         ) from error
+
+
+def _digest(topology: Topology) -> str:
+    faces = topology.faces.astype("<i4").tobytes()
+    return hashlib.sha256(b"%d " % topology.n_vertices + faces).hexdigest()[:16]
 
 
 def _path(fingerprint: str) -> Path:

@@ -285,7 +285,10 @@ class SourceFile:
         # One read for all poses.
         if self._file is None and self.path.suffix.lower() in PATCHED_SUFFIXES:
             self._file = CharacterFile(self._character)
-        posed = write_character(path, self._character, vertices, form.key, transforms, self._file)
+        rules = self._body.rules
+        posed = write_character(
+            path, self._character, vertices, form.key, transforms, self._file, rules
+        )
         return posed.vertices, posed.notes
 
     def write_clip(
@@ -316,7 +319,9 @@ class SourceFile:
             raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
         space = self._body.space
         transforms = np.stack([space.transforms(latent) for latent in latents])
-        frames = write_character_clip(path, self._character, vertices, transforms, fps)
+        frames = write_character_clip(
+            path, self._character, vertices, transforms, fps, self._body.rules
+        )
         return [(frame.vertices, frame.notes) for frame in frames]
 
     @cached_property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import struct
 from copy import copy, deepcopy
@@ -135,6 +136,15 @@ class GltfPatch:
         accessors = self.description.setdefault("accessors", [])
         accessors.append(accessor)
         return len(accessors) - 1
+
+    def digest(self, key: str) -> str:
+        """Return 64 hexadecimal digits of all but the entry `key` of the extras of its asset."""
+        asset = self.description["asset"]
+        extras = {name: value for name, value in asset["extras"].items() if name != key}
+        held = self.description | {"asset": asset | {"extras": extras}, "buffers": []}
+        digest = hashlib.sha256(json.dumps(held, sort_keys=True).encode())
+        digest.update(self._binary)
+        return digest.hexdigest()
 
     def encoded(self) -> bytes:
         """Return the bytes of the GLB file.

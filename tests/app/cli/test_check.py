@@ -6,13 +6,20 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from lcollision_core.characters import read_own_file
 from lcollision_core.meshes import ContactRules, write_mesh
+from lcollision_core.model import NamedPose, open_body, write_poses
 from tests.app.support import STABBED, Lcollision
+from tests.core.character_file import described, figure
+from tests.core.gltf_builder import GltfBuilder
+from tests.rigged_shapes import head_in_torso, write_gltf
 
 
 def test_collision_is_reported_with_its_energy(lcollision: Lcollision, stabbed: Path) -> None:
@@ -38,6 +45,7 @@ def test_collision_is_reported_with_its_energy(lcollision: Lcollision, stabbed: 
             "touching": 0,
         },
         "rules": ContactRules().to_json(),
+        "rules_of": None,
         "coincident_pairs": 0,
         "colliding": True,
     }
@@ -269,3 +277,148 @@ def test_a_bug_does_not_look_like_an_answer() -> None:
     assert result.returncode == 3
     assert "ZeroDivisionError" in result.stderr
     assert "bug" in result.stderr
+
+
+@pytest.fixture
+def exported(lcollision: Lcollision, tmp_path: Path) -> Callable[..., Path]:
+    """Write a pose of a character whose shins run into its feet, which its rules ignore."""
+    hero = write_gltf(head_in_torso(), tmp_path / "hero.glb")
+    model = open_body(hero)
+    write_poses(tmp_path / "poses.json", model, [NamedPose("bow", np.full(model.latent_size, 0.1))])
+    ignored = ("--ignore", "Left shin:Left foot", "--ignore", "Right shin:Right foot")
+    assert lcollision("contacts", hero, *ignored).exit_code == 0
+
+    def export(name: str, *options: str) -> Path:
+        out = tmp_path / name
+        done = lcollision("decode", hero, tmp_path / "poses.json", "-o", out, *options)
+        assert done.exit_code == 0, done.output
+        return out
+
+    return export
+
+
+@pytest.mark.parametrize("form", ["joints", "mesh", "morph", "clip"])
+def test_a_character_s_file_written_here_is_checked_by_its_rules_anywhere(
+    lcollision: Lcollision,
+    exported: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    form: str,
+) -> None:
+    out = exported("posed.glb", "--form", form)
+    # Another machine has neither the character nor what was chosen for it.
+    (tmp_path / "hero.glb").unlink()
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "elsewhere"))
+    result = lcollision("check", out)
+    assert result.exit_code == 0, result.output
+    assert "posed.glb: no collisions; " in result.stdout
+    assert ", by the contact rules of hero (--no-rules counts all pairs) (" in result.stdout
+    (report,) = json.loads(lcollision("check", "--json", out).stdout)
+    assert report["rules_of"] == "hero"
+    assert report["rules"]["ignored"][0] == ["Left shin", "Left foot"]
+    n_left_out = sum(report["excluded_pairs"].values())
+    strict = lcollision("check", "--json", "--no-rules", out)
+    (report,) = json.loads(strict.stdout)
+    assert strict.exit_code == 1
+    assert (report["pairs"], report["rules_of"]) == (n_left_out, None)
+    assert report["rules"] == ContactRules().to_json()
+
+
+@pytest.mark.parametrize("name", ["posed.obj", "posed.ply", "hero.glb"])
+def test_a_mesh_of_a_character_that_was_opened_is_checked_by_its_rules(
+    lcollision: Lcollision,
+    exported: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    name: str,
+) -> None:
+    out = tmp_path / name
+    if name != "hero.glb":
+        exported(name, "--axes", "unreal")
+    (report,) = json.loads(lcollision("check", "--json", out).stdout)
+    assert (report["colliding"], report["rules_of"]) == (False, "hero")
+    # Its energies are of its own unit, whatever that of the file.
+    depth = lcollision("check", "--json", out, "--tolerated-depth", 0.5)
+    assert json.loads(depth.stdout)[0]["rules"]["tolerated_depth"] == 0.5
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "elsewhere"))
+    result = lcollision("check", "--json", out)
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)[0]["rules_of"] is None
+
+
+def _edited(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    builder = GltfBuilder()
+    builder.description, builder.blob = described(path)
+    change(builder.description)
+    builder.write(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda held: held["nodes"][0].update(name="x"), "another program has changed it since"),
+        (
+            lambda held: held["asset"]["extras"]["lcollision"].update(format_version=2),
+            "its version must be 1, got 2; update LCollision",
+        ),
+        (
+            lambda held: held["asset"]["extras"]["lcollision"].update(shown_by=[[1]]),
+            "what it says of its source is damaged",
+        ),
+        (
+            lambda held: held["asset"]["extras"]["lcollision"].update(shown_by=[]),
+            "its vertices are not those of its source",
+        ),
+        (
+            lambda held: held["asset"]["extras"]["lcollision"]["rules"].update(near_exclusion=-1),
+            "the near exclusion must be 0 or more",
+        ),
+        (
+            lambda held: held["asset"]["extras"]["lcollision"]["source"].update(nodes=7),
+            "nodes must be a list of objects, got 7",
+        ),
+    ],
+    ids=["changed", "later", "damaged", "other parts", "impossible rules", "impossible source"],
+)
+def test_what_a_file_says_of_itself_is_not_trusted(
+    lcollision: Lcollision,
+    exported: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    change: Callable[[dict[str, Any]], None],
+    sentence: str,
+) -> None:
+    out = exported("posed.glb", "--form", "joints")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "elsewhere"))
+    _edited(out, change)
+    result = lcollision("check", "--json", out)
+    assert result.exit_code == 1, result.output
+    assert json.loads(result.stdout)[0]["rules_of"] is None
+    (told,) = [line for line in result.stderr.splitlines() if "all pairs are counted" in line]
+    assert sentence in told
+
+
+def test_parts_in_another_order_and_scenery_do_not_confuse_what_is_checked(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    builder = figure()
+    nodes = builder.description["nodes"]
+    # Two nodes show one mesh, of which the pose makes two; and there is a floor.
+    nodes.append({"name": "Twin", "mesh": nodes[4]["mesh"], "skin": 0, "translation": [9, 0, 0]})
+    floor = builder.array(np.array([[0, -9, 0], [9, -9, 0], [0, -9, 9]]))
+    primitive = {"attributes": {"POSITION": floor}, "indices": builder.array(np.arange(3), "u2")}
+    nodes.append({"name": "Floor", "mesh": builder.add("meshes", primitives=[primitive])})
+    own, out = builder.write(tmp_path / "figure.glb"), tmp_path / "posed.glb"
+    model = open_body(own)
+    latent = np.full(model.latent_size, 0.3)
+    write_poses(tmp_path / "poses.json", model, [NamedPose("bow", latent)])
+    for form in ("joints", "mesh", "morph"):
+        words = ("decode", own, tmp_path / "poses.json", "-o", out, "--form", form)
+        assert lcollision(*words).exit_code == 0
+        found = read_own_file(out)
+        assert found is not None
+        character, vertices, rules = found
+        assert rules == model.rules
+        assert character.topology == model.topology
+        assert np.abs(character.rest_vertices - model.reference).max() < 1e-9
+        assert np.abs(vertices - model.decode(latent)).max() < 1e-5

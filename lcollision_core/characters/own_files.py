@@ -1,0 +1,148 @@
+"""What a character's file that this program wrote says of itself: its rest pose, and its rules.
+
+It is an object in `asset.extras` of the glTF file, and holds the parts of the source's description
+that the pose has changed, so that the source, which may be elsewhere, can be read from it again.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lcollision_core.characters.character import Character
+from lcollision_core.characters.reading import character_of
+from lcollision_core.errors import MeshFileError
+from lcollision_core.json_values import quoted
+from lcollision_core.meshes.contact_rules import ContactRules
+from lcollision_core.meshes.formats import gltf
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.meshes.formats.gltf_patch import GltfPatch
+from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
+from lcollision_core.meshes.joined import join_parts
+from lcollision_core.meshes.scene_files import one_sentence, scene_of
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.regular_files import read_regular
+
+_KEY, _VERSION = "lcollision", 1
+_LONGEST_NAME = 100
+_CLIPS, _PATHS = "animations", ("translation", "rotation", "scale", "weights")
+_CHANGED = ("nodes", "meshes", "skins", "scenes", "scene")
+"""What a pose changes of a description, apart from its animations."""
+
+
+def sign(
+    patch: GltfPatch,
+    source: dict[str, Any],
+    name: str,
+    shown_by: Sequence[int],
+    rules: ContactRules,
+) -> None:
+    """Write into a file that holds a pose what it was before, and which pairs do not count.
+
+    Parameters
+    ----------
+    patch : the file, complete
+    source : the description that it had
+    name : of the character
+    shown_by : of each part of the character the number of the node that shows it now
+    rules : of the character
+    """
+    asset = patch.description.get("asset", {})
+    extras = asset.get("extras", {}) if isinstance(asset, dict) else None
+    if not isinstance(extras, dict):
+        # They are the source's own.
+        return
+    patch.description["asset"] = asset = {**asset, "extras": {**extras}}
+    before = {name: source.get(name) for name in _CHANGED}
+    before = {name: value for name, value in before.items() if value != patch.description.get(name)}
+    before[_CLIPS] = _brief(source)
+    asset["extras"][_KEY] = {
+        "format_version": _VERSION,
+        "character": name,
+        "rules": rules.to_json(),
+        "source": before,
+        "shown_by": list(shown_by),
+        "digest": patch.digest(_KEY),
+    }
+
+
+def _brief(source: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return an animation that moves what the source's move, without its joints: one key of each.
+
+    That says what is a character's and what scenery; see `character_parts`.
+    """
+    joints = {node for skin in source.get("skins", ()) for node in skin["joints"]}
+    found: dict[int, dict[str, Any]] = {}
+    for animation in source.get(_CLIPS, ()):
+        for channel in animation.get("channels", ()):
+            node = channel["target"].get("node")
+            if node is not None and node not in joints and channel["target"].get("path") in _PATHS:
+                found[node] = channel | {"sampler": animation["samplers"][channel["sampler"]]}
+    if not found:
+        return []
+    channels = [channel | {"sampler": n} for n, channel in enumerate(found.values())]
+    return [{"channels": channels, "samplers": [one["sampler"] for one in found.values()]}]
+
+
+def read_own_file(path: Path) -> tuple[Character, FloatArray, ContactRules] | None:
+    """Read a file that this program wrote with a pose in it; None for any other.
+
+    Returns
+    -------
+    character : in its rest pose
+    vertices : (V, 3) float64 array, the pose
+    rules : that the character had
+
+    Raises
+    ------
+    MeshFileError : it was changed since, by another program, or is of a later version.
+    """
+    with one_sentence(path, "is not checked by the rules that it was written with"):
+        patch = GltfPatch(GltfDocument(read_regular(path, MAX_FILE_BYTES), path), path)
+        asset = patch.description.get("asset")
+        extras = asset.get("extras") if isinstance(asset, dict) else None
+        held = extras.get(_KEY) if isinstance(extras, dict) else None
+        if not isinstance(held, dict):
+            return None
+        version = held.get("format_version")
+        if version != _VERSION:
+            raise MeshFileError.must_be(
+                "its version", _VERSION, quoted(version), "update LCollision"
+            )
+        if held.get("digest") != patch.digest(_KEY):
+            raise MeshFileError("another program has changed it since", "export it again")
+        shown_by, source, name = held.get("shown_by"), held.get("source"), held.get("character")
+        if not (
+            isinstance(source, dict)
+            and isinstance(name, str)
+            and isinstance(shown_by, list)
+            and all(type(node) is int for node in shown_by)
+        ):
+            raise MeshFileError("what it says of its source is damaged", "export it again")
+        rules = ContactRules.from_json(held.get("rules"))
+        posed = gltf.read_scene(io.BytesIO(patch.encoded()), path)
+        patch.description |= {key: source[key] for key in (*_CHANGED, _CLIPS) if key in source}
+        patch.description = {
+            k: value for k, value in patch.description.items() if value is not None
+        }
+        character = character_of(scene_of(io.BytesIO(patch.encoded()), path), path)
+        shown = "".join(filter(str.isprintable, name))[:_LONGEST_NAME]
+        character = replace(character, name=shown or character.name)
+        mesh = join_parts(posed)
+        places = mesh.posed(posed.rest)[0][mesh.joined]
+        rows: dict[int, list[FloatArray]] = {}
+        starts = np.cumsum([0, *(len(part.points) for part in posed.parts)]).tolist()
+        for part, start, end in zip(posed.parts, starts[:-1], starts[1:], strict=True):
+            rows.setdefault(part.node, []).append(places[start:end])
+        in_order = [rows[node].pop(0) for node in shown_by if rows.get(node)]
+        found = np.concatenate(in_order) if in_order else np.empty((0, 3))
+        if found.shape != (len(character.joined), 3):
+            raise MeshFileError("its vertices are not those of its source", "export it again")
+        vertices = np.empty_like(character.rest_vertices)
+        vertices[character.joined] = found
+        return character, vertices, rules
