@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,43 +22,57 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 _TOLERANCE = 1e-3
-"""Normalised: how far a vertex may lie from its partner's mirror image."""
+"""Normalised: how far a vertex may lie from its partner's mirror image in a symmetric mesh."""
+
+_NEAR, _MOST = 0.01, 0.7
+"""Normalised, how far in another mesh; and the least share of its vertices that lie so near."""
+
+_STEPS = 4
+"""In which the plane of a mesh that is not symmetric is found."""
 
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """The plane that a mesh's reference is symmetric about.
+    """The plane between the sides of a mesh, and what lies where on the other side.
 
     Attributes
     ----------
-    partner : (V,) int32 array, read-only, each vertex's mirror image, its own inverse
-    axis : 0, 1 or 2, from one side to the other
-    offset : of the plane along the axis, in the mesh's unit
+    partner : (V,) int32 array, read-only, each vertex's mirror image: its own inverse where the
+        mesh is symmetric, else the vertex nearest to the image
+    normal : (3,) float64 unit vector, from one side to the other
+    offset : of the plane along the normal, in the mesh's unit
     """
 
     partner: npt.NDArray[np.int32]
-    axis: int
+    normal: FloatArray
     offset: float
+
+    @cached_property
+    def flip(self) -> FloatArray:
+        """(4, 4) the reflection in the plane."""
+        flip = np.eye(4)
+        flip[:3, :3] -= 2.0 * np.outer(self.normal, self.normal)
+        flip[:3, 3] = 2.0 * self.offset * self.normal
+        return flip
+
+    def reflect(self, points: npt.ArrayLike) -> FloatArray:
+        """Return the mirror images of (..., 3) points."""
+        image: FloatArray = np.asarray(points) @ self.flip[:3, :3] + self.flip[:3, 3]
+        return image
 
     def image(self, vertices: npt.NDArray[Any]) -> FloatArray:
         """Reflect (V, 3) vertices, and give each the number of its partner: (V, 3)."""
-        image = np.array(vertices, dtype=np.float64)[self.partner]
-        image[:, self.axis] = 2.0 * self.offset - image[:, self.axis]
-        return image
+        return self.reflect(np.asarray(vertices, dtype=np.float64)[self.partner])
 
     def image_of_placement(self, placement: RigidTransform) -> RigidTransform:
         """Return the motion that takes a mesh's image to where the placed mesh's image is."""
-        flip, shift = np.ones(3), np.zeros(3)
-        flip[self.axis], shift[self.axis] = -1.0, 2.0 * self.offset
-        moved = placement.apply(shift)
-        turned = flip[:, None] * placement.rotation * flip
-        return RigidTransform(turned, flip * moved + shift, placement.scale)
+        flip, shift = self.flip[:3, :3], self.flip[:3, 3]
+        moved = self.reflect(placement.apply(shift))
+        return RigidTransform(flip @ placement.rotation @ flip, moved, placement.scale)
 
     def image_of_pin(self, pin: Pin) -> Pin:
         """Return the pin of the partner's patch in the mirrored place."""
-        position = list(pin.position)
-        position[self.axis] = 2.0 * self.offset - position[self.axis]
-        x, y, z = position
+        x, y, z = self.reflect(pin.position).tolist()
         return replace(pin, vertex=int(self.partner[pin.vertex]), position=(x, y, z))
 
 
@@ -205,8 +220,7 @@ class PoseMirror:
             if resolution.exactly_free:
                 found, pairs_after = resolution.latent, 0
                 mirrored = check.decode(found)[0]
-        picked = self.check.space.topology.picked
-        distances = np.linalg.norm((mirrored - image)[picked], axis=1)
+        distances = self._misfit(pose, found, mirrored - image)
         return MirroredPose(
             latent=found,
             placement=image_placement,
@@ -219,6 +233,22 @@ class PoseMirror:
             resolution=resolution,
             source=MirrorSource(pose, placement, fingerprint_of_pose(found, image_placement)),
         )
+
+    def _misfit(
+        self,
+        latent: FloatArray,  # noqa: ARG002 - the vertices tell
+        mirrored: FloatArray,  # noqa: ARG002
+        off: FloatArray,
+    ) -> FloatArray:
+        """Return how far places of a mirrored pose are from the mirror image: (n,), normalised.
+
+        Parameters
+        ----------
+        latent, mirrored : (D,) codes of a pose, and of its mirrored one
+        off : (V, 3) from the mirror image's vertices to those of the mirrored pose
+        """
+        distances: FloatArray = np.linalg.norm(off[self.check.space.topology.picked], axis=1)
+        return distances
 
     def _codes_of_image(
         self,
@@ -269,37 +299,51 @@ class PoseMirror:
 
 
 def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int) -> Symmetry | None:
-    """Find each vertex's partner on the other side, where the mesh is its own mirror image.
+    """Find each vertex's partner on the other side of a mesh.
+
+    Where the mesh is its own mirror image, faces are mapped onto faces. Else, as with a sword in
+    one hand or armour on one shoulder, a vertex's partner is the one nearest to its image, and most
+    vertices must have one near to it: the pose that comes nearest to so many partners is the
+    mirrored one, whatever has none.
 
     Parameters
     ----------
-    reference : (V, 3) array, a symmetric pose
+    reference : (V, 3) array, a pose whose limbs lie symmetrically
     topology : of the mesh; vertices that no face names are their own partners
     up_axis : 0, 1 or 2; left and right are along one of the other two
 
     Returns
     -------
-    symmetry : that maps faces onto faces; None if there is none
+    symmetry : None if there is none
     """
     from scipy.spatial import cKDTree
 
     used, faces = topology.used_vertices, topology.faces
     vertices = np.asarray(reference, dtype=np.float64)[used]
-    tolerance = _TOLERANCE * float(np.ptp(vertices, axis=0).max())
+    size = float(np.ptp(vertices, axis=0).max())
     tree = cKDTree(vertices)
     everyone = np.arange(len(vertices), dtype=np.int32)
-    for axis in range(3):
-        if axis == up_axis:
-            continue
-        offset = float(vertices[:, axis].min() + vertices[:, axis].max()) / 2.0
-        image = Symmetry(everyone, axis, offset).image(vertices)
-        distance, nearest = tree.query(image)
-        partner = np.arange(topology.n_vertices, dtype=np.int32)
-        partner[used] = used[nearest]
-        is_exchange = distance.max() < tolerance and (nearest[nearest] == everyone).all()
-        if is_exchange and np.array_equal(
-            sorted_faces(partner[faces[:, ::-1]]), sorted_faces(faces)
-        ):
-            partner.flags.writeable = False
-            return Symmetry(partner, axis, offset)
-    return None
+    best: tuple[float, Symmetry] | None = None
+    for axis in (axis for axis in range(3) if axis != up_axis):
+        across = vertices[:, axis]
+        for offset in (0.5 * (across.min() + across.max()), np.median(across)):
+            for _ in range(_STEPS):
+                plane = Symmetry(everyone, np.eye(3)[axis], float(offset))
+                distance, nearest = tree.query(plane.reflect(vertices))
+                partner = np.arange(topology.n_vertices, dtype=np.int32)
+                partner[used] = used[nearest]
+                partner.flags.writeable = False
+                found = replace(plane, partner=partner)
+                is_exchange = (
+                    distance.max() < _TOLERANCE * size and (nearest[nearest] == everyone).all()
+                )
+                if is_exchange and np.array_equal(
+                    sorted_faces(partner[faces[:, ::-1]]), sorted_faces(faces)
+                ):
+                    return found
+                share = float((distance < _NEAR * size).mean())
+                if share >= _MOST and (best is None or share > best[0]):
+                    best = share, found
+                # What is on one side alone has moved the middle.
+                offset = np.median(0.5 * (across + across[nearest]))
+    return None if best is None else best[1]

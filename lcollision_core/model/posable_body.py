@@ -422,7 +422,7 @@ class PosableBody(ABC):
 
     @cached_property
     def symmetry(self) -> Symmetry | None:
-        """Left and right of the mesh; None if its reference is not its own mirror image."""
+        """Left and right of the mesh; None if its reference is not nearly its own mirror image."""
         return find_symmetry(self.reference, self.topology, self.up_axis)
 
     @cached_property
@@ -436,9 +436,9 @@ class PosableBody(ABC):
         """
         if self.symmetry is None:
             raise LCollisionError(
-                "cannot be mirrored: its first pose is not symmetric, so that left and "
-                "right are unknown",
-                "train a model whose first pose is",
+                "cannot be mirrored: in its first pose the limbs do not lie symmetrically, so that "
+                "left and right are unknown",
+                "train a model whose first pose is symmetric",
                 where=f"poses of {self.name}",
             )
         resolve = self.resolve if self.can_resolve else None

@@ -35,7 +35,7 @@ from lcollision_core.model.mirror import PoseMirror, Symmetry
 from lcollision_core.model.naming import MAX_NAME_LENGTH, MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.model.posable_body import PosableBody, read_only
 from lcollision_core.model.rig_fit import fit_rig
-from lcollision_core.model.rig_mirror import RigMirror, find_joint_partners
+from lcollision_core.model.rig_mirror import JointSides, RigMirror, find_joint_sides
 from lcollision_core.model.rig_names import motion_names, side_of
 from lcollision_core.model_file import digest_of
 
@@ -288,19 +288,22 @@ class RigModel(PosableBody):
         return random_codes(self.space, n_poses, generator)
 
     @cached_property
+    def _sides(self) -> JointSides | None:
+        return find_joint_sides(self.space)
+
+    @cached_property
     def symmetry(self) -> Symmetry | None:
-        """Left and right of the rig; None if its joints are not each other's mirror images.
+        """Left and right of the rig; None if its joints have no two sides.
 
         The mesh need not be symmetric: a vertex's partner is the one nearest to its image.
         """
-        found = find_joint_partners(self.space)
-        if found is None:
+        sides = self._sides
+        if sides is None:
             return None
-        _, axis, offset = found
         everyone = np.arange(self.n_vertices, dtype=np.int32)
-        image = Symmetry(everyone, axis, offset * self.body_size).image(self.reference)
-        partner = cKDTree(self.reference).query(image)[1].astype(np.int32)
-        return Symmetry(read_only(partner), axis, offset * self.body_size)
+        plane = Symmetry(everyone, sides.normal, sides.offset * self.body_size)
+        partner = cKDTree(self.reference).query(plane.reflect(self.reference))[1]
+        return replace(plane, partner=read_only(partner.astype(np.int32)))
 
     @cached_property
     def pose_mirror(self) -> PoseMirror:
@@ -310,11 +313,12 @@ class RigModel(PosableBody):
         ------
         LCollisionError : the rig has no two sides.
         """
-        found, symmetry = find_joint_partners(self.space), self.symmetry
-        if found is None or symmetry is None:
+        sides, symmetry = self._sides, self.symmetry
+        if sides is None or symmetry is None:
             raise LCollisionError(
-                "cannot be mirrored: its joints do not lie symmetrically in the rest pose",
-                "export it in a symmetric rest pose",
+                "cannot be mirrored: its joints are not named after left and right, and do not "
+                "lie symmetrically",
+                "name them so, as in LeftArm and RightArm",
                 where=f"poses of {self.name}",
             )
         return RigMirror(
@@ -324,7 +328,7 @@ class RigModel(PosableBody):
             self.nearest,
             self.resolve,
             self.space,
-            found[0],
+            sides,
         )
 
     @cached_property

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.face_groups import without_joints
 from lcollision_core.model import PosableBody, RigModel, open_body, propose_rules, sample_poses
 from lcollision_core.model.pose_file import NamedPose, read_poses, write_poses
+from lcollision_core.model.rig_mirror import named_pairs
 from lcollision_core.posing import DragOptions, Pin, Twist, make_grip
 from lcollision_core.resolve import PoseResolver, ResolveOptions, Step
 from tests.core.gltf_builder import arm, rotation
@@ -292,8 +295,65 @@ def test_what_only_one_side_has_does_not_keep_from_mirroring(
     assert mirrored.latent[code_of(model, "Sword", 0)] == pytest.approx(0.4)
 
 
-def test_a_limb_of_one_side_alone_is_not_mirrored() -> None:
-    assert with_joint("RightHandThumb1", "RightHand", (-0.8, -0.1, 1.45)).symmetry is None
+def test_a_limb_of_one_side_alone_keeps_its_turn() -> None:
+    model = with_joint("RightHandThumb1", "RightHand", (-0.8, -0.1, 1.45))
+    latent = np.zeros(model.latent_size)
+    latent[code_of(model, "RightHandThumb1", 0)] = 0.4
+    latent[code_of(model, "LeftForeArm", 0)] = 1.0
+    mirrored = model.mirror(latent).latent
+    assert mirrored[code_of(model, "RightHandThumb1", 0)] == pytest.approx(0.4)
+    assert mirrored[code_of(model, "RightForeArm", 0)] == pytest.approx(1.0, abs=0.02)
+
+
+def test_an_arm_that_hangs_at_rest_is_mirrored_to_one_that_is_stretched_out() -> None:
+    """What is posed is mirrored, not the turn from a rest pose that has no two sides."""
+    body = rigged_body()
+    rig = body.rig
+    assert rig is not None
+    arm = [n for n, name in enumerate(rig.joint_names) if name.startswith("LeftArm")]
+    arm += [n for n, name in enumerate(rig.joint_names) if re.match("Left(Fore|Hand)", name)]
+    down = Rotation.from_euler("y", 60.0, degrees=True).as_matrix()
+    shoulder = rig.rest[arm[0], :3, 3].copy()
+    rest, points, vertices = rig.rest.copy(), rig.points.copy(), body.rest_vertices.copy()
+    rest[arm, :3, 3] = (rest[arm, :3, 3] - shoulder) @ down.T + shoulder
+    led = np.isin(rig.joint_of[:, 0], arm)
+    vertices[led] = (vertices[led] - shoulder) @ down.T + shoulder
+    points[led] = vertices[led, None]
+    hanging = replace(body, rest_vertices=vertices, rig=replace(rig, rest=rest, points=points))
+    model = RigModel.of(hanging)
+    posed = np.zeros(model.latent_size)
+    posed[code_of(model, "RightForeArm", 0)] = 1.0
+    mirrored = model.mirror(posed)
+    symmetry = model.symmetry
+    assert symmetry is not None
+    before, after = (model.space.transforms(one)[:, :3, 3] for one in (posed, mirrored.latent))
+    left, right = (rig.joint_names.index(f"{side}HandEnd") for side in ("Left", "Right"))
+    assert np.abs(after[left] - symmetry.reflect(before[right])).max() < 0.02
+    assert np.abs(after[right] - symmetry.reflect(before[left])).max() < 0.02
+    assert mirrored.fit_error_max < 0.02
+    again = model.mirror(mirrored.latent).latent
+    np.testing.assert_allclose(again, posed, atol=1e-6)
+
+
+SPELLINGS = {
+    "mixamorig:{}Arm": ("Left", "Right"),
+    "upperarm_{}": ("l", "r"),
+    "{}Shldr": ("l", "r"),
+    "Bip01 {} UpperArm": ("L", "R"),
+    "Arm{}": ("L", "R"),
+    "Bone.001.{}": ("L", "R"),
+    "arm_{}_01": ("Lft", "Rgt"),
+    "{}腕": ("左", "右"),
+    "J_Bip_{}_UpperArm": ("L", "R"),
+    "{}UpperArm": ("L", "R"),
+    "ARM_{}": ("LEFT", "RIGHT"),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_joints_are_paired_by_their_names(spelling: str) -> None:
+    left, right = (spelling.format(side) for side in SPELLINGS[spelling])
+    assert named_pairs(["Hips", right, "Coil", left, "Coir.L", "Spine_l"]) == [(3, 1)]
 
 
 def test_a_mesh_of_the_character_is_encoded_wherever_it_lies(model: RigModel) -> None:
