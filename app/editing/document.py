@@ -163,9 +163,11 @@ class PoseDocument(LiveEditing):
         return self._model is not None and self._model.has_predictor
 
     @property
-    def can_mirror(self) -> bool:
-        """Whether the model's mesh has a left and a right that mirror each other."""
-        return self._model is not None and self._model.symmetry is not None
+    def why_not_mirrored(self) -> str:
+        """Why the model's poses cannot be mirrored; "" if they can."""
+        if self._model is None or self._model.symmetry is not None:
+            return ""
+        return f"Cannot be mirrored: {self._model.no_sides[0]}"
 
     # Mirroring.
 

@@ -236,6 +236,15 @@ def equip_action(action: QAction, spec: Spec) -> None:
         give_icon(action, spec.icon)
 
 
+NO_BODY = "Open a character or a model first"
+
+
+def allow_action(action: QAction, tip: str, why_not: str = "") -> None:
+    """Enable an action, or grey it and say in its tool tip why it cannot be used now."""
+    action.setEnabled(not why_not)
+    explain_action(action, why_not or tip)
+
+
 def explain_action(action: QAction, tip: str) -> None:
     """Say in an action's tool tip what it does, or why it cannot now, and name its shortcut."""
     shown = action.shortcut().toString(QKeySequence.SequenceFormat.NativeText)

@@ -174,7 +174,7 @@ class BodyMenus(QObject):
     def _add_mirror(self, menu: QMenu, domain: int) -> None:
         """Offer to mirror a body part, where there is one like it on the other side."""
         document = self._document
-        other = document.model.pose_mirror.partner(domain) if document.can_mirror else None
+        other = None if document.why_not_mirrored else document.model.pose_mirror.partner(domain)
         if other is not None:
             name = menu_text(document.model.domain_names[other])
             mirror = self._add(menu, f"M&irror to {name}", document.mirror_part, domain)

@@ -13,7 +13,8 @@ from app.view.mouse import RADIUS_STEP
 from app.window.actions import (
     ACTIONS,
     DRAG_STRENGTHS,
-    explain_action,
+    NO_BODY,
+    allow_action,
     make_choices,
     make_menu,
 )
@@ -88,18 +89,18 @@ class DragActions(QObject):
     @Slot()
     def _update_actions(self) -> None:
         document, actions = self._document, self._actions
-        can = dict.fromkeys(self.acts, document.has_model)
+        why_not = dict.fromkeys(self.acts, "" if document.has_model else NO_BODY)
         if document.has_model:
             vertex = self._viewport.pointed_vertex
             is_pinned = document.is_pinned(vertex)
             actions["pin"].setText("Un&pin" if is_pinned else ACTIONS["pin"].text)
-            can |= {"pin": vertex is not None, "unpin_all": bool(document.pins)}
+            why_not["pin"] = "Point at the body first" if vertex is None else ""
+            why_not["unpin_all"] = "" if document.pins else "Nothing is pinned"
             for key, (limbs, _) in _LIMBS.items():
-                can[key] = bool(self._domains(key))
                 missing = f"No body part of this model is named after {limbs}"
-                explain_action(actions[key], ACTIONS[key].tip if can[key] else missing)
-        for key, is_possible in can.items():
-            actions[key].setEnabled(is_possible)
+                why_not[key] = "" if self._domains(key) else missing
+        for key, reason in why_not.items():
+            allow_action(actions[key], ACTIONS[key].tip, reason)
 
     def _domains(self, key: str) -> list[int]:
         """Return the body parts that an action pins."""

@@ -9,7 +9,7 @@ from PySide6.QtCore import QObject, Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QWidget
 
-from app.window.actions import ACTIONS, explain_action
+from app.window.actions import ACTIONS, NO_BODY, allow_action
 from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.forms import resolve_form
 from app.wording import menu_text
@@ -129,23 +129,26 @@ class EditActions(QObject):
     @Slot()
     def _update_actions(self) -> None:
         document, stack = self._document, self._document.undo_stack
-        allowed = {
-            "undo": stack.canUndo(),
-            "redo": stack.canRedo(),
-            "mirror": document.can_mirror,
-            "unlock": bool(document.locked_domains),
-            "parts": not document.changing_model,
-            "resolve": document.can_resolve and not (document.solving or document.incoming),
-            "resolve_options": document.can_resolve,
-            "cancel": bool(document.busy or self._pictures.busy),
+        unable = "" if document.can_resolve else "This model has no predictor to resolve with"
+        waits = "Wait until Resolve has ended" if document.solving else ""
+        if document.incoming:
+            waits = f"{document.incoming}, which replaces this pose"
+        is_busy = document.busy or self._pictures.busy
+        why_not = {
+            "undo": "" if stack.canUndo() else "There is nothing to undo",
+            "redo": "" if stack.canRedo() else "There is nothing to redo",
+            "mirror": document.why_not_mirrored,
+            "unlock": "" if document.locked_domains else "No body part is locked",
+            "parts": "Wait until the model is changed" if document.changing_model else "",
+            "resolve": unable or waits,
+            "resolve_options": unable,
+            "cancel": "" if is_busy else "Nothing is being computed",
         }
         for key in self.acts:
-            self._actions[key].setEnabled(document.has_model and allowed.get(key, True))
+            reason = why_not.get(key, "") if document.has_model else NO_BODY
+            allow_action(self._actions[key], ACTIONS[key].tip, reason)
         for dialog in self._window.findChildren(BodyPartsDialog):
             dialog.save.setEnabled(not document.changing_model)
-        waits = f"{document.incoming}, which replaces this pose"
-        tip = waits if document.incoming else ACTIONS["resolve"].tip
-        explain_action(self._actions["resolve"], tip)
         for key, step in (("undo", stack.undoText()), ("redo", stack.redoText())):
             text = f"{ACTIONS[key].text} {menu_text(step[:1].lower() + step[1:])}"
             self._actions[key].setText(text.rstrip())

@@ -337,7 +337,9 @@ class FileActions(QObject):
         document = self._document
         if document.has_model and document.modified:
             file = document.file
-            answer = ask_about_changes(self._window, self._name, file.name if file else "")
+            answer = ask_about_changes(
+                self._window, self._name, document.model.name, file.name if file else ""
+            )
             may_go_on = self.save() if answer is Choice.SAVE else answer is Choice.DISCARD
             if not may_go_on:
                 return False
@@ -408,7 +410,10 @@ class FileActions(QObject):
     @Slot(object)
     def _on_other_model(self, found: OtherModelError) -> None:
         assert found.model is not None
-        may_switch = ask_to_switch(self._window, Path(found.where).name, found.model.name)
+        name = found.model.name
+        # Of two models of one name the sentence says what differs.
+        differs = found.what if name == self._document.model.name else ""
+        may_switch = ask_to_switch(self._window, Path(found.where).name, name, differs)
         if may_switch and self._may_lose_library():
             self._document.open_poses(found.where, found.model.path)
 

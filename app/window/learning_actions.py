@@ -11,6 +11,7 @@ from PySide6.QtCore import QObject, Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QStatusBar, QToolButton, QWidget
 
+from app.window.actions import ACTIONS, NO_BODY, allow_action
 from app.window.dialogs.learning import STAGE_WORDS, LearningDialog
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.file_actions import FileActions
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from lcollision_core.learning import LearningRequest
 
 Dialog = TypeVar("Dialog", bound=QDialog)
+
+_NO_RUN = "No model is being learned"
+_LEARNED = "This body is a learned model already; open the character's own file to learn it"
 
 _SECONDS_TO_CLOSE = 5.0
 _INDICATOR_SHARE = 0.45
@@ -86,8 +90,8 @@ class LearningActions(QObject):
             "learn_character": self._learn_character,
             "learning": self.show_runs,
         }
-        actions["learning"].setEnabled(False)
-        actions["learn_character"].setEnabled(False)
+        allow_action(actions["learning"], ACTIONS["learning"].tip, _NO_RUN)
+        allow_action(actions["learn_character"], ACTIONS["learn_character"].tip, NO_BODY)
         self.runs.changed.connect(self._on_runs)
         files.learning_wanted.connect(self.new_model)
         document.opened.connect(self._on_opened)
@@ -169,7 +173,9 @@ class LearningActions(QObject):
 
     @Slot()
     def _on_model(self) -> None:
-        self._actions["learn_character"].setEnabled(not self._document.model.is_trained)
+        learn = self._actions["learn_character"]
+        is_trained = self._document.model.is_trained
+        allow_action(learn, ACTIONS["learn_character"].tip, _LEARNED if is_trained else "")
         if not self._began:
             self._began = True
             # What it imports takes longer than a frame.
@@ -180,7 +186,8 @@ class LearningActions(QObject):
     def _on_runs(self) -> None:
         run = self._most_urgent()
         self.indicator.setVisible(run is not None)
-        self._actions["learning"].setEnabled(run is not None)
+        why_not = "" if run is not None else _NO_RUN
+        allow_action(self._actions["learning"], ACTIONS["learning"].tip, why_not)
         if run is not None:
             others = len(self.runs.runs) - 1
             text = indicator_text(run) + (f" (and {others} more)" if others else "")

@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QDialog, QMenu, QWidget
 
 from app.editing.commands import Source
 from app.editing.history import retagged
-from app.window.actions import ACTIONS, explain_action
+from app.window.actions import ACTIONS, NO_BODY, allow_action
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.names import ask_for_name
 from app.window.dialogs.questions import ask_to_replace, ask_to_replace_files
@@ -94,27 +94,32 @@ class LibraryActions(QObject):
         own = bool(chosen) and panel.source is Source.LIBRARY
         one = panel.chosen is not None and len(chosen) == 1
         addable = self._addable()
-        allowed = {
-            "update": has_model and document.can_update,
-            "load": one,
-            "blend": one,
-            "rename": own and one,
-            "tags": own,
-            "duplicate": own,
-            "mirror_poses": bool(chosen) and document.can_mirror,
-            "remove": own,
-            "add": bool(addable),
-            "export_poses": bool(chosen),
-            "export_motion": bool(chosen),
-            "export_library": has_model and bool(document.poses),
+        select = "" if chosen else "Select poses in the Poses panel first"
+        select_one = "" if one else "Select one pose in the Poses panel first"
+        select_own = "" if own else "Select poses of your library first"
+        update_first = "Load a pose of your library to change it later"
+        if has_model and document.library_pose is not None:
+            update_first = "The pose is as in your library"
+        why_not = {
+            "update": "" if has_model and document.can_update else update_first,
+            "load": select_one,
+            "blend": select_one,
+            "rename": select_own or select_one,
+            "tags": select_own,
+            "duplicate": select_own,
+            "mirror_poses": select or document.why_not_mirrored,
+            "remove": select_own,
+            "add": "" if addable else "Select poses of the model or of a file first",
+            "export_poses": select,
+            "export_motion": select,
+            "export_library": "" if has_model and document.poses else "Your library has no poses",
         }
         for key in self.acts:
-            self._actions[key].setEnabled(has_model and allowed.get(key, True))
+            reason = why_not.get(key, "") if has_model else NO_BODY
+            allow_action(self._actions[key], ACTIONS[key].tip, reason)
         kept = document.library_pose if has_model else None
         update, add = self._actions["update"], self._actions["add"]
         update.setText("&Update pose" if kept is None else f"&Update “{menu_text(kept.name)}”")
-        tip = ACTIONS["update"].tip if kept else "Load a pose of your library to change it later"
-        explain_action(update, tip)
         what = "selected" if chosen or not addable else f"all {len(addable)}"
         add.setText(f"Add &{what} to library")
 

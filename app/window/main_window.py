@@ -368,12 +368,11 @@ class MainWindow(QMainWindow):
         for dock in self.docks.values():
             dock.widget().setEnabled(has_model)
         for key in (*self.files.acts, "contacts"):
-            self.actions_by_key[key].setEnabled(has_model or key == "open_model")
+            reason = "" if has_model or key == "open_model" else actions.NO_BODY
+            actions.allow_action(self.actions_by_key[key], ACTIONS[key].tip, reason)
         if has_model:
             model, upright = self.document.model, self.actions_by_key["upright"]
-            why_not = self.files.why_not_upright()
-            upright.setEnabled(not why_not)
-            actions.explain_action(upright, why_not or ACTIONS["upright"].tip)
+            actions.allow_action(upright, ACTIONS["upright"].tip, self.files.why_not_upright())
             self._status.show_facts(f"{model.name} · {model.n_vertices} vertices")
         self._update_title()
 

@@ -10,13 +10,23 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QWidget
 
 from app.view.shading import Shading
-from app.window.actions import CAMERA_ACTIONS, SHADINGS, make_choices, make_menu
+from app.window.actions import (
+    ACTIONS,
+    CAMERA_ACTIONS,
+    NO_BODY,
+    SHADINGS,
+    allow_action,
+    make_choices,
+    make_menu,
+)
 from app.window.widgets import silent
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
     from app.view.viewport import Viewport
+
+_NO_ESTIMATE = "Only a learned model with a predictor has an estimate"
 
 
 class ViewActions(QObject):
@@ -69,11 +79,15 @@ class ViewActions(QObject):
     @Slot()
     def _update_actions(self) -> None:
         document = self._document
+        missing = "" if document.has_model else NO_BODY
         for action in (*self.shadings, *self.cameras):
-            needed = action.data() is not Shading.PREDICTED or document.has_predictor
-            action.setEnabled(document.has_model and needed)
-        for action in (self._ghost, self._reset_camera):
-            action.setEnabled(document.has_model)
+            shading = action.data()
+            untrained = shading is Shading.PREDICTED and not document.has_predictor
+            reason = missing or (_NO_ESTIMATE if untrained else "")
+            spec = SHADINGS.get(shading) or CAMERA_ACTIONS[shading]
+            allow_action(action, spec.tip, reason)
+        for key, action in (("ghost", self._ghost), ("reset_camera", self._reset_camera)):
+            allow_action(action, ACTIONS[key].tip, missing)
 
     @Slot()
     def _on_ghost(self) -> None:

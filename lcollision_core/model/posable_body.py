@@ -425,6 +425,17 @@ class PosableBody(ABC):
         """Left and right of the mesh; None if its reference is not nearly its own mirror image."""
         return find_symmetry(self.reference, self.topology, self.up_axis)
 
+    no_sides = (
+        "in its first pose the limbs do not lie symmetrically, so that left and right are unknown",
+        "train a model whose first pose is symmetric",
+    )
+    """Why there is no `symmetry`, where there is none, and what helps."""
+
+    def _not_mirrored(self) -> LCollisionError:
+        reason, next_step = self.no_sides
+        where = f"poses of {self.name}"
+        return LCollisionError(f"cannot be mirrored: {reason}", next_step, where=where)
+
     @cached_property
     def pose_mirror(self) -> PoseMirror:
         """Exchanges left and right of this model's poses.
@@ -435,12 +446,7 @@ class PosableBody(ABC):
         ModelFileError : the model has a damaged predictor.
         """
         if self.symmetry is None:
-            raise LCollisionError(
-                "cannot be mirrored: in its first pose the limbs do not lie symmetrically, so that "
-                "left and right are unknown",
-                "train a model whose first pose is symmetric",
-                where=f"poses of {self.name}",
-            )
+            raise self._not_mirrored()
         resolve = self.resolve if self.can_resolve else None
         return PoseMirror(
             self.attention_mask, self.symmetry, self.exact_check(), self.nearest, resolve

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import RigPoseSpace
-from lcollision_core.characters.joint_roles import Role
+from lcollision_core.characters.joint_roles import Role, Side
 from lcollision_core.jobs import CancelToken
 from lcollision_core.model.mirror import PoseMirror
 
@@ -31,6 +31,7 @@ _ALIKE = np.radians(10.0)
 """Angle up to which a bone lies at rest as the mirror image of its partner does."""
 
 _MIDDLE = {Role.SPINE, Role.NECK, Role.HEAD}
+_LOOSE = {Role.OTHER, Role.FACE}
 
 _SIDES = (
     *(("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("左", "右")),
@@ -110,6 +111,8 @@ def find_joint_sides(space: RigPoseSpace) -> JointSides | None:
     if len(others):
         found = _by_place(space, others, normal, offset)
         partner[others[found >= 0]] = others[found[found >= 0]]
+        for left, right in _by_role(space, others[found < 0]):
+            partner[left], partner[right] = right, left
     has_pairs = bool((partner != np.arange(len(partner)))[partner >= 0].any())
     carries = partner >= 0
     for joint in range(space.n_joints - 1, 0, -1):
@@ -156,6 +159,21 @@ def _by_place(
     alone = (distance > _TOLERANCE) | (nearest[nearest] != np.arange(len(joints)))
     found: npt.NDArray[np.intp] = np.where(alone, -1, nearest)
     return found
+
+
+def _by_role(
+    space: RigPoseSpace, joints: npt.NDArray[np.intp]
+) -> list[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
+    """Return the left and the right of some joints of each role of which there are equally many."""
+    sides, roles = np.array(space.sides)[joints], np.array(space.roles)[joints]
+    pairs = []
+    for role in dict.fromkeys(roles.tolist()):
+        left, right = (
+            joints[(roles == role) & (sides == side)] for side in (Side.LEFT, Side.RIGHT)
+        )
+        if role not in _MIDDLE | _LOOSE and len(left) == len(right):
+            pairs.append((left, right))
+    return pairs
 
 
 def _between(space: RigPoseSpace, partner: npt.NDArray[np.intp], normal: FloatArray) -> FloatArray:

@@ -287,6 +287,11 @@ class RigModel(PosableBody):
             return np.zeros((n_poses, ROOT_CODES))
         return random_codes(self.space, n_poses, generator)
 
+    no_sides = (
+        "its joints are not named after left and right, and do not lie symmetrically",
+        "name them so, as in LeftArm and RightArm",
+    )
+
     @cached_property
     def _sides(self) -> JointSides | None:
         return find_joint_sides(self.space)
@@ -315,12 +320,7 @@ class RigModel(PosableBody):
         """
         sides, symmetry = self._sides, self.symmetry
         if sides is None or symmetry is None:
-            raise LCollisionError(
-                "cannot be mirrored: its joints are not named after left and right, and do not "
-                "lie symmetrically",
-                "name them so, as in LeftArm and RightArm",
-                where=f"poses of {self.name}",
-            )
+            raise self._not_mirrored()
         return RigMirror(
             self.attention_mask,
             symmetry,

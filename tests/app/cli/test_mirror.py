@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from lcollision_core.meshes import RigidTransform
-from lcollision_core.model import NamedPose, PoseModel, read_poses, write_poses
+from lcollision_core.model import NamedPose, PoseModel, open_body, read_poses, write_poses
 from tests.app.support import Lcollision
+from tests.core.gltf_builder import arm
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +102,25 @@ def test_what_cannot_be_mirrored_is_one_sentence(
     refused = lcollision("mirror", "body", empty, "-o", images)
     assert refused.exit_code == 2
     assert "has no poses in it" in refused.stderr
-    swing = PoseModel.load("body-swing")
-    write_poses(empty, swing, [NamedPose("first", swing.training_latent[0])])
-    refused = lcollision("mirror", "body-swing", empty, "-o", images)
+    one_arm = open_body(arm().write(tmp_path / "arm.glb"))
+    write_poses(empty, one_arm, [NamedPose("first", one_arm.training_latent[0])])
+    refused = lcollision("mirror", tmp_path / "arm.glb", empty, "-o", images)
     assert refused.exit_code == 2
-    assert "left and right are unknown" in refused.stderr
+    assert "its joints are not named after left and right" in refused.stderr
     assert not images.exists()
+
+
+def test_a_body_that_is_not_symmetric_is_mirrored_as_nearly_as_it_can_be(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    """The dance begins in a pose that is not quite symmetric."""
+    swing, given, images = PoseModel.load("body-swing"), tmp_path / "a.json", tmp_path / "b.json"
+    write_poses(given, swing, [NamedPose("first", swing.training_latent[30])])
+    done = lcollision("mirror", "body-swing", given, "-o", images, "--json")
+    assert done.exit_code == 0, done.output
+    (report,) = json.loads(done.stdout)
+    assert report["fit_error_mean"] < 0.01
+    again = lcollision("mirror", "body-swing", images, "-o", tmp_path / "c.json", "--json")
+    assert json.loads(again.stdout)[0]["restored"]
+    (back,) = read_poses(tmp_path / "c.json", swing)
+    np.testing.assert_array_equal(back.latent, swing.training_latent[30])

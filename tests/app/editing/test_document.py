@@ -497,6 +497,5 @@ def test_a_model_without_predictor_shows_poses_but_does_not_resolve(
     assert document.frame is not None
     assert document.frame.prediction is None
     assert not document.can_resolve
-    assert not document.can_mirror
     with pytest.raises(ModelFileError, match="no predictor"):
         document.resolve()

@@ -15,6 +15,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.editing.recovery import Autosave, find_lost_poses
 from app.view.shading import Shading
+from app.window.actions import ACTIONS
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
@@ -277,3 +278,25 @@ def test_a_joint_is_what_the_menu_of_its_slider_says(
     assert (changed.space.roles[1].name, changed.space.sides[1].value) == ("SHIN", "right")
     assert open_body(arm_file).fingerprint == changed.fingerprint
     menu.close()
+
+
+def test_a_greyed_action_says_why(qtbot: QtBot, tmp_path: Path, arm_file: Path) -> None:
+    """Of a body whose one arm has no other side, and of none."""
+    window = MainWindow(PoseDocument(library_folder=tmp_path), settings_in(tmp_path))
+    window.show()
+    actions = window.actions_by_key
+    for key in ("mirror", "export", "contacts", "learn_character", "reset_camera"):
+        assert not actions[key].isEnabled()
+        assert "Open a character or a model first" in actions[key].toolTip()
+    dropped(qtbot, window, arm_file)
+    assert actions["mirror"].statusTip() == (
+        "Cannot be mirrored: its joints are not named after left and right, and do not lie "
+        "symmetrically"
+    )
+    assert actions["undo"].statusTip() == "There is nothing to undo"
+    for key, action in actions.items():
+        assert action.isEnabled() == (action.statusTip() == ACTIONS[key].tip), key
+    window.document.set_code(7, 0.1)
+    assert actions["undo"].isEnabled()
+    assert actions["undo"].statusTip() == ACTIONS["undo"].tip
+    close_window(window)
