@@ -104,6 +104,16 @@ def mirrored_text(mirrored: MirroredPose) -> str:
     return f"mirrored with a {fit_error(mirrored.fit_error_mean, mirrored.fit_error_max)}, {state}"
 
 
+def error_rates(false_positive: float | None, false_negative: float | None) -> str:
+    """Say how often a predictor errs on either side; None where nothing was there to judge."""
+    sides = (
+        (false_positive, "the free poses are called colliding"),
+        (false_negative, "the colliding ones free"),
+    )
+    rates = ((None if rate is None else f"{100.0 * rate:.1f} %", what) for rate, what in sides)
+    return ", ".join(f"{rate or 'an unknown share'} of {what}" for rate, what in rates)
+
+
 def with_capital(text: str) -> str:
     """Begin with a capital, unless the first word is a file's name or a number."""
     word = text.partition(" ")[0]

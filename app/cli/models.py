@@ -12,7 +12,7 @@ from app.cli.console import ExitStatus, JsonOption, note, print_json, tell
 from app.cli.contact_options import rules_json, rules_sentence
 from app.cli.inputs import Axis
 from app.cli.results import require_output
-from app.wording import counted
+from app.wording import counted, error_rates
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -312,7 +312,8 @@ def _predictor_sentence(report: dict[str, Any]) -> str:
         return f"predictor {predictor['preset']}, not measured"
     return (
         f"predictor {predictor['preset']}: accuracy {100.0 * metrics['accuracy']:.1f} % on unseen "
-        f"samples (majority baseline: {100.0 * metrics['majority_rate']:.1f} %), of "
+        f"samples (majority baseline: {100.0 * metrics['majority_rate']:.1f} %; "
+        f"{error_rates(metrics['false_positive_rate'], metrics['false_negative_rate'])}), of "
         f"{predictor['rows']} labelled"
     )
 

@@ -18,7 +18,7 @@ from app.cli.contact_options import (
 )
 from app.cli.inputs import Axis
 from app.cli.interrupt import cancel_on_interrupt
-from app.wording import duration_text, spent_text
+from app.wording import duration_text, error_rates, spent_text
 from lcollision_core.errors import CancelledError, LCollisionError
 
 if TYPE_CHECKING:
@@ -151,16 +151,10 @@ def _print(card: LearnedCard) -> None:
         f"  reconstruction error {100.0 * card.error_mean:.2f} % of the body size, at most "
         f"{100.0 * card.error_max:.2f} %"
     )
-    rates = (
-        (f"{100.0 * rate:.1f} %" if rate is not None else "an unknown share") + what
-        for rate, what in (
-            (card.false_positive_rate, " of the free poses are called colliding"),
-            (card.false_negative_rate, " of the colliding ones free"),
-        )
-    )
     tell(
         f"  {100.0 * card.accuracy:.1f} % of unseen samples are classified correctly (majority "
-        f"baseline: {100.0 * card.majority_rate:.1f} %): {', '.join(rates)}"
+        f"baseline: {100.0 * card.majority_rate:.1f} %): "
+        f"{error_rates(card.false_positive_rate, card.false_negative_rate)}"
     )
     tell(
         f"  {100.0 * card.colliding_share:.1f} % of its {card.samples} samples collide; "

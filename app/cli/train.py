@@ -35,6 +35,7 @@ from app.cli.models import (
     measured_model_sentence,
     note_if_beside,
 )
+from app.wording import error_rates
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken
 
@@ -257,11 +258,11 @@ def told_of_embedding(status: TrainingStatus) -> Told:
 
 
 def told_of_predictor(status: PredictorStatus) -> Told:
-    """Put the epoch, the loss and the held-out accuracy into words."""
+    """Put the epoch, the loss and the held-out error rates into words."""
     if status.preparing is not None:
         return status.preparing, 1.0, "labelling patches", []
     facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
-    if status.held_out_accuracy is not None:
-        facts.append(f"{100.0 * status.held_out_accuracy:.1f} % accuracy")
+    if any(rate is not None for rate in status.held_out_errors):
+        facts.append(error_rates(*status.held_out_errors))
     epoch = f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}"
     return status.done, status.total, epoch, facts

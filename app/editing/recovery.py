@@ -123,6 +123,11 @@ class LostPose:
     file_stamp: FileStamp | None = None
 
     @property
+    def model_name(self) -> str:
+        """What people call the model."""
+        return Path(self.model).stem
+
+    @property
     def poses_file(self) -> Path:
         """An ordinary poses file, with the edited pose in it."""
         return self.session.folder / _POSES

@@ -224,8 +224,7 @@ class _Learner:
                 done = _PATCHES * status.preparing
             else:
                 done = _PATCHES + (1.0 - _PATCHES) * status.done / status.total
-            accuracy = status.held_out_accuracy
-            self._at(done, [] if accuracy is None else [f"{100.0 * accuracy:.1f} % accuracy"])
+            self._at(done, [])
 
         trained = train_predictor(
             store.load(effort.n_samples),

@@ -22,6 +22,7 @@ from lcollision_core.model.mirror import MirroredPose, MirrorSource, Symmetry, p
 from lcollision_core.model.model_store import ListedModel, user_models_folder
 from lcollision_core.model.naming import MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.model.posable_body import PosableBody
+from lcollision_core.model.rig_model import RigModel
 from lcollision_core.regular_files import read_regular
 
 if TYPE_CHECKING:
@@ -184,7 +185,7 @@ def write_poses(
     document = {
         "format": POSES_FORMAT,
         "format_version": POSES_VERSION if needs_latest else 1,
-        "model": {"name": model.name, "fingerprint": model.fingerprint},
+        "model": {"name": model.name, "fingerprint": model.fingerprint, **_measures(model)},
         **({} if working is None else {"working": entries[-1]}),
         "poses": entries[: len(poses)],
         **(extra or {}),
@@ -296,7 +297,11 @@ def _other_model(
         str(owner.get(key))[:MAX_POSE_NAME_LENGTH] for key in ("fingerprint", "name")
     )
     listed, character = find_latent_space(fingerprint, name), find_character(fingerprint)
-    if listed is not None:
+    known = listed or character
+    if known is not None and known.name == model.name:
+        what = f"holds poses of another {name!r}, {known.path}: {_difference(owner, model)}"
+        next_step = f"use them with {known.path}"
+    elif listed is not None:
         what = f"holds poses of the model {listed.name!r}, not of {model.name!r}"
         next_step = f"use them with {listed.name!r}"
     elif character is not None:
@@ -304,7 +309,8 @@ def _other_model(
         next_step = f"use them with {character.path}"
     elif name == model.name:
         what = (
-            f"holds poses of another model called {name!r} too, which is not among the models here"
+            f"holds poses of another model called {name!r} too, which is not among the models "
+            f"here: {_difference(owner, model)}"
         )
         next_step = "use them with the model that they were made with"
     else:
@@ -313,7 +319,28 @@ def _other_model(
             f"the models here"
         )
         next_step = f"copy its file to {user_models_folder()}, or name it"
-    return OtherModelError(what, next_step, where=path, model=listed or character)
+    return OtherModelError(what, next_step, where=path, model=known)
+
+
+def _measures(model: PosableBody) -> dict[str, int]:
+    """Return what people can tell models of one name apart by."""
+    joints = {"joints": model.space.n_joints} if isinstance(model, RigModel) else {}
+    return joints | {"vertices": model.n_vertices, "codes": model.latent_size}
+
+
+def _difference(owner: dict[str, Any], model: PosableBody) -> str:
+    """Say what the model of a file differs in from another model of its name."""
+    said = [
+        f"{owner[what]} {what} instead of {number}"
+        for what, number in _measures(model).items()
+        if type(owner.get(what)) is int and owner[what] != number
+    ]
+    if said:
+        return f"it has {', '.join(said)}"
+    alike = "has as many vertices, but" if "vertices" in owner else "is another export:"
+    if isinstance(model, RigModel):
+        return f"it {alike} its joints rest elsewhere, turn otherwise or move other vertices"
+    return f"it {alike} its codes were learned in another training"
 
 
 def to_json(pose: NamedPose) -> dict[str, Any]:

@@ -85,7 +85,7 @@ class ExportDialog(_FrameForm):
             self.source.setAutoDefault(False)
             self.source.setToolTip("Your OBJ or GLB file of this body, whose UVs and groups stay")
             self.source.clicked.connect(self._ask_for_source)
-            self.add_widget("Keep file", self.source)
+            self.add_widget("Write into a copy of", self.source)
         self.form = self.add_choice("export_form", "Form", {MESH: "Mesh"}, "What is written")
         self._readers["export_form"] = self._remembered_form
         self.axes, self._scale = self._add_frame(model)
@@ -136,7 +136,9 @@ class ExportDialog(_FrameForm):
         source = self._character or self.like
         has_rig = self._character is not None
         if not has_rig:
-            self.source.setText(menu_text(self.like.name) if self.like else "None: write a mesh")
+            self.source.setText(
+                menu_text(self.like.name) if self.like else "No file (a plain mesh)"
+            )
         offered = offered_forms(source, has_rig=has_rig) if source is not None else ()
         self._forms = {form.key: form for form in offered if not form.is_sequence}
         wanted = self._settings["export_form"]

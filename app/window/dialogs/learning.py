@@ -384,7 +384,11 @@ def _figures(card: LearnedCard) -> list[tuple[str, str]]:
             "Error",
             f"{error}, at most {height_text(card.error_max)}",
         ),
-        ("Estimate", f"right for {_percent(card.accuracy)} of new poses"),
+        (
+            "Estimate",
+            f"right for {_percent(card.accuracy)} of new poses; always giving the more frequent "
+            f"answer, for {_percent(card.majority_rate)}",
+        ),
         (
             "False positive rate",
             "unknown: no sample was free"

@@ -39,15 +39,17 @@ class Choice(Enum):
     CANCEL = _Role.RejectRole
 
 
-def ask_about_changes(parent: QWidget, pose_name: str, file_name: str = "") -> Choice:
+def ask_about_changes(
+    parent: QWidget, pose_name: str, model_name: str, file_name: str = ""
+) -> Choice:
     """Ask about unsaved changes, naming what Save writes: the file, if there is one.
 
     The pose's name alone would promise that the library's pose of that name changes.
     """
-    text = f"Save the pose “{pose_name}” to a file?"
+    text = f"Save the pose “{pose_name}” of “{model_name}” to a file?"
     if file_name:
-        text = f"Save the changes to “{file_name}”?"
-    note = "They will be lost if you don't save them."
+        text = f"Save the pose “{pose_name}” of “{model_name}” to “{file_name}”?"
+    note = "It will be lost if you don't save it."
     return _ask(parent, "Unsaved changes", text, note, ("Save", "Discard", "Cancel"))
 
 
@@ -77,7 +79,8 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Choice:
     return _ask(
         parent,
         "Recover a pose",
-        f"The editor closed unexpectedly while “{lost.pose_name}” was not saved.",
+        f"The editor closed unexpectedly while the pose “{lost.pose_name}” of "
+        f"“{lost.model_name}” was not saved.",
         f"It was saved automatically on {moment.day} {moment:%B at %H:%M}. Recover it?",
         ("Recover", "Delete it", "Ask later"),
     )
@@ -104,9 +107,14 @@ def ask_to_replace(parent: QWidget, name: str) -> bool:
     return answer is Choice.SAVE
 
 
-def ask_to_switch(parent: QWidget, file: str, model: str) -> bool:
-    """Ask whether the model that a file of poses belongs to is to be opened with it."""
-    text = f"{file} holds poses of the model “{model}”."
+def ask_to_switch(parent: QWidget, file: str, model: str, differs: str = "") -> bool:
+    """Ask whether the model that a file of poses belongs to is to be opened with it.
+
+    Parameters
+    ----------
+    differs : the sentence for a model of the same name as the one that is open
+    """
+    text = f"{file} {differs or f'holds poses of the model “{model}”'}."
     note = f"Open “{model}” with these poses?"
     buttons = (f"Open “{menu_text(model)}”", "", "Cancel")
     return _ask(parent, "Poses of another model", text, note, buttons) is Choice.SAVE

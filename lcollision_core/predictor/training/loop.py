@@ -36,7 +36,7 @@ _RUN_VERSION = 7
 """Raised when training changes, so that no checkpoint is resumed with other rules."""
 
 _WATCHED_ROWS = 4000
-"""Held-out rows whose accuracy is shown while training."""
+"""Held-out rows whose error rates are shown while training."""
 
 _BUILDING_ROWS = 65_536
 """Training rows that a network may see when it is built: enough for its statistics."""
@@ -98,7 +98,7 @@ class TrainingLoop:
         self._epochs = self.config.passes(len(self._training_index))
         self._total = self._epochs * self._steps_an_epoch
         self._losses: list[float] = []
-        self._accuracy: float | None = None
+        self._errors: tuple[float | None, float | None] = (None, None)
         self._average: AveragedModel | None = None
         self._averaged_every = min(_STEPS_BETWEEN_AVERAGES, self._steps_an_epoch)
         self._reported = -math.inf
@@ -241,7 +241,7 @@ class TrainingLoop:
             talk = step % _STEPS_BETWEEN_TALKS == 0
             stop = talk and processes.any_of(stop)
         if step % self._steps_an_epoch == 0:
-            self._accuracy = _accuracy(self._judged(network), self._watched)
+            self._errors = _error_rates(self._judged(network), self._watched)
         if processes.rank == 0 and (stop or due):
             self._save(step, network, optimiser, checkpoint)
         if stop:
@@ -263,7 +263,7 @@ class TrainingLoop:
                 done=step,
                 total=self._total,
                 loss=math.fsum(self._losses) / len(self._losses) if self._losses else None,
-                held_out_accuracy=self._accuracy,
+                held_out_errors=self._errors,
                 preparing=self._preparing,
             )
         )
@@ -303,7 +303,7 @@ class TrainingLoop:
         for number, moments in optimiser.state_dict()["state"].items():
             for name, values in moments.items():
                 state[f"{_OPTIMISER}{number}:{name}"] = values.cpu().numpy()
-        facts = {"step": step, "losses": self._losses, "accuracy": self._accuracy}
+        facts = {"step": step, "losses": self._losses, "errors": self._errors}
         checkpoint.put(_PART, state, facts)
 
     def _restore(
@@ -326,7 +326,7 @@ class TrainingLoop:
             state["state"].setdefault(int(number), {})[what] = values
         optimiser.load_state_dict(state)
         self._losses = list(stored.metadata["losses"])
-        self._accuracy = stored.metadata["accuracy"]
+        self._errors = tuple(stored.metadata.get("errors", (None, None)))
         return int(stored.metadata["step"])
 
 
@@ -365,14 +365,20 @@ class _Batches:
         return tensor.to(self.device, non_blocking=True)
 
 
-def _accuracy(network: PredictorNetwork, rows: LabelRows) -> float:
+def _error_rates(network: PredictorNetwork, rows: LabelRows) -> tuple[float | None, float | None]:
+    """Return the false positive and the false negative rate; None where no row is of the kind."""
     device = next(network.parameters()).device
     parts = torch.split(torch.from_numpy(rows.latent), BATCH_ROWS)
     network.eval()
     with torch.inference_mode():
         logit = torch.cat([network(part.to(device)).logit for part in parts])
     network.train()
-    return float(((logit > 0.0).cpu().numpy() == rows.colliding).mean())
+    wrong = (logit > 0.0).cpu().numpy() != rows.colliding
+    free, colliding = wrong[~rows.colliding], wrong[rows.colliding]
+    return (
+        float(free.mean()) if len(free) else None,
+        float(colliding.mean()) if len(colliding) else None,
+    )
 
 
 def _averaged(network: PredictorNetwork, weight: float) -> AveragedModel:

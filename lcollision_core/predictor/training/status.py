@@ -16,7 +16,8 @@ class PredictorStatus:
     epoch, epochs : passes over the rows, finished and in all
     done, total : steps of the whole run
     loss : mean over the steps of this epoch so far, None before the first
-    held_out_accuracy : of some held-out rows after the last epoch, None before that
+    held_out_errors : false positive and false negative rate on some held-out rows after the last
+        epoch; None before that, and where no row is of the kind
     preparing : fraction of the training rows whose patches are labelled; None once training began
     """
 
@@ -25,7 +26,7 @@ class PredictorStatus:
     done: int
     total: int
     loss: float | None
-    held_out_accuracy: float | None
+    held_out_errors: tuple[float | None, float | None]
     preparing: float | None = None
 
 

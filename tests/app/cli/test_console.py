@@ -35,14 +35,19 @@ BARS = {
     "predictor": (
         "from app.cli.train import told_of_predictor as told_of\n"
         "from lcollision_core.predictor import PredictorStatus\n"
-        "status = PredictorStatus(1, 30, 20, 100, 0.5, 0.875, None)\n"
+        "status = PredictorStatus(1, 30, 20, 100, 0.5, (0.04, None), None)\n"
         "rows = False",
-        ("epoch 2 of 30", "20%", "loss 0.500, 87.5 % accuracy"),
+        (
+            "epoch 2 of 30",
+            "20%",
+            "loss 0.500, 4.0 % of the free poses are called colliding, an unknown share of the "
+            "colliding ones free",
+        ),
     ),
     "patches": (
         "from app.cli.train import told_of_predictor as told_of\n"
         "from lcollision_core.predictor import PredictorStatus\n"
-        "status = PredictorStatus(0, 30, 0, 100, None, None, 0.25)\n"
+        "status = PredictorStatus(0, 30, 0, 100, None, (None, None), 0.25)\n"
         "rows = False",
         ("labelling patches", "25%"),
     ),

@@ -153,7 +153,10 @@ def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
     # It looks out for signals until the process ends.
     start_up.setParent(None)
     rest(qtbot, window)
-    assert offers == ["The editor closed unexpectedly while “bent” was not saved."]
+    name = model_file.stem
+    assert offers == [
+        f"The editor closed unexpectedly while the pose “bent” of “{name}” was not saved."
+    ]
     assert document.pose_name == "bent"
     assert document.modified
     assert np.array_equal(shown(window), decoded(document))

@@ -451,7 +451,9 @@ def test_changes_are_saved_kept_or_given_up_as_the_user_says(
     assert not window.close()
     assert not asked.isActive()
     assert window.isVisible()
-    assert questions == [f"Save the pose “{document.pose_name}” to a file?"]
+    assert questions == [
+        f"Save the pose “{document.pose_name}” of “{document.model.name}” to a file?"
+    ]
     path = tmp_path / "mine.json"
     document.save(path)
     assert not window.isWindowModified()
@@ -468,7 +470,9 @@ def test_changes_are_saved_kept_or_given_up_as_the_user_says(
     assert window.close()
     assert not asked.isActive()
     # Save writes the file, not the pose of the library that this one began as.
-    assert questions[1:] == ["Save the changes to “mine.json”?"]
+    assert questions[1:] == [
+        f"Save the pose “{document.pose_name}” of “{document.model.name}” to “mine.json”?"
+    ]
     assert read_poses(path, document.model)[0].latent.tobytes() == latent.tobytes()
 
 

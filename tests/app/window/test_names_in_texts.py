@@ -94,7 +94,7 @@ def test_dialogs_show_a_name_to_the_letter(hostile: MainWindow) -> None:
         dialog.reject()
 
     for act in (
-        lambda: ask_about_changes(hostile, name),
+        lambda: ask_about_changes(hostile, name, "hero"),
         lambda: ask_for_name(hostile, "Rename", f"New name of “{name}”:", name),
     ):
         asked = answer(look)

@@ -20,9 +20,12 @@ from lcollision_core.model import (
     NamedPose,
     OtherModelError,
     PoseModel,
+    RigModel,
     name_of_file,
+    open_body,
     read_pose_file,
     read_poses,
+    remember_file,
     unique_names,
     user_models_folder,
     write_poses,
@@ -31,6 +34,7 @@ from lcollision_core.model.latent_identity import find_latent_space
 from lcollision_core.model.pose_file import MAX_PINS, POSES_VERSION
 from lcollision_core.posing import Pin
 from tests.core.shapes import random_rotation
+from tests.rigged_shapes import rigged_body, rigged_tube, write_gltf
 
 
 @pytest.fixture
@@ -329,3 +333,32 @@ def test_any_files_name_makes_a_poses_name(model: PoseModel, tmp_path: Path) -> 
     write_poses(tmp_path / "poses.json", model, poses)
     names = [pose.name for pose in read_poses(tmp_path / "poses.json", model)]
     assert names == ["? bend", "y" * 200]
+
+
+def test_of_two_characters_of_one_name_it_is_said_what_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of two exports of one character, of which poses of one do not fit the other."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    body, poses = rigged_body(), tmp_path / "poses.json"
+    model = RigModel.of(replace(body, name="ely"))
+    write_poses(poses, model, [NamedPose("rest", np.zeros(model.latent_size))])
+    shorter = RigModel.of(replace(rigged_tube(), name="ely"))
+    with pytest.raises(OtherModelError, match="another model called 'ely' too") as caught:
+        read_poses(poses, shorter)
+    n_joints, n_vertices = model.space.n_joints, model.n_vertices
+    assert f"it has {n_joints} joints instead of 3, {n_vertices} vertices" in str(caught.value)
+    assert body.rig is not None
+    rest = body.rig.rest.copy()
+    rest[5, 0, 3] += 0.01
+    moved = RigModel.of(replace(body, name="ely", rig=replace(body.rig, rest=rest)))
+    with pytest.raises(OtherModelError, match="has as many vertices, but its joints rest else"):
+        read_poses(poses, moved)
+    # Where the file of the other is known, it is named.
+    file = write_gltf(body, tmp_path / "ely.glb")
+    known = open_body(file)
+    assert isinstance(known, RigModel)
+    remember_file(known, file)
+    write_poses(poses, known, [NamedPose("rest", known.training_latent[0])])
+    with pytest.raises(OtherModelError, match=r"holds poses of another 'ely', .*ely\.glb: it has"):
+        read_poses(poses, shorter)
