@@ -17,6 +17,10 @@ confirmed_free_rate : of those
 miss_mean, miss_reachable : mean distance that is left at the end, of all targets and of those that
     a training pose reaches; normalised
 rest_motion : mean distance of the vertices from the start beyond 0.25 from the patch; normalised
+others_motion : median over the other limbs of all drags of the mean distance of their vertices from
+    the start; normalised
+others_bent : the most by which another limb differs from the start, by the root of the mean squared
+    distance of its vertices after the best rigid motion; normalised
 largest_stretch : of all edges, the largest ratio of the length to the longest in a training pose
 pin_drift, pin_drift_reachable : the most that a pin moved, of all and of those that the target does
     not contradict, as a training pose reaches it; normalised; None with fewer than five targets
@@ -35,6 +39,8 @@ from app.benchmarks.timing import Row
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.alignment import fit_rigid
+from lcollision_core.meshes.limbs import Limbs
 from lcollision_core.model import PosableBody, RigModel
 from lcollision_core.posing import DragOptions, Grip, Pin, far_end, make_grip
 from lcollision_core.posing.stretch import largest_stretch
@@ -202,6 +208,13 @@ def _places_on_rig(model: RigModel) -> dict[str, int]:
     return places
 
 
+def _other_limbs(limbs: Limbs, grip: Grip) -> list[npt.NDArray[np.intp]]:
+    """Return the vertices of each limb that does not carry a patch, nor hangs on what does."""
+    held = set(limbs.path(limbs.holding(grip.vertices, grip.weights)))
+    tops = limbs.tops[limbs.leads]
+    return [np.flatnonzero(tops == top) for top in np.unique(tops) if top not in held]
+
+
 def _time_mode(
     model: PosableBody,
     start: FloatArray,
@@ -216,7 +229,7 @@ def _time_mode(
     seconds: list[float] = []
     free: list[bool] = []
     confirmed: list[bool] = []
-    misses, rest, stretch = [], [], []
+    misses, rest, stretch, others, bent = [], [], [], [], []
     drifts: list[tuple[str, float]] = []
     options = DragOptions(solid=solid)
     before = model.decode(start, n_threads=1)
@@ -242,6 +255,11 @@ def _time_mode(
         reach = np.linalg.norm(model.reference - model.reference[drag.grip.vertex], axis=1)
         moved = np.linalg.norm(after - before, axis=1)[reach > _REST * size]
         rest.append(float(moved.mean()) / size)
+        for limb in _other_limbs(model.pose_space.limbs, drag.grip):
+            others.append(float(np.linalg.norm(after[limb] - before[limb], axis=1).mean()))
+            rotation, translation = fit_rigid(before[limb], after[limb])
+            left = before[limb] @ rotation.T + translation - after[limb]
+            bent.append(float(np.sqrt((left**2).sum(axis=1).mean())))
         longest = model.pose_space.longest_edges
         stretch.append(largest_stretch(after / size, model.topology.edges, longest))
         for pin in drag.pins:
@@ -264,6 +282,8 @@ def _time_mode(
         "miss_mean": float(np.mean(misses)),
         "miss_reachable": float(np.mean(np.array(misses)[reachable])),
         "rest_motion": float(np.mean(rest)),
+        "others_motion": float(np.median(others)) / size,
+        "others_bent": float(np.max(bent)) / size,
         "largest_stretch": float(np.max(stretch)),
         "pin_drift": max((d for _, d in drifts), default=None),
         "pin_drift_reachable": max((d for kind, d in drifts if kind == "reachable"), default=None),

@@ -12,7 +12,7 @@ from PySide6.QtCore import QObject, Signal, Slot
 from app.editing.codes import CodeEditing
 from app.editing.history import Gesture, read_only
 from app.wording import counted
-from app.work.frames import NO_CONTACTS, ExactVerdict, LiveFrame
+from app.work.frames import NO_POINTS, ExactVerdict, LiveFrame
 from app.work.live_pose import DragSession, LivePose
 
 if TYPE_CHECKING:
@@ -57,6 +57,8 @@ class LiveEditing(CodeEditing):
     frame : the newest computed one; while a slider moves, an instant behind `latent`
     exact : the exact check of `latent`; None until then
     solid : drags and edits of the codes keep the pose out of itself
+    standing : what stands on the ground stays there in drags
+    whole_body : all of the body helps in drags, not only the limb that is held
     drag_strength : how strongly drags keep to poses like those of the training, 0 not at all
     """
 
@@ -71,6 +73,7 @@ class LiveEditing(CodeEditing):
         self.frame: LiveFrame | None = None
         self.exact: ExactVerdict | None = None
         self.solid = True
+        self.standing, self.whole_body = True, False
         self.drag_strength = 1.0
         self._predicts = False
         self._drag: Drag | None = None
@@ -133,17 +136,18 @@ class LiveEditing(CodeEditing):
         """Whether a pose is wanted that the worker has not settled on yet."""
         return self._drag is not None and self._live.is_dragging
 
-    def begin_drag(self, grip: Grip | Twist, label: str) -> None:
+    def begin_drag(self, grip: Grip | Twist, label: str, whole_body: bool = False) -> None:
         """Take hold of a patch, or of a body part to twist; pins and locked body parts stay.
 
         Parameters
         ----------
         label : of the step of undo
+        whole_body : let all of the body help this time, whatever `self.whole_body` is
         """
         self.begin_gesture(label)
-        self._drag = self._begun(grip, self.pose.pins)
+        self._drag = self._begun(grip, self.pose.pins, whole_body)
 
-    def begin_pin_drag(self, index: int) -> None:
+    def begin_pin_drag(self, index: int, whole_body: bool = False) -> None:
         """Take hold of a pinned patch; the pin comes along, and the other pins stay."""
         from lcollision_core.posing import make_grip
 
@@ -151,7 +155,7 @@ class LiveEditing(CodeEditing):
         pin = pins[index]
         grip = make_grip(self.model.pose_space, pin.vertex, pin.radius)
         self.begin_gesture(f"Move pin on {self.part_name(pin.vertex)}")
-        self._drag = self._begun(grip, pins[:index] + pins[index + 1 :])
+        self._drag = self._begun(grip, pins[:index] + pins[index + 1 :], whole_body)
         self._drag.pin = index, grip
 
     def drag_to(self, target: npt.ArrayLike) -> None:
@@ -205,7 +209,7 @@ class LiveEditing(CodeEditing):
             return
         if drag.session.grip is not None:
             # No hand presses against the contacts any more.
-            self.frame = replace(self.frame, contacts=NO_CONTACTS)
+            self.frame = replace(self.frame, contacts=NO_POINTS, standing=NO_POINTS)
         elif not was_moving:
             return
         # What shows the wanted codes shows those of the pose again.
@@ -219,12 +223,20 @@ class LiveEditing(CodeEditing):
                 # The predictor has come in the middle of the drag.
                 self._live.follow(self.model, self.latent, self._predicts)
 
-    def _begun(self, grip: Grip | Twist | None, pins: tuple[Pin, ...] = ()) -> Drag:
+    def _begun(
+        self, grip: Grip | Twist | None, pins: tuple[Pin, ...] = (), whole_body: bool = False
+    ) -> Drag:
         from lcollision_core.posing import DragOptions
 
         # What a code's target leaves as it was stays, so that locks need no more than that.
         locked = frozenset() if grip is None else self.locked_domains
-        options = DragOptions(self.solid, self.drag_strength, locked)
+        options = DragOptions(
+            solid=self.solid,
+            strength=self.drag_strength,
+            locked_domains=locked,
+            standing=self.standing,
+            whole_body=self.whole_body or whole_body,
+        )
         return Drag(
             DragSession(self.model, self.latent, grip, pins, options, self.placement),
         )
@@ -269,21 +281,30 @@ class LiveEditing(CodeEditing):
         """Patches that stay where they are while others are dragged."""
         return self.pose.pins
 
-    def pin(self, grip: Grip) -> None:
-        """Pin a patch where it is."""
-        self.pin_grips([grip], f"Pin {self.part_name(grip.vertex)}")
+    def pin(self, grip: Grip, oriented: bool = False) -> None:
+        """Pin a patch where it is; see `pin_grips`."""
+        self.pin_grips([grip], f"Pin {self.part_name(grip.vertex)}", oriented)
 
-    def pin_grips(self, grips: Sequence[Grip], label: str) -> None:
-        """Pin patches where they are, as one step; a pin on the same vertex is replaced."""
+    def pin_grips(self, grips: Sequence[Grip], label: str, oriented: bool = False) -> None:
+        """Pin patches where they are, as one step; a pin on the same vertex is replaced.
+
+        Parameters
+        ----------
+        oriented : their body parts keep their orientation too
+        """
         from lcollision_core.model import MAX_PINS
-        from lcollision_core.posing import Pin
+        from lcollision_core.posing import Pin, frame_round
 
         frame = self.frame
         if frame is None:
             return
         is_late = frame.latent is not self.latent
         vertices = self.model.decode(self.latent, n_threads=1) if is_late else frame.vertices
-        added = {grip.vertex: Pin.of(grip, vertices) for grip in grips}
+        space = self.model.pose_space
+        added = {
+            grip.vertex: Pin.of(grip, vertices, frame_round(space, grip.vertex) if oriented else ())
+            for grip in grips
+        }
         kept = [pin for pin in self.pins if pin.vertex not in added]
         pins = (*kept, *added.values())
         if len(pins) > MAX_PINS:
@@ -295,11 +316,11 @@ class LiveEditing(CodeEditing):
         """Whether a pin is on a vertex."""
         return any(pin.vertex == vertex for pin in self.pins)
 
-    def toggle_pin(self, vertex: int) -> None:
-        """Pin the patch round a vertex, of the present radius, or remove the pin on it."""
+    def toggle_pin(self, vertex: int, oriented: bool = False) -> None:
+        """Pin the patch round a vertex, of the present radius, or remove such a pin on it."""
         index = next((i for i, pin in enumerate(self.pins) if pin.vertex == vertex), None)
-        if index is None:
-            self.pin(self.grip_at(vertex))
+        if index is None or bool(self.pins[index].frame) is not oriented:
+            self.pin(self.grip_at(vertex), oriented)
         else:
             self.unpin(index)
 
@@ -341,8 +362,6 @@ class LiveEditing(CodeEditing):
     @Slot(object)
     def _on_dragged(self, frame: LiveFrame) -> None:
         """Adopt what a drag has reached as the pose."""
-        from lcollision_core.posing import Pin
-
         drag = self._drag
         if drag is None:
             return
@@ -354,7 +373,7 @@ class LiveEditing(CodeEditing):
             if drag.pin is not None:
                 index, grip = drag.pin
                 pins = list(self.pins)
-                pins[index] = Pin.of(grip, frame.vertices)
+                pins[index] = pins[index].moved(grip, frame.vertices)
                 state = replace(state, pose=replace(state.pose, pins=tuple(pins)))
         self.frame, self.exact = frame, frame.verdict
         self._adopted = frame.latent

@@ -42,6 +42,8 @@ SETTINGS: dict[str, Setting] = {
     "shading": Setting("domains", choices=("plain", "domains", "predicted", "exact", "movement")),
     "show_ghost": Setting(True),
     "solid": Setting(True),
+    "standing": Setting(True),
+    "whole_body": Setting(False),
     "drag_strength": Setting(1.0, 0.0, 100.0),
     "model": Setting("body"),
     "recent_files": Setting(()),

@@ -248,6 +248,12 @@ def places_of(view: View, points: npt.NDArray[Any], size: Pixel) -> FloatArray:
     return np.stack([0.5 * size[0] + right / pixel, 0.5 * size[1] - upward / pixel], axis=1)
 
 
+def pixel_length(view: View, point: FloatArray, size: Pixel) -> float:
+    """Return how long one pixel of a picture is at a (3,) point, in the data's unit."""
+    depth = float((point - view.position) @ _axes(view)[2])
+    return float(_pixel(max(depth, 1e-9), size[1]))
+
+
 def _axes(view: View) -> FloatArray:
     """Return the camera's right, up and forward, each of length 1, as the rows of a matrix."""
     forward = view.focus - view.position

@@ -32,6 +32,9 @@ _NOTCH = 120.0  # of a wheel, in eighths of a degree
 _CLICK = 4
 """Pixels that the pointer may move in a click."""
 
+_KEYS_OF_DRAGS = {Qt.Key.Key_Escape: 0.0, Qt.Key.Key_PageUp: 1.0, Qt.Key.Key_PageDown: -1.0}
+"""Keys that a drag takes before the window, and the notches of the wheel that they stand for."""
+
 _FOR_THE_WINDOW = (
     QEvent.Type.KeyPress,
     QEvent.Type.KeyRelease,
@@ -98,7 +101,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
     dragged : QPointF, where the pointer is now
     drag_ended : bool, whether by Escape
     double_clicked : QPointF
-    wheel_turned : QPointF, float, in notches, and Qt.KeyboardModifiers
+    wheel_turned : QPointF, float, in notches, and Qt.KeyboardModifiers; also by keys in a drag
     pinched : QPointF and float, the factor by which two fingers were spread
     menu_wanted : QPointF in the widget, where it was clicked with the right button
     """
@@ -272,19 +275,23 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
             self.menu_wanted.emit(self._pointer or QPointF(self.rect().center()))
 
     def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802 - Qt's name
-        """Signal how far the wheel or two fingers have turned; not during a drag."""
+        """Signal how far the wheel or two fingers have turned; not before a drag has begun."""
         event.accept()
         notches = event.angleDelta().y() / _NOTCH
-        if notches and self._press is None:
+        if notches and (self._press is None or self.is_dragging):
             self.wheel_turned.emit(event.position(), notches, event.modifiers())
 
     def event(self, event: QEvent) -> bool:
-        """Signal fingers that are spread, and Escape in a drag; leave the rest to the window."""
-        if self.is_dragging and isinstance(event, QKeyEvent) and event.key() == Qt.Key.Key_Escape:
+        """Signal fingers that are spread, and keys in a drag; leave the rest to the window."""
+        if self.is_dragging and isinstance(event, QKeyEvent) and event.key() in _KEYS_OF_DRAGS:
             # Before the window's shortcut.
             event.accept()
             if event.type() is QEvent.Type.KeyPress:
-                self._let_go(escaped=True)
+                notches = _KEYS_OF_DRAGS[Qt.Key(event.key())]
+                if notches and self._pointer is not None:
+                    self.wheel_turned.emit(self._pointer, notches, Qt.KeyboardModifier.NoModifier)
+                elif not notches:
+                    self._let_go(escaped=True)
             return True
         if event.type() in _FOR_THE_WINDOW:
             event.ignore()

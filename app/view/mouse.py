@@ -11,6 +11,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, QPointF, Qt, Signal, Slot
 
 from app.view.camera import Pixel, View, seen_at, shifted, turn_about, turned, zoomed
+from app.view.depth import DragDepth, along_axis
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -29,6 +30,8 @@ _ZOOM_SECONDS = 0.5
 
 _DEGREES_PER_PIXEL = 0.4
 _TWIST_PER_PIXEL = np.pi / 300.0
+_DEPTH_PER_NOTCH = 0.015
+"""Normalised length by which a notch of the wheel brings nearer what is dragged."""
 
 _Drag = Callable[[QPointF], None]
 
@@ -36,9 +39,11 @@ _Drag = Callable[[QPointF], None]
 class Mouse(QObject):
     """Turns motions of the mouse over one canvas into drags of the body and of the camera.
 
-    Left on the body drags the patch under the pointer in the plane of the picture, with Ctrl it
-    twists the body part; left beside it, middle or Alt turn the camera, with Shift they shift it.
-    Right, up and down, zooms, as the wheel does.
+    Left on the body drags the patch under the pointer in the plane of the picture or along the
+    surface that is in the way; meanwhile the wheel brings it nearer. With Ctrl it twists the body
+    part, with Ctrl and Shift the whole body helps; an arrow is dragged along its axis. Left beside
+    the body, middle or Alt turn the camera, with Shift they shift it. Right, up and down, zooms, as
+    the wheel does.
 
     Parameters
     ----------
@@ -50,6 +55,7 @@ class Mouse(QObject):
     ----------
     vertex : under the pointer, or None
     pin : index of the pin under the pointer, or None
+    arrows : vertex whose patch has arrows to drag, or None
 
     Signals
     -------
@@ -72,11 +78,13 @@ class Mouse(QObject):
         self._document, self._canvas, self._scene = document, canvas, scene
         self.vertex: int | None = None
         self.pin: int | None = None
+        self.arrows: int | None = None
         self._last_vertex: int | None = None
         self._keeps = False
         self._drag: _Drag | None = None
         self._grip: Grip | None = None
         self._target: FloatArray | None = None
+        self._deepen: Callable[[float], None] | None = None
         self._zoom_anchor: tuple[QPointF, FloatArray, float] | None = None
         canvas.hovered.connect(self._on_hovered)
         canvas.drag_began.connect(self._on_drag_began)
@@ -90,9 +98,13 @@ class Mouse(QObject):
 
     def let_go(self) -> None:
         """Forget what is under the pointer and what is dragged, as of another model."""
-        self._drag = self._grip = self._target = None
+        self._forget_drag()
+        self.arrows = None
         self.point_at(None)
         self._last_vertex = None
+
+    def _forget_drag(self) -> None:
+        self._drag = self._grip = self._target = self._deepen = None
 
     def point_at(self, place: QPointF | None) -> None:
         """Find what is under the pointer, and show the patch that a drag would take."""
@@ -129,10 +141,15 @@ class Mouse(QObject):
         self._keeps = False
         self._canvas.look_again()
 
-    def toggle_pin(self) -> None:
-        """Pin the patch under the pointer, or take its pin away."""
+    def toggle_pin(self, oriented: bool = False) -> None:
+        """Pin the patch under the pointer, maybe with its orientation, or take its pin away."""
         if self.vertex is not None:
-            self._document.toggle_pin(self.vertex)
+            self._document.toggle_pin(self.vertex, oriented)
+
+    def toggle_arrows(self) -> None:
+        """Draw arrows on the patch under the pointer, or take them away."""
+        self.arrows = None if self.vertex == self.arrows else self.vertex
+        self.redraw_wanted.emit()
 
     def mark(self, scene: Scene, vertices: npt.NDArray[np.float32]) -> None:
         """Bring the marks on the body up to date, just before a picture.
@@ -143,10 +160,27 @@ class Mouse(QObject):
         vertices : (V, 3) array, of the pose that is drawn
         """
         self._mark_pins(scene)
-        lines = []
+        line = None
         if self._grip is not None and self._target is not None:
-            lines = [[self._grip.position(vertices), self._target]]
-        scene.marks.show_lines(np.array(lines).reshape(-1, 2, 3))
+            up = self._up
+            below = self._target + ((vertices @ up).min() - self._target @ up) * up
+            line = np.stack([self._grip.position(vertices), self._target, below])
+        scene.marks.show_target(line)
+        origin = None if self.arrows is None else self._home(self.arrows, vertices)
+        scene.marks.show_arrows(origin, self._axes)
+
+    @property
+    def _up(self) -> FloatArray:
+        return np.eye(3)[self._document.model.up_axis]
+
+    @property
+    def _axes(self) -> FloatArray:
+        """The body's left, front and up, as rows."""
+        up, front = self._up, self._document.model.front
+        return np.stack([np.cross(up, front), front, up])
+
+    def _home(self, vertex: int, vertices: npt.NDArray[np.floating]) -> FloatArray:
+        return self._document.grip_at(vertex).position(vertices)
 
     def _mark_pins(self, scene: Scene) -> None:
         document, pins = self._document, self._document.pins
@@ -187,7 +221,9 @@ class Mouse(QObject):
         if keys & Qt.KeyboardModifier.ControlModifier:
             document = self._document
             document.set_grip_radius(document.grip_radius * RADIUS_STEP**notches)
-        else:
+        elif self._deepen is not None:
+            self._deepen(-notches)
+        elif not self._canvas.is_dragging:
             self._zoom(place, _ZOOM_PER_NOTCH**-notches)
 
     # Drags.
@@ -200,18 +236,23 @@ class Mouse(QObject):
         if scene is None:
             return
         modifier = Qt.KeyboardModifier
+        helped = bool(keys & modifier.ControlModifier and keys & modifier.ShiftModifier)
+        left = button is Qt.MouseButton.LeftButton
+        axis = scene.marks.arrow_at(_pixel(start), scene.view, self._size) if left else None
         if button is Qt.MouseButton.RightButton:
             self._drag = self._zooming(start)
-        elif keys & modifier.ShiftModifier:
+        elif axis is not None and self.arrows is not None:
+            self._drag = self._moving_along(scene, start, self.arrows, self._axes[axis])
+        elif keys & modifier.ShiftModifier and not helped:
             self._drag = self._shifting(start)
-        elif button is Qt.MouseButton.LeftButton and not keys & modifier.AltModifier:
+        elif left and not keys & modifier.AltModifier:
             self.point_at(start)
             if self.vertex is None:
                 self._drag = self._turning(start)
-            elif keys & modifier.ControlModifier and self.pin is None:
+            elif keys & modifier.ControlModifier and not helped and self.pin is None:
                 self._drag = self._twisting(scene, start, self.vertex)
             else:
-                self._drag = self._moving(scene, start, self.vertex)
+                self._drag = self._moving(scene, start, self.vertex, helped)
         else:
             self._drag = self._turning(start)
         # A patch that is not dragged would be in the way of what is looked at.
@@ -225,7 +266,7 @@ class Mouse(QObject):
 
     @Slot(bool)
     def _on_drag_ended(self, escaped: bool) -> None:
-        self._drag = self._grip = self._target = None
+        self._forget_drag()
         if self._document.dragging:
             if escaped:
                 self._document.cancel_drag()
@@ -233,36 +274,68 @@ class Mouse(QObject):
                 self._document.end_drag()
         self.redraw_wanted.emit()
 
-    def _moving(self, scene: Scene, start: QPointF, vertex: int) -> _Drag:
-        """Move a patch, or the pin under the pointer, in the plane of the picture."""
-        document = self._document
+    def _moving(self, scene: Scene, start: QPointF, vertex: int, whole_body: bool) -> _Drag:
+        """Move a patch, or the pin under the pointer, in a plane or over the body."""
+        document, vertices = self._document, np.asarray(scene.surface.vertices)
+        grip = document.grip_at(vertex)
+        home = taken = grip.position(vertices)
         if self.pin is not None:
-            pin = document.pins[self.pin]
-            pinned = np.array(pin.position)
-            document.begin_pin_drag(self.pin)
-            self._grip, home, deep_as = None, pinned, pinned
+            home = taken = np.array(document.pins[self.pin].position)
+            document.begin_pin_drag(self.pin, whole_body)
         else:
             picked = self._canvas.pick(start, scene.body)
-            grip = self._grip = document.grip_at(vertex)
-            home = grip.position(np.asarray(scene.surface.vertices))
-            deep_as = home if picked is None else picked[1]
-            document.begin_drag(grip, f"Drag {document.part_name(vertex)}")
+            taken = taken if picked is None else picked[1]
+            document.begin_drag(grip, f"Drag {document.part_name(vertex)}", whole_body)
+        self._grip = grip
         self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
-        view = scene.view
-        taken = seen_at(view, _pixel(start), self._size, deep_as)
+        limbs = document.model.pose_space.limbs
+        moving = limbs.carried(limbs.holding(grip.vertices, grip.weights), 2.0 * grip.radius)
+        body_size = document.model.body_size
+        depth = DragDepth(
+            scene.view, self._size, taken, vertices.copy(), document.model.faces, moving, body_size
+        )
+        offset = home - depth.point(_pixel(start))
+        places = [start]
 
         def move(place: QPointF) -> None:
-            if not document.dragging:
-                # Another action has ended the drag, and the button is still pressed.
-                self._grip = self._target = None
-                self._show_patch()
-                return
-            there = seen_at(view, _pixel(place), self._size, deep_as)
-            self._target = home + there - taken
-            document.drag_to(self._target)
-            self.redraw_wanted.emit()
+            places[0] = place
+            self._aim(lambda: depth.point(_pixel(place)) + offset)
+
+        def deepen(notches: float) -> None:
+            depth.shift(_pixel(places[0]), notches * _DEPTH_PER_NOTCH * body_size)
+            move(places[0])
+
+        self._deepen = deepen
+        return move
+
+    def _moving_along(self, scene: Scene, start: QPointF, vertex: int, axis: FloatArray) -> _Drag:
+        """Move the patch of a vertex, with its pin if it has one, along an axis."""
+        document, view = self._document, scene.view
+        grip = self._grip = document.grip_at(vertex)
+        home = grip.position(np.asarray(scene.surface.vertices))
+        pinned = [index for index, pin in enumerate(document.pins) if pin.vertex == vertex]
+        if pinned:
+            document.begin_pin_drag(pinned[0])
+        else:
+            document.begin_drag(grip, f"Drag {document.part_name(vertex)}")
+        self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
+        begun = along_axis(view, _pixel(start), self._size, home, axis)
+
+        def move(place: QPointF) -> None:
+            way = along_axis(view, _pixel(place), self._size, home, axis) - begun
+            self._aim(lambda: home + way * axis)
 
         return move
+
+    def _aim(self, target: Callable[[], FloatArray]) -> None:
+        """Drag on, unless another action has ended the drag while the button is pressed."""
+        if not self._document.dragging:
+            self._grip = self._target = self._deepen = None
+            self._show_patch()
+            return
+        self._target = target()
+        self._document.drag_to(self._target)
+        self.redraw_wanted.emit()
 
     def _twisting(self, scene: Scene, start: QPointF, vertex: int) -> _Drag:
         """Twist a body part about its long axis by the motion across it."""

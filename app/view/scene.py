@@ -82,7 +82,7 @@ class Scene:
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)
         self._patch = Patch(self.body, self.surface.polydata, model.pose_space)
-        self.marks = Marks(self._renderer)
+        self.marks = Marks(self._renderer, model.body_size, np.eye(3)[model.up_axis])
         self.set_theme(theme)
 
     def set_theme(self, theme: Theme) -> None:

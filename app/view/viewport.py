@@ -180,10 +180,15 @@ class Viewport(QWidget):
         menu.aboutToShow.connect(on_open)
         menu.aboutToHide.connect(on_close)
 
-    def toggle_pin(self) -> None:
-        """Pin the patch under the pointer, or take its pin away."""
+    def toggle_pin(self, oriented: bool = False) -> None:
+        """Pin the patch under the pointer, maybe with its orientation, or take its pin away."""
         if self.mouse is not None:
-            self.mouse.toggle_pin()
+            self.mouse.toggle_pin(oriented)
+
+    def toggle_arrows(self) -> None:
+        """Draw arrows to drag on the patch under the pointer, or take them away."""
+        if self.mouse is not None:
+            self.mouse.toggle_arrows()
 
     def set_shading(self, shading: Shading) -> None:
         """Choose what the colours say."""
@@ -403,6 +408,7 @@ class Viewport(QWidget):
         if self.mouse is not None:
             self.mouse.mark(scene, frame.vertices)
         scene.marks.show_contacts(frame.contacts)
+        scene.marks.show_standing(frame.standing)
         scene.fit_to_screen(self.devicePixelRatioF())
 
     def _put(self, scene: Scene, frame: LiveFrame) -> None:

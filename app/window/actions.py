@@ -81,11 +81,35 @@ ACTIONS: dict[str, Spec] = {
     "solid": Spec(
         "&Solid", "Ctrl+Alt+S", "Keep the body from moving into itself", "solid", checkable=True
     ),
+    "standing": Spec(
+        "Keep feet on the &ground",
+        "Ctrl+Alt+G",
+        "Keep what stands on the ground there while other parts are dragged",
+        checkable=True,
+    ),
+    "whole_body": Spec(
+        "Whole &body helps",
+        "Ctrl+Alt+W",
+        "Let drags move the whole body, not only the limb under the pointer",
+        checkable=True,
+    ),
+    "arrows": Spec(
+        "Show a&xes", "A", "Show arrows to drag the patch under the pointer along the body's axes"
+    ),
     "pin": Spec("&Pin", "P", "Hold the patch under the pointer in its place"),
+    "pin_turn": Spec(
+        "Pin with &orientation",
+        "O",
+        "Hold the patch under the pointer, and keep its body part's tilt",
+    ),
     "unpin_all": Spec("&Unpin all", "Shift+P", "Remove all pins"),
-    "pin_feet": Spec("Pin &feet", "Ctrl+Alt+F", "Hold the feet in their places"),
-    "pin_hands": Spec("Pin &hands", "Ctrl+Alt+H", "Hold the hands in their places"),
-    "smaller": Spec("S&maller patch", "[", "Drag a smaller patch of the body"),
+    "pin_feet": Spec("Pin &feet", "Ctrl+Alt+F", "Hold the feet in their places, flat as they are"),
+    "pin_hands": Spec(
+        "Pin &hands", "Ctrl+Alt+H", "Hold the hands in their places, turned as they are"
+    ),
+    "smaller": Spec(
+        "S&maller patch", "[", "Drag a smaller patch; a small one takes a single finger"
+    ),
     "larger": Spec("&Larger patch", "]", "Drag a larger patch of the body"),
     "resolve": Spec("&Resolve", "Ctrl+R", "Find the nearest pose without collisions", "resolve"),
     "cancel": Spec("&Cancel", "Escape", "Stop what is being computed", "cancel"),

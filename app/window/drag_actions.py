@@ -57,7 +57,11 @@ class DragActions(QObject):
         self._viewport, self._actions = viewport, actions
         self.acts: dict[str, Callable[[], object]] = {
             "solid": lambda: document.set_solid(actions["solid"].isChecked()),
+            "standing": lambda: self._choose("standing"),
+            "whole_body": lambda: self._choose("whole_body"),
+            "arrows": viewport.toggle_arrows,
             "pin": viewport.toggle_pin,
+            "pin_turn": lambda: viewport.toggle_pin(oriented=True),
             "unpin_all": document.unpin_all,
             "pin_feet": lambda: self._pin("pin_feet"),
             "pin_hands": lambda: self._pin("pin_hands"),
@@ -70,11 +74,19 @@ class DragActions(QObject):
         )
         self.strengths_menu = make_menu("Drag stiff&ness", strengths, viewport)
         document.set_solid(settings["solid"])
+        document.standing, document.whole_body = settings["standing"], settings["whole_body"]
+        for key in ("standing", "whole_body"):
+            actions[key].setChecked(settings[key])
         document.solid_changed.connect(self._on_solid)
         for changed in (document.model_changed, document.pins_changed, viewport.pointed):
             changed.connect(self._update_actions)
         self._on_solid()
         self._update_actions()
+
+    def _choose(self, key: str) -> None:
+        """Let later drags do what an action is about, or not."""
+        is_on = self._settings[key] = self._actions[key].isChecked()
+        setattr(self._document, key, is_on)
 
     def _set_strength(self, strength: float) -> None:
         self._document.drag_strength = self._settings["drag_strength"] = strength
@@ -92,9 +104,11 @@ class DragActions(QObject):
         why_not = dict.fromkeys(self.acts, "" if document.has_model else NO_BODY)
         if document.has_model:
             vertex = self._viewport.pointed_vertex
-            is_pinned = document.is_pinned(vertex)
-            actions["pin"].setText("Un&pin" if is_pinned else ACTIONS["pin"].text)
-            why_not["pin"] = "Point at the body first" if vertex is None else ""
+            frames = [bool(pin.frame) for pin in document.pins if pin.vertex == vertex]
+            for key, is_turned in (("pin", False), ("pin_turn", True)):
+                actions[key].setText("Un&pin" if is_turned in frames else ACTIONS[key].text)
+            pointed = "Point at the body first" if vertex is None else ""
+            why_not |= dict.fromkeys(("pin", "pin_turn", "arrows"), pointed)
             why_not["unpin_all"] = "" if document.pins else "Nothing is pinned"
             for key, (limbs, _) in _LIMBS.items():
                 missing = f"No body part of this model is named after {limbs}"
@@ -114,4 +128,4 @@ class DragActions(QObject):
         document = self._document
         space = document.model.pose_space
         grips = [document.grip_at(far_end(space, domain)) for domain in self._domains(key)]
-        document.pin_grips(grips, f"Pin {_LIMBS[key][0]}")
+        document.pin_grips(grips, f"Pin {_LIMBS[key][0]}", oriented=True)

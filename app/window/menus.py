@@ -25,9 +25,10 @@ MENUS: dict[str, tuple[str, ...]] = {
         *("reset", "randomise", "mirror", SEPARATOR, "filter", "unlock", "parts", "contacts"),
     ),
     "&Pose": (
-        *("solid", SEPARATOR),
+        *("solid", "standing", "whole_body", "arrows", SEPARATOR),
         *(
             "pin",
+            "pin_turn",
             "pin_feet",
             "pin_hands",
             "unpin_all",

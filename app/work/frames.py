@@ -25,8 +25,8 @@ _QUICK_CHECK_SECONDS = 0.006
 _CHECKS = 5
 """Recent checks whose median time counts."""
 
-NO_CONTACTS: FloatArray = np.empty((0, 3))
-NO_CONTACTS.flags.writeable = False
+NO_POINTS: FloatArray = np.empty((0, 3))
+NO_POINTS.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +98,7 @@ class LiveFrame:
     verdict : the exact check, where it came at once
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
         the pose from going on towards its target
+    standing : (S, 3) float64 array, points of the surface that a drag leaves on the ground
     target : of the drag that led here, None for a pose that was asked for
     miss : what is left to the target: normalised length, radians of a twist
     settled : whether the same target would lead no further
@@ -111,6 +112,7 @@ class LiveFrame:
     seconds: float
     verdict: ExactVerdict | None
     contacts: FloatArray
+    standing: FloatArray
     target: FloatArray | None = None
     miss: float = 0.0
     settled: bool = True
@@ -160,6 +162,7 @@ class FrameEvaluator:
         return replace(
             frame,
             contacts=_frozen(step.contacts),
+            standing=_frozen(step.standing),
             target=target,
             miss=step.miss,
             settled=step.settled,
@@ -187,7 +190,8 @@ class FrameEvaluator:
             normals=_frozen(self.normals(vertices)),
             prediction=self._predict(latent) if predicts else None,
             verdict=verdict,
-            contacts=NO_CONTACTS,
+            contacts=NO_POINTS,
+            standing=NO_POINTS,
             seconds=time.thread_time() - start,
         )
 

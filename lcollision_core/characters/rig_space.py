@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -16,11 +17,16 @@ from lcollision_core.characters.character import Character, Rig
 from lcollision_core.characters.joint_roles import Role, joint_limits
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.displacement import DisplacementMetrics
+from lcollision_core.meshes.limbs import Limbs
 from lcollision_core.meshes.topology import FloatArray, IntArray, length_graph
 from lcollision_core.meshes.units import body_size
 
+_Influences = tuple[IntArray, IntArray, FloatArray, FloatArray]
+
 ROOT_CODES = 6
 """Of the whole body: its shift along left, up and front, and its turn about them."""
+
+_SHIFTS = 3
 
 _SHIFT, _TURN = 1.0, np.pi
 """Most that the whole body is moved, normalised, and turned about an axis."""
@@ -39,6 +45,15 @@ _STRETCH_SLACK = 1.25
 
 _SPREAD = 0.25
 """Of its range: the deviation of a code in plausible poses, where no clip says more."""
+
+_TURNED = 3e-5
+"""In drags, the price of a squared turn of a joint of the limb that is held against its parent."""
+
+_RELUCTANT, _HELPING, _WHOLE_TURN = 100.0, 3.0, 100.0
+"""Factors of that price, of other joints: where they join in, where they help, and of the root."""
+
+_LEAST_LIMB = 0.12
+"""Normalised length of a single bone that is a limb."""
 
 _SEED = 0
 
@@ -274,13 +289,18 @@ class RigPoseSpace:
 
     def _codes_that_move_parts(self) -> npt.NDArray[np.bool_]:
         """Return (K, D) which codes move vertices that a part leads: those of bones above them."""
+        by_part = np.zeros((self.n_domains, len(self._bones)), dtype=np.bool_)
+        by_part[np.repeat(self.vertex_domain, np.diff(self._first)), self._joints] = True
+        codes: npt.NDArray[np.bool_] = (by_part @ self._carried)[:, self._bone_of_code]
+        return codes
+
+    @cached_property
+    def _carried(self) -> npt.NDArray[np.bool_]:
+        """(B, B) which bones, by column, carry each bone: itself and those above it."""
         carried = np.eye(len(self._bones), dtype=np.bool_)
         for bone, parent in enumerate(self._parents[1:].tolist(), 1):
             carried[bone] |= carried[parent]
-        by_part = np.zeros((self.n_domains, len(self._bones)), dtype=np.bool_)
-        by_part[np.repeat(self.vertex_domain, np.diff(self._first)), self._joints] = True
-        codes: npt.NDArray[np.bool_] = (by_part @ carried)[:, self._bone_of_code]
-        return codes
+        return carried
 
     @property
     def metric(self) -> FloatArray:
@@ -324,15 +344,46 @@ class RigPoseSpace:
         owned[:ROOT_CODES] = self._root_part in chosen
         return owned
 
-    def held_codes(self, vertex: int, pinned: bool) -> npt.NDArray[np.bool_]:
-        """Return the codes of the whole body unless its root is dragged or patches are pinned.
+    @cached_property
+    def limbs(self) -> Limbs:
+        """The tree of the joints that have codes, `Limbs.leads` being the heaviest influences."""
+        n_bones, rig = len(self._bones), self.rig
+        heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
+        leads = np.maximum(self._bone_of[heaviest], 0)
+        lengths, sizes = np.zeros(n_bones), np.ones(n_bones, dtype=np.int64)
+        for bone in range(n_bones - 1, -1, -1):
+            below = self._carried[:, bone]
+            inside = self.rest_vertices[below[leads]] - self._bone_origins[bone]
+            lengths[bone] = np.linalg.norm(inside, axis=1).max(initial=0.0)
+            sizes[bone] = below.sum()
+        # A bone that is short and alone, as of a twist or an eye, is no limb of its own.
+        is_limb = (sizes > 1) | (lengths > _LEAST_LIMB)
+        counted = self._parents[is_limb & (self._parents >= 0)]
+        limbs = Limbs(
+            parents=self._parents,
+            branches=np.bincount(counted, minlength=n_bones) > 1,
+            lengths=lengths,
+            leads=leads,
+            owner=self._bone_of_code,
+            is_relative=True,
+        )
+        stands = limbs.standing(self.rest_vertices, self.up, limbs.root)
+        above = [set(limbs.path(top)[1:]) for top in stands]
+        bases = set.intersection(*above) if above else set()
+        if not (leads == 0).any():
+            parts = self.part_of_joint[self._bones]
+            bases |= set(np.flatnonzero((self._parents == 0) & (parts == self._root_part)).tolist())
+        return replace(limbs, bases=frozenset(bases))
 
-        See `posing.PoseSpace`: a hand that is dragged does not pull the body off its feet.
+    def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:  # noqa: ARG002
+        """Price the turns of the joints against their parents; see `posing.PoseSpace`.
+
+        What hangs on a joint follows it. The body as a whole shifts for nothing, but hardly turns.
         """
-        held = np.zeros(len(self.low), dtype=np.bool_)
-        apart = self.vertex_domain[vertex] != self._root_part >= 0
-        held[:ROOT_CODES] = apart and not pinned
-        return held
+        others = _HELPING if whole_body else _RELUCTANT
+        prices = np.where(self.limbs.codes_of(held), 1.0, others)
+        prices[:_SHIFTS], prices[_SHIFTS:ROOT_CODES] = 0.0, _WHOLE_TURN
+        return np.diag(_TURNED * prices)
 
     def _motions(self, codes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         numbers = np.zeros(3 + 3 * len(self._bones))
@@ -347,9 +398,7 @@ class RigPoseSpace:
         )
 
     @property
-    def _influences(
-        self,
-    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    def _influences(self) -> _Influences:
         return self._first, self._joints, self._weights, self._points
 
     def _decoded(self, codes: FloatArray) -> FloatArray:
@@ -362,9 +411,14 @@ class RigPoseSpace:
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
+        return self._pulled_back(codes, by_vertices, self._influences)
+
+    def _pulled_back(
+        self, codes: FloatArray, by_vertices: FloatArray, influences: _Influences
+    ) -> FloatArray:
         by_turns, by_shift = rig_kernels.pull_back_moments(
             np.ascontiguousarray(by_vertices, dtype=np.float64),
-            *self._influences,
+            *influences,
             self._parents,
             *self._motions(codes),
         )
@@ -396,13 +450,21 @@ class RigPoseSpace:
         ----------
         weights : (m, V) of the patches' means
         """
-        means = weights.toarray()[:, None, :, None] * np.eye(3)[:, None]
-        means = means.reshape(-1, weights.shape[1], 3)
+        # Only the vertices of the patches count.
+        chosen = np.unique(weights.indices)
+        means = weights[:, chosen].toarray()[:, None, :, None] * np.eye(3)[:, None]
+        means = means.reshape(-1, len(chosen), 3)
+        counts = np.diff(self._first)[chosen]
+        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+        rows = np.repeat(self._first[chosen] - first[:-1], counts) + np.arange(first[-1])
+        influences = first, self._joints[rows], self._weights[rows], self._points[rows]
 
         def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
             bent = np.array(codes, dtype=np.float64)
             bent[self._hinges] = np.maximum(bent[self._hinges], _LEAST_BEND)
-            return np.concatenate([self.pull_back(bent, means), self.pull_back(codes, by_vertices)])
+            return np.concatenate(
+                [self._pulled_back(bent, means, influences), self.pull_back(codes, by_vertices)]
+            )
 
         return slopes
 

@@ -72,8 +72,17 @@ class Symmetry:
 
     def image_of_pin(self, pin: Pin) -> Pin:
         """Return the pin of the partner's patch in the mirrored place."""
-        x, y, z = self.reflect(pin.position).tolist()
-        return replace(pin, vertex=int(self.partner[pin.vertex]), position=(x, y, z))
+
+        def image(place: tuple[float, float, float]) -> tuple[float, float, float]:
+            x, y, z = self.reflect(place).tolist()
+            return x, y, z
+
+        return replace(
+            pin,
+            vertex=int(self.partner[pin.vertex]),
+            position=image(pin.position),
+            frame=tuple((int(self.partner[at]), image(place)) for at, place in pin.frame),
+        )
 
 
 @dataclass(frozen=True, eq=False)

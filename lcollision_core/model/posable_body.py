@@ -250,7 +250,7 @@ class PosableBody(ABC):
         """Return what drags poses placed for export by hand; for one thread at a time."""
         from lcollision_core.posing import PoseDragger
 
-        return PoseDragger(self.exact_check(placement))
+        return PoseDragger(self.exact_check(placement), np.eye(3)[self.up_axis])
 
     def mirror(
         self,

@@ -38,6 +38,8 @@ MAX_FILE_BYTES = 2**28
 MAX_TAGS = 50
 
 MAX_PINS = 50
+_MOST_OF_FRAME = 2
+"""Vertices that keep the orientation of a pin, besides its own."""
 
 _NOT_ROTATED = 1e-6
 _LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e30
@@ -351,7 +353,11 @@ def to_json(pose: NamedPose) -> dict[str, Any]:
     if pose.tags:
         entry["tags"] = list(pose.tags)
     if pose.pins:
-        entry["pins"] = [asdict(pin) for pin in pose.pins]
+        # A pin without a frame is what older programs know.
+        entry["pins"] = [
+            {name: value for name, value in asdict(pin).items() if value or name != "frame"}
+            for pin in pose.pins
+        ]
     source = pose.mirror_of
     if source is not None and source.is_of(pose.latent, pose.placement):
         entry["mirror_of"] = _placed_to_json(source) | {"image": source.image}
@@ -430,20 +436,36 @@ def _pins(value: Any, n_vertices: int) -> tuple[Pin, ...]:
         return ()
     from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Pin
 
+    def vertex_of(number: Any) -> int:
+        if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < n_vertices:
+            raise ValueError(f"the vertex of each of its pins must be 0 to {n_vertices - 1}")
+        return number
+
+    def place_of(numbers: Any) -> tuple[float, float, float]:
+        x, y, z = _numbers(numbers, (3,), "pin's position", _LARGEST_PLACE).tolist()
+        return x, y, z
+
     pins = []
     for entry in value:
         held = _object(entry, "pin")
-        vertex = held.get("vertex")
-        if not isinstance(vertex, int) or isinstance(vertex, bool) or not 0 <= vertex < n_vertices:
-            raise ValueError(f"the vertex of each of its pins must be 0 to {n_vertices - 1}")
+        vertex = vertex_of(held.get("vertex"))
         radius = float(_numbers(held.get("radius"), (), "pin's radius", LARGEST_RADIUS))
         if radius < LEAST_RADIUS:
             raise ValueError(
                 f"the radius of each of its pins must be {LEAST_RADIUS:g} to {LARGEST_RADIUS:g}"
             )
-        place = _numbers(held.get("position"), (3,), "pin's position", _LARGEST_PLACE)
-        x, y, z = place.tolist()
-        pins.append(Pin(vertex, radius, (x, y, z)))
+        frame = held.get("frame", [])
+        if not (
+            isinstance(frame, list)
+            and len(frame) <= _MOST_OF_FRAME
+            and all(isinstance(corner, list) and len(corner) == 2 for corner in frame)
+        ):
+            raise ValueError(
+                f"the frame of each of its pins must be at most {_MOST_OF_FRAME} pairs of a vertex "
+                "and a position"
+            )
+        corners = tuple((vertex_of(at), place_of(place)) for at, place in frame)
+        pins.append(Pin(vertex, radius, place_of(held.get("position")), corners))
     return tuple(pins)
 
 

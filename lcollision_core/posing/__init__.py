@@ -11,5 +11,5 @@ from lcollision_core.posing.grip import (
     Twist,
     make_grip,
 )
-from lcollision_core.posing.parts import far_end, long_axis
+from lcollision_core.posing.parts import far_end, frame_round, long_axis
 from lcollision_core.posing.pose_space import LatentPoseSpace, PoseSpace

@@ -14,9 +14,11 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.contacts import ContactRegions, Contacts, least_step
 from lcollision_core.posing.exact import ExactCheck, exported_vertices
 from lcollision_core.posing.goals import (
+    STANDING_WEIGHT,
     CodesGoal,
     Decoded,
     Goal,
+    Held,
     PatchGoal,
     TwistGoal,
 )
@@ -25,6 +27,9 @@ from lcollision_core.posing.stretch import largest_stretch
 
 MAX_STEPS = 3
 """Steps of one event: where the pointer leapt, the next events go on."""
+
+PATIENCE = 3
+"""Events in a row that come no nearer to the target, after which more of the body joins in."""
 
 ROUNDS = 3
 """Times that a step is solved with the contacts that it ran into before."""
@@ -37,20 +42,15 @@ KEPT_CONTACTS = 18
 DAMPING = 0.02
 """Price of the mean squared vertex displacement of a step, against the squared miss of the grip."""
 
-HOLD, MOVED = 0.1, 0.02
-"""Price of the mean squared displacement since the drag began, part by part: of a part that has
-moved by `MOVED` (root mean square, normalised) half as much, so that few parts move and the rest of
-the body stays: reweighted least squares, as for the group lasso (Yuan and Lin 2006)."""
-
 IMPLAUSIBLE = 3e-6
 """Price of the squared Mahalanobis distance from the drag's start: see `PoseSpace.precision`."""
 
 STRETCH = 0.14
 """The most by which a drag of strength 1 makes an edge longer than it is in any plausible pose."""
 
-_NEAR, _WORTHWHILE, _SETTLED = 0.5, 0.5, 0.01
+_NEAR, _WORTHWHILE, _SHORT, _SETTLED = 0.5, 0.5, 0.25, 0.01
 """Of a goal's reach: a miss that the next event takes, the gain of a step that another follows at
-once, and the miss or gain of one that no other follows."""
+once, the gain of one that comes no nearer, and the miss or gain of one that no other follows."""
 
 _ROUNDING = 1e-6
 """Fraction by which the squared depths of a contact vary with the rounding of the vertices."""
@@ -68,11 +68,15 @@ class DragOptions:
     solid : keep the pose out of itself
     strength : of the prices of implausible poses and stretched limbs: 0 for none
     locked_domains : body parts whose codes stay
+    standing : what stands on the ground stays there, unless its limb is dragged
+    whole_body : all of it helps, not only the limb that is held
     """
 
     solid: bool = True
     strength: float = 1.0
     locked_domains: frozenset[int] = frozenset()
+    standing: bool = True
+    whole_body: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +92,7 @@ class DragStep:
         None of a drag that is not solid
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
         the pose from going on
+    standing : (S, 3) float64 array, points of the surface, likewise, that stay on the ground
     settled : whether the same target would lead no further
     """
 
@@ -96,6 +101,7 @@ class DragStep:
     miss: float
     found: SelfCollisions | None
     contacts: FloatArray
+    standing: FloatArray
     settled: bool
 
     @property
@@ -107,18 +113,19 @@ class DragStep:
 class PoseDragger:
     """Drags poses of one space; for one thread at a time.
 
-    After `begin` each `move` is one event of the pointer. A solid drag that starts free stays
-    exactly free; one that starts colliding deepens the contact of no two body parts.
+    After `begin` each `move` is one event of the pointer. It moves the limb that is held; only
+    where that comes no nearer to the target, what it hangs on joins in, limb by limb. What hangs on
+    what moves follows it. A solid drag that starts free stays exactly free; one that starts
+    colliding deepens the contact of no two body parts.
 
     Parameters
     ----------
     check : decodes and checks the poses, placed for export
+    up : (3,) unit vector, away from the ground; not needed for drags of codes alone
     """
 
-    def __init__(self, check: ExactCheck) -> None:
-        self._check, self._space = check, check.space
-        led = np.bincount(check.space.vertex_domain, minlength=check.space.n_domains)
-        self._shares = np.maximum(led, 1) / len(check.space.vertex_domain)
+    def __init__(self, check: ExactCheck, up: FloatArray | None = None) -> None:
+        self._check, self._space, self._up = check, check.space, up
         self._goal: Goal | None = None
 
     def begin(
@@ -156,8 +163,10 @@ class PoseDragger:
         if not np.isfinite(start).all():
             raise ShapeError("a pose to drag has a number that is not finite", "repair the pose")
         self._start = start
-        self._low, self._high = np.minimum(space.low, start), np.maximum(space.high, start)
-        self._hold_still(space.codes_of(self._options.locked_domains))
+        locked = space.codes_of(self._options.locked_domains)
+        self._least = self._low = np.where(locked, start, np.minimum(space.low, start))
+        self._most = self._high = np.where(locked, start, np.maximum(space.high, start))
+        self._reaches: list[frozenset[int]] = []
         self._contacts = Contacts(check)
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
@@ -165,32 +174,66 @@ class PoseDragger:
         if self._options.solid:
             self._found = check.find(check.exported(self._here.vertices))
             self._allowed = ContactRegions.of(space, self._found).by_name()
-        held = [
-            (
-                make_grip(space, pin.vertex, pin.radius),
-                np.array(pin.position) / check.body_size,
-            )
-            for pin in pins
-        ]
-        strength = self._options.strength
-        if grip is None:
-            self._goal = CodesGoal(space)
-        elif isinstance(grip, Grip):
-            self._hold_still(space.held_codes(grip.vertex, bool(held)))
-            self._goal = PatchGoal(space, grip, held, strength)
-        else:
-            if not 0 <= grip.domain < space.n_domains:
-                raise LCollisionError.must_be(
-                    "the body part to twist", f"1 to {space.n_domains}", grip.domain + 1
-                )
-            first = int((space.vertex_domain == grip.domain).argmax())
-            self._hold_still(space.held_codes(first, bool(held)))
-            self._goal = TwistGoal(space, grip.domain, held, strength, self._here.vertices)
+        self._stands: list[Held] = []
+        self._goal = CodesGoal(space) if grip is None else self._take(grip, pins)
         self._stretch = self._stretch_of(self._here.vertices)
         return self._result(0.0, settled=True)
 
-    def _hold_still(self, codes: npt.NDArray[np.bool_]) -> None:
-        self._low[codes] = self._high[codes] = self._start[codes]
+    def _take(self, grip: Grip | Twist, pins: Iterable[Pin]) -> Goal:
+        """Find what moves and what stays as a patch or a body part is held."""
+        space, limbs, options = self._space, self._space.limbs, self._options
+        here = self._here.vertices
+        if isinstance(grip, Grip):
+            inside, weights, least = grip.vertices, grip.weights, 2.0 * grip.radius
+        elif 0 <= grip.domain < space.n_domains:
+            inside = np.flatnonzero(space.vertex_domain == grip.domain)
+            weights, least = np.full(len(inside), 1.0 / len(inside)), 0.0
+        else:
+            raise LCollisionError.must_be(
+                "the body part to twist", f"1 to {space.n_domains}", grip.domain + 1
+            )
+        held = limbs.holding(inside, weights)
+        stays = [
+            Held(make_grip(space, vertex, radius), np.array(place) / self._check.body_size)
+            for pin in pins
+            for vertex, radius, place in pin.patches
+        ]
+        if options.standing and self._up is not None:
+            stands = limbs.standing(here, self._up, held).values()
+            self._stands = [
+                Held(Grip.at(vertex), here[vertex], STANDING_WEIGHT)
+                for vertex in np.concatenate([*stands, []]).astype(int).tolist()
+            ]
+        pinned = [limbs.holding(one.grip.vertices, one.grip.weights) for one in stays]
+        pinned += [int(limbs.leads[one.grip.vertex]) for one in self._stands]
+        reaches = [set(one) for one in limbs.reaches(held, least)]
+        # A twist of a learned model's body part needs its neighbours, as they turn in space.
+        if options.whole_body or (isinstance(grip, Twist) and not limbs.is_relative):
+            # Without a hold on the ground, the body would float to the target.
+            floats = limbs.is_relative and not pinned and held != limbs.root
+            reaches = [set(range(len(limbs.parents))) - ({limbs.root} if floats else set())]
+        moving: frozenset[int] = frozenset()
+        self._reaches = []
+        for reach in reaches:
+            moving = limbs.with_pinned(moving | reach, pinned)
+            self._reaches.append(moving)
+        self._held = limbs.with_pinned(limbs.limb(held, least), pinned)
+        self._let_move()
+        # What nothing moves need not be kept.
+        self._stands = [
+            one for one in self._stands if moving & set(limbs.path(limbs.leads[one.grip.vertex]))
+        ]
+        stays += self._stands
+        if isinstance(grip, Grip):
+            return PatchGoal(space, grip, stays, options.strength)
+        return TwistGoal(space, grip.domain, stays, options.strength, here)
+
+    def _let_move(self) -> None:
+        """Let the codes move of what comes next into reach."""
+        self._n_short = 0
+        moving = self._space.limbs.codes_of(self._reaches.pop(0))
+        self._low = np.where(moving, self._least, self._start)
+        self._high = np.where(moving, self._most, self._start)
 
     def move(self, target: npt.ArrayLike) -> DragStep:
         """Go towards a target, by a few short steps at most.
@@ -223,7 +266,23 @@ class PoseDragger:
             # Further steps are for a pointer that leapt, not for one that is out of reach.
             if left < _NEAR * goal.reach or gain < _WORTHWHILE * goal.reach:
                 break
-        return self._result(miss, settled=min(miss, gain) < _SETTLED * goal.reach)
+        settled = min(miss, gain) < _SETTLED * goal.reach
+        if gain < _SHORT * goal.reach < miss and self._more_may_move(goal):
+            self._n_short += 1
+            settled = False
+            if self._n_short == PATIENCE:
+                self._let_move()
+        else:
+            self._n_short = 0
+        return self._result(miss, settled)
+
+    def _more_may_move(self, goal: Goal) -> bool:
+        """Whether there is more that could help, and no contact is in the way."""
+        return (
+            bool(self._reaches)
+            and isinstance(goal, PatchGoal)
+            and not len(self._contacts.touching(self._here.codes))
+        )
 
     def end(self) -> None:
         """End the drag; its contacts are forgotten."""
@@ -245,7 +304,8 @@ class PoseDragger:
             low, high = np.where(stays, here, low), np.where(stays, here, high)
         else:
             price = self._options.strength * IMPLAUSIBLE * space.precision
-            price += self._hold(here - self._start)
+            whole_body = self._options.whole_body
+            price += goal.price * space.price(here - self._start, self._held, whole_body)
             gradient = gradient + price @ (here - self._start)
             hessian = hessian + DAMPING * space.metric + price
         for _ in range(ROUNDS):
@@ -281,12 +341,6 @@ class PoseDragger:
             and ((low <= aim) & (aim <= high)).all()
             and (contacts.normals @ aim <= contacts.offsets).all()
         )
-
-    def _hold(self, moved: FloatArray) -> FloatArray:
-        """Return the (D, D) price of a (D,) change since the start: high for parts that rest."""
-        metrics = self._space.domain_metrics
-        squared = metrics.squared(moved) / self._shares
-        return metrics.weighted(HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / MOVED))
 
     def _goes(self, there: FloatArray) -> bool:
         """Go to codes if the pose may be there; else remember what is in the way."""
@@ -332,5 +386,7 @@ class PoseDragger:
             miss=miss,
             found=self._found,
             contacts=vertices[touching].astype(np.float64),
+            standing=np.array([one.place for one in self._stands]).reshape(-1, 3)
+            * self._check.body_size,
             settled=settled,
         )

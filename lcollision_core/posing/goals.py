@@ -20,8 +20,23 @@ PIN_WEIGHT = 100.0
 STRETCH_WEIGHT = 0.01
 """Of the sum of squares by which edges are longer than in any plausible pose, likewise."""
 
-Held = Sequence[tuple[Grip, FloatArray]]
-"""Patches that stay, each with the (3,) normalised place of its mean."""
+STANDING_WEIGHT = 10.0
+"""Likewise of each point of what stands on the ground."""
+
+
+class Held(NamedTuple):
+    """A patch that stays.
+
+    Attributes
+    ----------
+    grip : the patch
+    place : (3,) float64 array, normalised, of its mean
+    weight : of the squared drift
+    """
+
+    grip: Grip
+    place: FloatArray
+    weight: float = PIN_WEIGHT
 
 
 class Decoded(NamedTuple):
@@ -45,10 +60,12 @@ class Goal(Protocol):
     reach : the most of the miss that one step aims at
     longest_step : of one step the most of the root of the mean squared vertex displacement, as one
         quadratic models the cost only so far
+    price : factor of the price of what moves, see `PoseSpace.price`
     """
 
     reach: float
     longest_step: float
+    price: float
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
         """Measure what is left to a target."""
@@ -68,12 +85,12 @@ class PatchGoal:
     strength : of the price of stretched edges
     """
 
-    reach, longest_step = 0.012, 0.01
+    reach, longest_step, price = 0.012, 0.01, 1.0
 
-    def __init__(self, space: PoseSpace, grip: Grip, pins: Held, strength: float) -> None:
+    def __init__(self, space: PoseSpace, grip: Grip, pins: Sequence[Held], strength: float) -> None:
         self._space, self._pins, self._grip, self._strength = space, pins, grip, strength
-        self._means = _mean_slopes(space, [grip, *(pin for pin, _ in pins)])
-        self._weights = np.array([1.0] * 3 + [PIN_WEIGHT] * 3 * len(pins))
+        self._means = _mean_slopes(space, [grip, *(pin.grip for pin in pins)])
+        self._weights = np.repeat([1.0, *(pin.weight for pin in pins)], 3)
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
         """Measure the distance to the target."""
@@ -98,17 +115,22 @@ class TwistGoal:
     decoded : (V, 3) float64 array, the vertices at the drag's start
     """
 
-    reach, longest_step = 0.25, 0.01
+    reach, longest_step, price = 0.25, 0.01, 0.01
 
     def __init__(
-        self, space: PoseSpace, domain: int, pins: Held, strength: float, decoded: FloatArray
+        self,
+        space: PoseSpace,
+        domain: int,
+        pins: Sequence[Held],
+        strength: float,
+        decoded: FloatArray,
     ) -> None:
         inside = np.flatnonzero(space.vertex_domain == domain)
         self._part = Grip(int(inside[0]), 0.0, inside, np.full(len(inside), 1.0 / len(inside)))
         self._space, self._strength = space, strength
-        self._pins = [(self._part, self._part.position(decoded)), *pins]
-        self._means = _mean_slopes(space, [pin for pin, _ in self._pins])
-        self._weights = np.array([PIN_WEIGHT] * 3 * len(self._pins) + [1.0])
+        self._pins = [Held(self._part, self._part.position(decoded)), *pins]
+        self._means = _mean_slopes(space, [pin.grip for pin in self._pins])
+        self._weights = np.append(np.repeat([pin.weight for pin in self._pins], 3), 1.0)
         self._arms = self._arms_of(decoded)
         self.axis = long_axis(self._arms)
 
@@ -150,6 +172,7 @@ class CodesGoal:
     """
 
     reach = longest_step = 0.02
+    price = 0.0
 
     def __init__(self, space: PoseSpace) -> None:
         self._space = space
@@ -175,8 +198,10 @@ def _mean_slopes(space: PoseSpace, patches: Sequence[Grip]) -> MeanSlopes:
     return space.mean_slopes(csr_matrix((weights, vertices, ends), shape=shape))
 
 
-def _drifts(pins: Held, pose: Decoded) -> list[FloatArray]:
-    return [_shortened(place - pin.position(pose.vertices), PatchGoal.reach) for pin, place in pins]
+def _drifts(pins: Sequence[Held], pose: Decoded) -> list[FloatArray]:
+    return [
+        _shortened(pin.place - pin.grip.position(pose.vertices), PatchGoal.reach) for pin in pins
+    ]
 
 
 def _shortened(way: FloatArray, most: float) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,11 @@ class Grip:
     vertices: npt.NDArray[np.int64]
     weights: FloatArray
 
+    @classmethod
+    def at(cls, vertex: int) -> Grip:
+        """Take one vertex alone."""
+        return cls(vertex, 0.0, np.array([vertex]), np.ones(1))
+
     def position(self, vertices: npt.NDArray[np.floating]) -> FloatArray:
         """Return the (3,) weighted mean of the patch on (V, 3) vertices."""
         mean: FloatArray = self.weights @ vertices[self.vertices].astype(np.float64)
@@ -53,6 +59,9 @@ class Twist:
     domain: int
 
 
+Point = tuple[float, float, float]
+
+
 @dataclass(frozen=True)
 class Pin:
     """A patch that stays in its place while others are dragged.
@@ -61,17 +70,38 @@ class Pin:
     ----------
     vertex, radius : of the `Grip`
     position : x, y, z of the patch's mean in the data's unit, in the model's frame
+    frame : further vertices of the same body part and their positions, of a pin that keeps the
+        orientation too
     """
 
     vertex: int
     radius: float
-    position: tuple[float, float, float]
+    position: Point
+    frame: tuple[tuple[int, Point], ...] = ()
 
     @classmethod
-    def of(cls, grip: Grip, vertices: npt.NDArray[np.floating]) -> Pin:
-        """Pin a patch where (V, 3) vertices, in the data's unit, have it."""
-        x, y, z = grip.position(vertices).tolist()
-        return cls(grip.vertex, grip.radius, (x, y, z))
+    def of(cls, grip: Grip, vertices: npt.NDArray[np.floating], frame: Iterable[int] = ()) -> Pin:
+        """Pin a patch, and further vertices, where (V, 3) vertices, in the data's unit, are."""
+
+        def point(place: FloatArray) -> Point:
+            x, y, z = place.tolist()
+            return x, y, z
+
+        places = vertices.astype(np.float64)
+        others = tuple((int(vertex), point(places[vertex])) for vertex in frame)
+        return cls(grip.vertex, grip.radius, point(grip.position(vertices)), others)
+
+    def moved(self, grip: Grip, vertices: npt.NDArray[np.floating]) -> Pin:
+        """Return the same pin where (V, 3) vertices have its patch."""
+        return Pin.of(grip, vertices, (vertex for vertex, _ in self.frame))
+
+    @property
+    def patches(self) -> list[tuple[int, float, Point]]:
+        """The vertex, radius and position of all that stays."""
+        return [
+            (self.vertex, self.radius, self.position),
+            *((vertex, LEAST_RADIUS, place) for vertex, place in self.frame),
+        ]
 
 
 def make_grip(space: PoseSpace, vertex: int, radius: float = GRIP_RADIUS) -> Grip:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.meshes.limbs import far_apart
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.pose_space import PoseSpace
 
 _END = 0.8
 """Share of a part's vertices that lie before its far end."""
+
+_FRAME = 0.15
+"""Normalised: a foot is about so long."""
 
 
 def long_axis(points: npt.NDArray[np.floating]) -> FloatArray:
@@ -26,12 +30,14 @@ def long_axis(points: npt.NDArray[np.floating]) -> FloatArray:
 def far_end(space: PoseSpace, domain: int) -> int:
     """Return the vertex in the middle of a body part's end, away from the rest of the body.
 
+    Fingers do not count.
+
     Parameters
     ----------
     space : of the poses; the end is that of the reference
     domain : index from 0
     """
-    inside = np.flatnonzero(space.vertex_domain == domain)
+    inside = _without_fingers(space, domain)
     points = space.rest_vertices[inside]
     axis = long_axis(points)
     along = points @ (
@@ -40,3 +46,26 @@ def far_end(space: PoseSpace, domain: int) -> int:
     end = along >= np.quantile(along, _END)
     away = np.linalg.norm(points - points[end].mean(axis=0), axis=1)
     return int(inside[end][away[end].argmin()])
+
+
+def frame_round(space: PoseSpace, vertex: int) -> list[int]:
+    """Return vertices that, with a given one, fix the orientation of a hand, foot or head.
+
+    They are as far as possible from it and from each other, within the body part's nearer end.
+
+    Parameters
+    ----------
+    space : of the poses; distances are those of the reference
+    vertex : index from 0
+    """
+    inside = _without_fingers(space, int(space.vertex_domain[vertex]))
+    points = space.rest_vertices
+    near = inside[np.linalg.norm(points[inside] - points[vertex], axis=1) < _FRAME]
+    return far_apart(points, near, vertex)[1:]
+
+
+def _without_fingers(space: PoseSpace, domain: int) -> npt.NDArray[np.intp]:
+    """Return the vertices of a body part that do not belong to short limbs hanging on it."""
+    inside = np.flatnonzero(space.vertex_domain == domain)
+    counted = inside[~space.limbs.are_short[space.limbs.leads[inside]]]
+    return counted if len(counted) else inside

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Set
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
+from scipy.sparse import csgraph, csr_matrix
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.displacement import DisplacementMetrics
+from lcollision_core.meshes.limbs import Limbs
 from lcollision_core.meshes.topology import FloatArray, Topology, length_graph
 
 MeanSlopes = Callable[[FloatArray, FloatArray], FloatArray]
 """Derivatives by the codes, (3 m + n, D), of (D,) codes and (n, V, 3) derivatives by the vertices:
 see `PoseSpace.mean_slopes`."""
+
+_HOLD, _MOVED = 0.1, 0.02
+"""Price of the mean squared displacement of a body part since a drag began, and the root of it,
+normalised, at which the price is half."""
+
+_RELUCTANT = 10.0
+"""Factor of that price, of body parts other than those of the limb that is held."""
 
 _JACOBIAN_POSES = 8
 _LEAST_VARIANCE = 0.02
@@ -84,13 +92,18 @@ class PoseSpace(Protocol):
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes body parts own: (D,)."""
 
-    def held_codes(self, vertex: int, pinned: bool) -> npt.NDArray[np.bool_]:
-        """Return which codes a drag leaves as they are: (D,).
+    @property
+    def limbs(self) -> Limbs:
+        """The tree of what moves by itself."""
+
+    def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:
+        """Return the (D, D) price of a change of the codes since a drag began.
 
         Parameters
         ----------
-        vertex : the middle of what is dragged
-        pinned : whether patches are pinned
+        moved : (D,) the change
+        held : segments of `limbs`, of the limb that is held and of pinned ones
+        whole_body : the others are to help readily, not only where nothing else does
         """
 
     def decode(self, codes: FloatArray) -> FloatArray:
@@ -182,9 +195,49 @@ class LatentPoseSpace:
         """Return which codes belong to domains: (D,); see `Embedding.codes_of`."""
         return self.embedding.codes_of(domains)
 
-    def held_codes(self, vertex: int, pinned: bool) -> npt.NDArray[np.bool_]:  # noqa: ARG002
-        """Return none: latent poses have no place of their own."""
-        return np.zeros(len(self.low), dtype=np.bool_)
+    @cached_property
+    def limbs(self) -> Limbs:
+        """The tree of the domains: each hangs on the neighbour nearest to the one in the middle."""
+        domains = self.vertex_domain[self.topology.edges]
+        borders = np.zeros((self.n_domains, self.n_domains))
+        np.add.at(borders, (domains[:, 0], domains[:, 1]), 1.0)
+        np.fill_diagonal(borders, 0.0)
+        borders += borders.T
+        steps = csgraph.shortest_path(borders > 0.0, unweighted=True)
+        root = int(np.where(np.isfinite(steps), steps, self.n_domains).sum(axis=1).argmin())
+        nearer = steps[root][None, :] < steps[root][:, None]
+        parents = np.where(nearer, borders, -1.0).argmax(axis=1)
+        # What touches nothing hangs on the middle too.
+        parents[~np.isfinite(steps[root])] = root
+        parents[root] = -1
+        n_children = np.bincount(parents[parents >= 0], minlength=self.n_domains)
+        return Limbs(
+            parents=parents,
+            branches=n_children > 1,
+            lengths=np.full(self.n_domains, np.inf),
+            leads=self.vertex_domain,
+            owner=np.concatenate(
+                [
+                    np.arange(self.n_domains),
+                    np.repeat(np.arange(self.n_domains), self.group_sizes[1:]),
+                ]
+            ),
+            is_relative=False,
+        )
+
+    def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:
+        """Price the mean squared displacement, part by part; see `PoseSpace.price`.
+
+        A part that has moved far costs less for each further step, so that few parts move:
+        reweighted least squares, as for the group lasso (Yuan and Lin 2006).
+        """
+        metrics, limbs = self.domain_metrics, self.limbs
+        shares = np.maximum(np.bincount(self.vertex_domain, minlength=self.n_domains), 1)
+        squared = metrics.squared(moved) * len(self.vertex_domain) / shares
+        others = 1.0 if whole_body else _RELUCTANT
+        hangs = [bool(held & set(limbs.path(domain))) for domain in range(self.n_domains)]
+        factor = np.where(hangs, 1.0, others)
+        return metrics.weighted(factor * _HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / _MOVED))
 
     def decode(self, codes: FloatArray) -> FloatArray:
         """Decode (B, D) latent poses to (B, V, 3) vertices."""

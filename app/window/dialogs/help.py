@@ -75,6 +75,8 @@ class ShortcutsDialog(QDialog):
 
     _ELSEWHERE = (
         ("Drag the body", "move the patch under the pointer"),
+        ("Wheel or page keys while dragging", "bring the patch nearer or move it away"),
+        ("Ctrl+Shift-drag the body", "let the whole body help"),
         ("Ctrl-drag the body", "twist the body part"),
         ("Escape while dragging", "put everything back"),
         ("Double-click the body, or P", "pin the patch, or unpin it"),

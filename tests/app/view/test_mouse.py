@@ -436,7 +436,7 @@ def test_a_drag_that_another_action_ends_shows_no_target(qtbot: QtBot, viewport:
     QTest.mouseMove(canvas, place + QPoint(40, 0))
     assert not scene.show_grip(None)
     settled(qtbot, viewport)
-    assert len(scene.marks._lines) == 0
+    assert scene.marks._line is None
     QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(40, 0))
     settled(qtbot, viewport)
 
@@ -474,6 +474,7 @@ def test_a_double_click_pins_and_unpins_and_a_pin_is_dragged_by_its_dot(
     canvas, scene, document = viewport.canvas, viewport.scene, viewport._document
     assert canvas is not None
     assert scene is not None
+    document.standing, document.whole_body = False, True
     vertex = seen_vertex(viewport, 0)
     place = place_of(viewport, vertex)
     QTest.mouseDClick(canvas, LEFT, NO_KEY, place)

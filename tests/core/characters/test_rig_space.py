@@ -233,13 +233,12 @@ def test_the_root_goes_with_its_own_part_and_stays_while_others_are_dragged() ->
         int(np.flatnonzero(space.vertex_domain == space.part_names.index(part))[0])
         for part in ("Hips", "Left hand")
     )
-    np.testing.assert_array_equal(space.held_codes(of_hand, pinned=False), whole)
-    assert not space.held_codes(of_hand, pinned=True).any()
-    assert not space.held_codes(of_hips, pinned=False).any()
-    # Without a joint that carries all there is no part of the root.
-    tube = CHARACTERS["tube"]
-    parted = replace(tube, rig=replace(rig_of(tube), parents=np.array([-1, 0, -1])))
-    assert not RigPoseSpace(parted).held_codes(0, pinned=False).any()
+    limbs = space.limbs
+    for vertex in (of_hips, of_hand):
+        reaches = limbs.reaches(limbs.holding(np.array([vertex]), np.ones(1)))
+        moved = limbs.codes_of(set().union(*reaches))
+        assert moved[whole].all() == (vertex == of_hips)
+        assert moved[~whole].any() == (vertex == of_hand)
 
 
 def test_a_root_that_leads_no_vertex_goes_with_what_does() -> None:
@@ -256,7 +255,8 @@ def test_a_root_that_leads_no_vertex_goes_with_what_does() -> None:
     assert space.part_names == ("one", "two", "three")
     assert set(space.joint_of_code[:6]) == {0}
     assert space.codes_of([0]).sum() == 6 + 3
-    assert not space.held_codes(int(np.argmax(space.vertex_domain == 0)), pinned=False).any()
+    first = space.limbs.holding(np.array([0]), np.ones(1))
+    assert space.limbs.codes_of([first])[:6].all()
 
 
 def test_hinges_bend_one_way_and_forward_is_where_the_toes_point() -> None:
@@ -399,7 +399,7 @@ def test_a_hand_is_dragged_to_the_hip_and_stays_out_of_it() -> None:
     target = np.array([0.1, -0.02, 1.1])
     ends = {}
     for solid in (False, True):
-        dragger = PoseDragger(ExactCheck(space, detector, size))
+        dragger = PoseDragger(ExactCheck(space, detector, size), space.up)
         dragger.begin(np.zeros(len(space.low)), grip, (), DragOptions(solid=solid))
         for event in range(1, 61):
             step = dragger.move(begin + min(1.0, event / 45) * (target - begin))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,9 +21,9 @@ from lcollision_core.posing import (
     Twist,
     make_grip,
 )
-from lcollision_core.posing.goals import Decoded, PatchGoal, TwistGoal
+from lcollision_core.posing.goals import Decoded, Held, PatchGoal, TwistGoal
 
-PLAIN = DragOptions(solid=False)
+PLAIN = DragOptions(solid=False, standing=False, whole_body=True)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +103,7 @@ def test_a_solid_drag_is_free_where_a_plain_one_collides(
     collided = []
     dragger = tube_model.dragger()
     for solid in (False, True):
-        step = dragger.begin(free, tip, options=DragOptions(solid=solid, strength=0.0))
+        step = dragger.begin(free, tip, options=replace(PLAIN, solid=solid, strength=0.0))
         for fraction in np.linspace(0.0, 1.5, 60):
             step = dragger.move(start + fraction * (end - start))
             exact = tube_model.detector.detect(step.vertices)
@@ -217,7 +219,7 @@ def test_slopes_of_goals_are_those_of_differences(
 ) -> None:
     space = tube_model.pose_space
     start = space.decode(free[None])[0]
-    pins = [(foot, foot.position(start) + 0.004)]
+    pins = [Held(foot, foot.position(start) + 0.004)]
     goals = [
         (PatchGoal(space, tip, pins, 0.0), tip.position(start) + np.array([0.008, -0.004, 0.002])),
         (TwistGoal(space, 0, pins, 0.0, start), np.array([0.1])),
@@ -227,7 +229,7 @@ def test_slopes_of_goals_are_those_of_differences(
 
         def cost(codes: FloatArray, goal=goal, target=target) -> float:
             at = space.decode(codes[None])[0]
-            drift = float(((foot.position(at) - pins[0][1]) ** 2).sum())
+            drift = float(((foot.position(at) - pins[0].place) ** 2).sum())
             miss = goal.miss(Decoded(codes, at), target)
             if isinstance(goal, TwistGoal):
                 arms = start[goal._part.vertices] - goal._part.position(start)
@@ -256,7 +258,7 @@ def test_limbs_do_not_stretch_beyond_the_limit(
     longest = np.max([lengths(v) for v in tube_model.decode(tube_model.training_latent)], axis=0)
     dragger, stretched = tube_model.dragger(), {}
     for strength in (0.0, 1.0):
-        dragger.begin(free, tip, options=DragOptions(solid=False, strength=strength))
+        dragger.begin(free, tip, options=replace(PLAIN, strength=strength))
         step = settled(dragger, 5.0 * tip.position(tube_model.decode(free)))
         stretched[strength] = (lengths(step.vertices.astype(np.float64)) / longest).max()
     assert stretched[1.0] < 1.03 + 1e-6 < stretched[0.0]

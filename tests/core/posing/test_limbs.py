@@ -1,0 +1,213 @@
+"""What a drag moves of a body of limbs, what follows, and what stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.characters import RigPoseSpace
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.model import PoseModel, RigModel, open_body
+from lcollision_core.posing import DragOptions, DragStep, Grip, Pin, far_end, frame_round, make_grip
+from tests.rigged_shapes import rigged_body
+
+PLAIN = DragOptions(solid=False)
+UP = np.eye(3)[2]
+
+
+@pytest.fixture(scope="module")
+def body() -> RigModel:
+    return RigModel.of(rigged_body())
+
+
+def dragged(
+    model: RigModel | PoseModel,
+    grip: Grip,
+    way: FloatArray,
+    pins: tuple[Pin, ...] = (),
+    options: DragOptions = PLAIN,
+    start: FloatArray | None = None,
+) -> DragStep:
+    """Drag a patch by a normalised way, slowly, and let it settle."""
+    dragger = model.dragger()
+    step = dragger.begin(
+        np.zeros(model.latent_size) if start is None else start, grip, pins, options
+    )
+    begin = grip.position(step.vertices)
+    for share in np.linspace(0.0, 1.0, 30)[1:]:
+        step = dragger.move(begin + share * way * model.body_size)
+    for _ in range(60):
+        if step.settled:
+            break
+        step = dragger.move(begin + way * model.body_size)
+    return step
+
+
+def grip_on(model: RigModel, joint: str, radius: float = 0.03) -> Grip:
+    """Take the patch whose middle is led by a joint and is nearest to it."""
+    space = model.space
+    names = [name.split(":")[-1] for name in space.rig.joint_names]
+    heaviest = space.rig.joint_of[np.arange(model.n_vertices), space.rig.weights.argmax(axis=1)]
+    led = np.flatnonzero(heaviest == names.index(joint))
+    away = np.linalg.norm(space.rest_vertices[led] - space.origins[names.index(joint)], axis=1)
+    return make_grip(space, int(led[away.argmin()]), radius)
+
+
+def moved_joints(model: RigModel, latent: FloatArray) -> set[str]:
+    """Return the joints that have turned against their parents by more than a tenth of a degree."""
+    turned = model.space.joint_of_code[6:][np.abs(latent[6:]) > np.radians(0.1)]
+    return {model.space.rig.joint_names[joint].split(":")[-1] for joint in turned}
+
+
+def test_what_hangs_on_the_hips_follows_them_and_feet_stay(body: RigModel) -> None:
+    step = dragged(body, grip_on(body, "Hips"), -0.12 * UP)
+    assert step.miss < 0.005
+    assert moved_joints(body, step.latent) <= {
+        f"{side}{name}" for side in ("Left", "Right") for name in ("UpLeg", "Leg", "Foot")
+    }
+    away = (step.vertices - body.reference) / body.body_size
+    for name, foot in enumerate(body.domain_names):
+        if "foot" in foot.lower():
+            inside = body.space.vertex_domain == name
+            assert np.linalg.norm(away[inside], axis=1).mean() < 0.005
+    hand = body.space.vertex_domain == body.domain_names.index("Left hand")
+    np.testing.assert_allclose(away[hand].mean(axis=0), [0.0, 0.0, -0.12], atol=0.01)
+    assert len(step.standing) == 6
+    without = dragged(
+        body, grip_on(body, "Hips"), -0.12 * UP, options=DragOptions(False, standing=False)
+    )
+    assert moved_joints(body, without.latent) == set()
+    assert len(without.standing) == 0
+
+
+def test_a_hand_moves_its_arm_then_the_trunk_and_no_other_limb(body: RigModel) -> None:
+    grip = grip_on(body, "RightHand")
+    arm = {"RightArm", "RightForeArm", "RightHand"}
+    pins = tuple(
+        Pin.of(make_grip(body.space, far_end(body.space, domain)), body.reference)
+        for domain, name in enumerate(body.domain_names)
+        if "foot" in name.lower()
+    )
+    near = dragged(body, grip, np.array([0.1, -0.1, 0.1]), pins)
+    assert near.miss < 0.005
+    assert moved_joints(body, near.latent) <= arm
+    assert not near.latent[:6].any()
+    far = dragged(body, grip, np.array([-0.3, -0.3, 0.1]), pins)
+    assert "Spine" in moved_joints(body, far.latent) <= arm | {"Spine", "Neck"}
+    assert not far.latent[:6].any()
+    helped = dragged(
+        body, grip, np.array([-0.3, -0.3, 0.1]), pins, DragOptions(False, whole_body=True)
+    )
+    assert helped.miss < far.miss
+    assert helped.latent[:6].any()
+
+
+def test_who_holds_what_carries_the_legs_holds_the_root() -> None:
+    """Rigs whose trunk and pelvis hang on a root of their own."""
+    character = rigged_body()
+    rig = character.rig
+    assert rig is not None
+    names = list(rig.joint_names)
+    root, spine = names.index("Hips"), names.index("Spine")
+    # A root at the hips, on which the pelvis and the spine hang.
+    parents = np.concatenate([[-1], rig.parents + 1])
+    parents[1 + root], parents[1 + spine] = 0, 0
+    below = replace(
+        rig,
+        joint_names=("Groove", *rig.joint_names),
+        parents=parents,
+        rest=np.concatenate([rig.rest[root][None], rig.rest]),
+        nodes=np.arange(len(parents)),
+        joint_of=rig.joint_of + 1,
+    )
+    model = RigModel.of(replace(character, rig=below))
+    step = dragged(model, grip_on(model, "Hips"), -0.12 * UP)
+    assert step.miss < 0.005
+    assert "Hips" not in moved_joints(model, step.latent)
+    assert step.latent[:3].any()
+
+
+def test_a_pinned_foot_keeps_its_orientation(body: RigModel) -> None:
+    space = body.space
+    (foot,) = (k for k, name in enumerate(body.domain_names) if name == "Left foot")
+    grip = make_grip(space, far_end(space, foot))
+    inside = space.vertex_domain == foot
+    options = DragOptions(False, standing=False)
+    drifts = {}
+    for frame in ((), tuple(frame_round(space, grip.vertex))):
+        pin = Pin.of(grip, body.reference, frame)
+        step = dragged(body, grip_on(body, "Hips"), np.array([0.0, 0.1, -0.1]), (pin,), options)
+        away = np.linalg.norm(step.vertices[inside] - body.reference[inside], axis=1)
+        drifts[len(frame)] = float(away.max()) / body.body_size
+    assert drifts[2] < 0.01 < drifts[0]
+
+
+def test_a_smaller_patch_takes_a_finger(characters: Path) -> None:
+    model = open_body(str(characters / "mannequin-moves.glb"))
+    assert isinstance(model, RigModel)
+    space: RigPoseSpace = model.space
+    start = model.training_latent[0].astype(np.float64)
+    tip = grip_on(model, "RightHandIndex3").vertex
+    bent = start.copy()
+    bends = [
+        "RightHandIndex" in space.rig.joint_names[joint] and axis == 0
+        for joint, axis in zip(space.joint_of_code, space.axis_of_code, strict=True)
+    ]
+    bent[bends] = np.minimum(start[bends] + 0.2, space.high[bends])
+    way = (model.decode(bent) - model.decode(start))[tip] / model.body_size
+    large, small = (
+        moved_joints(
+            model, dragged(model, make_grip(space, tip, radius), way, start=start).latent - start
+        )
+        for radius in (0.06, 0.008)
+    )
+    assert "RightArm" in large
+    assert not any("Index" in name for name in large)
+    assert small <= {f"RightHandIndex{number}" for number in (1, 2, 3)}
+    assert small
+
+
+@pytest.mark.parametrize("name", ["mannequin-moves.glb", "xbot-moves.glb"])
+def test_the_knees_of_a_real_character_take_up_a_drag_of_its_hips(
+    characters: Path, name: str
+) -> None:
+    model = open_body(str(characters / name))
+    assert isinstance(model, RigModel)
+    step = dragged(model, grip_on(model, "Hips", 0.05), -0.12 * model.space.up)
+    legs = {
+        side + name for side in ("Left", "Right") for name in ("UpLeg", "Leg", "Foot", "ToeBase")
+    }
+    assert step.miss < 0.005
+    assert {"LeftLeg", "RightLeg"} <= moved_joints(model, step.latent) <= legs
+    away = np.linalg.norm(step.vertices - model.reference, axis=1) / model.body_size
+    for domain, part in enumerate(model.domain_names):
+        if "foot" in part.lower():
+            assert away[model.space.vertex_domain == domain].mean() < 0.005
+
+
+def test_domains_of_a_learned_model_hang_on_its_trunk() -> None:
+    model = PoseModel.load("body")
+    limbs, names = model.pose_space.limbs, model.domain_names
+    on = {names[k]: names[parent] if parent >= 0 else "" for k, parent in enumerate(limbs.parents)}
+    assert on["belly & chest"] == ""
+    assert on["right hand"] == "right upper arm"
+    assert on["left shin & foot"] == "left thigh"
+    assert {on[name] for name in ("head", "left thigh", "right upper arm")} == {"belly & chest"}
+
+
+def test_a_hand_of_a_learned_model_leaves_the_codes_of_other_limbs() -> None:
+    model = PoseModel.load("body")
+    start = model.training_latent[0].astype(np.float64)
+    names = model.domain_names
+    grip = make_grip(model.pose_space, far_end(model.pose_space, names.index("right hand")))
+    step = dragged(model, grip, np.array([0.0, -0.1, 0.1]), start=start)
+    assert step.miss < 0.005
+    own = {names.index("right hand"), names.index("right upper arm")}
+    others = model.embedding.codes_of(set(range(len(names))) - own)
+    np.testing.assert_array_equal(step.latent[others], start[others])
+    away = np.linalg.norm(step.vertices - model.decode(start), axis=1) / model.body_size
+    for part in ("left hand & forearm", "left shin & foot", "right shin & foot"):
+        assert away[model.pose_space.vertex_domain == names.index(part)].mean() < 0.005
