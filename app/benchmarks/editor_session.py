@@ -112,9 +112,10 @@ class Session(QObject):
             the window of it and the panels takes, and until that is on the screen
         """
         seconds = []
-        for value in random.Random(0).sample(range(self._slider.maximum()), _EVENTS):
+        chance = random.Random(0)
+        for _ in range(_EVENTS):
             start = time.perf_counter()
-            self._slider.setValue(value)
+            self._slider.move_to(chance.uniform(*self._slider.ends))
             self.wait_for(self.is_shown)
             ended, render = self._last_paint
             compose = self._last_swap - self._composing
@@ -130,7 +131,8 @@ class Session(QObject):
         while done < _BURST_EVENTS:
             due = int(_BURST_EVENTS * (time.monotonic() - start) / _BURST_SECONDS) + 1
             for event in range(done, min(due, _BURST_EVENTS)):
-                self._slider.setValue(round((event + 1) / _BURST_EVENTS * self._slider.maximum()))
+                low, high = self._slider.ends
+                self._slider.move_to(low + (event + 1) / _BURST_EVENTS * (high - low))
             last = time.monotonic()
             done = max(done, min(due, _BURST_EVENTS))
             self.pause()
@@ -261,7 +263,7 @@ class Session(QObject):
 
         def slide() -> None:
             slider = window.sliders.row_of(chance.randrange(model.latent_size)).slider
-            slider.setValue(chance.randrange(slider.maximum() + 1))
+            slider.setValue(chance.randint(slider.minimum(), slider.maximum()))
 
         def drag() -> None:
             vertex = chance.randrange(model.n_vertices)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal
 
-from app.editing.history import PoseHistory
+from app.editing.history import PoseHistory, read_only
+from app.wording import counted
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -62,9 +64,17 @@ class CodeEditing(PoseHistory):
         self._set_codes(f"Reset {self.code_name(index)}", index, 0.0)
 
     def reset_all(self) -> None:
-        """Set all numbers to 0, except those of locked domains."""
+        """Set all numbers to 0 and remove all pins in one step; say which locked domains stay.
+
+        The body goes there at once, whatever is in the way, as to any pose that is loaded.
+        """
+        self._close_gesture()
+        state = self._with_latent(read_only(self._with_locked(np.zeros_like(self.latent))))
+        self._push("Reset all", replace(state, pose=replace(state.pose, pins=())))
+        if self.locked_domains and not self.all_locked:
+            n_locked = counted(len(self.locked_domains), "locked body part")
+            self.message.emit(f"Everything was reset except {n_locked}: see Edit > Unlock all")
         self._tell_if_locked()
-        self._edit("Reset all", self._with_locked(np.zeros_like(self.latent)))
 
     def randomise(self, amount: float, seed: int) -> None:
         """Move the pose towards a random one, except its locked domains.

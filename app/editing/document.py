@@ -14,7 +14,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.commands import DocumentState, Source
-from app.editing.history import UNNAMED, read_only
+from app.editing.history import UNNAMED, named_after, read_only
 from app.editing.live_editing import LiveEditing
 from app.wording import counted, fit_error, heading, height_text, mirrored_text
 from app.work import jobs
@@ -415,14 +415,13 @@ class PoseDocument(LiveEditing):
         ModelFileError : there is no file yet, or it cannot be written.
         """
         from lcollision_core.meshes import file_stamp
-        from lcollision_core.model import name_of_file, write_poses
+        from lcollision_core.model import write_poses
 
         self._close_gesture()
         target = Path(path) if path is not None else self.file
         if target is None:
             raise ModelFileError("the pose has no file yet", "save it under a name")
-        name = self.pose_name if self.pose_name != UNNAMED else name_of_file(target)
-        pose = replace(self.pose, name=name)
+        pose = named_after(self.pose, target)
         write_poses(target, self.model, self.file_poses, pose)
         self.file_stamp = file_stamp(target)
         self._keep_saved(pose, target)
@@ -484,13 +483,14 @@ class PoseDocument(LiveEditing):
             self.solve_finished.emit(None)
 
     def cancel_all(self) -> None:
-        """Stop all long work except preparing the model; `message` tells of each export."""
+        """Stop all long work except preparing the model; `message` tells what it was."""
         self.cancel_resolve()
-        exports = [label for number in self._exports if (label := self._long.label_of(number))]
+        stopped = (*self._exports, self._incoming, self._changing)
+        labels = [label for number in stopped if (label := self._long.label_of(number))]
         self._exports.clear()
         self._long.cancel_all()
         self._prepare()
-        for label in exports:
+        for label in labels:
             self.message.emit(f"{label} was cancelled")
 
     def close(self, timeout: float = 5.0) -> bool:
@@ -615,7 +615,7 @@ class PoseDocument(LiveEditing):
     def _on_poses_mirrored(self, images: list[tuple[NamedPose, MirroredPose]]) -> None:
         added = self.add_to_library([pose for pose, _ in images])
         if not added:
-            self.message.emit("Your library has these mirror images already")
+            self.message.emit("These mirrored poses are already in your library")
             return
         said = [f"Added {counted(added, 'mirrored pose')} to your library"]
         if len(images) == 1:

@@ -251,7 +251,7 @@ class PoseHistory(QObject):
         old = self.library_pose
         if old is None:
             raise ModelFileError(
-                "this pose is not one of your library, or no longer", "keep it under a name"
+                "this pose is not in your library", "add it with Library > Add to library"
             )
         if self.changed:
             new = replace(self.pose, name=old.name, tags=old.tags)
@@ -340,7 +340,7 @@ class PoseHistory(QObject):
             return ModelFileError(what, "choose a shorter one")
         taken = self.name_taken_by(name)
         if taken and taken != old:
-            what = f"your library has a pose “{taken}” already"
+            what = f"your library already has a pose “{taken}”"
             return ModelFileError(what, "choose another name")
         return None
 
@@ -552,3 +552,10 @@ def _working(pose: NamedPose) -> NamedPose:
 
 def _called(poses: Sequence[NamedPose]) -> str:
     return poses[0].name if len(poses) == 1 else counted(len(poses), "pose")
+
+
+def named_after(pose: NamedPose, file: Path) -> NamedPose:
+    """Return a pose under its own name, or where it has none under that of its file."""
+    from lcollision_core.model import name_of_file
+
+    return pose if pose.name != UNNAMED else replace(pose, name=name_of_file(file))

@@ -48,8 +48,11 @@ SETTINGS: dict[str, Setting] = {
     "model": Setting("body"),
     "recent_files": Setting(()),
     "last_folder": Setting(""),
+    "closed_learning": Setting(()),
     "window_geometry": Setting(QByteArray()),
     "window_layout": Setting(QByteArray()),
+    "sliders_width": Setting(0, 0, 10_000),
+    "collision_width": Setting(0, 0, 10_000),
     "randomise_amount": Setting(0.5, 0.0, 1.0),
     "resolve_threshold": Setting(0.5, 0.01, 0.99),
     "resolve_metric": Setting("eye", choices=("eye", "latent")),
@@ -92,7 +95,7 @@ class Settings:
         return _accepted(setting, self._store.value(key, setting.default))
 
     def __setitem__(self, key: str, value: Any) -> None:
-        """Remember a value; one beyond its limits is drawn back to them."""
+        """Remember a value; clamped to its limits."""
         setting = SETTINGS[key]
         if setting.low is not None and setting.high is not None:
             value = type(setting.default)(min(max(value, setting.low), setting.high))

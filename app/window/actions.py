@@ -65,7 +65,7 @@ ACTIONS: dict[str, Spec] = {
     "reset": Spec(
         "Reset &all",
         "Ctrl+Backspace",
-        "Set all sliders to zero: the average pose, of a character the rest pose",
+        "Set all sliders to zero and remove the pins; locked body parts stay as they are",
         "reset",
     ),
     "randomise": Spec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),

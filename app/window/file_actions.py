@@ -12,6 +12,7 @@ from PySide6.QtCore import QObject, Qt, Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
+from app.editing.history import named_after
 from app.window.dialogs.export import ExportDialog
 from app.window.dialogs.forms import screenshot_form, turntable_form
 from app.window.dialogs.questions import (
@@ -283,10 +284,21 @@ class FileActions(QObject):
         return True
 
     def _save_as(self) -> bool:
-        path = self.ask_save("Save poses", self._name, {"Poses": POSES_SUFFIX}, self._document.file)
+        from lcollision_core.model import write_poses
+
+        document = self._document
+        document.end_gesture()
+        model, poses, asked = document.model, document.file_poses, document.pose
+        path = self.ask_save("Save poses", self._name, {"Poses": POSES_SUFFIX}, document.file)
         if path is None:
             return False
-        self._document.save(path)
+        if document.pose is asked:
+            document.save(path)
+        else:
+            # Another pose has come in while the dialog was open.
+            pose = named_after(asked, path)
+            write_poses(path, model, poses, pose)
+            document.message.emit(f"Saved “{pose.name}” to {path.name}, not the pose opened since")
         return True
 
     def _export(self) -> None:

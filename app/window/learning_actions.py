@@ -135,10 +135,18 @@ class LearningActions(QObject):
             dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
             dialog.setAttribute(Qt.WidgetAttribute.WA_ShowWithoutActivating, not activates)
             dialog.open_wanted.connect(self._open)
+            dialog.closed.connect(self._on_closed)
         dialog.show_run(path)
         dialog.show()
         if activates:
             dialog.activateWindow()
+
+    @Slot(object)
+    def _on_closed(self, path: Path) -> None:
+        """Remember, also for other windows, that the user has seen enough of a run."""
+        there = {str(run.path) for run in self.runs.runs} | {str(path)}
+        settings = self._files.settings
+        settings["closed_learning"] = tuple({*settings["closed_learning"], str(path)} & there)
 
     def _visible(self, kind: type[Dialog]) -> Dialog | None:
         shown = (held for held in self._window.findChildren(kind) if held.isVisible())
@@ -204,7 +212,8 @@ class LearningActions(QObject):
                 self.indicator.style().unpolish(self.indicator)
                 self.indicator.style().polish(self.indicator)
         for held in self.runs.runs:
-            if held.phase is RunPhase.DONE and self._told.get(held.path) is not RunPhase.DONE:
+            is_new = held.phase is RunPhase.DONE and self._told.get(held.path) is not RunPhase.DONE
+            if is_new and str(held.path) not in self._files.settings["closed_learning"]:
                 self._show(held.path, activates=False)
         self._told = {held.path: held.phase for held in self.runs.runs}
 

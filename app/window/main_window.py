@@ -7,12 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QEvent, QSize, Qt, QTimer, Signal, Slot
+from PySide6.QtCore import QEvent, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import (
     QAction,
     QCloseEvent,
     QGuiApplication,
-    QResizeEvent,
     QShowEvent,
 )
 from PySide6.QtWidgets import QApplication, QDialog, QMainWindow, QWidget
@@ -31,6 +30,7 @@ from app.window.dialogs.questions import wait_for_exports
 from app.window.drag_actions import DragActions
 from app.window.edit_actions import EditActions
 from app.window.file_actions import FileActions
+from app.window.layout import Layout
 from app.window.learning_actions import LearningActions
 from app.window.library_actions import LibraryActions
 from app.window.menus import fill_menus, make_bar
@@ -54,19 +54,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_LAYOUT_VERSION = 1
-_SIZE = QSize(1440, 900)
-_SIDE_FRACTIONS = {"sliders": (0.25, 344, 460), "collision": (0.22, 312, 380)}
-"""Fraction of the window's width, least and most, in device-independent pixels."""
-_NARROW = 1100
-"""A window narrower than this has no space for the poses between the panels at its sides."""
-_VIEW_WIDTH = 400
-"""Width of the view, before the panels beside it get more than they need."""
-_AREAS = {
-    "sliders": Qt.DockWidgetArea.LeftDockWidgetArea,
-    "collision": Qt.DockWidgetArea.RightDockWidgetArea,
-    "library": Qt.DockWidgetArea.BottomDockWidgetArea,
-}
+_TITLES = {"sliders": "Sliders", "collision": "Collisions", "library": "Poses"}
 
 
 class MainWindow(QMainWindow):
@@ -96,11 +84,6 @@ class MainWindow(QMainWindow):
         self.setObjectName("editor")
         self.setWindowIcon(program_icon())
         FileDrops(self).dropped.connect(self._on_dropped)
-        self.setDockNestingEnabled(True)
-        for corner in (Qt.Corner.TopLeftCorner, Qt.Corner.BottomLeftCorner):
-            self.setCorner(corner, Qt.DockWidgetArea.LeftDockWidgetArea)
-        self.setCorner(Qt.Corner.TopRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
-
         self.viewport = Viewport(document)
         self.viewport.setMinimumSize(160, 120)
         self.setCentralWidget(self.viewport)
@@ -112,11 +95,14 @@ class MainWindow(QMainWindow):
             document, act["resolve"], act["resolve_options"], act["learn_character"]
         )
         self.library = LibraryPanel(document, act["keep"], act["update"], act["add"])
+        contents = (self.sliders, self.collision, self.library)
         self.docks = {
-            "sliders": self._dock("sliders", "Sliders", self.sliders),
-            "collision": self._dock("collision", "Collisions", self.collision),
-            "library": self._dock("library", "Poses", self.library),
+            key: Panel(key, title, content, self)
+            for (key, title), content in zip(_TITLES.items(), contents, strict=True)
         }
+        for key, dock in self.docks.items():
+            actions.equip_action(dock.toggleViewAction(), DOCKS[key])
+        self._layout = Layout(self, self.docks, settings)
         self.files = FileActions(self, document, settings, self.viewport, self.attempt)
         self._status = StatusBar()
         self.setStatusBar(self._status)
@@ -174,7 +160,7 @@ class MainWindow(QMainWindow):
         WindowShortcuts(self)
         self._preparing = Preparing(self)
         self._connect()
-        self._restore()
+        self._layout.restore()
         self._on_model()
 
     # Public operations.
@@ -224,27 +210,17 @@ class MainWindow(QMainWindow):
 
     def reset_layout(self) -> None:
         """Put all panels back to their places."""
-        for key, dock in self.docks.items():
-            dock.setFloating(False)
-            self.addDockWidget(_AREAS[key], dock)
-            dock.show()
-        self._size_docks()
+        self._layout.reset()
 
     # Qt's.
 
     def showEvent(self, event: QShowEvent) -> None:  # noqa: N802 - Qt's name
-        """Give the panels their widths, which only a shown window keeps."""
+        """Give the panels their sizes."""
         super().showEvent(event)
         if not event.spontaneous():
             # Or else the first button of the tool bar would look chosen.
             self.viewport.setFocus()
-        if self.settings["window_layout"].isEmpty():
-            QTimer.singleShot(0, self, self._size_docks)
-
-    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Let the poses have the corner where the window is narrow."""
-        super().resizeEvent(event)
-        self._share_corner()
+        QTimer.singleShot(0, self, self._layout.begin)
 
     def close_unasked(self) -> None:
         """Close at once; what is not saved is offered at the next start."""
@@ -272,8 +248,7 @@ class MainWindow(QMainWindow):
         if not (may_close or self._unasked):
             event.ignore()
             return
-        self.settings["window_geometry"] = self.saveGeometry()
-        self.settings["window_layout"] = self.saveState(_LAYOUT_VERSION)
+        self._layout.save()
         self.settings["randomise_amount"] = self.randomise.amount.value() / 100
         self._preparing.close()
         self.learning.close()
@@ -297,12 +272,6 @@ class MainWindow(QMainWindow):
         action.setObjectName(key)
         action.triggered.connect(self._on_action)
         return action
-
-    def _dock(self, key: str, title: str, content: QWidget) -> Panel:
-        dock = Panel(key, title, content, self)
-        actions.equip_action(dock.toggleViewAction(), DOCKS[key])
-        self.addDockWidget(_AREAS[key], dock)
-        return dock
 
     def _connect(self) -> None:
         document = self.document
@@ -330,36 +299,6 @@ class MainWindow(QMainWindow):
         self._preparing.begun.connect(self.viewport.waiting.explain)
         QGuiApplication.styleHints().colorSchemeChanged.connect(self._on_system_theme)
 
-    def _restore(self) -> None:
-        screen = QGuiApplication.primaryScreen().availableGeometry().size()
-        self.resize(_SIZE.boundedTo(screen))
-        self.restoreGeometry(self.settings["window_geometry"])
-        self.restoreState(self.settings["window_layout"], _LAYOUT_VERSION)
-        self._share_corner()
-
-    def _share_corner(self) -> None:
-        corner, area = Qt.Corner.BottomRightCorner, Qt.DockWidgetArea.RightDockWidgetArea
-        if self.width() < _NARROW:
-            area = Qt.DockWidgetArea.BottomDockWidgetArea
-        if self.corner(corner) is not area:
-            self.setCorner(corner, area)
-
-    @Slot()
-    def _size_docks(self) -> None:
-        sides = [self.docks[key] for key in _SIDE_FRACTIONS]
-        widths = [
-            round(min(max(fraction * self.width(), least), most))
-            for fraction, least, most in _SIDE_FRACTIONS.values()
-        ]
-        if sum(widths) + _VIEW_WIDTH > self.width():
-            widths = [side.minimumSizeHint().width() for side in sides]
-        self.resizeDocks(sides, widths, Qt.Orientation.Horizontal)
-        self.resizeDocks(
-            [self.docks["library"]],
-            [self.docks["library"].sizeHint().height()],
-            Qt.Orientation.Vertical,
-        )
-
     # Following the document.
 
     @Slot()
@@ -367,6 +306,8 @@ class MainWindow(QMainWindow):
         has_model = self.document.has_model
         for dock in self.docks.values():
             dock.widget().setEnabled(has_model)
+        # Names may be longer.
+        self._layout.fit()
         for key in (*self.files.acts, "contacts"):
             reason = "" if has_model or key == "open_model" else actions.NO_BODY
             actions.allow_action(self.actions_by_key[key], ACTIONS[key].tip, reason)

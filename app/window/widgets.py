@@ -56,6 +56,9 @@ from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE, current_theme, visib
 HANDLE = 7.0
 """Radius of a slider's handle, in device-independent pixels."""
 
+LEAST_TRACK = 60
+"""Least width of a slider, in device-independent pixels."""
+
 SWATCH = 12
 """Side of a body part's square of colour, in device-independent pixels."""
 
@@ -372,12 +375,26 @@ class Slider(QSlider):
         self._colour = colour
         self._pointer = self._exact_value = 0.0
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-        self.setMinimumWidth(60)
+        self.setMinimumWidth(LEAST_TRACK)
 
     @property
     def origin(self) -> float:
         """Where the bar begins, as a fraction of the groove from its left end."""
         return 0.0
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """What the ends of the groove stand for."""
+        return float(self.minimum()), float(self.maximum())
+
+    @property
+    def place(self) -> float:
+        """What the handle stands for."""
+        return float(self.value())
+
+    def move_to(self, place: float) -> None:
+        """Move the handle, as the user does."""
+        self.setValue(round(place))
 
     def sizeHint(self) -> QSize:  # noqa: N802
         """Ask for one row's height."""
@@ -408,22 +425,24 @@ class Slider(QSlider):
         x = event.position().x()
         self.setSliderDown(True)
         if abs(x - self._handle_x()) > HANDLE + 2:
-            self.setValue(self._value_at(x))
-        self._pointer, self._exact_value = x, float(self.value())
+            low, high = self.ends
+            fraction = (x - HANDLE) / max(self.width() - 2 * HANDLE, 1.0)
+            self.move_to(low + fraction * (high - low))
+        self._pointer, self._exact_value = x, self.place
 
     def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
         """Move the handle with the pointer; slowly while Ctrl or Shift is held."""
         if not self.isSliderDown():
             return
         x = event.position().x()
-        steps = self.maximum() - self.minimum()
-        way = (x - self._pointer) * steps / max(self.width() - 2 * HANDLE, 1.0)
+        low, high = self.ends
+        way = (x - self._pointer) * (high - low) / max(self.width() - 2 * HANDLE, 1.0)
         if event.modifiers() & _FINE_KEYS:
             way *= _FINE
         # Step by step, so that the handle does not jump as the key is pressed or let go.
         self._pointer = x
         self._exact_value += way
-        self.setValue(round(self._exact_value))
+        self.move_to(self._exact_value)
 
     def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: ARG002, N802
         """Let the handle go."""
@@ -468,12 +487,9 @@ class Slider(QSlider):
             painter.drawRoundedRect(QRectF(reached - 2.5, middle - 8.5, 5, 17), 2, 2)
 
     def _handle_x(self) -> float:
-        fraction = (self.value() - self.minimum()) / max(self.maximum() - self.minimum(), 1)
+        low, high = self.ends
+        fraction = (self.place - low) / ((high - low) or 1.0)
         return HANDLE + (self.width() - 2 * HANDLE) * fraction
-
-    def _value_at(self, x: float) -> int:
-        fraction = (x - HANDLE) / max(self.width() - 2 * HANDLE, 1.0)
-        return self.minimum() + round(fraction * (self.maximum() - self.minimum()))
 
 
 def screen_of(window: QWidget) -> QRect:

@@ -123,7 +123,8 @@ def decoded(document: PoseDocument) -> npt.NDArray[np.float32]:
 def handle(row: CodeRow) -> QPoint:
     """Return where a row's handle is, in its slider."""
     slider = row.slider
-    share = slider.value() / slider.maximum()
+    low, high = slider.ends
+    share = (slider.place - low) / (high - low)
     return QPoint(round(HANDLE + share * (slider.width() - 2 * HANDLE)), slider.height() // 2)
 
 

@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import NORMAL, ROW_HEIGHT
 from app.window.dialogs.names import free_model_name, why_no_model_name
+from app.window.mnemonics import Mnemonics
 from app.window.widgets import dialog_vbox, hbox, labelled, swatch, vbox
 from app.work.jobs import PartEdits
 from lcollision_core.errors import ModelFileError
@@ -50,6 +51,7 @@ class BodyPartsDialog(QDialog):
     def __init__(self, model: PosableBody, copies: bool, parent: QWidget) -> None:
         super().__init__(parent)
         self.setWindowTitle("Body parts")
+        Mnemonics(self)
         self.resize(420, 480)
         self._model = model
         self.list = QListWidget()
@@ -85,7 +87,9 @@ class BodyPartsDialog(QDialog):
         self.copy_name = QLineEdit(free_model_name(model.name, 2))
         self.copy_name.setAccessibleName("Name of the copy")
         copy_row = QWidget()
-        copy_row.setLayout(hbox(labelled("Name of the copy", "caption"), self.copy_name))
+        copy_label = labelled("Name of the copy", "caption")
+        copy_label.setBuddy(self.copy_name)
+        copy_row.setLayout(hbox(copy_label, self.copy_name))
         copy_row.setVisible(copies)
         self.refusal = labelled("", "refusal", wraps=True)
         self.refusal.hide()

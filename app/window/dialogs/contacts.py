@@ -22,6 +22,7 @@ from PySide6.QtWidgets import (
 from app.view.legend import with_swatch
 from app.view.shading import UNCOUNTED_FACE
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
+from app.window.mnemonics import Mnemonics
 from app.window.number_box import NumberBox
 from app.window.widgets import dialog_vbox, hbox, labelled, vbox
 from app.wording import counted, with_capital
@@ -85,6 +86,7 @@ class ContactsDialog(QDialog):
     def __init__(self, document: PoseDocument, parent: QWidget) -> None:
         super().__init__(parent)
         self.setWindowTitle("Contacts")
+        Mnemonics(self)
         self.setFixedWidth(_WIDTH)
         self._document = document
         self.near, self.rest, self.tolerated = (self._field(name) for name in _MOST)
@@ -126,6 +128,8 @@ class ContactsDialog(QDialog):
             button.setAutoDefault(False)
         buttons.rejected.connect(self.reject)
         near, tolerated = (labelled(text, "title") for text in ("Skin folds", "Tolerated depth"))
+        near.setBuddy(self.near)
+        tolerated.setBuddy(self.tolerated)
         page = dialog_vbox(
             self._note("Crossing triangles that a rule leaves out are no collisions."),
             self._row(near, "near", self.near, "Pairs this near along the surface"),

@@ -7,6 +7,7 @@ from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QPlainTextEdit, QPushButton, QWidget
 
 from app.view.theme import NORMAL, WIDE
+from app.window.mnemonics import Mnemonics
 from app.window.widgets import Sign, dialog_vbox, hbox, labelled, vbox
 from app.wording import one_line, with_capital
 from app.work.log import log_file
@@ -25,6 +26,7 @@ class FailureDialog(QDialog):
     def __init__(self, failure: Failure, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.setWindowTitle("Couldn't do that")
+        Mnemonics(self)
         self.setMinimumWidth(480)
         self.failure = failure
         what, advice = map(with_capital, map(one_line, (failure.headline, failure.next_step)))

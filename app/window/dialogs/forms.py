@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
 
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
+from app.window.mnemonics import Mnemonics
 from app.window.number_box import NumberBox
 from app.window.widgets import dialog_vbox, labelled, swatch
 
@@ -70,6 +71,7 @@ class Form(QDialog):
     def __init__(self, title: str, action: str, settings: Settings, parent: QWidget) -> None:
         super().__init__(parent)
         self.setWindowTitle(title)
+        Mnemonics(self)
         self.setFixedWidth(_WIDTH)
         self._settings = settings
         self._refused = False

@@ -22,6 +22,7 @@ from app.view.icons import program_icon
 from app.view.theme import CLOSE, NORMAL, WIDE
 from app.window.actions import ACTIONS
 from app.window.dialogs.questions import message_box, widen
+from app.window.mnemonics import Mnemonics
 from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling
 
 if TYPE_CHECKING:
@@ -100,6 +101,7 @@ class ShortcutsDialog(QDialog):
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle("Keyboard and mouse")
+        Mnemonics(self)
         self.resize(560, min(620, screen_of(parent or self).height() - _TITLE_BAR))
         page = QWidget()
         form = QFormLayout(page, horizontalSpacing=WIDE * 2, verticalSpacing=CLOSE - 2)

@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.dialogs.questions import ask_to_discard
+from app.window.mnemonics import Mnemonics
 from app.window.widgets import (
     SWATCH,
     Card,
@@ -73,6 +74,7 @@ class LearningDialog(QDialog):
     Signals
     -------
     open_wanted : Path, the work folder of a run whose model is to be opened
+    closed : Path, the run that was shown as the user closed the dialog
 
     Parameters
     ----------
@@ -89,6 +91,7 @@ class LearningDialog(QDialog):
     """
 
     open_wanted = Signal(object)
+    closed = Signal(object)
 
     def __init__(
         self,
@@ -99,6 +102,7 @@ class LearningDialog(QDialog):
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle("Learning")
+        Mnemonics(self)
         self._runs, self._work, self._attempt = runs, work, attempt
         self.path: Path | None = None
         self._shown: tuple[Path, RunPhase] | None = None
@@ -106,7 +110,7 @@ class LearningDialog(QDialog):
         self._read_for: Path | None = None
         self._reading = 0
         self.which = QComboBox()
-        self.which.setAccessibleName("Model that is learned")
+        self.which.setAccessibleName("Model being learned")
         self._sign = Sign(_SIGN)
         self.headline = labelled("", "headline", wraps=True)
         self.state = labelled("", wraps=True)
@@ -127,6 +131,8 @@ class LearningDialog(QDialog):
 
     def done(self, result: int) -> None:
         """Read no card any more, and close."""
+        if self.path is not None:
+            self.closed.emit(self.path)
         self._work.cancel(self._reading)
         self.path = self._read_for = None
         super().done(result)
@@ -247,7 +253,7 @@ class LearningDialog(QDialog):
         if phase is RunPhase.WAITING:
             others = [held.name for held in self._runs.runs if held.phase is RunPhase.RUNNING]
             when = f"after “{one_line(others[0])}”" if others else "in a moment"
-            return f"It begins {when}, as long as the editor is open."
+            return f"It starts {when}, while the editor is open."
         words = [f"{100 * status.done:.0f} %"]
         if phase is RunPhase.RUNNING and status.seconds_left is not None and status.done > 0.0:
             words.append(f"{duration_text(status.seconds_left)} left")
@@ -256,11 +262,13 @@ class LearningDialog(QDialog):
         return ", ".join((*words, *(status.facts if run.is_active else ())))
 
     def _fit(self) -> None:
-        """Take the size that the content needs, and stay on the screen."""
+        """Grow to what the content needs, if it has to, and stay on the screen."""
         self.setMinimumWidth(_WIDTH)
         self._column.activate()
         width = max(_WIDTH, self.sizeHint().width())
-        self.resize(width, max(self.sizeHint().height(), self._column.totalHeightForWidth(width)))
+        height = max(self.sizeHint().height(), self._column.totalHeightForWidth(width))
+        before = self.size() if self.isVisible() else QSize()
+        self.resize(before.expandedTo(QSize(width, height)))
         screen, frame = screen_of(self), self.frameGeometry()
         left = min(frame.x(), screen.right() + 1 - frame.width())
         top = min(frame.y(), screen.bottom() + 1 - frame.height())

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QDialog, QInputDialog, QLabel, QLineEdit, QVBoxLayout, QWidget
 
+from app.window.mnemonics import Mnemonics
 from app.window.widgets import labelled
 from app.wording import heading, menu_text
 
@@ -42,6 +43,7 @@ class NameDialog(QInputDialog):
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle(title)
+        Mnemonics(self)
         self.setLabelText(menu_text(label))
         # Names such as "<b>" in a label are no HTML.
         for held in self.findChildren(QLabel):
@@ -110,7 +112,7 @@ def why_no_model_name(name: str) -> str:
     if not name or len(name) > 60 or NO_FILE_NAME & set(name) or file_stem(name) != name:
         return "A model needs a name of up to 60 letters, without a dot or a slash."
     if name.casefold() in {model.name.casefold() for model in list_models()}:
-        return f"There is a model “{name}” already; choose another name."
+        return f"A model “{name}” already exists; choose another name."
     if name.casefold() in {work.name.casefold() for work in list_work()}:
         return f"A model “{name}” is being learned; choose another name."
     return ""

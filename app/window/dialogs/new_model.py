@@ -20,6 +20,7 @@ from app.window.dialogs.new_model_pages import (
     PosesPage,
     QualityPage,
 )
+from app.window.mnemonics import Mnemonics
 from app.window.widgets import FileDrops, dialog_vbox, hbox, labelled, screen_of, scrolling, vbox
 from app.wording import counted, one_line, with_capital
 from app.work import learning_jobs
@@ -67,6 +68,7 @@ class NewModelDialog(QDialog):
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle("New model")
+        Mnemonics(self)
         FileDrops(self).dropped.connect(self.add)
         self.resize(_SIZE.boundedTo(screen_of(parent).size() - _MARGIN))
         self._work, self._settings = work, settings

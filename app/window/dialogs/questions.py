@@ -11,6 +11,7 @@ from PySide6.QtWidgets import QGridLayout, QMessageBox, QSpacerItem, QWidget
 
 from app.view.icons import pixmap
 from app.view.theme import WIDE, current_theme
+from app.window.mnemonics import Mnemonics
 from app.wording import counted, menu_text, one_line, with_capital
 
 if TYPE_CHECKING:
@@ -133,8 +134,8 @@ def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
 
 def ask_to_discard(parent: QWidget, name: str) -> bool:
     """Ask whether what a run of learning has done is to be thrown away."""
-    text = f"Discard what has been learned of “{name}”?"
-    note = "The files that it is learned from stay as they are."
+    text = f"Discard the unfinished model “{name}”?"
+    note = "The files it learns from stay as they are."
     buttons = ("Discard", "", "Cancel")
     answer = _ask(parent, "Discard a model", text, note, buttons, Choice.CANCEL)
     return answer is Choice.SAVE
@@ -175,7 +176,7 @@ def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:
     """Ask whether files that lie beside the one that was chosen are to be replaced."""
     names = ", ".join(f"“{file.name}”" for file in files[:_NAMED])
     more = f" and {len(files) - _NAMED} more" if len(files) > _NAMED else ""
-    text = "Replace files that are there already?"
+    text = "Replace existing files?"
     note = f"Each mesh of the character gets a file of its own, in place of {names}{more}."
     buttons = ("Replace", "", "Cancel")
     answer = _ask(parent, "Replace files", text, note, buttons, Choice.CANCEL)
@@ -193,6 +194,7 @@ def message_box(parent: QWidget, title: str, text: str, note: str) -> QMessageBo
     """Return a message that shows names literally; see `widen`."""
     box = QMessageBox(parent)
     box.setWindowTitle(title)
+    Mnemonics(box)
     box.setTextFormat(Qt.TextFormat.PlainText)
     box.setText(one_line(text))
     box.setInformativeText(note)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QKeyEvent, QMouseEvent
 
-from app.view.theme import ROW_HEIGHT, TIGHT
+from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT
 from app.window.number_box import NumberBox
 from app.window.widgets import (
+    LEAST_TRACK,
     NAME_SHARE,
     ElidedLabel,
     HoverRow,
@@ -25,7 +27,16 @@ from app.wording import heading
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
 
-_STEPS = 1000
+_OF_CODES = 1000.0
+"""What a bare code counts in its slider's whole numbers, which assistive technologies read."""
+
+_KEYS = {
+    **dict.fromkeys((Qt.Key.Key_Right, Qt.Key.Key_Up), 0.01),
+    **dict.fromkeys((Qt.Key.Key_Left, Qt.Key.Key_Down), -0.01),
+    Qt.Key.Key_PageUp: 0.1,
+    Qt.Key.Key_PageDown: -0.1,
+}
+"""What keys move a handle by, as fractions of the range."""
 
 _DECIMALS, _DECIMALS_OF_UNITS = 3, 1
 """Of bare codes, and of degrees and per cent."""
@@ -48,10 +59,12 @@ class CodeSlider(Slider):
     drag_started, drag_ended : around a drag, unless Escape ends it: see `Slider`
     click_unwanted : of a double click, whose first press may have moved the handle
     reset_wanted : to zero
+    number_wanted : float, by mouse, keys or an assistive technology
 
     Parameters
     ----------
     low, high : range of the number, the first below 0 and the second above
+    shown : people are shown the number times this, as degrees, which `value` rounds
     colour : "#rrggbb" of the bar, None for that of the theme
     """
 
@@ -59,31 +72,55 @@ class CodeSlider(Slider):
     drag_ended = Signal()
     click_unwanted = Signal()
     reset_wanted = Signal()
+    number_wanted = Signal(float)
 
-    def __init__(self, low: float, high: float, colour: str | None) -> None:
+    def __init__(self, low: float, high: float, shown: float, colour: str | None) -> None:
         super().__init__(colour)
-        self._low, self._high = low, high
-        self.setRange(0, _STEPS)
-        self.setSingleStep(_STEPS // 100)
-        self.setPageStep(_STEPS // 10)
+        self._shown = _OF_CODES if shown == 1.0 else shown
+        self._low, self._high = low * self._shown, high * self._shown
+        self._place = 0.0
+        self.setRange(math.floor(self._low), math.ceil(self._high))
+        self.setSingleStep(max(1, round((self._high - self._low) / 100)))
+        self.setPageStep(max(1, round((self._high - self._low) / 10)))
+        self.valueChanged.connect(self.move_to)
         self.show_number(0.0)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The range, as it is shown."""
+        return self._low, self._high
+
+    @property
+    def place(self) -> float:
+        """The number, as it is shown, between two whole ones too."""
+        return self._place
 
     @property
     def number(self) -> float:
         """The number that the handle stands for."""
-        return self._low + (self._high - self._low) * self.value() / _STEPS
+        return self._place / self._shown
+
+    def move_to(self, place: float) -> None:
+        """Move the handle, and ask for its number."""
+        self._show(place)
+        self.number_wanted.emit(self.number)
 
     def show_number(self, number: float) -> None:
         """Move the handle without any signal; beyond the range it stays at the end."""
-        fraction = (number - self._low) / (self._high - self._low)
+        self._show(number * self._shown)
+
+    def _show(self, place: float) -> None:
+        self._place = min(max(place, self._low), self._high)
         with silent(self):
-            self.setValue(round(min(max(fraction, 0.0), 1.0) * _STEPS))
+            self.setValue(round(self._place))
         self.update()
 
     def show_held(self, number: float | None) -> None:
         """Mark where contact holds the number, although the handle is elsewhere; None for none."""
         span = self._high - self._low
-        held = None if number is None else min(max((number - self._low) / span, 0.0), 1.0)
+        held = None
+        if number is not None:
+            held = min(max((number * self._shown - self._low) / span, 0.0), 1.0)
         if held != self.held_at:
             self.held_at = held
             self.update()
@@ -116,6 +153,8 @@ class CodeSlider(Slider):
         """Reset, or move as any slider does."""
         if event.key() in (Qt.Key.Key_Delete, Qt.Key.Key_Backspace):
             self.reset_wanted.emit()
+        elif event.key() in _KEYS:
+            self.move_to(self._place + _KEYS[event.key()] * (self._high - self._low))
         else:
             super().keyPressEvent(event)
 
@@ -160,7 +199,7 @@ class CodeRow(HoverRow):
         # Its end tells what the part does.
         label = ElidedLabel(name, Qt.TextElideMode.ElideMiddle)
         label.setMaximumWidth(name_width)
-        self.slider = CodeSlider(low, high, model.domain_colours[moved])
+        self.slider = CodeSlider(low, high, float(space.shown[code]), model.domain_colours[moved])
         self._explained: tuple[bool, bool] | None = None
         beyond = _BEYOND * (high - low)
         self._limits = self._field_limits = low - beyond, high + beyond
@@ -175,8 +214,9 @@ class CodeRow(HoverRow):
         source = f"motion {index + 1}"
         if not model.is_trained:
             source = next(g for g in space.groups if code < g.codes.stop).code_names[index]
-        self.slider.setAccessibleName(name)
-        self.field.setAccessibleName(f"{name}, number")
+        full = heading(document.code_name(code))
+        self.slider.setAccessibleName(full)
+        self.field.setAccessibleName(f"{full}, number")
         self.slider.setToolTip(
             plain_tip(
                 f"{name} ({source}): drag to move, hold Ctrl to move ten times finer, "
@@ -193,10 +233,15 @@ class CodeRow(HoverRow):
         self.slider.click_unwanted.connect(self._on_click_unwanted)
         self.slider.drag_ended.connect(self._on_drag_ended)
         self.slider.drag_abandoned.connect(document.cancel_gesture)
-        self.slider.valueChanged.connect(lambda: self._move(self.slider.number))
+        self.slider.number_wanted.connect(self._move)
         self.slider.reset_wanted.connect(lambda: document.reset_code(code))
         self.field.valueChanged.connect(lambda shown: self._move(shown / self._shown))
         self.field.refused.connect(lambda told: document.message.emit(f"{name}: {told}"))
+
+    @staticmethod
+    def width_beside(name: int) -> int:
+        """Return the least width of a row whose name has this width and is not cut."""
+        return name + LEAST_TRACK + _FIELD_WIDTH + 2 * CLOSE + 2 * TIGHT
 
     def show_number(self, number: float) -> None:
         """Follow the document, also beyond what can be typed; a handle that is held stays."""
@@ -211,7 +256,7 @@ class CodeRow(HoverRow):
                 self.field.setRange(*(self._shown * limit for limit in limits))
                 self._field_limits = limits
             self.field.setValue(self._shown * number)
-        # The slider's own value is a count of steps.
+        # With its unit, and finer than the slider's own value.
         self.slider.setAccessibleDescription(self.field.text())
         self._explain(number)
 
@@ -241,7 +286,7 @@ class CodeRow(HoverRow):
             kind = "trained range" if self._is_trained else "joint's range"
             words += f"; this one is outside the {kind}, {least} to {most}"
         if held:
-            words = f"held by contact; {words}"
+            words = f"stopped by contact; {words}"
         self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
 
     def show_held(self, number: float | None) -> None:

@@ -8,11 +8,11 @@ from PySide6.QtCore import QTimer, Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QWidget
 
-from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, TIGHT
 from app.window.panels.exact import ExactCard
 from app.window.panels.prediction import PredictionCard
 from app.window.panels.proposal import ProposalCard
-from app.window.panels.resolve import ResolveCard
+from app.window.panels.resolve import OutcomeCard, ResolveCard
 from app.window.widgets import scrolling, vbox
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _MIN_WIDTH = 288
 
 
 class CollisionPanel(QWidget):
-    """Cards, one below the other; the first, the headline, is always in sight.
+    """Cards, one below the other; the headline and Resolve, at the ends, are always in sight.
 
     Signals
     -------
@@ -54,12 +54,16 @@ class CollisionPanel(QWidget):
         self.proposal = ProposalCard(document)
         self.prediction = PredictionCard(document, learn_action)
         self.resolve = ResolveCard(document, resolve_action, options_action)
+        self.outcome = OutcomeCard(document)
         page = QWidget()
-        margins = (NORMAL, 0, NORMAL, CLOSE)
-        page.setLayout(vbox(self.proposal, self.prediction, self.resolve, None, margins=margins))
+        margins = (NORMAL, 0, NORMAL, 0)
+        page.setLayout(vbox(self.proposal, self.prediction, self.outcome, None, margins=margins))
         self._area = scrolling(page)
+        # In a low window it gives way to what is always in sight.
+        self._area.setMinimumHeight(ROW_HEIGHT)
         headline = vbox(self.exact, margins=(NORMAL, TIGHT, NORMAL, 0))
-        self.setLayout(vbox(headline, self._area))
+        remedy = vbox(self.resolve, margins=(NORMAL, 0, NORMAL, CLOSE))
+        self.setLayout(vbox(headline, self._area, remedy))
         self.proposal.faces_named.connect(self.faces_named)
         self.prediction.domain_hovered.connect(self.domain_hovered)
         document.outcome_changed.connect(self._on_outcome)
@@ -73,5 +77,5 @@ class CollisionPanel(QWidget):
     @Slot()
     def _scroll_to_outcome(self) -> None:
         """Show the whole result of Resolve, or its beginning if there is no space for all."""
-        self._area.ensureWidgetVisible(self.resolve, 0, CLOSE)
-        self._area.ensureWidgetVisible(self.resolve.exactly_free, 0, CLOSE)
+        self._area.ensureWidgetVisible(self.outcome, 0, CLOSE)
+        self._area.ensureWidgetVisible(self.outcome.exactly_free, 0, CLOSE)

@@ -24,7 +24,7 @@ _SIGNS = {"free": "check", "colliding": "warning"}
 _SIGN_SIZE = 24
 _SOURCE = "computed on the mesh"
 _BEFORE = "previous pose"
-_HELD = "Held by contact"
+_HELD = "Stopped by contact"
 _NO_DEEPER = "Solid keeps it from going deeper; Resolve separates it"
 
 

@@ -39,8 +39,8 @@ EVEN_ODDS = 0.5
 _BAR_WIDTH, _BAR_STEPS = 40, 1000
 _TIP = "The model's instant estimate of how likely this pose collides with itself"
 _MISSING = (
-    "This model can't estimate collisions, so Resolve is off. Open another model, or learn one by "
-    "“New model” in the File menu."
+    "This model can't estimate collisions, so Resolve is off. Open another model, or train one "
+    "with File > New model."
 )
 _BY_RIG = "No estimate: this character is posed by its rig."
 

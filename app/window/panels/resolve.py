@@ -72,7 +72,7 @@ class Fact(QWidget):
 
 
 class ResolveCard(Card):
-    """The lower end of the right panel.
+    """The lower end of the right panel, always in sight.
 
     Parameters
     ----------
@@ -97,8 +97,6 @@ class ResolveCard(Card):
         self.working = QWidget()
         progress = vbox(ElidedLabel("Searching for a pose…"), self.bar, spacing=TIGHT)
         self.working.setLayout(hbox(progress, self.cancel, spacing=NORMAL))
-        self.outcome = QWidget()
-        self._make_outcome()
         self.resting = QWidget()
         self.resting.setLayout(hbox(self.button, self.options, wide=self.button))
         # They swap in place, so that nothing jumps.
@@ -108,8 +106,8 @@ class ResolveCard(Card):
         locked = "All body parts are locked: unlock one to resolve"
         self._locked = labelled(locked, "caption", wraps=True)
         self.stack.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
-        for widget in (self.stack, self._locked, self.outcome):
-            self.column.addWidget(widget)
+        self.column.addWidget(self.stack)
+        self.column.addWidget(self._locked)
         self.button.clicked.connect(resolve_action.trigger)
         self.cancel.clicked.connect(document.cancel_resolve)
         self.options.clicked.connect(options_action.trigger)
@@ -117,13 +115,59 @@ class ResolveCard(Card):
         document.solve_started.connect(self._on_started)
         document.solve_progressed.connect(self._on_progressed)
         document.solve_finished.connect(self._on_finished)
-        document.outcome_changed.connect(self._on_outcome)
         document.locks_changed.connect(self._on_locks)
         self._on_action()
         self._on_locks()
-        self._on_outcome()
 
-    def _make_outcome(self) -> None:
+    @Slot()
+    def _on_action(self) -> None:
+        # Hidden while it works, it keeps ready to have the keyboard again.
+        self.button.setEnabled(self._action.isEnabled() or self._document.solving)
+        self.button.setToolTip(self._action.toolTip())
+
+    @Slot()
+    def _on_started(self) -> None:
+        self._go_to(self.working, self.cancel)
+        # Until the first report its progress is unknown.
+        self.bar.setRange(0, 0)
+
+    def _go_to(self, page: QWidget, button: QPushButton) -> None:
+        """Show another page; the keyboard follows from one to the other, or stays elsewhere."""
+        focused = QApplication.focusWidget()
+        had_focus = focused is not None and self.stack.isAncestorOf(focused)
+        self.stack.setCurrentWidget(page)
+        if had_focus:
+            button.setFocus()
+
+    @Slot(object)
+    def _on_progressed(self, status: object) -> None:
+        if isinstance(status, tuple) and len(status) == 2 and status[1] > 0 and status[0] > 0:
+            done, total = status
+            self.bar.setRange(0, int(total))
+            self.bar.setValue(int(done))
+
+    @Slot(object)
+    def _on_finished(self, result: object) -> None:  # noqa: ARG002
+        self._go_to(self.resting, self.button)
+        # Qt animates an endless bar even while it is hidden.
+        self.bar.setRange(0, 1)
+
+    @Slot()
+    def _on_locks(self) -> None:
+        self._locked.setVisible(self._document.all_locked)
+
+
+class OutcomeCard(Card):
+    """What Resolve has found; hidden before, and while it works.
+
+    Parameters
+    ----------
+    document : its outcome is shown
+    """
+
+    def __init__(self, document: PoseDocument) -> None:
+        super().__init__()
+        self._document = document
         self.converged = Fact(
             "Whether the search ended by itself; the exact check alone decides whether the pose "
             "collides"
@@ -148,52 +192,19 @@ class ResolveCard(Card):
         numbers.addRow(labelled("Moved", "caption"), self._moved)
         numbers.addRow(labelled("Took", "caption"), self._took)
         facts = (self.exactly_free, self.converged, self.predicted_free)
-        margins = (0, TIGHT, 0, 0)
-        self.outcome.setLayout(vbox(*facts, numbers, self._note, spacing=TIGHT, margins=margins))
-
-    @Slot()
-    def _on_action(self) -> None:
-        # Hidden while it works, it keeps ready to have the keyboard again.
-        self.button.setEnabled(self._action.isEnabled() or self._document.solving)
-        self.button.setToolTip(self._action.toolTip())
-
-    @Slot()
-    def _on_started(self) -> None:
-        self._go_to(self.working, self.cancel)
-        self.outcome.hide()
-        # Until the first report its progress is unknown.
-        self.bar.setRange(0, 0)
-
-    def _go_to(self, page: QWidget, button: QPushButton) -> None:
-        """Show another page; the keyboard follows from one to the other, or stays elsewhere."""
-        focused = QApplication.focusWidget()
-        had_focus = focused is not None and self.stack.isAncestorOf(focused)
-        self.stack.setCurrentWidget(page)
-        if had_focus:
-            button.setFocus()
-
-    @Slot(object)
-    def _on_progressed(self, status: object) -> None:
-        if isinstance(status, tuple) and len(status) == 2 and status[1] > 0 and status[0] > 0:
-            done, total = status
-            self.bar.setRange(0, int(total))
-            self.bar.setValue(int(done))
-
-    @Slot(object)
-    def _on_finished(self, result: object) -> None:  # noqa: ARG002
-        self._go_to(self.resting, self.button)
-        # Qt animates an endless bar even while it is hidden.
-        self.bar.setRange(0, 1)
+        self.column.addLayout(vbox(*facts, numbers, self._note, spacing=TIGHT))
+        for changed in (
+            document.solve_started,
+            document.solve_finished,
+            document.outcome_changed,
+        ):
+            changed.connect(self._on_outcome)
         self._on_outcome()
-
-    @Slot()
-    def _on_locks(self) -> None:
-        self._locked.setVisible(self._document.all_locked)
 
     @Slot()
     def _on_outcome(self) -> None:
         result = self._document.outcome if self._document.has_model else None
-        self.outcome.setVisible(result is not None and not self._document.solving)
+        self.setVisible(result is not None and not self._document.solving)
         if result is not None:
             self._show(result)
 

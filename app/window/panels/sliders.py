@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QPoint, Qt, QTimer, Signal, Slot
+from PySide6.QtCore import QPoint, QSize, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import QMouseEvent
 from PySide6.QtWidgets import QLineEdit, QToolButton, QWidget
 
@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 _HEADER_HEIGHT, _ARROW = 28, 16
+
+_MIN_WIDTH = 316
+"""Width that shows most names whole, in device-independent pixels."""
 
 _LEAST_HELD = 1e-3
 """Difference from what was asked for that is worth a mark: the last digit of a number."""
@@ -110,7 +113,7 @@ class SliderGroup(QWidget):
         self.header.button.setChecked(is_open)
 
     def show_matching(self, words: str) -> bool:
-        """Show only rows whose name, with that of their group, holds all of the words.
+        """Show only rows of which all of the words are said, see `PosableBody.code_words`.
 
         Parameters
         ----------
@@ -120,11 +123,7 @@ class SliderGroup(QWidget):
         -------
         found : whether a row is left
         """
-        names = (
-            # By the number of before as well.
-            f"{self._group.name} {own} {self._group.full_name(index)}".casefold()
-            for index, own in enumerate(self._panel.document.model.code_names[self._group.codes])
-        )
+        names = self._panel.document.model.code_words[self._group.codes]
         matches = [all(word in name for word in words.split()) for name in names]
         if words and self._open_before is None:
             self._open_before = self.header.button.isChecked()
@@ -180,11 +179,11 @@ class SlidersPanel(QWidget):
         self.document = document
         self.groups: list[SliderGroup] = []
         self._fingerprint = ""
-        self._latent_size = 0
+        self._latent_size = self._natural_width = 0
         self._asked: tuple[CodeRow, float, FloatArray] | None = None
         self.filter = QLineEdit()
-        self.filter.setPlaceholderText("Filter sliders, such as “thigh”")
-        self.filter.setToolTip("Show only the sliders whose names contain these words")
+        self.filter.setPlaceholderText("Filter sliders, such as “finger”")
+        self.filter.setToolTip("Show the sliders of a part or motion, such as “left hand twist”")
         self.filter.setAccessibleName("Filter sliders")
         self.filter.setClearButtonEnabled(True)
         self._page = QWidget()
@@ -203,6 +202,10 @@ class SlidersPanel(QWidget):
         document.frame_changed.connect(self._on_frame)
         if document.has_model:
             self._on_model()
+
+    def sizeHint(self) -> QSize:  # noqa: N802 - Qt's name
+        """Ask for whole names."""
+        return QSize(self._natural_width, super().sizeHint().height())
 
     def add_card(self, card: QWidget) -> None:
         """Put something below the sliders, where it stays in sight."""
@@ -257,9 +260,17 @@ class SlidersPanel(QWidget):
             QWidget.setTabOrder(before, group.header.button)
             before = group.header.button
         self._latent_size = model.latent_size
+        self._natural_width = self._width_of_names()
+        self.setMinimumWidth(min(self._natural_width, _MIN_WIDTH))
         for group, is_open in zip(self.groups, opened, strict=False):
             group.set_open(is_open)
         self._on_filter(self.filter.text())
+
+    def _width_of_names(self) -> int:
+        """Return the width at which no name is cut."""
+        name = longest_name(self, map(heading, self.document.model.code_names))
+        bar = self._area.verticalScrollBar().sizeHint().width()
+        return CodeRow.width_beside(name) + 2 * CLOSE + bar
 
     def _on_latent(self) -> None:
         latent = self.document.latent

@@ -83,7 +83,7 @@ def test_update_changes_the_kept_pose_and_undo_brings_it_back_to_the_bit(
     document: PoseDocument,
 ) -> None:
     assert document.library_pose is None
-    with pytest.raises(ModelFileError, match="not one of your library"):
+    with pytest.raises(ModelFileError, match="is not in your library"):
         document.update_library_pose()
     document.add_pose_to_library("A")
     document.tag_poses(["A"], ["kick"])

@@ -564,3 +564,33 @@ def test_no_random_sequence_shows_a_colliding_pose(
     assert len(seen) > 100
     assert not any(collide)
     assert any(touch)
+
+
+def test_reset_all_is_one_step_that_takes_the_pins_and_says_what_stays(
+    qtbot: QtBot, solid: PoseDocument
+) -> None:
+    other = next(k for k in range(9) if solid.training_pose(k).latent.any())
+    solid.load_pose(solid.training_pose(other))
+    solid.pin(end_of(solid))
+    solid.set_locked(0, True)
+    settle(qtbot, solid)
+    before, pins, steps = solid.latent, solid.pins, solid.undo_stack.count()
+    assert pins
+    with qtbot.waitSignal(solid.message) as told:
+        solid.reset_all()
+    assert told.args == ["Everything was reset except 1 locked body part: see Edit > Unlock all"]
+    locked = solid.model.pose_space.codes_of([0])
+    # Also with Solid on, there is no way on which something could stop it.
+    assert not solid.moving
+    assert not solid.latent[~locked].any()
+    assert (solid.latent[locked] == before[locked]).all()
+    assert solid.pins == ()
+    assert solid.undo_stack.count() == steps + 1
+    solid.undo()
+    assert solid.latent.tobytes() == before.tobytes()
+    assert solid.pins == pins
+    solid.set_locked(0, False)
+    with qtbot.assertNotEmitted(solid.message):
+        solid.reset_all()
+    assert not solid.latent.any()
+    settle(qtbot, solid)

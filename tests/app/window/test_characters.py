@@ -102,8 +102,8 @@ def test_a_character_without_predictor_lacks_nothing(
     with qtbot.waitSignal(window.document.solve_finished, timeout=PATIENCE):
         actions["resolve"].trigger()
     rest(qtbot, window)
-    assert panel.resolve.exactly_free.answer is True
-    assert not panel.resolve.predicted_free.isVisible()
+    assert panel.outcome.exactly_free.answer is True
+    assert not panel.outcome.predicted_free.isVisible()
 
 
 def test_a_file_without_rig_is_a_mesh_of_the_character(
@@ -232,7 +232,7 @@ def test_poses_of_a_character_bring_it_back_over_another_body(
     def accept(dialog: QDialog) -> None:
         assert isinstance(dialog, QMessageBox)
         asked.append(dialog.text())
-        next(b for b in dialog.buttons() if b.text().startswith("Open")).click()
+        next(b for b in dialog.buttons() if b.text().replace("&", "").startswith("Open")).click()
 
     timer = answer(accept)
     with qtbot.waitSignal(document.opened, timeout=PATIENCE):

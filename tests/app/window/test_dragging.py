@@ -239,7 +239,7 @@ def test_a_part_is_mirrored_to_the_other_side_by_the_menu(
     (mirror,) = (a for a in menu.actions() if "irror to" in a.text().replace("&", ""))
     # An edit that still moves the pose ends where it is.
     assert document.model.pose_space.metric.any()
-    document.reset_all()
+    document.randomise(1.0, 3)
     qtbot.waitUntil(lambda: document.latent is not before)
     assert document.moving
     mirror.trigger()

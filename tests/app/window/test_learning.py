@@ -409,3 +409,38 @@ def test_a_failure_to_look_for_runs_is_told(
         window = open_window(qtbot, document, settings_in(tmp_path))
     assert failed.args[0].headline == "the list of runs cannot be read"
     close_window(window)
+
+
+def test_the_dialog_keeps_its_size_and_does_not_come_back_once_closed(
+    qtbot: QtBot, watching: MainWindow, editor_model: PoseModel
+) -> None:
+    runs = watching.learning.runs
+    work = WorkFolder(model_destination("hero"))
+    work.prepare(LearningRequest(("/nowhere.npz",)))
+
+    def tell(stage: str, done: float) -> None:
+        work.tell(WorkStatus(WorkState.RUNNING, stage, done, done, 480.0))
+        runs.look()
+
+    with locked(work.path / "run"):
+        tell("poses", 0.1)
+        watching.actions_by_key["learning"].trigger()
+        dialog = dialog_of(watching)
+        dialog.resize(800, 780)
+        for stage, done in (("latent space", 0.3), ("labels", 0.6), ("predictor", 0.9)):
+            tell(stage, done)
+            assert (dialog.width(), dialog.height()) == (800, 780)
+        dialog.reject()
+    finished("hero", editor_model)
+    runs.look()
+    assert watching.learning.indicator.text() == "hero is ready"
+    assert not [d for d in watching.findChildren(LearningDialog) if d.isVisible()]
+    # Nor in the next window; who asks for it has it back.
+    watching.learning._told.clear()
+    runs.changed.emit()
+    assert not [d for d in watching.findChildren(LearningDialog) if d.isVisible()]
+    QTest.mouseClick(watching.learning.indicator, LEFT)
+    dialog = dialog_of(watching)
+    qtbot.waitUntil(dialog.card.isVisible, timeout=PATIENCE)
+    dialog.dismiss.click()
+    qtbot.waitUntil(lambda: not dialog.isVisible(), timeout=PATIENCE)

@@ -101,17 +101,17 @@ def test_a_drag_with_a_key_held_is_ten_times_finer(
 ) -> None:
     slider = window.sliders.row_of(1).slider
     start = handle(window.sliders.row_of(1))
-    way, before = 20, slider.value()
-    per_pixel = slider.maximum() / (slider.width() - 2 * HANDLE)
+    way, before = 20, slider.place
+    per_pixel = (slider.ends[1] - slider.ends[0]) / (slider.width() - 2 * HANDLE)
     left, no_key = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
     QTest.mousePress(slider, left, key, start)
     for step in range(1, way + 1):
         move_held(slider, start + QPoint(step, 0), key)
-    assert slider.value() - before == pytest.approx(0.1 * way * per_pixel, abs=1.0)
+    assert slider.place - before == pytest.approx(0.1 * way * per_pixel, abs=1.0)
     # Let go of the key, the handle goes on from where it is.
-    fine = slider.value()
+    fine = slider.place
     move_held(slider, start + QPoint(way + 1, 0), no_key)
-    assert slider.value() - fine == pytest.approx(per_pixel, abs=1.0)
+    assert slider.place - fine == pytest.approx(per_pixel, abs=1.0)
     QTest.mouseRelease(slider, left, no_key, start + QPoint(way + 1, 0))
     rest(qtbot, window)
     assert window.document.undo_stack.count() == 1
@@ -193,7 +193,7 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     document, card = window.document, window.collision.resolve
     document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
-    before = shown(window)
+    before, outcome = shown(window), window.collision.outcome
     assert document.model.detector.detect(before).colliding
     steps = document.undo_stack.count()
     with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
@@ -207,16 +207,16 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     assert not document.model.detector.detect(after).colliding
     assert window.collision.exact.verdict.text() == "No collisions (checked)"
     assert document.outcome is not None
-    assert card.outcome.isVisible()
-    assert card.exactly_free.answer is True
-    assert card.predicted_free.answer == document.outcome.predicted_free
+    assert outcome.isVisible()
+    assert outcome.exactly_free.answer is True
+    assert outcome.predicted_free.answer == document.outcome.predicted_free
     assert document.undo_stack.count() == steps + 1
     assert np.array_equal(document.ghost, before)
     QTest.keyClick(window, Qt.Key.Key_Z, Qt.KeyboardModifier.ControlModifier)
     rest(qtbot, window)
     assert document.latent.tobytes() == colliding.tobytes()
     assert shown(window).tobytes() == before.tobytes()
-    assert not card.outcome.isVisible()
+    assert not outcome.isVisible()
     QTest.keyClick(
         window,
         Qt.Key.Key_Z,
@@ -224,7 +224,7 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     )
     rest(qtbot, window)
     assert shown(window).tobytes() == after.tobytes()
-    assert card.exactly_free.answer is True
+    assert outcome.exactly_free.answer is True
 
 
 def words_on_the_screen(window: MainWindow) -> Iterator[str]:
@@ -676,3 +676,30 @@ def test_a_failing_worker_leaves_the_editor_usable(
     drag(qtbot, window.sliders.row_of(0), by=12)
     rest(qtbot, window)
     assert np.array_equal(shown(window), decoded(window.document))
+
+
+def test_save_as_saves_the_pose_that_was_open_when_it_was_asked_for(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document, file = window.document, tmp_path / "asked.json"
+    document.load_pose(document.training_pose(2))
+    asked, later = document.pose, document.training_pose(3)
+
+    def answered(*_: object) -> Path:
+        # As a file that is read meanwhile.
+        document.load_pose(later)
+        return file
+
+    monkeypatch.setattr(window.files, "ask_save", answered)
+    with qtbot.waitSignal(document.message) as told:
+        window.actions_by_key["save_as"].trigger()
+    assert told.args == [f"Saved “{asked.name}” to asked.json, not the pose opened since"]
+    (saved,) = read_poses(file, document.model)
+    assert saved.latent.tobytes() == asked.latent.tobytes()
+    # The pose that has come in stays as it is: it has not been saved.
+    assert document.file is None
+    assert document.pose.name == later.name
+    monkeypatch.setattr(window.files, "ask_save", lambda *_: file)
+    window.actions_by_key["save_as"].trigger()
+    assert document.file == file
+    rest(qtbot, window)

@@ -27,7 +27,8 @@ from app.window.main_window import MainWindow
 from app.window.panels.dock import beside
 from app.window.widgets import screen_of
 from app.work.threads import Failure
-from tests.app.windows import close_window, open_window, rest, settings_in, settle_layout
+from lcollision_core.model import PoseModel, sample_poses
+from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in, settle_layout
 
 SMALL = QSize(800, 600)
 
@@ -196,3 +197,76 @@ def test_where_there_is_no_room_beside_a_panel_hides_no_body() -> None:
     vast = QRect(0, 0, 1200, 900)
     corner = beside(vast, QRect(0, 0, 1000, 800), body, room)
     assert room.contains(corner)
+
+
+def drag_line(qtbot: QtBot, window: MainWindow, dock: QDockWidget, by: int) -> None:
+    """Drag the line at the right of a panel, as a user does."""
+    start = QPoint(dock.geometry().right() + 3, dock.geometry().center().y())
+    QTest.mousePress(window, Qt.MouseButton.LeftButton, pos=start)
+    for step in range(1, 6):
+        QTest.mouseMove(window, start + QPoint(by * step // 5, 0))
+        qtbot.wait(20)
+    QTest.mouseRelease(window, Qt.MouseButton.LeftButton, pos=start + QPoint(by, 0))
+    settle_layout(qtbot, window)
+
+
+def test_the_width_of_a_panel_is_the_users_and_remembered(
+    qtbot: QtBot, document: PoseDocument, editor_model: PoseModel, tmp_path: Path
+) -> None:
+    first = open_window(qtbot, document, settings_in(tmp_path), (1360, 840))
+    settle_layout(qtbot, first)
+    sliders, others = first.docks["sliders"], first.docks["collision"].width()
+    before = sliders.width()
+    drag_line(qtbot, first, sliders, 90)
+    wanted = sliders.width()
+    assert wanted == pytest.approx(before + 90, abs=3)
+    # A narrow window takes of it only as long as it is narrow.
+    for width in (800, 1360, 1580):
+        first.resize(width, 800)
+        settle_layout(qtbot, first)
+        assert first.width() == width
+        assert (sliders.width() == wanted) == (width > 800)
+    close_window(first)
+    again = PoseDocument(editor_model)
+    second = open_window(qtbot, again, settings_in(tmp_path), (1500, 840))
+    qtbot.waitUntil(lambda: second.docks["sliders"].width() == wanted)
+    second.reset_layout()
+    settle_layout(qtbot, second)
+    assert second.docks["sliders"].width() != wanted
+    assert second.docks["collision"].width() >= others
+    close_window(second)
+    assert again.close()
+    again.deleteLater()
+
+
+@pytest.mark.parametrize("size", [(800, 600), (1360, 840)])
+def test_resolve_is_in_sight_beside_long_lists_and_notes(
+    qtbot: QtBot,
+    document: PoseDocument,
+    editor_model: PoseModel,
+    tmp_path: Path,
+    size: tuple[int, int],
+) -> None:
+    window = open_window(qtbot, document, settings_in(tmp_path), (1360, 840))
+    window.resize(*size)
+    document.blend_towards(sample_poses(editor_model, 1, 0, colliding=True)[0], 1.0)
+    rest(qtbot, window)
+    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+        window.actions_by_key["resolve"].trigger()
+    panel = window.collision
+    # As of a body with many parts, whose rules leave much out.
+    for row in panel.prediction.rows:
+        row.setFixedHeight(400)
+    panel.proposal.show()
+    panel.proposal.text.setText("The same parts touch in nearly all of the poses. " * 8)
+    panel.exact.details.setText("54 pairs of triangles are not counted, as parts touch\n" * 3)
+    rest(qtbot, window)
+    settle_layout(qtbot, window)
+    assert (window.width(), window.height()) == size
+    for widget in (panel.resolve.button, panel.resolve.options, panel.exact.verdict):
+        assert widget.isVisible()
+        assert lies_in(widget, window)
+        assert lies_in(widget, window.docks["collision"])
+        assert widget.visibleRegion().boundingRect().size() == widget.size()
+    assert panel.resolve.button.height() >= 30
+    close_window(window)

@@ -27,7 +27,7 @@ def answer_with(words: str, told: list[str], picture: str = "scale_and_import") 
             return
         told.extend([box.text(), box.informativeText()])
         take_picture(box, picture)
-        next(button for button in box.buttons() if button.text() == words).click()
+        next(button for button in box.buttons() if button.text().replace("&", "") == words).click()
 
     QTimer.singleShot(0, click)
 

@@ -55,44 +55,33 @@ def is_seen_whole(window: MainWindow, widget: QWidget) -> bool:
 def test_the_result_of_resolve_scrolls_into_sight(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
-    card = window.collision.resolve
     window.resize(1280, 560)
     window.document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     assert scrolled(window).verticalScrollBar().value() == 0
     resolve(qtbot, window)
     assert scrolled(window).verticalScrollBar().maximum() > 0
-    qtbot.waitUntil(lambda: is_seen_whole(window, card.outcome), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: is_seen_whole(window, window.collision.outcome), timeout=PATIENCE)
 
 
-def test_the_panel_keeps_the_width_that_its_cards_need_also_where_a_layout_says_less(
+def test_the_panel_keeps_the_width_that_its_cards_need_also_where_settings_say_less(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = PosePrediction(np.zeros(2), 1.0)
     monkeypatch.setattr(FrameEvaluator, "_predict", lambda *_: told)
     settings = settings_in(tmp_path)
-    before = open_window(qtbot, document, settings)
-    shrink_and_grow(qtbot, before)
-    assert has_room(before)
-    # As it was remembered while the panel could be made as narrow as one liked.
-    before.collision.setMinimumWidth(0)
-    settle_layout(qtbot, before)
-    shrink_and_grow(qtbot, before)
-    assert not has_room(before)
-    close_window(before)
+    settings["collision_width"] = 100
     after = open_window(qtbot, PoseDocument(document.model), settings)
     qtbot.waitUntil(lambda: not after.document.busy, timeout=PATIENCE)
     rest(qtbot, after)
     assert after.collision.prediction.percent.text() == "100 %"
     assert after.collision.prediction.verdict.text() == "Overruled by the check"
     assert has_room(after)
-    close_window(after)
-
-
-def shrink_and_grow(qtbot: QtBot, window: MainWindow) -> None:
     for size in ((300, 300), (1280, 720)):
-        window.resize(*size)
-        settle_layout(qtbot, window)
+        after.resize(*size)
+        settle_layout(qtbot, after)
+        assert has_room(after)
+    close_window(after)
 
 
 def has_room(window: MainWindow) -> bool:
@@ -205,7 +194,7 @@ def colours_of(widget: QWidget) -> set[str]:
 def test_a_free_pose_reads_as_success_whatever_was_predicted(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
-    document, card = window.document, window.collision.resolve
+    document, card = window.document, window.collision.outcome
     facts = (card.exactly_free, card.converged, card.predicted_free)
     document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
@@ -248,12 +237,12 @@ def test_a_free_pose_reads_as_success_whatever_was_predicted(
 def test_the_ghost_goes_and_comes_back_with_the_result_it_belongs_to(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
-    document, card, scene = window.document, window.collision.resolve, window.viewport.scene
+    document, card, scene = window.document, window.collision.outcome, window.viewport.scene
     assert scene is not None
 
     def seen() -> tuple[bool, bool]:
         rest(qtbot, window)
-        return card.outcome.isVisible(), scene.ghost_shown
+        return card.isVisible(), scene.ghost_shown
 
     document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
@@ -278,7 +267,7 @@ def test_a_result_says_of_what_the_body_has_moved_its_shares(
     window.document.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     resolve(qtbot, window)
-    (moved,) = (text for text in texts(window.collision.resolve) if "at most" in text)
+    (moved,) = (text for text in texts(window.collision.outcome) if "at most" in text)
     assert re.fullmatch(r"[\d.]+ % of the body size,\nat most [\d.]+ %", moved)
     window.resizeDocks([window.docks["collision"]], [1], Qt.Orientation.Horizontal)
     settle_layout(qtbot, window)

@@ -120,7 +120,7 @@ def pressing(text: str) -> Callable[[QDialog], None]:
 
     def act(dialog: QDialog) -> None:
         assert isinstance(dialog, QMessageBox)
-        (button,) = [held for held in dialog.buttons() if held.text() == text]
+        (button,) = [held for held in dialog.buttons() if held.text().replace("&", "") == text]
         QTest.mouseClick(button, LEFT)
 
     return act
@@ -577,7 +577,7 @@ def test_a_library_that_could_not_be_written_is_asked_about_before_it_goes(
         take_picture(dialog, "library-unsaved")
         if choice == "Try again":
             blocked.unlink()
-        (button,) = (held for held in dialog.buttons() if held.text() == choice)
+        (button,) = (held for held in dialog.buttons() if held.text().replace("&", "") == choice)
         button.click()
 
     timer = answer(choose)

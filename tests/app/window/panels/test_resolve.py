@@ -42,6 +42,7 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document, card = window.document, window.collision.resolve
+    outcome = window.collision.outcome
     document.blend_towards(colliding, 1.0)
     for domain in (0, 1):
         assert "All body parts are locked: unlock one to resolve" not in texts(card)
@@ -53,14 +54,14 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
         window.statusBar().clearMessage()
     assert document.latent.tobytes() == colliding.tobytes()
     assert not resolve(qtbot, window).exactly_free
-    assert LOCKED in texts(card)
-    assert "No search was needed" not in texts(card)
-    assert card.converged.sign.name == "info"
+    assert LOCKED in texts(outcome)
+    assert "No search was needed" not in texts(outcome)
+    assert outcome.converged.sign.name == "info"
     # A free pose needs none, locked or not.
     document.load_pose(NamedPose("mean", np.zeros_like(colliding)))
     assert resolve(qtbot, window).exactly_free
-    assert "No search was needed" in texts(card)
-    assert LOCKED not in texts(card)
+    assert "No search was needed" in texts(outcome)
+    assert LOCKED not in texts(outcome)
     document.set_locked(0, False)
     assert "All body parts are locked: unlock one to resolve" not in texts(card)
 
@@ -68,7 +69,7 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
 def test_a_search_that_had_no_time_is_not_called_needless(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
-    document, card = window.document, window.collision.resolve
+    document, card = window.document, window.collision.outcome
     document.blend_towards(colliding, 1.0)
     outcome = resolve(qtbot, window)
     for free in (True, False):
@@ -92,7 +93,7 @@ def test_the_time_told_is_what_was_waited_as_well(
         result, ghost = real(*arguments)  # type: ignore[arg-type]
         return replace(result, seconds=0.194), ghost
 
-    card = window.collision.resolve
+    card = window.collision.outcome
     window.document.blend_towards(colliding, 1.0)
     resolve(qtbot, window)
     assert not any("of preparation" in text for text in texts(card))

@@ -8,7 +8,7 @@ from threading import Event
 import numpy as np
 import pytest
 from PySide6.QtCore import QPoint, Qt
-from PySide6.QtGui import QIcon
+from PySide6.QtGui import QAccessible, QIcon
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QInputDialog, QLabel, QWidget
 from pytestqt.qtbot import QtBot
@@ -21,8 +21,10 @@ from app.window.panels.code_slider import CodeRow
 from app.window.panels.pose_grid import THUMBNAIL
 from app.window.panels.prediction import DomainRow
 from app.wording import heading
-from lcollision_core.model import NamedPose, PoseModel, write_poses
+from app.work.jobs import PartEdits
+from lcollision_core.model import NamedPose, PoseModel, RigModel, write_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
+from tests.rigged_shapes import rigged_body
 
 CONTROL, LEFT = Qt.KeyboardModifier.ControlModifier, Qt.MouseButton.LeftButton
 
@@ -431,7 +433,54 @@ def test_escape_ends_the_drag_of_a_slider_and_no_work(
     rest(qtbot, window)
 
 
-def test_a_slider_describes_its_number_as_it_is_shown(window: MainWindow) -> None:
+def test_a_slider_tells_assistive_technologies_what_is_shown(
+    qtbot: QtBot, window: MainWindow
+) -> None:
     row = window.sliders.row_of(1)
     window.document.set_code(1, 0.25)
     assert row.slider.accessibleDescription() == row.field.text() == "0.250"
+    window.document.set_model(RigModel.of(rigged_body()))
+    document, panel = window.document, window.sliders
+    rest(qtbot, window)
+    model = document.model
+    (group,) = (g for g in model.latent_space.groups if g.name == "Left forearm")
+    code = group.codes.start + model.code_names[group.codes].index("bend")
+    row = panel.row_of(code)
+    document.set_code(code, np.radians(45.3))
+    rest(qtbot, window)
+    told = QAccessible.queryAccessibleInterface(row.slider)
+    assert told.role() is QAccessible.Role.Slider
+    assert told.text(QAccessible.Text.Name) == "Left forearm, bend"
+    assert told.text(QAccessible.Text.Description) == row.field.text() == "45.3°"
+    value = told.valueInterface()
+    assert value.currentValue() == 45
+    low, high = (float(end[code]) for end in (model.latent_space.low, model.latent_space.high))
+    assert value.minimumValue() == pytest.approx(np.degrees(low), abs=1.0)
+    assert value.maximumValue() == pytest.approx(np.degrees(high), abs=1.0)
+    # They may set it, too; and what is between two degrees is kept.
+    value.setCurrentValue(30)
+    rest(qtbot, window)
+    assert document.latent[code] == pytest.approx(np.radians(30.0))
+    QTest.keyClick(row.slider, Qt.Key.Key_Right)
+    rest(qtbot, window)
+    step = 0.01 * (high - low)
+    assert document.latent[code] == pytest.approx(np.radians(30.0) + step)
+    QTest.keyClick(row.slider, Qt.Key.Key_Home)
+    rest(qtbot, window)
+    assert document.latent[code] == pytest.approx(low)
+
+
+def test_escape_says_what_it_has_stopped(qtbot: QtBot, window: MainWindow) -> None:
+    document = window.document
+    going, told = Event(), []
+    document.message.connect(told.append)
+    document.write("Exporting a.obj", lambda *_: str(going.wait(PATIENCE / 1000)))
+    document.edit_parts(PartEdits({0: "knee"}, {}))
+    assert document.changing_model
+    window.activateWindow()
+    QTest.keyClick(window, Qt.Key.Key_Escape)
+    assert told == ["Exporting a.obj was cancelled", "Saving the body parts was cancelled"]
+    going.set()
+    rest(qtbot, window)
+    assert not document.changing_model
+    assert document.model.domain_names[0] != "knee"

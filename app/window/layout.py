@@ -1,0 +1,150 @@
+"""Where the panels of the window are, and how wide: as the user left them, in any window."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QEvent, QObject, QSize, Qt, QTimer, Slot
+from PySide6.QtGui import QGuiApplication
+from PySide6.QtWidgets import QMainWindow
+
+if TYPE_CHECKING:
+    from app.editing.settings import Settings
+    from app.window.panels.dock import Panel
+
+_VERSION = 1
+_SIZE = QSize(1440, 900)
+_SIDE_FRACTIONS = {"sliders": (0.25, 344, 460), "collision": (0.22, 312, 380)}
+"""Fraction of the window's width, least and most, in device-independent pixels, of a panel whose
+width the user has not chosen."""
+_NARROW = 1100
+"""A window narrower than this has no space for the poses between the panels at its sides."""
+_LINE = 5
+"""Width of the line beside a panel, as in the style sheet."""
+_VIEW_WIDTH = 400
+"""Width of the view, before the panels beside it get more than they need."""
+_AREAS = {
+    "sliders": Qt.DockWidgetArea.LeftDockWidgetArea,
+    "collision": Qt.DockWidgetArea.RightDockWidgetArea,
+    "library": Qt.DockWidgetArea.BottomDockWidgetArea,
+}
+
+
+class Layout(QObject):
+    """Places the panels of a window, and remembers the widths that the user gives them.
+
+    A window too narrow for these takes from them only until it is wide again.
+
+    Parameters
+    ----------
+    window : whose panels they are
+    docks : panels by key
+    settings : remember the places, and the widths in device-independent pixels
+    """
+
+    def __init__(self, window: QMainWindow, docks: Mapping[str, Panel], settings: Settings) -> None:
+        super().__init__(window)
+        self._window, self._docks, self._settings = window, docks, settings
+        self._pressed: dict[str, int] = {}
+        window.setDockNestingEnabled(True)
+        for corner in (Qt.Corner.TopLeftCorner, Qt.Corner.BottomLeftCorner):
+            window.setCorner(corner, Qt.DockWidgetArea.LeftDockWidgetArea)
+        window.setCorner(Qt.Corner.TopRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
+        for key, dock in docks.items():
+            window.addDockWidget(_AREAS[key], dock)
+        # The lines between panels are the window's own: they have no signal.
+        window.installEventFilter(self)
+
+    def restore(self) -> None:
+        """Give the window the size and the places of the last time."""
+        screen = QGuiApplication.primaryScreen().availableGeometry().size()
+        self._window.resize(_SIZE.boundedTo(screen))
+        self._window.restoreGeometry(self._settings["window_geometry"])
+        self._window.restoreState(self._settings["window_layout"], _VERSION)
+
+    @Slot()
+    def begin(self) -> None:
+        """Give the panels of a window that is shown their sizes, which only such a one keeps."""
+        self.fit()
+        if self._settings["window_layout"].isEmpty():
+            self._fit_poses()
+
+    def save(self) -> None:
+        """Remember the window's size and the places of the panels."""
+        self._settings["window_geometry"] = self._window.saveGeometry()
+        self._settings["window_layout"] = self._window.saveState(_VERSION)
+
+    def reset(self) -> None:
+        """Put all panels back in their places, as wide as they were at first."""
+        for key, dock in self._docks.items():
+            dock.setFloating(False)
+            self._window.addDockWidget(_AREAS[key], dock)
+            dock.show()
+        for key in _SIDE_FRACTIONS:
+            self._settings[f"{key}_width"] = 0
+        self.fit()
+        self._fit_poses()
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
+        """Follow the window's size, and the lines between its panels."""
+        if event.type() is QEvent.Type.Resize:
+            self.fit()
+        elif event.type() is QEvent.Type.LayoutRequest:
+            self._limit()
+        elif event.type() is QEvent.Type.MouseButtonPress:
+            self._pressed = self._widths()
+        elif event.type() is QEvent.Type.MouseButtonRelease:
+            # Not before the line is where it was let go.
+            QTimer.singleShot(0, self, self._remember_widths)
+        return super().eventFilter(watched, event)
+
+    @Slot()
+    def fit(self) -> None:
+        """Give the panels at the sides their widths, and the poses a narrow window's corner."""
+        window = self._window
+        corner, area = Qt.Corner.BottomRightCorner, Qt.DockWidgetArea.RightDockWidgetArea
+        if window.width() < _NARROW:
+            area = Qt.DockWidgetArea.BottomDockWidgetArea
+        if window.corner(corner) is not area:
+            window.setCorner(corner, area)
+        wanted = {key: self._wanted_width(key) for key in self._widths()}
+        least = {key: self._docks[key].minimumSizeHint().width() for key in wanted}
+        spare = max(window.width() - _VIEW_WIDTH - sum(least.values()), 0)
+        more = sum(max(wanted[key] - least[key], 0) for key in wanted)
+        share = min(spare / more, 1.0) if more else 0.0
+        widths = [round(least[k] + share * max(wanted[k] - least[k], 0)) for k in wanted]
+        docks = [self._docks[key] for key in wanted]
+        window.resizeDocks(docks, widths, Qt.Orientation.Horizontal)
+
+    def _limit(self) -> None:
+        """Let the window be narrower than with the poses between the panels at its sides."""
+        sides = [self._docks[key].minimumSizeHint().width() + _LINE for key in self._widths()]
+        self._window.setMinimumWidth(sum(sides) + self._window.centralWidget().minimumWidth())
+
+    def _fit_poses(self) -> None:
+        library = self._docks["library"]
+        height = library.sizeHint().height()
+        self._window.resizeDocks([library], [height], Qt.Orientation.Vertical)
+
+    def _wanted_width(self, key: str) -> int:
+        """Return the width that the user chose, else what suits the window and the content."""
+        fraction, least, most = _SIDE_FRACTIONS[key]
+        suits = max(fraction * self._window.width(), self._docks[key].sizeHint().width(), least)
+        return int(self._settings[f"{key}_width"] or min(suits, most))
+
+    def _widths(self) -> dict[str, int]:
+        """Return the widths of the panels that stand in their places at the sides."""
+        return {
+            key: dock.width()
+            for key in _SIDE_FRACTIONS
+            if not (dock := self._docks[key]).isFloating()
+            and dock.isVisible()
+            and self._window.dockWidgetArea(dock) is _AREAS[key]
+        }
+
+    @Slot()
+    def _remember_widths(self) -> None:
+        for key, width in self._widths().items():
+            if width != self._pressed.get(key, width):
+                self._settings[f"{key}_width"] = width
