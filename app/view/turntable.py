@@ -68,7 +68,7 @@ class TurntableStyle:
             what, next_step = "can't be written as a turntable", f"name it {', '.join(FORMATS)}"
         elif suffix == ".png" and path.with_suffix("").exists():
             where = path.with_suffix("")
-            what, next_step = "is there already", "choose a new name for the PNG sequence"
+            what, next_step = "already exists", "choose a new name for the PNG sequence"
         elif suffix == ".gif" and self.background == "transparent":
             what, next_step = "cannot have a transparent background", "choose WebP or PNG"
         elif suffix == ".gif" and self.rate > FASTEST_GIF:

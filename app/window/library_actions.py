@@ -133,7 +133,7 @@ class LibraryActions(QObject):
             reason = document.why_not_called(name, replaced)
             if reason or not replaced or ask_to_replace(self._window, replaced):
                 return reason
-            return f"your library has a pose “{replaced}” already; choose another name"
+            return f"your library already has a pose “{replaced}”; choose another name"
 
         proposed = document.free_name(document.pose_name)
         label = "Name in your library:"
@@ -207,7 +207,7 @@ class LibraryActions(QObject):
         self._document.message.emit(
             f"Added {counted(added, 'pose')} to your library"
             if added
-            else "Your library has these poses already"
+            else "These poses are already in your library"
         )
 
     def _export_motion(self) -> None:

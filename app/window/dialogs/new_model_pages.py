@@ -197,7 +197,7 @@ class PosesPage(Page):
     def __init__(self) -> None:
         super().__init__(
             "Which poses?",
-            "The more different poses, the more the model can do. It learns how the body bends "
+            "The more varied the poses, the more the model can do: it learns how the body bends "
             "from them alone.",
         )
         self._summary: SourcesSummary | None = None

@@ -71,7 +71,7 @@ def test_a_png_sequence_is_a_folder_of_numbered_pictures(
     with Image.open(folder / names[0]) as image:
         assert (image.size, image.mode) == ((60, 40), "RGB")
     kept = (folder / names[0]).read_bytes()
-    with pytest.raises(MeshFileError, match="is there already; choose a new name"):
+    with pytest.raises(MeshFileError, match="already exists; choose a new name"):
         window.viewport.pictures.turntable(tmp_path / "turn.png", style)
     assert (folder / names[0]).read_bytes() == kept
 

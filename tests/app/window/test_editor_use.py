@@ -139,7 +139,7 @@ def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
     def recover(dialog: QDialog) -> None:
         assert isinstance(dialog, QMessageBox)
         offers.append(dialog.text())
-        (button,) = [held for held in dialog.buttons() if held.text() == "Recover"]
+        (button,) = [held for held in dialog.buttons() if held.text().replace("&", "") == "Recover"]
         button.click()
 
     document = PoseDocument()

@@ -167,7 +167,7 @@ def test_a_library_is_mirrored_and_back_to_the_bit(
         assert held[name].latent.tobytes() == trained.tobytes()
     place = choose(window, "twist left")
     said = mirror_by_menu(qtbot, window, place)
-    assert said == "Your library has these mirror images already"
+    assert said == "These mirrored poses are already in your library"
     assert len(document.poses) == 4
     qtbot.waitUntil(lambda: not library._due.isActive(), timeout=PATIENCE)
     rest(qtbot, window)

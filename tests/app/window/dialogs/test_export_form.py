@@ -278,7 +278,9 @@ def test_files_of_a_motion_that_nobody_has_named_are_asked_about(
         assert isinstance(dialog, QMessageBox)
         take_picture(dialog, "replace_files")
         told.extend([dialog.text(), dialog.informativeText()])
-        next(button for button in dialog.buttons() if button.text() == words).click()
+        next(
+            button for button in dialog.buttons() if button.text().replace("&", "") == words
+        ).click()
 
     def change(dialog: MotionDialog) -> None:
         dialog.form.setCurrentIndex(dialog.form.findData("pc2"))
@@ -289,7 +291,7 @@ def test_files_of_a_motion_that_nobody_has_named_are_asked_about(
     # The question comes once the names of the files are known.
     timers.append(answer(decide))
     qtbot.waitUntil(lambda: bool(told) and not document.busy, timeout=PATIENCE)
-    assert told[0] == "Replace files that are there already?"
+    assert told[0] == "Replace existing files?"
     assert "“run Body.pc2”" in told[1]
     assert (precious.read_bytes() == b"precious") is (words == "Cancel")
     assert (tmp_path / "run Hat.pc2").exists() is (words == "Replace")
