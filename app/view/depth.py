@@ -12,6 +12,12 @@ FloatArray = npt.NDArray[np.float64]
 _MOST_THICK = 0.12
 """Of the body size: no limb that is held is thicker."""
 
+_CLEAR = 0.01
+"""Of the body size: from the surface to what is dragged over it, so that it does not catch on it."""
+
+_WIDE = 0.06
+"""Of the body size: half as wide is a hand, which goes round what it would run into."""
+
 _LEAST_SEEN = 0.05
 """The least squared sine of the angle between an axis and the line of sight."""
 
@@ -19,9 +25,9 @@ _LEAST_SEEN = 0.05
 class DragDepth:
     """Finds the point that is meant by a place of the picture.
 
-    It lies as deep as what was taken hold of, but before the surface of the rest of the body where
-    that is nearer, so that a hand comes to rest on a hip instead of behind it. Once `shift` is
-    called, it lies only so deep as is wanted.
+    It lies as deep as what was taken hold of, but before the rest of the body where that is nearer,
+    as if half an ellipsoid rolled over it: a hand goes round a hip and comes to rest on it instead
+    of behind it. Once `shift` is called, it lies only so deep as is wanted.
 
     Parameters
     ----------
@@ -46,15 +52,20 @@ class DragDepth:
         self._view, self._size, self._plane = view, size, taken
         self._snaps = True
         moves = moving[faces]
+        self._wide = _WIDE * body_size
         self._corners = vertices[faces[~moves.any(axis=1)]].astype(np.float64)
         places = places_of(view, self._corners.reshape(-1, 3), size).reshape(-1, 3, 2)
         self._low, self._high = places.min(axis=1), places.max(axis=1)
+        # Middles of faces too, where a mesh is coarse.
+        middles = self._corners.mean(axis=1)
+        used = np.unique(faces[~moves.any(axis=1)])
+        self._points = np.concatenate([vertices[used].astype(np.float64), middles])
         away = taken - view.position
         found = _distances(view.position, away, vertices[faces[moves.all(axis=1)]])
         # The far side of what is held rests on the surface.
         behind = found[found > 1.0] * np.linalg.norm(away)
         thick = float(behind.min(initial=np.inf) - np.linalg.norm(away))
-        self._thickness = thick if thick < _MOST_THICK * body_size else 0.0
+        self._thickness = (thick if thick < _MOST_THICK * body_size else 0.0) + _CLEAR * body_size
 
     def point(self, place: Pixel) -> FloatArray:
         """Return the (3,) point that is meant by a place of the picture."""
@@ -62,12 +73,19 @@ class DragDepth:
         there = seen_at(view, place, self._size, self._plane)
         if not self._snaps:
             return there
+        way = there - view.position
+        length = float(np.linalg.norm(way))
+        ray = way / length
+        arms = self._points - view.position
+        depths = arms @ ray
+        squared = 1.0 - ((arms**2).sum(axis=1) - depths**2) / self._wide**2
+        near = squared > 0.0
+        rolled = depths[near] - self._thickness * np.sqrt(squared[near])
         at = np.array(place)
-        near = ((self._low <= at) & (at <= self._high)).all(axis=1)
-        away = there - view.position
-        found = _distances(view.position, away, self._corners[near])
-        before = found.min(initial=np.inf) - self._thickness / float(np.linalg.norm(away))
-        point: FloatArray = view.position + min(before, 1.0) * away
+        inside = ((self._low <= at) & (at <= self._high)).all(axis=1)
+        hit = _distances(view.position, ray, self._corners[inside]) - self._thickness
+        depth = min(length, rolled.min(initial=np.inf), hit.min(initial=np.inf))
+        point: FloatArray = view.position + depth * ray
         return point
 
     def shift(self, place: Pixel, by: float) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,13 +16,19 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QMenu, QToolButton
 from pytestqt.qtbot import QtBot
 
+from app.editing.document import PoseDocument
 from app.view.camera import places_of
 from app.window.main_window import MainWindow
+from lcollision_core.model import open_body
 from tests.app.views import place_of
 from tests.app.windows import (
     PATIENCE,
+    close_window,
+    is_open,
     move_held,
+    open_window,
     rest,
+    settings_in,
     shown,
     take_picture,
 )
@@ -202,3 +210,116 @@ def test_arms_are_crossed_by_mouse_alone(qtbot: QtBot, body_window: MainWindow) 
     assert vertices[right][0] > past
     assert vertices[left][0] < -past
     assert seconds < MOST_SECONDS
+
+
+class Puppeteer(Hand):
+    """Drags a character by the middles of its body parts, seen from the front or the side."""
+
+    def part(self, name: str) -> npt.NDArray[np.floating]:
+        """Return the (3,) middle of a body part as it is shown."""
+        model = self._document.model
+        (domain,) = (k for k, n in enumerate(model.domain_names) if n.casefold() == name)
+        return shown(self._window)[model.pose_space.vertex_domain == domain].mean(axis=0)
+
+    def drag(
+        self, name: str, to: npt.NDArray[np.floating], key: Qt.KeyboardModifier = NO_KEY
+    ) -> None:
+        """Drag what is seen of a body part to where a (3,) point is seen."""
+        self.n_drags += 1
+        canvas, viewport = self._canvas, self._window.viewport
+        assert viewport.scene is not None
+        ends = places_of(
+            viewport.scene.view,
+            np.array([self.part(name), to], dtype=np.float64),
+            (canvas.width(), canvas.height()),
+        )
+        places = [QPoint(*np.round(p).astype(int).tolist()) for p in np.linspace(*ends, 30)]
+        QTest.mousePress(canvas, LEFT, key, places[0])
+        for place in places[1:]:
+            move_held(canvas, place, key)
+            self._pause(0.3)
+        assert self._document.dragging
+        self._pause(3.0)
+        take_picture(self._window, f"{self._document.model.name}, dragging {name}")
+        QTest.mouseRelease(canvas, LEFT, key, places[-1])
+        self._pause(1.5)
+
+
+@pytest.fixture
+def character_window(
+    qtbot: QtBot, tmp_path: Path, characters: Path, request: pytest.FixtureRequest
+) -> Iterator[MainWindow]:
+    """Return a window of a character in its rest pose, with Solid on."""
+    name, theme = request.param
+    document = PoseDocument(open_body(characters / name), library_folder=tmp_path / "library")
+    settings = settings_in(tmp_path)
+    settings["theme"], settings["solid"] = theme, True
+    held = open_window(qtbot, document, settings, (1280, 860))
+    yield held
+    if is_open(held):
+        close_window(held)
+    assert document.close()
+    document.deleteLater()
+
+
+@pytest.mark.parametrize(
+    "character_window",
+    [("mannequin-moves.glb", "light"), ("xbot-moves.glb", "dark")],
+    indirect=True,
+    ids=["mannequin", "xbot"],
+)
+def test_a_character_is_posed_by_mouse_in_four_drags_each(
+    qtbot: QtBot, character_window: MainWindow
+) -> None:
+    """Each hand comes to rest on the body, not behind it, and what is not held stays."""
+    window, document = character_window, character_window.document
+    model, space = document.model, document.model.pose_space
+    size, up, front = model.body_size, space.up, space.front
+    left = np.cross(up, front)
+    hand = Puppeteer(qtbot, window)
+    name = model.name
+
+    def begin(camera: str) -> None:
+        document.reset_all()
+        rest(qtbot, window)
+        hand.look_from(camera)
+        hand.n_drags = 0
+
+    def done(pose: str) -> npt.NDArray[np.float64]:
+        rest(qtbot, window)
+        take_picture(window, f"{name}, {pose}")
+        assert hand.n_drags <= MOST_DRAGS
+        assert document.exact is not None
+        assert not document.exact.colliding
+        return shown(window).astype(np.float64) / size
+
+    hips, head = space.origins[space.joint_of_code[0]], hand.part("head") / size
+    begin("Front")
+    hand.drag("right hand", size * (hips + 0.07 * left))
+    done("right hand on left hip")
+    way = hand.part("right hand") / size - hips
+    print(name, "hip", way @ left, way @ front, way @ up)
+
+    begin("Front")
+    hand.drag("right hand", size * (head - 0.06 * up))
+    done("hand on chin")
+    way = hand.part("right hand") / size - head
+    print(name, "chin", way @ left, way @ front, way @ up)
+
+    begin("Front")
+    chest = 0.6 * hips + 0.4 * head
+    hand.drag("right hand", size * (chest + 0.10 * left + 0.05 * up))
+    hand.drag("left hand", size * (chest - 0.10 * left))
+    done("arms crossed")
+    for side in ("left", "right"):
+        way = hand.part(f"{side} hand") / size - chest
+        print(name, side, way @ left, way @ front, way @ up)
+
+    begin("Left")
+    before = shown(window)
+    hand.drag("hips", hand.part("hips") - size * (0.2 * up + 0.12 * front))
+    done("sit")
+    moved = (shown(window) - before) / size
+    for part in ("hips", "left foot", "right foot", "head"):
+        (k,) = (k for k, n in enumerate(model.domain_names) if n.casefold() == part)
+        print(name, part, moved[space.vertex_domain == k].mean(axis=0))
