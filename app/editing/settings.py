@@ -40,6 +40,9 @@ class Setting:
 SETTINGS: dict[str, Setting] = {
     "theme": Setting("system", choices=("system", "light", "dark")),
     "shading": Setting("domains", choices=("plain", "domains", "predicted", "exact", "movement")),
+    "character_shading": Setting(
+        "textured", choices=("textured", "plain", "domains", "exact", "movement")
+    ),
     "show_ghost": Setting(True),
     "solid": Setting(True),
     "standing": Setting(True),

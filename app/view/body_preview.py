@@ -102,7 +102,7 @@ class BodyPreview(QWidget):
         up_axis : 0, 1 or 2
         """
         # Loads VTK: not before there is something to see.
-        from app.view.surface import Surface, actor_of
+        from app.view.surface import Surface, body_actor
 
         self.clear("")
         centre = 0.5 * (shown[0].min(axis=0) + shown[0].max(axis=0))
@@ -113,9 +113,7 @@ class BodyPreview(QWidget):
         self._plotter = off_screen_plotter(*self._pixels())
         self._plotter.enable_anti_aliasing("msaa", multi_samples=4)
         self._surface = Surface(faces, self._shown.shape[1])
-        self._body = actor_of(
-            self._surface.polydata, ambient=0.22, diffuse=0.92, specular=0.1, specular_power=18
-        )
+        self._body = body_actor(self._surface.polydata, coloured=False)
         self._plotter.renderer.AddActor(self._body)
         if self.isVisible():
             self._timer.start()

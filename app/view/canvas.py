@@ -164,13 +164,17 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         Parameters
         ----------
         position : in the widget, in device-independent pixels
-        actor : the mesh
+        actor : the mesh, which may be hidden by another look of it
         """
         ratio = self.devicePixelRatioF()
         self._picker.InitializePickList()
         self._picker.AddPickList(actor)
         x, y = position.x() * ratio, (self.height() - 1 - position.y()) * ratio
-        if not self._picker.Pick(x, y, 0.0, self.renderer) or self._picker.GetCellId() < 0:
+        is_shown = actor.GetVisibility()
+        actor.SetVisibility(True)
+        is_hit = self._picker.Pick(x, y, 0.0, self.renderer)
+        actor.SetVisibility(is_shown)
+        if not is_hit or self._picker.GetCellId() < 0:
             return None
         return int(self._picker.GetPointId()), np.array(self._picker.GetPickPosition())
 

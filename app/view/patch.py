@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse.csgraph import dijkstra
 from vtkmodules.vtkCommonDataModel import vtkDataObject
 
@@ -12,6 +13,7 @@ from app.view.shading import rgb
 
 if TYPE_CHECKING:
     import pyvista as pv
+    from vtkmodules.vtkRenderingOpenGL2 import vtkUniforms
 
     from lcollision_core.posing import Grip, PoseSpace
 
@@ -21,7 +23,7 @@ _ALONG = 0.85
 _FAR, _BEYOND = 3.0, 1.5
 """Radii from the middle of what is not painted, and as far as distances are measured."""
 
-_FRAGMENT = """//VTK::Light::Impl
+_FRAGMENT = """
   float straight = distance(patchVC.xyz, patchMiddle.xyz) / patchMiddle.w;
   float fromMiddle = max(straight, patchVC.w);
   float pixel = clamp(fwidth(fromMiddle), 1e-6, 2.0 * fwidth(straight) + 1e-6);
@@ -37,34 +39,45 @@ _FRAGMENT = """//VTK::Light::Impl
     lit = mix(lit, vec3(1.0), clamp(1.7 - abs(inward - 1.7), 0.0, 1.0));
     fragOutput0.rgb = lit;
   }
+  //VTK::DepthPeeling::Impl
 """
 """A fill that falls off as the weights do, and a rim, white within dark, of constant width."""
 
 
 class Patch:
-    """Paints a grip on a surface over whatever its colours say, smooth at any size of its faces.
+    """Paints a grip on surfaces over whatever their colours say, smooth at any size of their faces.
 
     Distances are those of the reference, in which grips are made.
 
     Parameters
     ----------
-    actor : draws the surface
-    polydata : the surface
-    space : of the poses that the surface shows
+    space : of the poses that the surfaces show
     """
 
-    def __init__(
-        self,
-        actor: pv.Actor,
-        polydata: pv.PolyData,
-        space: PoseSpace,
-    ) -> None:
-        self._polydata = polydata
+    def __init__(self, space: PoseSpace) -> None:
         self._space, rest_vertices = space, space.rest_vertices
-        polydata.point_data["patch"] = np.column_stack(
-            [rest_vertices, np.full(len(rest_vertices), _FAR)]
-        ).astype(np.float32)
-        self._along = polydata.point_data["patch"]
+        self._along = np.column_stack([rest_vertices, np.full(len(rest_vertices), _FAR)])
+        self._surfaces: list[tuple[pv.PolyData, npt.NDArray[np.intp] | None]] = []
+        self._uniforms: list[vtkUniforms] = []
+        self._look = [0.0, 0.0, 0.0, 1.0]
+        self._middle = [0.0, 0.0, 0.0, 0.0]
+        self._grip: Grip | None = None
+
+    def lie_on(
+        self, polydata: pv.PolyData, vertices: npt.NDArray[np.intp] | None = None
+    ) -> None:
+        """Give a surface the distances that `paint_on` needs.
+
+        Parameters
+        ----------
+        polydata : the surface
+        vertices : (P,) array, the vertex of the body at each of its points; None for all in order
+        """
+        self._surfaces.append((polydata, vertices))
+        polydata.point_data["patch"] = self._along_of(vertices)
+
+    def paint_on(self, actor: pv.Actor) -> None:
+        """Paint on what draws a surface, or a part of one."""
         actor.mapper.MapDataArrayToVertexAttribute(
             "patchMC", "patch", vtkDataObject.FIELD_ASSOCIATION_POINTS, -1
         )
@@ -76,12 +89,11 @@ class Patch:
         ):
             place = f"//VTK::Normal::{block}"
             replace(place, True, f"{place}\n{text}", False)
-        shading.AddFragmentShaderReplacement("//VTK::Light::Impl", True, _FRAGMENT, False)
-        self._uniforms = shading.GetFragmentCustomUniforms()
-        self._look = [0.0, 0.0, 0.0, 1.0]
-        self._grip: Grip | None = None
-        self._uniforms.SetUniform4f("patchMiddle", [0.0, 0.0, 0.0, 0.0])
-        self.fit(1.0)
+        # What follows lights and textures.
+        place = "//VTK::DepthPeeling::Impl"
+        shading.AddFragmentShaderReplacement(place, True, _FRAGMENT, False)
+        self._uniforms.append(shading.GetFragmentCustomUniforms())
+        self._set_uniforms()
 
     def set_colour(self, colour: str) -> None:
         """Fill with a colour, "#rrggbb", where the surface has none of its own."""
@@ -100,11 +112,22 @@ class Patch:
             graph = self._space.surface_graph
             along = dijkstra(graph, directed=False, indices=grip.vertex, limit=beyond)
             self._along[:, 3] = np.minimum(_ALONG * along / grip.radius, _FAR)
-            self._polydata.Modified()
-        self._uniforms.SetUniform4f("patchMiddle", middle)
+            for polydata, vertices in self._surfaces:
+                polydata.point_data["patch"][:] = self._along_of(vertices)
+        self._middle = middle
+        self._set_uniforms()
         return True
 
     def fit(self, sharpness: float) -> None:
         """Draw the rim for a screen, given its device pixels per device-independent one."""
         self._look[3] = sharpness
-        self._uniforms.SetUniform4f("patchLook", self._look)
+        self._set_uniforms()
+
+    def _along_of(self, vertices: npt.NDArray[np.intp] | None) -> npt.NDArray[np.float32]:
+        along = self._along if vertices is None else self._along[vertices]
+        return along.astype(np.float32)
+
+    def _set_uniforms(self) -> None:
+        for uniforms in self._uniforms:
+            uniforms.SetUniform4f("patchMiddle", self._middle)
+            uniforms.SetUniform4f("patchLook", self._look)

@@ -14,7 +14,8 @@ from app.view.marks import Marks
 from app.view.outline import Outline, PartShape
 from app.view.patch import Patch
 from app.view.shading import COLLIDING_FACE, NAMED_FACE, UNCOUNTED_FACE
-from app.view.surface import Surface, actor_of
+from app.view.surface import Surface, actor_of, body_actor
+from app.view.textured import TexturedBody
 
 if TYPE_CHECKING:
     from app.view.palettes import Theme
@@ -49,10 +50,10 @@ class Scene:
         self._faces, self._mask = model.faces, model.attention_mask
         self._up_axis, self._body_size = model.up_axis, model.body_size
         self.surface = Surface(model.faces, model.n_vertices)
-        self.body = actor_of(
-            self.surface.polydata, True, ambient=0.22, diffuse=0.92, specular=0.1, specular_power=18
-        )
+        self.body = body_actor(self.surface.polydata)
         self.body.SetPickable(True)
+        self._model = model
+        self._textured: TexturedBody | None = None
 
         self._ghost = Surface(model.faces, model.n_vertices, n_channels=4)
         self._ghost_actor = actor_of(
@@ -81,7 +82,9 @@ class Scene:
         ):
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)
-        self._patch = Patch(self.body, self.surface.polydata, model.pose_space)
+        self._patch = Patch(model.pose_space)
+        self._patch.lie_on(self.surface.polydata)
+        self._patch.paint_on(self.body)
         self.marks = Marks(self._renderer, model.body_size, np.eye(3)[model.up_axis])
         self.set_theme(theme)
 
@@ -118,6 +121,8 @@ class Scene:
         self.surface.normals[:] = normals
         if colours is not None:
             self.paint(colours)
+        if self._textured is not None and self.is_textured:
+            self._textured.follow(self.surface)
         if self.ghost_shown:
             self._fade_ghost()
         if self._floor.GetVisibility():
@@ -126,6 +131,27 @@ class Scene:
     def paint(self, colours: npt.NDArray[np.uint8]) -> None:
         """Colour the mesh where it is; (V, 3) uint8 array."""
         self.surface.colours[:] = colours
+
+    def show_textured(self, textured: bool) -> None:
+        """Draw the body as it looks, where that is known, or in the colours of `paint`."""
+        if textured == self.is_textured:
+            return
+        if textured and self._textured is None:
+            if self._model.appearance is None:
+                return
+            self._textured = TexturedBody(self._model.appearance, self._patch)
+            for actor in self._textured.actors:
+                self._renderer.AddActor(actor)
+        assert self._textured is not None
+        if textured:
+            self._textured.follow(self.surface)
+        self._textured.set_visible(textured)
+        self.body.SetVisibility(not textured)
+
+    @property
+    def is_textured(self) -> bool:
+        """Whether the body is drawn as it looks."""
+        return not self.body.GetVisibility()
 
     def show_ghost(
         self, vertices: npt.NDArray[Any] | None, normals: npt.NDArray[Any] | None = None
@@ -166,6 +192,7 @@ class Scene:
 
     def look_like(self, other: Scene) -> None:
         """Show what another scene of the same mesh shows, from where it is looked at."""
+        self.show_textured(other.is_textured)
         self.show(other.surface.vertices, other.surface.normals, other.surface.colours)
         if other.ghost_shown:
             self.show_ghost(other._ghost.vertices, other._ghost.normals)

@@ -42,6 +42,7 @@ UNIT = "in % of the body size"
 class Shading(Enum):
     """What the colours of the mesh show; the value is the title of the legend."""
 
+    TEXTURED = "Textured"
     PLAIN = "Plain"
     DOMAINS = "Body parts"
     PREDICTED = "Estimated overlap"
@@ -151,7 +152,7 @@ class Shader:
         has_predictor : False if no estimate will ever come
         excludes : whether there are pairs that do not count
         """
-        if shading is Shading.PLAIN:
+        if shading in (Shading.TEXTURED, Shading.PLAIN):
             return Legend()
         if shading is Shading.DOMAINS:
             # The panels, and a label at the pointer, name the colours.

@@ -395,6 +395,7 @@ class Viewport(QWidget):
         if self._colours_stale:
             self._colours_stale = False
             assert self._shader is not None
+            scene.show_textured(self.shading is Shading.TEXTURED)
             scene.paint(self._shader.colours(self.shading, self._known_of(frame)))
         if self._crossing_stale:
             self._crossing_stale = False

@@ -162,6 +162,9 @@ ACTIONS: dict[str, Spec] = {
 """All actions outside groups, by key."""
 
 SHADINGS: dict[Shading, Spec] = {
+    Shading.TEXTURED: Spec(
+        "&Textured", "Ctrl+0", "The character as it looks: its colours and textures"
+    ),
     Shading.PLAIN: Spec("&Plain", "Ctrl+1", "The body in one colour"),
     Shading.DOMAINS: Spec(
         "&Body parts",

@@ -25,8 +25,10 @@ if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
     from app.view.viewport import Viewport
+    from lcollision_core.meshes import Topology
 
 _NO_ESTIMATE = "Only a learned model with a predictor has an estimate"
+_NO_LOOK = "Only a character from a file has colours and textures of its own"
 
 
 class ViewActions(QObject):
@@ -63,31 +65,44 @@ class ViewActions(QObject):
             "ghost": lambda: document.show_ghost(ghost.isChecked()),
             "reset_camera": viewport.show_whole,
         }
-        shading = Shading[settings["shading"].upper()]
-        self.shadings = make_choices(SHADINGS, shading, self._choose_shading, window)
+        self._topology: Topology | None = None
+        self.shadings = make_choices(SHADINGS, viewport.shading, self._choose_shading, window)
         self.cameras = make_choices(CAMERA_ACTIONS, None, viewport.set_camera, window)
         self.shading_menu = make_menu("C&olour by", self.shadings, window)
         self.camera_menu = make_menu("&Camera view", self.cameras, window)
         viewport.shading_changed.connect(self._on_shading)
-        document.model_changed.connect(self._update_actions)
+        document.model_changed.connect(self._on_model)
         document.ghost_changed.connect(self._on_ghost)
-        viewport.set_shading(shading)
         document.show_ghost(settings["show_ghost"])
         ghost.setChecked(settings["show_ghost"])
-        self._update_actions()
+        self._on_model()
 
     @Slot()
-    def _update_actions(self) -> None:
+    def _on_model(self) -> None:
+        """Offer what can be shown of the model; another body begins as its kind did last."""
         document = self._document
         missing = "" if document.has_model else NO_BODY
+        lacking = {}
+        if not document.has_predictor:
+            lacking[Shading.PREDICTED] = _NO_ESTIMATE
+        if document.has_model and document.model.appearance is None:
+            lacking[Shading.TEXTURED] = _NO_LOOK
         for action in (*self.shadings, *self.cameras):
-            shading = action.data()
-            untrained = shading is Shading.PREDICTED and not document.has_predictor
-            reason = missing or (_NO_ESTIMATE if untrained else "")
-            spec = SHADINGS.get(shading) or CAMERA_ACTIONS[shading]
-            allow_action(action, spec.tip, reason)
+            spec = SHADINGS.get(action.data()) or CAMERA_ACTIONS[action.data()]
+            allow_action(action, spec.tip, missing or lacking.get(action.data(), ""))
         for key, action in (("ghost", self._ghost), ("reset_camera", self._reset_camera)):
             allow_action(action, ACTIONS[key].tip, missing)
+        topology = document.model.topology if document.has_model else None
+        if topology is not self._topology or topology is None:
+            self._topology = topology
+            self._viewport.set_shading(Shading[self._settings[self._remembered].upper()])
+
+    @property
+    def _remembered(self) -> str:
+        """The setting of the shading: characters with a look of their own have another."""
+        document = self._document
+        look = document.model.appearance if document.has_model else None
+        return "shading" if look is None or look.is_plain else "character_shading"
 
     @Slot()
     def _on_ghost(self) -> None:
@@ -96,8 +111,9 @@ class ViewActions(QObject):
         self._settings["show_ghost"] = self._document.ghost_shown
 
     def _choose_shading(self, shading: Shading) -> None:
-        """Colour the body as the user wants it, also the next time."""
-        self._settings["shading"] = shading.name.lower()
+        """Colour the body as the user wants it, also the next one of its kind."""
+        key = "character_shading" if shading is Shading.TEXTURED else self._remembered
+        self._settings[key] = shading.name.lower()
         self._viewport.set_shading(shading)
 
     @Slot(object)

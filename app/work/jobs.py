@@ -128,6 +128,9 @@ def open_model(
         except ModelFileError as error:
             model = model.noted(error.headline)
     warm_up(model)
+    if isinstance(model, RigModel) and model.appearance is not None:
+        for note in model.appearance.notes:
+            model = model.noted(note)
     return OpenedModel(model, str(path))
 
 
@@ -139,7 +142,7 @@ def warm_up(model: PosableBody) -> None:
     latent.flags.writeable = False
     evaluator.verdict(evaluator.frame(latent, 0))
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
-    _ = model.groups_by_kind
+    _ = model.groups_by_kind, model.appearance
 
 
 def _drag_once(model: PosableBody) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -94,6 +95,7 @@ class Character:
     rig : None for one without joints
     clips : lengths in seconds of its animations, by their names
     sample : (clip, fps) to its frames; None for the clip's own key frames at at most 30 a second
+    look : reads how it looks, which takes long; to None where its file does not say that
     notes : sentences on what was changed on reading
     """
 
@@ -110,3 +112,4 @@ class Character:
     clips: Mapping[str, float]
     sample: Callable[[str, float | None], ClipFrames]
     notes: tuple[str, ...] = ()
+    look: Callable[[], Appearance | None] = lambda: None

@@ -9,8 +9,9 @@ import numpy as np
 
 from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.formats.scene import Scene, parents_first
-from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
+from lcollision_core.meshes.joined import JoinedMesh, join_parts, look_of, sample_clip
 from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.scene_files import one_sentence, read_scene
 from lcollision_core.meshes.topology import FloatArray
@@ -69,6 +70,10 @@ def character_of(scene: Scene, path: Path, axis: int | None = None) -> Character
         transforms = None if rig is None else poses.transforms[:, rig.nodes]
         return ClipFrames(clip, names, times, transforms, skin)
 
+    def look() -> Appearance | None:
+        with one_sentence(path):
+            return look_of(scene, mesh)
+
     up_direction, is_sure = scene.up, True
     if axis is not None:
         up_direction = np.eye(3)[axis]
@@ -89,6 +94,7 @@ def character_of(scene: Scene, path: Path, axis: int | None = None) -> Character
         lengths,
         sample,
         mesh.notes + notes,
+        look,
     )
 
 

@@ -10,6 +10,7 @@ from scipy import sparse
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes.appearance import Appearance, join_appearances
 from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH
 from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.dual_quaternions import blend_dual_quaternions
@@ -161,6 +162,19 @@ def sample_clip(
             "choose fewer frames a second",
         )
     return times, found[0].sample(times)
+
+
+def look_of(scene: Scene, mesh: JoinedMesh) -> Appearance | None:
+    """Read how a scene looks, on the vertices of its mesh; None where its file does not say that.
+
+    Raises
+    ------
+    MeshFileError : the file is damaged.
+    """
+    looks = [part.look() for part in scene.parts if part.look is not None]
+    if len(looks) < len(scene.parts):
+        return None
+    return join_appearances(looks, [len(part.points) for part in scene.parts], mesh.joined)
 
 
 def join_parts(scene: Scene) -> JoinedMesh:

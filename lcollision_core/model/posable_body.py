@@ -38,6 +38,7 @@ from lcollision_core.model.mirror import (
 )
 
 if TYPE_CHECKING:
+    from lcollision_core.meshes.appearance import Appearance
     from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
     from lcollision_core.predictor import Prediction
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
@@ -105,6 +106,11 @@ class PosableBody(ABC):
     @abstractmethod
     def code_effects(self) -> tuple[CodeEffect, ...]:
         """The effect of raising each of the D codes."""
+
+    @property
+    def appearance(self) -> Appearance | None:
+        """How the body looks in the file that it came from; None where that is not known."""
+        return None
 
     @property
     @abstractmethod

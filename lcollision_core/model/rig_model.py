@@ -40,6 +40,7 @@ from lcollision_core.model.rig_names import motion_names, side_of
 from lcollision_core.model_file import digest_of
 
 if TYPE_CHECKING:
+    from lcollision_core.meshes.appearance import Appearance
     from lcollision_core.predictor import Prediction
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
@@ -172,6 +173,11 @@ class RigModel(PosableBody):
     def own_rules(self) -> ContactRules:
         """The rules that the character starts with, which its file does not hold."""
         return self.own_card.rules
+
+    @cached_property
+    def appearance(self) -> Appearance | None:
+        """How the character looks; reading it takes as long as its textures are large."""
+        return self.character.look()
 
     @property
     def pose_space(self) -> RigPoseSpace:

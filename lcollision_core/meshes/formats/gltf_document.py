@@ -45,6 +45,8 @@ _STRUCTURE: dict[str, Any] = {
     "meshes": [
         {"primitives": [{"attributes": {}, "extensions": {}, "targets": [{}]}], "weights": [float]}
     ],
+    "samplers": [{}],
+    "textures": [{}],
     "nodes": [{"children": [int], "weights": [float], "extensions": {}}],
     "scenes": [{"nodes": [int]}],
     "skins": [{"joints": [int]}],
@@ -201,6 +203,24 @@ class GltfDocument:
                 raise MeshFileError(f"it has no data for {what}")
         return self._buffers[number]
 
+    def image(self, described: dict[str, Any], what: str) -> bytes:
+        """Return the file of an image, which is in this one or beside it.
+
+        Parameters
+        ----------
+        described : the image
+        what : as in "image 3"
+
+        Raises
+        ------
+        MeshFileError : it is missing, too large, or not beside this file.
+        """
+        if "uri" in described:
+            return resource(described["uri"], self._path, MAX_FILE_BYTES, what)
+        view = element(self.objects("bufferViews"), described.get("bufferView"), f"view of {what}")
+        length = whole(view.get("byteLength"), f"the length of {what}", 0, MAX_FILE_BYTES)
+        return self._view(described, what, length, 1, np.dtype("u1")).tobytes()
+
 
 def compressed(extension: str) -> MeshFileError:
     """Return the error for data that an extension compresses and nothing else holds."""
@@ -309,10 +329,10 @@ def _require_kind(value: Any, kind: Any, where: str) -> None:
             _require_kind(value[name], held, f"{name} of {where}" if where else name)
 
 
-def resource(uri: object, path: Path, most_bytes: int) -> bytes:
+def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer") -> bytes:
     """Read a data URI, or a regular file in the folder of the scene or below it."""
     if not isinstance(uri, str):
-        raise MeshFileError.must_be("the URI of its buffer", "a text", quoted(uri))
+        raise MeshFileError.must_be(f"the URI of {what}", "a text", quoted(uri))
     try:
         if uri.startswith("data:"):
             head, comma, content = uri.partition(",")
@@ -330,4 +350,4 @@ def resource(uri: object, path: Path, most_bytes: int) -> bytes:
         return read_regular(file, most_bytes)
     except (OSError, ValueError, binascii.Error) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise MeshFileError.unreadable(f"its buffer {quoted(uri)}", reason) from error
+        raise MeshFileError.unreadable(f"{what} {quoted(uri)}", reason) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.gltf_animation import read_clips, stored_transform
+from lcollision_core.meshes.formats.gltf_appearance import GltfLooks
 from lcollision_core.meshes.formats.gltf_document import (
     DRACO,
     GltfDocument,
@@ -71,7 +73,8 @@ def read_shown(document: GltfDocument) -> Scene:
             raise MeshFileError(*NO_MESH)
         what = f"it holds {n_meshes} meshes, none of which shows triangles"
         raise MeshFileError(f"{what} ({notes[0]})" if notes else what)
-    parts = tuple(_part(document, primitive, rest[0]) for primitive in shown)
+    looks = GltfLooks(document)
+    parts = tuple(_part(document, primitive, rest[0], looks) for primitive in shown)
     defaults = tuple(
         _default_weights(document, one, part) for one, part in zip(shown, parts, strict=True)
     )
@@ -199,7 +202,9 @@ def _local_transforms(nodes: list[dict[str, Any]]) -> FloatArray:
     return local
 
 
-def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Part:
+def _part(
+    document: GltfDocument, shown: ShownPrimitive, rest: FloatArray, looks: GltfLooks
+) -> Part:
     mesh = document.objects("meshes")[shown.mesh]
     primitive = mesh["primitives"][shown.primitive]
     attributes = primitive["attributes"]
@@ -253,6 +258,7 @@ def _part(document: GltfDocument, shown: ShownPrimitive, rest: FloatArray) -> Pa
         is_skinned,
         morphs,
         is_single=stored.dtype == np.float32,
+        look=partial(looks.appearance, primitive, faces, n, where),
     )
 
 

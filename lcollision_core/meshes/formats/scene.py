@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.topology import FloatArray
 
 MAX_FRAME_NUMBERS = 1 << 28
@@ -67,6 +68,7 @@ class Part:
     is_single : whether the file holds the points as float32
     dual : (W,) float64 array, the share in [0, 1] that dual quaternions have of the blend; None
         where it is linear, as above
+    look : reads how it looks, which takes long; None where its file does not say that
     """
 
     mesh: str
@@ -83,6 +85,7 @@ class Part:
     morphs: npt.NDArray[np.float32]
     is_single: bool = False
     dual: FloatArray | None = None
+    look: Callable[[], Appearance] | None = None
 
 
 @dataclass(frozen=True, eq=False)
