@@ -102,13 +102,15 @@ def _actor_of(polydata: pv.PolyData, material: Material) -> pv.Actor:
 
 
 def _texture_of(texture: Texture) -> vtkTexture:
-    height, width = texture.pixels.shape[:2]
+    # VTK takes an image of one column for one row.
+    pixels = np.repeat(texture.pixels, 2 if texture.pixels.shape[1] == 1 else 1, axis=1)
+    height, width = pixels.shape[:2]
     image = pv.ImageData(dimensions=(width, height, 1))
-    image.point_data.set_scalars(texture.pixels.reshape(-1, 4), "pixels")
+    image.point_data.set_scalars(pixels.reshape(-1, 4), "pixels")
     made = vtkTexture()
     made.SetInputData(image)
     made.SetColorModeToDirectScalars()
     made.SetWrap(vtkTexture.Repeat)
     made.SetInterpolate(texture.is_smooth)
-    made.SetMipmap(True)
+    made.SetMipmap(texture.has_mipmaps)
     return made

@@ -33,11 +33,13 @@ class Texture:
         v = 0
     wrap : along u, along v
     is_smooth : whether large pixels blend into each other
+    has_mipmaps : whether small pixels are averaged
     """
 
     pixels: npt.NDArray[np.uint8]
     wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
     is_smooth: bool = True
+    has_mipmaps: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from lcollision_core.meshes.formats.gltf_document import (
 from lcollision_core.meshes.formats.images import ImageReader, screen_colours
 from lcollision_core.meshes.topology import FloatArray
 
-_NEAREST = 9728
+_NEAREST, _LINEAR = 9728, 9729
 _WRAPS = {10497: Wrap.REPEAT, 33648: Wrap.MIRROR, 33071: Wrap.CLAMP}
 _MOST_UV_SETS = 16
 _GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
@@ -177,7 +177,12 @@ class GltfLooks:
         if "sampler" in texture:
             sampler = element(document.objects("samplers"), texture["sampler"], "a sampler")
         u, v = (_WRAPS.get(_code(sampler, key), Wrap.REPEAT) for key in ("wrapS", "wrapT"))
-        return Texture(self._pixels[source], (u, v), _code(sampler, "magFilter") != _NEAREST)
+        return Texture(
+            self._pixels[source],
+            (u, v),
+            is_smooth=_code(sampler, "magFilter") != _NEAREST,
+            has_mipmaps=_code(sampler, "minFilter") not in (_NEAREST, _LINEAR),
+        )
 
 
 def _code(sampler: dict[str, Any], key: str) -> int:

@@ -217,7 +217,8 @@ class GltfDocument:
         """
         if "uri" in described:
             return resource(described["uri"], self._path, MAX_FILE_BYTES, what)
-        view = element(self.objects("bufferViews"), described.get("bufferView"), f"view of {what}")
+        views, index = self.objects("bufferViews"), described.get("bufferView")
+        view = element(views, index, f"for {what} the buffer view")
         length = whole(view.get("byteLength"), f"the length of {what}", 0, MAX_FILE_BYTES)
         return self._view(described, what, length, 1, np.dtype("u1")).tobytes()
 

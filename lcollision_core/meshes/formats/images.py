@@ -53,13 +53,13 @@ class ImageReader:
             with warnings.catch_warnings(action="ignore"):
                 image = Image.open(io.BytesIO(data), formats=_FORMATS)
             if image.width * image.height > _MOST_PIXELS:
-                size = f"{image.width} by {image.height} pixels"
-                raise MeshFileError(f"has {size}, more than {_MOST_PIXELS}", where=what)
+                raise Image.DecompressionBombError
             # Of a large JPEG no more is decoded than is needed.
             image.draft(None, (_MOST_SIDE, _MOST_SIDE))
             pixels = _shrunk(_in_8_bits(image))
-        except MeshFileError:
-            raise
+        except Image.DecompressionBombError as error:
+            most = f"more than {_MOST_PIXELS >> 20} million pixels"
+            raise MeshFileError(f"has {most}", where=what) from error
         # On a damaged image Pillow raises whatever its line at hand raises; nothing of ours runs
         # here.
         except Exception as error:

@@ -167,5 +167,6 @@ def test_legends_name_what_is_drawn(shader: Shader) -> None:
 
 
 def test_each_shading_is_remembered() -> None:
-    choices = SETTINGS["shading"].choices
-    assert choices == tuple(shading.name.lower() for shading in Shading)
+    names = [shading.name.lower() for shading in Shading]
+    kept = [set(SETTINGS[key].choices) for key in ("shading", "character_shading")]
+    assert kept == [{*names} - {"textured"}, {*names} - {"predicted"}]
