@@ -63,9 +63,7 @@ class Patch:
         self._middle = [0.0, 0.0, 0.0, 0.0]
         self._grip: Grip | None = None
 
-    def lie_on(
-        self, polydata: pv.PolyData, vertices: npt.NDArray[np.intp] | None = None
-    ) -> None:
+    def lie_on(self, polydata: pv.PolyData, vertices: npt.NDArray[np.intp] | None = None) -> None:
         """Give a surface the distances that `paint_on` needs.
 
         Parameters

@@ -70,15 +70,21 @@ class GltfLooks:
         self._finishes: dict[int, _Finish] = {}
 
     def appearance(
-        self, primitive: dict[str, Any], faces: npt.NDArray[np.int64], n: int, where: str
+        self,
+        primitive: dict[str, Any],
+        faces: npt.NDArray[np.int64],
+        n: int,
+        n_copies: int,
+        where: str,
     ) -> Appearance:
         """Read how a primitive looks.
 
         Parameters
         ----------
         primitive : of the description; the number of its material is right
-        faces : (F, 3) array, its triangles
+        faces : (F, 3) array, the triangles of all its copies
         n : its vertices, each of which is a point
+        n_copies : how often it is shown
         where : as in "mesh 3"
         """
         finish = _NO_FINISH
@@ -103,10 +109,10 @@ class GltfLooks:
                 _require_finite(stored, what)
                 uv, material = stored @ finish.turned.T + finish.offset, finish.material
         return Appearance(
-            np.arange(n),
+            np.arange(n_copies * n),
             faces,
-            uv.astype(np.float32),
-            screen_colours(colours),
+            np.tile(uv.astype(np.float32), (n_copies, 1)),
+            np.tile(screen_colours(colours), (n_copies, 1)),
             np.zeros(len(faces), dtype=np.int64),
             (material,),
             tuple(notes),

@@ -258,7 +258,7 @@ def _part(
         is_skinned,
         morphs,
         is_single=stored.dtype == np.float32,
-        look=partial(looks.appearance, primitive, faces, n, where),
+        look=partial(looks.appearance, primitive, faces, n, len(points) // n, where),
     )
 
 

@@ -142,9 +142,7 @@ def test_a_damaged_texture_is_said_and_its_colour_is_shown(
 
 
 def test_a_body_without_a_look_cannot_be_shown_textured(window: MainWindow) -> None:
-    action = next(
-        a for a in window.menus["&View"].actions() if a.data() is Shading.TEXTURED
-    )
+    action = next(a for a in window.menus["&View"].actions() if a.data() is Shading.TEXTURED)
     assert not action.isEnabled()
     window.viewport.set_shading(Shading.TEXTURED)
     assert window.viewport.scene is not None

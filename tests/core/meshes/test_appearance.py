@@ -321,3 +321,16 @@ def test_materials_and_images_are_read_once(tmp_path: Path) -> None:
     assert len(look.materials) == 1
     assert len(look.vertices) == 48
     assert look.faces.max() == 47
+
+
+def test_each_copy_of_an_instanced_mesh_has_its_look(tmp_path: Path) -> None:
+    builder = textured()
+    node = builder.description["nodes"][2]
+    del node["skin"]
+    places = builder.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
+    node["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": places}}}
+    builder.description["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
+    look = look_of(builder, tmp_path)
+    _, faces, uv = cube()
+    np.testing.assert_array_equal(look.faces, np.concatenate([faces, faces + 24]))
+    np.testing.assert_array_equal(look.uv, np.tile(uv, (2, 1)))
