@@ -69,7 +69,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 def scene_of(file: BinaryIO, path: Path, cancel: CancelToken | None = None) -> Scene:
     """Read an open file at its start, as `read_scene`; the sentence does not name it."""
-    scene = fbx.read_scene(file, cancel) if _is_fbx(path) else gltf.read_scene(file, path)
+    scene = fbx.read_scene(file, path, cancel) if _is_fbx(path) else gltf.read_scene(file, path)
     return with_parts(scene, character_parts(scene))
 
 

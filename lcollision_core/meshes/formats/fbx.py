@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, MissingExtraError
 from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes.formats.fbx_appearance import FbxLooks, Laid
 from lcollision_core.meshes.formats.gltf_document import MAX_NUMBERS
 from lcollision_core.meshes.formats.polygons import (
     MAX_FACES,
@@ -51,7 +52,7 @@ _UNKNOWN_AXIS = 6
 _MOST_FRAMES = 1_000_000
 
 
-def read_scene(file: BinaryIO, cancel: CancelToken | None = None) -> Scene:
+def read_scene(file: BinaryIO, path: Path, cancel: CancelToken | None = None) -> Scene:
     """Read what the file shows.
 
     Vertices are the file's control points, in its order of nodes. A clip's own frames are those of
@@ -65,13 +66,14 @@ def read_scene(file: BinaryIO, cancel: CancelToken | None = None) -> Scene:
     """
     source = _FbxFile(read_rest(file), cancel)
     held = source.asked()
+    looks = FbxLooks(partial(source.asked, looks=True), path)
     unseen = held["unseen"].tolist()
     why = "left out, as its file hides it or shows a finer level of detail"
     notes = [left_out_note(why, unseen)] if unseen else []
     shown = held["shown"].tolist()
     numbers, parts = [], []
     for number, node in enumerate(shown):
-        part = _part(_only(held, number), node, held["transforms"], notes)
+        part = _part(_only(held, number), number, node, held["transforms"], looks, notes)
         if part is not None:
             numbers.append(number)
             parts.append(part)
@@ -108,7 +110,9 @@ class _FbxFile:
     data: bytes
     cancel: CancelToken | None
 
-    def asked(self, clip: int | None = None, times: FloatArray | None = None) -> dict[str, Any]:
+    def asked(
+        self, clip: int | None = None, times: FloatArray | None = None, looks: bool = False
+    ) -> dict[str, Any]:
         """Return the arrays of `fbx_worker`."""
         if find_spec("ufbx") is None:
             raise MissingExtraError(
@@ -118,6 +122,7 @@ class _FbxFile:
         request = {
             "clip": clip,
             "times": None if times is None else times.tolist(),
+            "looks": looks,
             "most_memory": _MOST_MEMORY,
             "most_elements": 4 * MAX_FACES,
         }
@@ -204,10 +209,18 @@ def _only(held: dict[str, Any], number: int) -> dict[str, Any]:
     return {name[len(prefix) :]: held[name] for name in held if name.startswith(prefix)}
 
 
-def _part(held: dict[str, Any], node: int, transforms: FloatArray, notes: list[str]) -> Part | None:
+def _part(
+    held: dict[str, Any],
+    number: int,
+    node: int,
+    transforms: FloatArray,
+    looks: FbxLooks,
+    notes: list[str],
+) -> Part | None:
     """Return one mesh where a node shows it; None without faces."""
     sizes, is_face = held["faces"][:, 1], held["faces"][:, 1] >= 3
-    corners = held["corners"][np.repeat(is_face, sizes)]
+    is_used = np.repeat(is_face, sizes)
+    corners = held["corners"][is_used]
     points = held["points"]
     if not is_face.all():
         notes.append("edges and points without faces were left out")
@@ -227,10 +240,13 @@ def _part(held: dict[str, Any], node: int, transforms: FloatArray, notes: list[s
         notes.append("of the several skins of a mesh only the first was read")
     if is_mirrored(transforms[bones] @ bind, bone_of, weights):
         faces = faces[:, [0, 2, 1]]
+    polygon_of = np.repeat(np.arange(int(is_face.sum())), sizes[is_face] - 2)
+    material_of = material_of[is_face][polygon_of]
+    laid = Laid(number, is_used, corners, sizes[is_face], faces, polygon_of, material_of)
     return Part(
         str(held["name"]),
         tuple(held["materials"].tolist()),
-        np.repeat(material_of[is_face], sizes[is_face] - 2),
+        material_of,
         node,
         points,
         faces,
@@ -241,6 +257,7 @@ def _part(held: dict[str, Any], node: int, transforms: FloatArray, notes: list[s
         is_skinned="shares" in held,
         morphs=_morphs(held, len(points)),
         dual=held.get("dual"),
+        look=partial(looks.appearance, laid),
     )
 
 

@@ -2,9 +2,9 @@
 
 The bindings of ufbx count references to a scene's objects wrongly, so that they end the process
 when an object is asked for twice and then released; and a hostile file may do so, or fill the
-memory. What goes in by standard input is one line of JSON (`clip` and `times` to sample, or
-neither; `most_memory` in bytes, `most_elements`), then the file. What comes out is an .npz
-archive, or one line of reason at standard error and status 3.
+memory. What goes in by standard input is one line of JSON (`clip` and `times` to sample, or `looks`
+for colours and textures, or none of them; `most_memory` in bytes, `most_elements`), then the file.
+What comes out is an .npz archive, or one line of reason at standard error and status 3.
 """
 
 from __future__ import annotations
@@ -187,6 +187,46 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
     return part
 
 
+def _looks(scene: Any) -> dict[str, np.ndarray]:
+    """Return the materials, what they and their textures are, and what lies on the corners."""
+    colours, texture_of, names, clamps = [], [], [], []
+    found: dict[str, np.ndarray] = {}
+    known: dict[int, int] = {}
+    for material in _items(scene.materials):
+        maps = _kept(material.pbr)
+        base, factor = _kept(maps.base_color), _kept(maps.base_factor)
+        colour = np.array(list(base.value_vec4)[:3]) if base.has_value else np.ones(3)
+        colour = colour * (factor.value_vec4.x if factor.has_value else 1.0)
+        texture = _kept(base.texture)
+        files = [] if texture is None else list(_items(texture.file_textures))
+        number = -1
+        if files:
+            texture = files[0]
+            number = known.setdefault(texture.typed_id, len(known))
+            if number == len(names):
+                names.append(texture.relative_filename or texture.filename)
+                clamps.append([int(texture.wrap_u) == 1, int(texture.wrap_v) == 1])
+                content = np.frombuffer(texture.content, dtype=np.uint8)
+                found[f"content {number}"] = content
+        colours.append(colour)
+        texture_of.append(number)
+    found["colours"] = np.array(colours, dtype=np.float64).reshape(-1, 3)
+    found["texture_of"] = np.array(texture_of, dtype=np.int64)
+    found["textures"] = np.array(names, dtype=np.str_)
+    found["clamps"] = np.array(clamps, dtype=bool).reshape(-1, 2)
+    for number, (_, mesh) in enumerate(_shown(list(_items(scene.nodes)))):
+        materials = [one.typed_id for one in _items(mesh.materials)]
+        found[f"{number} materials"] = np.array(materials, dtype=np.int64)
+        for name, width, given in (
+            ("uv", 2, _kept(mesh.vertex_uv)),
+            ("colours", 4, _kept(mesh.vertex_color)),
+        ):
+            if given.exists:
+                values = _array(given.values, np.float64, width).reshape(-1, width)
+                found[f"{number} {name}"] = values[_array(given.indices, np.int64)]
+    return found
+
+
 def _keyframes(mesh: Any) -> Iterator[Any]:
     for deformer in _items(mesh.blend_deformers):
         for channel in _items(deformer.channels):
@@ -238,7 +278,7 @@ def main() -> int:
         scene = _kept(
             ufbx.load_memory(
                 sys.stdin.buffer.read(),
-                ignore_embedded=True,
+                ignore_embedded=not asked["looks"],
                 load_external_files=False,
                 clean_skin_weights=True,
                 skip_mesh_parts=True,
@@ -246,7 +286,9 @@ def main() -> int:
                 file_format=ufbx.FileFormat.FBX,
             )
         )
-        if asked["times"] is None:
+        if asked["looks"]:
+            found = _looks(scene)
+        elif asked["times"] is None:
             found = _described(scene, asked["most_elements"])
         else:
             found = _sampled(scene, asked["clip"], asked["times"])

@@ -14,7 +14,8 @@ import trimesh
 
 from lcollision_core.characters import read_character
 from lcollision_core.meshes.appearance import Appearance, Wrap
-from tests.core.gltf_builder import GltfBuilder
+from tests.core.fbx_builder import arm_fbx
+from tests.core.gltf_builder import GltfBuilder, tube
 from tests.core.textured_cube import (
     BLUE,
     GREEN,
@@ -334,3 +335,69 @@ def test_each_copy_of_an_instanced_mesh_has_its_look(tmp_path: Path) -> None:
     _, faces, uv = cube()
     np.testing.assert_array_equal(look.faces, np.concatenate([faces, faces + 24]))
     np.testing.assert_array_equal(look.uv, np.tile(uv, (2, 1)))
+
+
+def painted_fbx(folder: Path, texture: str | None = None) -> Path:
+    """Write a tube of a red material, with texture coordinates of its own at each corner."""
+    file = arm_fbx(folder / "arm.fbx")
+    text = file.read_text()
+    _, faces = tube()
+    uv = np.arange(2 * faces.size) / 1000.0
+    layer = f"""
+        LayerElementUV: 0 {{
+            Version: 101
+            Name: "map1"
+            MappingInformationType: "ByPolygonVertex"
+            ReferenceInformationType: "Direct"
+            UV: *{len(uv)} {{ a: {",".join(map(str, uv))} }}
+        }}
+        Layer: 0 {{
+            LayerElement: {{ Type: "LayerElementUV"
+            TypedIndex: 0 }}"""
+    text = text.replace("\n        Layer: 0 {", layer)
+    diffuse = 'P: "DiffuseColor", "Color", "", "A",1,0,0'
+    painted = f'"Material::Skin", "" {{ Properties70: {{ {diffuse}\n }} }}'
+    if texture is not None:
+        painted += f"""
+    Texture: 310, "Texture::skin", "" {{
+        Type: "TextureVideoClip"
+        RelativeFilename: "{texture}"
+    }}"""
+        text = text.replace(
+            "Connections:  {", 'Connections:  {\n    C: "OP",310,300, "DiffuseColor"'
+        )
+    file.write_text(text.replace('"Material::Skin", "" { }', painted))
+    return file
+
+
+def test_fbx_has_diffuse_colours(tmp_path: Path) -> None:
+    look = read_character(painted_fbx(tmp_path)).look()
+    assert look is not None
+    assert look.notes == ()
+    assert (look.colours == [255, 0, 0, 255]).all()
+    assert not look.is_plain
+
+
+@pytest.mark.parametrize("place", [".", "textures", "arm.fbm"])
+def test_fbx_finds_textures_by_their_names(tmp_path: Path, place: str) -> None:
+    (tmp_path / place).mkdir(exist_ok=True)
+    (tmp_path / place / "skin.png").write_bytes(png(FOUR))
+    character = read_character(painted_fbx(tmp_path, r"..\\artist\\skin.png"))
+    look = character.look()
+    assert look is not None
+    assert look.notes == ()
+    assert (look.colours == 255).all()
+    held = look.materials[look.material_of[0]].texture
+    assert held is not None
+    np.testing.assert_array_equal(held.pixels[..., :3], FOUR)
+    _, faces = tube()
+    np.testing.assert_array_equal(look.vertices[look.faces], character.topology.faces)
+    expected = np.arange(2 * faces.size).reshape(-1, 3, 2) / 1000.0
+    np.testing.assert_allclose(look.uv[look.faces], expected * [1, -1] + [0, 1], atol=1e-6)
+
+
+def test_fbx_without_its_texture_has_its_colour_and_a_note(tmp_path: Path) -> None:
+    look = read_character(painted_fbx(tmp_path, "skin.png")).look()
+    assert look is not None
+    assert (look.colours == [255, 0, 0, 255]).all()
+    assert look.notes == ("the texture 'skin.png' is not beside the file",)
