@@ -93,7 +93,7 @@ def check_mesh(
     from lcollision_core.meshes import audit_mesh, read_mesh
 
     start = time.perf_counter()
-    mesh = read_mesh(path)
+    mesh = read_mesh(path, topology=None if rest is None else rest.topology)
     if rest is not None and rest.topology != mesh.topology:
         raise MeshFileError(
             "has other faces than the rest pose", "name a rest pose of this mesh", where=path

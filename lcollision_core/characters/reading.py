@@ -14,20 +14,26 @@ from lcollision_core.meshes.formats.scene import Scene, parents_first
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, look_of, sample_clip
 from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.scene_files import one_sentence, read_scene
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.meshes.upright import guess_up
 
 _EVEN = 1e-6
 """By which scales along different axes may differ and are rounding."""
 
 
-def read_character(path: str | os.PathLike[str], up: int | str | None = None) -> Character:
+def read_character(
+    path: str | os.PathLike[str],
+    up: int | str | None = None,
+    topology: Topology | None = None,
+) -> Character:
     """Read the meshes, the rig and the clips of a file.
 
     Parameters
     ----------
     path : a .glb, .gltf, .vrm or .fbx file
     up : the up axis where the file is wrong about it: 0, 1, 2, "x", "y" or "z"
+
+    topology : of a model of the character, as which polygons are cut
 
     Raises
     ------
@@ -53,7 +59,7 @@ def character_of(scene: Scene, path: Path, axis: int | None = None) -> Character
     MeshFileError : it is damaged.
     """
     with one_sentence(path):
-        mesh = join_parts(scene)
+        mesh = join_parts(scene).cut_as(topology)
         rest = mesh.posed(scene.rest)[0]
         rig, notes = _rig(scene, mesh, rest)
         lengths = {clip.name: float(np.ptp(clip.key_times)) for clip in scene.clips}

@@ -14,13 +14,9 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats import gltf, obj, off, ply, stl
-from lcollision_core.meshes.formats.polygons import (
-    MAX_FACES,
-    Polygons,
-    triangulate,
-    with_order_of,
-)
+from lcollision_core.meshes.formats.polygons import MAX_FACES, Polygons, with_order_of
 from lcollision_core.meshes.formats.scene import Scene
+from lcollision_core.meshes.formats.triangulation import triangulate
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.precision import as_stored, can_hold, rounding_step
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, one_sentence, scene_of
@@ -78,14 +74,16 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
     No vertex is merged, moved, reordered or dropped. STL is the exception, as it stores no shared
     vertices: corners at equal coordinates become one vertex, numbered by first appearance. So is a
     scene of several meshes, or of one that joints or morph targets move, which is read in its rest
-    pose and joined at its seams. Polygons are cut into fans of triangles and `Mesh.notes` says so.
+    pose and joined at its seams. Polygons are cut into triangles, see `triangulate`, and
+    `Mesh.notes` says so.
 
     Parameters
     ----------
     path : an .obj, .ply, .off, .stl, .glb, .gltf, .vrm or .fbx file
-    topology : the connectivity that an STL file, or a glTF file of other vertices, is expected to
-        have: when its triangles fit, they are put back into this vertex order. A mesh with the
-        same faces shares the object.
+    topology : the connectivity that the mesh is expected to have, as that of its set or model.
+        Polygons are cut as it was cut from them. When the triangles of an STL file, or of a glTF
+        file of other vertices, fit, they are put back into this vertex order. A mesh with the same
+        faces shares the object.
 
     Returns
     -------
@@ -101,7 +99,7 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
     with one_sentence(path):
         polygons = _read_polygons(source, topology)
         vertices = np.ascontiguousarray(polygons.vertices)
-        faces, notes = triangulate(polygons)
+        faces, _, notes = triangulate(polygons, topology)
         _require_usable(vertices, faces)
         found = Topology(faces, len(vertices))
     vertices.flags.writeable = False
@@ -157,6 +155,7 @@ def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
     is_single = False
     if is_plain:
         vertices, faces, notes = part.points, part.faces, scene.notes
+        cut_of = part.cut_of
         transform = scene.rest.transforms[0, part.node] @ part.bind[0]
         is_single = part.is_single and np.array_equal(transform, np.eye(4))
         if not is_single:
@@ -166,12 +165,12 @@ def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
     else:
         mesh = join_parts(scene)
         vertices, faces = mesh.posed(scene.rest)[0], mesh.topology.faces.astype(np.int64)
-        notes = mesh.notes
+        notes, cut_of = mesh.notes, mesh.cut_of
     if topology is not None and len(vertices) != topology.n_vertices:
         reordered = with_order_of(vertices[faces.reshape(-1)], topology, _REORDERED, is_single)
         if reordered is not None:
             return reordered
-    return Polygons.triangles(vertices, faces, notes, is_single)
+    return Polygons.triangles(vertices, faces, notes, is_single, cut_of)
 
 
 def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> None:

@@ -16,6 +16,7 @@ from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.dual_quaternions import blend_dual_quaternions
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
 from lcollision_core.meshes.formats.scene import MAX_FRAME_NUMBERS, Part, Scene, ScenePoses
+from lcollision_core.meshes.formats.triangulation import are_of_same_polygons
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 IntArray = npt.NDArray[np.int64]
@@ -40,6 +41,7 @@ class JoinedMesh:
     ----------
     topology : of the V joined vertices, numbered by first appearance; faces that joining makes
         degenerate, and those without area at rest, are left out
+    cut_of : (F,) int64 array, ascending, the polygon that each face was cut from
     joined : (W,) int64 array: the joined vertex of each of the parts' W vertices
     bones : (B,) int64 array, nodes that move vertices; a node may be there several times
     bind : (B, 4, 4) float64 array, from the vertices' coordinates to each bone's
@@ -54,6 +56,7 @@ class JoinedMesh:
     """
 
     topology: Topology
+    cut_of: IntArray
     joined: IntArray
     bones: IntArray
     bind: FloatArray
@@ -65,6 +68,16 @@ class JoinedMesh:
     morphs: tuple[_Morphs, ...]
     groups: tuple[FaceGroup, ...]
     notes: tuple[str, ...]
+
+    def cut_as(self, topology: Topology | None) -> JoinedMesh:
+        """Return the same mesh, its polygons cut as a topology was cut from them, if it was."""
+        if (
+            topology is None
+            or topology.n_vertices != self.topology.n_vertices
+            or not are_of_same_polygons(self.topology.faces, topology.faces, self.cut_of)
+        ):
+            return self
+        return replace(self, topology=topology)
 
     def morphed(self, weights: tuple[FloatArray, ...]) -> FloatArray:
         """Return the (V, 3) points with the morph targets of the parts, of (M,) weights, added."""
@@ -199,6 +212,14 @@ def join_parts(scene: Scene) -> JoinedMesh:
     )
     kept, joined = _first_of_equal(keys)
     faces = np.concatenate([joined[part.faces + first_vertex[i]] for i, part in enumerate(parts)])
+    # Numbers that ascend are enough.
+    n_before = np.cumsum([0] + [len(part.faces) for part in parts])
+    cut_of = np.concatenate(
+        [
+            n + (np.arange(len(part.faces)) if part.cut_of is None else part.cut_of)
+            for n, part in zip(n_before.tolist(), parts, strict=False)
+        ]
+    )
     is_flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     morphs = []
     for i, part in enumerate(parts):
@@ -210,6 +231,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
     is_skinned = np.repeat([part.is_skinned for part in parts], np.diff(first_vertex))
     mesh = JoinedMesh(
         _topology(faces, is_flat, len(kept)),
+        cut_of[~is_flat],
         joined,
         bones,
         bind,
@@ -235,6 +257,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
     return replace(
         mesh,
         topology=_topology(faces, is_flat, len(kept)),
+        cut_of=cut_of[~is_flat],
         groups=_groups(parts, is_flat),
         notes=tuple(notes),
     )

@@ -204,7 +204,9 @@ class SourceFile:
             mesh = read_mesh(path, topology=body.topology)
             body.require_topology(mesh.topology, str(path))
         elif suffix in SCENE_SUFFIXES:
-            self._character = own if own is not None and is_own else read_character(path)
+            self._character = (
+                own if own is not None and is_own else read_character(path, topology=body.topology)
+            )
             body.require_topology(self._character.topology, str(path))
             self._require_unit(self._character)
         else:

@@ -27,7 +27,6 @@ from lcollision_core.meshes.formats.polygons import (
     Polygons,
     read_rest,
     require_plausible_count,
-    triangulate,
 )
 from lcollision_core.meshes.formats.scene import (
     NO_MESH,
@@ -38,6 +37,7 @@ from lcollision_core.meshes.formats.scene import (
     is_mirrored,
     left_out_note,
 )
+from lcollision_core.meshes.formats.triangulation import triangulate
 from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.topology import FloatArray
 
@@ -226,7 +226,7 @@ def _part(
         notes.append("edges and points without faces were left out")
     if not is_face.any():
         return None
-    faces, sentences = triangulate(Polygons(points, sizes[is_face], corners))
+    faces, cut_of, sentences = triangulate(Polygons(points, sizes[is_face], corners))
     notes += sentences
     material_of = held["material_of"]
     if not len(material_of):
@@ -240,9 +240,8 @@ def _part(
         notes.append("of the several skins of a mesh only the first was read")
     if is_mirrored(transforms[bones] @ bind, bone_of, weights):
         faces = faces[:, [0, 2, 1]]
-    polygon_of = np.repeat(np.arange(int(is_face.sum())), sizes[is_face] - 2)
-    material_of = material_of[is_face][polygon_of]
-    laid = Laid(number, is_used, corners, sizes[is_face], faces, polygon_of, material_of)
+    material_of = material_of[is_face][cut_of]
+    laid = Laid(number, is_used, corners, sizes[is_face], faces, cut_of, material_of)
     return Part(
         str(held["name"]),
         tuple(held["materials"].tolist()),
@@ -258,6 +257,7 @@ def _part(
         morphs=_morphs(held, len(points)),
         dual=held.get("dual"),
         look=partial(looks.appearance, laid),
+        cut_of=cut_of,
     )
 
 

@@ -34,6 +34,8 @@ class Polygons:
     corners : (sum of sizes,) int64 array, vertex indices from 0, one polygon after the other
     notes : sentences on what was done to the file's content
     is_single : whether the file holds the coordinates as float32
+    cut_of : of triangles that were cut already, ascending numbers of the polygons that they were
+        cut from; None where each is one
     """
 
     vertices: npt.NDArray[np.float64]
@@ -41,6 +43,7 @@ class Polygons:
     corners: npt.NDArray[np.int64]
     notes: tuple[str, ...] = ()
     is_single: bool = False
+    cut_of: npt.NDArray[np.int64] | None = None
 
     @classmethod
     def triangles(
@@ -49,10 +52,11 @@ class Polygons:
         faces: npt.NDArray[np.int64],
         notes: tuple[str, ...] = (),
         is_single: bool = False,
+        cut_of: npt.NDArray[np.int64] | None = None,
     ) -> Polygons:
         """Wrap (V, 3) vertices and (F, 3) faces."""
         sizes = np.full(len(faces), 3, dtype=np.int64)
-        return cls(vertices, sizes, faces.reshape(-1), notes, is_single)
+        return cls(vertices, sizes, faces.reshape(-1), notes, is_single, cut_of)
 
 
 def with_order_of(
@@ -91,55 +95,6 @@ def first_at_each_position(points: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
     first = np.empty_like(order)
     first[order] = order[is_new][np.cumsum(is_new) - 1]
     return first
-
-
-def triangulate(polygons: Polygons) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
-    """Cut every polygon into the fan of triangles round its first corner.
-
-    The cut depends on the order of the corners alone, never on their positions, so that all poses
-    of a set are cut alike.
-
-    Parameters
-    ----------
-    polygons : the content of a file
-
-    Returns
-    -------
-    faces : (F, 3) int64 array, in the order of the polygons
-    notes : a sentence for each kind of polygon that was cut
-
-    Raises
-    ------
-    MeshFileError : a polygon has fewer than three corners.
-    """
-    sizes = polygons.sizes
-    too_small = np.flatnonzero(sizes < 3)
-    if len(too_small):
-        face = int(too_small[0])
-        raise MeshFileError(
-            f"has {sizes[face]} corners, three are needed", where=f"face {face} (from 0)"
-        )
-    quads = int((sizes == 4).sum())
-    larger = int((sizes > 4).sum())
-    if not quads and not larger:
-        return polygons.corners.reshape(-1, 3), ()
-    notes = []
-    if quads:
-        notes.append(
-            "1 quad was triangulated" if quads == 1 else f"{quads} quads were triangulated"
-        )
-    if larger:
-        notes.append(
-            "1 polygon of more than four corners was triangulated"
-            if larger == 1
-            else f"{larger} polygons of more than four corners were triangulated"
-        )
-    triangles_each = sizes - 2
-    first_corner = np.repeat(np.cumsum(sizes) - sizes, triangles_each)
-    first_triangle = np.repeat(np.cumsum(triangles_each) - triangles_each, triangles_each)
-    step = np.arange(len(first_corner)) - first_triangle
-    fan = np.stack([first_corner, first_corner + step + 1, first_corner + step + 2], axis=1)
-    return polygons.corners[fan], tuple(notes)
 
 
 def require_plausible_count(count: int, what: str) -> None:

@@ -69,6 +69,8 @@ class Part:
     dual : (W,) float64 array, the share in [0, 1] that dual quaternions have of the blend; None
         where it is linear, as above
     look : reads how it looks, which takes long; None where its file does not say that
+    cut_of : (F,) int64 array, ascending, the polygon that each face was cut from; None where each
+        is one
     """
 
     mesh: str
@@ -86,6 +88,7 @@ class Part:
     is_single: bool = False
     dual: FloatArray | None = None
     look: Callable[[], Appearance] | None = None
+    cut_of: npt.NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -265,7 +265,7 @@ def test_a_bug_does_not_look_like_an_answer() -> None:
     code = (
         "from app.cli.main import main\n"
         "from lcollision_core import meshes\n"
-        "meshes.read_mesh = lambda path: 1 / 0\n"
+        "meshes.read_mesh = lambda *_, **__: 1 / 0\n"
         "main()\n"
     )
     result = subprocess.run(

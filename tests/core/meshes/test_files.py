@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import itertools
 import json
 import os
@@ -21,6 +22,7 @@ from lcollision_core.meshes import (
     read_pose_set,
     write_mesh,
 )
+from lcollision_core.meshes.formats import obj
 from lcollision_core.meshes.formats.polygons import first_at_each_position
 from lcollision_core.meshes.formats.text import number_rows, points
 
@@ -119,7 +121,7 @@ def test_obj_counts_vertices_from_one(tmp_path: Path) -> None:
 
 
 @st.composite
-def obj_texts(draw: st.DrawFn) -> tuple[str, np.ndarray, np.ndarray]:
+def obj_texts(draw: st.DrawFn) -> tuple[str, np.ndarray, list[list[int]]]:
     """Draw an OBJ file in one of its many dialects, and what it means."""
     n = draw(st.integers(3, 12))
     coordinate = st.floats(-1e6, 1e6, allow_subnormal=False)
@@ -138,10 +140,10 @@ def obj_texts(draw: st.DrawFn) -> tuple[str, np.ndarray, np.ndarray]:
         words = draw(blank).join(["v", *map(repr, vertex.tolist())])
         lines.append(draw(margin) + words + extra + draw(comment))
         lines += draw(st.sampled_from([[], [""], ["s off"], ["g part"], ["#"]]))
-    triangles = []
+    polygons = []
     for _ in range(draw(st.integers(1, 6))):
         polygon = draw(st.permutations(range(n)))[: draw(st.integers(3, min(n, 6)))]
-        triangles += [[polygon[0], b, c] for b, c in itertools.pairwise(polygon[1:])]
+        polygons.append(polygon)
         words = []
         for vertex in polygon:
             negative = signs == "negative" or (signs == "mixed" and draw(st.booleans()))
@@ -149,19 +151,17 @@ def obj_texts(draw: st.DrawFn) -> tuple[str, np.ndarray, np.ndarray]:
         joint = draw(st.sampled_from([" ", "\t", f" \\{end} "])) if end != "\r" else " "
         lines.append(draw(margin) + "f " + joint.join(words) + draw(margin) + draw(comment))
     text = end.join(lines) + draw(st.sampled_from(["", end]))
-    return text, vertices, np.array(triangles)
+    return text, vertices, polygons
 
 
 @given(obj_texts())
 @settings(SHARED_FOLDER, max_examples=150)
-def test_obj_dialects_mean_the_same(
-    tmp_path: Path, drawn: tuple[str, np.ndarray, np.ndarray]
-) -> None:
-    text, vertices, faces = drawn
-    (tmp_path / "m.obj").write_bytes(text.encode())
-    mesh = read_mesh(tmp_path / "m.obj")
-    assert np.array_equal(mesh.vertices, vertices)
-    assert mesh.faces.tolist() == faces.tolist()
+def test_obj_dialects_mean_the_same(drawn: tuple[str, np.ndarray, list[list[int]]]) -> None:
+    text, vertices, polygons = drawn
+    held = obj.read(io.BytesIO(text.encode()))
+    assert np.array_equal(held.vertices, vertices)
+    assert held.sizes.tolist() == list(map(len, polygons))
+    assert held.corners.tolist() == list(itertools.chain(*polygons))
 
 
 def test_obj_negative_numbers_count_back_from_where_they_stand(tmp_path: Path) -> None:
@@ -189,10 +189,13 @@ def test_seams_of_textures_and_normals_split_no_vertex(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("suffix", "text"),
     [
-        (".obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 2 2 2\nf 1 2 3 4\nf 1 2 5\nf 1 2 3 4 5\n"),
+        (
+            ".obj",
+            "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv -1 0.5 0\nf 1 2 3 4\nf 1 2 5\nf 1 2 3 4 5\n",
+        ),
         (
             ".off",
-            "OFF # comment\n\n5 3 0\n0 0 0\n1 0 0\n1 1 0\n# more\n0 1 0\n2 2 2\n"
+            "OFF # comment\n\n5 3 0\n0 0 0\n1 0 0\n1 1 0\n# more\n0 1 0\n-1 0.5 0\n"
             "4 0 1 2 3 255 0 0\n3 0 1 4\n5 0 1 2 3 4\n",
         ),
         (
@@ -201,7 +204,7 @@ def test_seams_of_textures_and_normals_split_no_vertex(tmp_path: Path) -> None:
             "property float y\n"
             "property float z\nproperty uchar red\nelement face 3\nproperty uchar flag\n"
             "property list uchar int vertex_indices\nend_header\n0 0 0 9\n1 0 0 9\n1 1 0 9\n"
-            "0 1 0 9\n2 2 2 9\n7 4 0 1 2 3\n7 3 0 1 4\n7 5 0 1 2 3 4\n",
+            "0 1 0 9\n-1 0.5 0 9\n7 4 0 1 2 3\n7 3 0 1 4\n7 5 0 1 2 3 4\n",
         ),
     ],
 )
