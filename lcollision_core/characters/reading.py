@@ -32,7 +32,6 @@ def read_character(
     ----------
     path : a .glb, .gltf, .vrm or .fbx file
     up : the up axis where the file is wrong about it: 0, 1, 2, "x", "y" or "z"
-
     topology : of a model of the character, as which polygons are cut
 
     Raises
@@ -42,10 +41,12 @@ def read_character(
     MissingExtraError : the extra `fbx`, which reads FBX, is not installed.
     ShapeError : `up` is no axis.
     """
-    return character_of(read_scene(path), Path(path), None if up is None else _axis(up))
+    return character_of(read_scene(path), Path(path), None if up is None else _axis(up), topology)
 
 
-def character_of(scene: Scene, path: Path, axis: int | None = None) -> Character:
+def character_of(
+    scene: Scene, path: Path, axis: int | None = None, topology: Topology | None = None
+) -> Character:
     """Make a character of what a file shows.
 
     Parameters
@@ -53,6 +54,7 @@ def character_of(scene: Scene, path: Path, axis: int | None = None) -> Character
     scene : without scenery
     path : of the file
     axis : 0, 1 or 2, the up axis where the file is wrong about it
+    topology : of a model of the character, as which polygons are cut
 
     Raises
     ------
