@@ -165,9 +165,7 @@ class PoseDocument(LiveEditing):
     @property
     def why_not_mirrored(self) -> str:
         """Why the model's poses cannot be mirrored; "" if they can."""
-        if self._model is None or self._model.symmetry is not None:
-            return ""
-        return f"Cannot be mirrored: {self._model.no_sides[0]}"
+        return "" if self._model is None else self._model.why_not_mirrored
 
     # Mirroring.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from lcollision_core.regular_files import read_regular
 
 _KEY, _VERSION = "lcollision", 1
 _LONGEST_NAME = 100
-_CLIPS, _PATHS = "animations", ("translation", "rotation", "scale", "weights")
+_CLIPS, _SHOWING = "animations", ("scale", "weights")
 _CHANGED = ("nodes", "meshes", "skins", "scenes", "scene")
 """What a pose changes of a description, apart from its animations."""
 
@@ -38,7 +38,7 @@ _CHANGED = ("nodes", "meshes", "skins", "scenes", "scene")
 def sign(
     patch: GltfPatch,
     source: dict[str, Any],
-    name: str,
+    character: Character,
     shown_by: Sequence[int],
     rules: ContactRules,
 ) -> None:
@@ -48,8 +48,8 @@ def sign(
     ----------
     patch : the file, complete
     source : the description that it had
-    name : of the character
-    shown_by : of each part of the character the number of the node that shows it now
+    character : with a rig, of that source
+    shown_by : of each of its parts the number of the node that shows it now
     rules : of the character
     """
     asset = patch.description.get("asset", {})
@@ -63,7 +63,8 @@ def sign(
     before[_CLIPS] = _brief(source)
     asset["extras"][_KEY] = {
         "format_version": _VERSION,
-        "character": name,
+        "character": character.name,
+        "roles": {} if character.rig is None else dict(character.rig.chosen),
         "rules": rules.to_json(),
         "source": before,
         "shown_by": list(shown_by),
@@ -72,43 +73,59 @@ def sign(
 
 
 def _brief(source: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return an animation that moves what the source's move, without its joints: one key of each.
+    """Return the source's animations without how they turn and move its joints.
 
-    That says what is a character's and what scenery; see `character_parts`.
+    What is left says which parts are a character's, and which faces are ever seen.
     """
     joints = {node for skin in source.get("skins", ()) for node in skin["joints"]}
-    found: dict[int, dict[str, Any]] = {}
+    found = []
     for animation in source.get(_CLIPS, ()):
-        for channel in animation.get("channels", ()):
-            node = channel["target"].get("node")
-            if node is not None and node not in joints and channel["target"].get("path") in _PATHS:
-                found[node] = channel | {"sampler": animation["samplers"][channel["sampler"]]}
-    if not found:
-        return []
-    channels = [channel | {"sampler": n} for n, channel in enumerate(found.values())]
-    return [{"channels": channels, "samplers": [one["sampler"] for one in found.values()]}]
+        kept = [
+            channel
+            for channel in animation.get("channels", ())
+            if channel["target"].get("path") in _SHOWING
+            or channel["target"].get("node") not in (None, *joints)
+        ]
+        if kept:
+            samplers = [animation["samplers"][channel["sampler"]] for channel in kept]
+            channels = [channel | {"sampler": n} for n, channel in enumerate(kept)]
+            found.append({"channels": channels, "samplers": samplers})
+    return found
 
 
-def read_own_file(path: Path) -> tuple[Character, FloatArray, ContactRules] | None:
-    """Read a file that this program wrote with a pose in it; None for any other.
+@dataclass(frozen=True, eq=False)
+class OwnFile:
+    """A file that this program wrote with a pose in it.
 
-    Returns
-    -------
-    character : in its rest pose
+    Attributes
+    ----------
+    character : in its rest pose, without clips
     vertices : (V, 3) float64 array, the pose
     rules : that the character had
+    roles : what its joints had been said to be, by their names
+    """
+
+    character: Character
+    vertices: FloatArray
+    rules: ContactRules
+    roles: dict[str, str]
+
+
+def read_own_file(path: Path) -> OwnFile | None:
+    """Read a file that this program wrote with a pose in it; None for any other.
 
     Raises
     ------
     MeshFileError : it was changed since, by another program, or is of a later version.
     """
     with one_sentence(path, "is not checked by the rules that it was written with"):
-        patch = GltfPatch(GltfDocument(read_regular(path, MAX_FILE_BYTES), path), path)
-        asset = patch.description.get("asset")
+        document = GltfDocument(read_regular(path, MAX_FILE_BYTES), path)
+        asset = document.description.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None
         held = extras.get(_KEY) if isinstance(extras, dict) else None
         if not isinstance(held, dict):
             return None
+        patch = GltfPatch(document, path)
         version = held.get("format_version")
         if version != _VERSION:
             raise MeshFileError.must_be(
@@ -117,11 +134,14 @@ def read_own_file(path: Path) -> tuple[Character, FloatArray, ContactRules] | No
         if held.get("digest") != patch.digest(_KEY):
             raise MeshFileError("another program has changed it since", "export it again")
         shown_by, source, name = held.get("shown_by"), held.get("source"), held.get("character")
+        roles = held.get("roles")
         if not (
             isinstance(source, dict)
             and isinstance(name, str)
             and isinstance(shown_by, list)
             and all(type(node) is int for node in shown_by)
+            and isinstance(roles, dict)
+            and all(isinstance(role, str) for role in roles.values())
         ):
             raise MeshFileError("what it says of its source is damaged", "export it again")
         rules = ContactRules.from_json(held.get("rules"))
@@ -132,7 +152,7 @@ def read_own_file(path: Path) -> tuple[Character, FloatArray, ContactRules] | No
         }
         character = character_of(scene_of(io.BytesIO(patch.encoded()), path), path)
         shown = "".join(filter(str.isprintable, name))[:_LONGEST_NAME]
-        character = replace(character, name=shown or character.name)
+        character = replace(character, name=shown or character.name, clips={})
         mesh = join_parts(posed)
         places = mesh.posed(posed.rest)[0][mesh.joined]
         rows: dict[int, list[FloatArray]] = {}
@@ -145,4 +165,4 @@ def read_own_file(path: Path) -> tuple[Character, FloatArray, ContactRules] | No
             raise MeshFileError("its vertices are not those of its source", "export it again")
         vertices = np.empty_like(character.rest_vertices)
         vertices[character.joined] = found
-        return character, vertices, rules
+        return OwnFile(character, vertices, rules, roles)

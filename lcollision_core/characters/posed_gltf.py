@@ -309,7 +309,7 @@ class _Source:
         """Return the bytes of the file, which says what it was made of; see `own_files`."""
         character, source = self._file.character, self._file.patch.description
         if character.rig is not None:
-            sign(self.patch, source, character.name, self._shown_by, rules)
+            sign(self.patch, source, character, self._shown_by, rules)
         return self.patch.encoded()
 
     def require_near(self, stored: FloatArray, wanted: npt.NDArray[Any]) -> None:

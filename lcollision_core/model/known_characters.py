@@ -197,8 +197,7 @@ def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigModel, FloatArray] | N
     suffix = path.suffix.lower()
     own = read_own_file(path) if suffix in PATCHED_SUFFIXES else None
     if own is not None:
-        character, vertices, rules = own
-        return RigModel.of(character).with_rules(rules), vertices
+        return RigModel.of(own.character).with_roles(own.roles).with_rules(own.rules), own.vertices
     if suffix in SCENE_SUFFIXES and has_skin(path):
         body = open_character(path, clips=False)
         if known_character(body.fingerprint) is not None and mesh.topology == body.topology:

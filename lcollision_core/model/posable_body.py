@@ -437,6 +437,11 @@ class PosableBody(ABC):
     )
     """Why there is no `symmetry`, where there is none, and what helps."""
 
+    @property
+    def why_not_mirrored(self) -> str:
+        """Why poses cannot be mirrored; "" if they can."""
+        return "" if self.symmetry is not None else f"Cannot be mirrored: {self.no_sides[0]}"
+
     def _not_mirrored(self) -> LCollisionError:
         reason, next_step = self.no_sides
         where = f"poses of {self.name}"

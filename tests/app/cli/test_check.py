@@ -417,8 +417,7 @@ def test_parts_in_another_order_and_scenery_do_not_confuse_what_is_checked(
         assert lcollision(*words).exit_code == 0
         found = read_own_file(out)
         assert found is not None
-        character, vertices, rules = found
-        assert rules == model.rules
-        assert character.topology == model.topology
-        assert np.abs(character.rest_vertices - model.reference).max() < 1e-9
-        assert np.abs(vertices - model.decode(latent)).max() < 1e-5
+        assert found.rules == model.rules
+        assert found.character.topology == model.topology
+        assert np.abs(found.character.rest_vertices - model.reference).max() < 1e-9
+        assert np.abs(found.vertices - model.decode(latent)).max() < 1e-5
