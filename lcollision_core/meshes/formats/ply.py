@@ -24,6 +24,7 @@ _TYPES = {
 }  # fmt: skip
 _FORMATS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNER_NAMES = ("vertex_indices", "vertex_index")
+_SURFACES = ("face", "tristrips")
 _MAX_HEADER_LINES = 10_000
 _MAX_LINE_BYTES = 10_000
 
@@ -46,7 +47,7 @@ _Column = tuple[npt.NDArray[Any], npt.NDArray[np.int64] | None]
 
 
 def read(file: BinaryIO) -> Polygons:
-    """Read the vertices' x, y, z and the faces; every other property is passed over.
+    """Read the vertices' x, y, z, the faces and triangle strips; all else is passed over.
 
     Parameters
     ----------
@@ -72,21 +73,51 @@ def read(file: BinaryIO) -> Polygons:
         ]
     body = _Body(data, byte_order or "=")
     columns: dict[str, dict[str, _Column]] = {}
+    wanted = {"vertex", *_SURFACES} & {element.name for element in elements}
     for element in elements:
         columns[element.name] = body.read(element)
-        if {"vertex", "face"} <= columns.keys():
+        if wanted <= columns.keys():
             break
     x, y, z = (columns["vertex"][axis][0] for axis in "xyz")
-    corners, sizes = next(
-        columns["face"][name] for name in _CORNER_NAMES if name in columns["face"]
-    )
-    assert sizes is not None  # as the header says
+    all_sizes, all_corners = [], []
+    for element_name in _SURFACES:
+        if element_name not in columns:
+            continue
+        held = columns[element_name]
+        values, sizes = next(held[name] for name in _CORNER_NAMES if name in held)
+        assert sizes is not None  # as the header says
+        corners = vertex_numbers(values, sizes, element_name)
+        if element_name == "tristrips":
+            corners = _triangles_of_strips(corners, sizes)
+            sizes = np.full(len(corners) // 3, 3)
+        all_sizes.append(sizes)
+        all_corners.append(corners)
     return Polygons(
         np.stack([x, y, z], axis=1, dtype=np.float64),
-        sizes,
-        vertex_numbers(corners, sizes),
+        np.concatenate(all_sizes),
+        np.concatenate(all_corners),
         is_single=x.dtype.itemsize == 4,
     )
+
+
+def _triangles_of_strips(
+    corners: npt.NDArray[np.int64], sizes: npt.NDArray[np.int64]
+) -> npt.NDArray[np.int64]:
+    """Return the corners of the triangles of strips, which have `sizes` corners.
+
+    Of a strip's triangles every second one is wound in the opposite sense; -1 begins another strip.
+    Triangles that name a vertex twice only lead from one strip to the next, and are left out.
+    """
+    places = np.arange(len(corners))
+    begin = np.zeros_like(places)
+    starts = (np.cumsum(sizes) - sizes)[sizes > 0]
+    begin[starts] = starts
+    begin = np.maximum.accumulate(np.where(corners == -1, places + 1, begin))
+    first = np.flatnonzero(begin[2:] <= places[:-2])
+    is_odd = (first - begin[first]) % 2
+    triangles = corners[np.stack([first + is_odd, first + 1 - is_odd, first + 2], axis=1)]
+    is_flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
+    return triangles[~is_flat].reshape(-1)
 
 
 def _as_double(item: _Property) -> _Property:
@@ -136,7 +167,8 @@ def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
 
 def _require_mesh(elements: list[_Element]) -> None:
     names = [element.name for element in elements]
-    for wanted in ("vertex", "face"):
+    surfaces = [name for name in _SURFACES if name in names] or ["face"]
+    for wanted in ("vertex", *surfaces):
         if names.count(wanted) != 1:
             raise MeshFileError(
                 f"its header names {names.count(wanted)} elements {wanted!r}, one is needed",
@@ -149,10 +181,11 @@ def _require_mesh(elements: list[_Element]) -> None:
     vertex = {item.name: item for item in elements[names.index("vertex")].properties}
     if not all(axis in vertex and vertex[axis].count_dtype is None for axis in "xyz"):
         raise MeshFileError("its vertices have no x, y and z")
-    face = {item.name: item for item in elements[names.index("face")].properties}
-    corners = next((face[name] for name in _CORNER_NAMES if name in face), None)
-    if corners is None or corners.count_dtype is None or corners.dtype.startswith("f"):
-        raise MeshFileError("its faces have no list vertex_indices")
+    for surface in surfaces:
+        face = {item.name: item for item in elements[names.index(surface)].properties}
+        corners = next((face[name] for name in _CORNER_NAMES if name in face), None)
+        if corners is None or corners.count_dtype is None or corners.dtype.startswith("f"):
+            raise MeshFileError(f"its element {surface!r} has no list vertex_indices")
 
 
 def _truncated(element: _Element, row: int | None = None) -> MeshFileError:
