@@ -6,6 +6,7 @@ Every command imports what it needs when it runs: ``lcollision --help`` loads no
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import sys
 import traceback
@@ -34,6 +35,8 @@ from lcollision_core.errors import CancelledError, LCollisionError
 
 # Small products take microseconds, which threads that share them out multiply on a busy machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# PyVista imports Matplotlib, which warns where it cannot keep a cache; nothing here is drawn by it.
+logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 """Typer's usage error; only this subclass has a public name."""

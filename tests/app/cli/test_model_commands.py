@@ -263,6 +263,29 @@ def test_figure_shows_each_domain_in_its_colour(
     assert (pixels[:20] == 255).all()
 
 
+def test_a_figure_is_drawn_without_a_word_where_nothing_can_be_cached(
+    tube: Path, tmp_path: Path
+) -> None:
+    # Also for root, nothing can be made below a file.
+    home, path = tmp_path / "home", tmp_path / "masks.png"
+    home.touch()
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("XDG_")}
+    for name in ("MPLCONFIGDIR", "MESA_SHADER_CACHE_DISABLE"):
+        kept.pop(name, None)
+    result = subprocess.run(
+        [sys.executable, "-m", "app", "info", tube, "--json", "--figure", path],
+        env={**kept, "HOME": str(home)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert path.exists()
+    assert [
+        line for line in result.stderr.splitlines() if not line.startswith("lcollision: ")
+    ] == []
+
+
 def test_domains_are_listed_and_renamed_for_good(lcollision: Lcollision, tube: Path) -> None:
     result = lcollision("domains", tube)
     assert result.exit_code == 0
