@@ -89,12 +89,14 @@ def gather_poses(
         own = characters.get(file)
         return {"clip": clip if own is None or clip in own.clips else None, "fps": fps}
 
-    found = []
+    found: list[PoseSet] = []
     for number, file in enumerate(files):
+        topology = found[0].topology if found else None
         if with_still and file in characters and not characters[file].clips:
             found.append(rest_pose_set(characters[file]))
         else:
-            found.append(read_pose_set(file, part(number), cancel, **of_animation(file)))
+            options = of_animation(file)
+            found.append(read_pose_set(file, part(number), cancel, topology=topology, **options))
     if by_rig and rigged is None:
         raise LCollisionError(
             "has no joints to pose it by",

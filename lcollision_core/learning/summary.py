@@ -90,10 +90,12 @@ def summarise_sources(
     LCollisionError : one of them cannot be learned from, or they are not of one topology.
     CancelledError : `cancel` was set.
     """
-    found = []
+    found: list[SourcesSummary] = []
     for path in paths:
-        summary = _of_character(path, cancel) if path.suffix.lower() in SCENE_SUFFIXES else None
-        found.append(summary or _of_poses(path, progress, cancel))
+        topology, summary = found[0].topology if found else None, None
+        if path.suffix.lower() in SCENE_SUFFIXES:
+            summary = _of_character(path, cancel, topology)
+        found.append(summary or _of_poses(path, progress, cancel, topology))
         if cancel is not None:
             cancel.raise_if_cancelled()
     first = next((one for one in found if one.n_joints), found[0])
@@ -111,11 +113,13 @@ def summarise_sources(
     )
 
 
-def _of_character(path: Path, cancel: CancelToken | None) -> SourcesSummary | None:
+def _of_character(
+    path: Path, cancel: CancelToken | None, topology: Topology | None
+) -> SourcesSummary | None:
     """Return what a scene's file holds; None where neither joints nor clips make poses of it."""
     scene = read_scene(path, cancel)
     with one_sentence(path):
-        mesh = join_parts(scene)
+        mesh = join_parts(scene).cut_as(topology)
         if not (scene.clips or mesh.is_skinned.any()):
             return None
         shown = [mesh.posed(scene.rest)]
@@ -145,8 +149,10 @@ def _of_character(path: Path, cancel: CancelToken | None) -> SourcesSummary | No
     )
 
 
-def _of_poses(path: Path, progress: Progress, cancel: CancelToken | None) -> SourcesSummary:
-    poses = read_pose_set(path, progress, cancel)
+def _of_poses(
+    path: Path, progress: Progress, cancel: CancelToken | None, topology: Topology | None
+) -> SourcesSummary:
+    poses = read_pose_set(path, progress, cancel, topology=topology)
     if len(poses) < 2:
         raise LCollisionError(
             "holds a single pose, of which nothing can be learned", "add more poses", where=path

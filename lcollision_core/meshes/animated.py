@@ -60,6 +60,7 @@ def read_animated(
     fps: float | None = None,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
+    topology: Topology | None = None,
 ) -> AnimatedMesh:
     """Read a scene with animations, or a point cache and the mesh beside it.
 
@@ -72,6 +73,7 @@ def read_animated(
         frames that it has.
     progress : called with (frames done, frames in all)
     cancel : polled between frames
+    topology : of another set of the same body, as which polygons are cut
 
     Raises
     ------
@@ -80,11 +82,11 @@ def read_animated(
     CancelledError : `cancel` was set.
     """
     if path.suffix.lower() not in POINT_CACHE_SUFFIXES:
-        return _read_clips(path, clip, fps, progress, cancel)
+        return _read_clips(path, clip, fps, progress, cancel, topology)
     for value, option in ((clip, "a clip"), (fps, "frames a second")):
         if value is not None:
             raise MeshFileError(f"is a point cache, of which {option} cannot be chosen", where=path)
-    return _read_cache(path)
+    return _read_cache(path, topology)
 
 
 def _read_clips(
@@ -93,6 +95,7 @@ def _read_clips(
     fps: float | None,
     progress: Progress,
     cancel: CancelToken | None,
+    topology: Topology | None,
 ) -> AnimatedMesh:
     scene = read_scene(path, cancel)
     with one_sentence(path):
@@ -101,7 +104,7 @@ def _read_clips(
                 "it holds no animation, so it is one mesh, not a pose set",
                 "name its folder, export it with its animation, or let its rig pose it",
             )
-        mesh = join_parts(scene)
+        mesh = join_parts(scene).cut_as(topology)
         frames, names = [mesh.posed(scene.rest)], ["rest"]
         chosen = [clip] if clip is not None else [one.name for one in scene.clips]
         n_numbers = 0
@@ -145,7 +148,7 @@ def labels_of(scene: Scene, mesh: JoinedMesh) -> npt.NDArray[np.str_] | None:
     return part_labels(labels, joint_of, mesh.weights)
 
 
-def _read_cache(path: Path) -> AnimatedMesh:
+def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
     """Read a point cache, and as pose 0 the mesh beside it."""
     beside = [path.with_suffix(suffix) for suffix in _MESHES_OF_CACHES]
     found = [file for file in beside if file.is_file()]
@@ -156,7 +159,9 @@ def _read_cache(path: Path) -> AnimatedMesh:
             where=path,
         )
     frames = read_point_cache(path)
-    mesh = read_mesh(found[0])
+    # Formats that split vertices would have them put into another order than the frames'.
+    is_plain = found[0].suffix.lower() in (".obj", ".ply", ".off")
+    mesh = read_mesh(found[0], topology=topology if is_plain else None)
     n_vertices = frames.shape[1]
     scene = read_scene(found[0]) if found[0].suffix.lower() in SCENE_SUFFIXES else None
     if scene is not None and n_vertices != mesh.topology.n_vertices:

@@ -190,6 +190,7 @@ def read_pose_set(
     *,
     clip: str | None = None,
     fps: float | None = None,
+    topology: Topology | None = None,
 ) -> PoseSet:
     """Read a pose set and refuse it at the first defect.
 
@@ -203,6 +204,7 @@ def read_pose_set(
     cancel : polled between poses
     clip : the animation of a file that has several; None for all
     fps : frames a second of an animation; None for its keys, at most 30 a second
+    topology : of another set of the same body, as which polygons are cut
 
     Returns
     -------
@@ -219,7 +221,7 @@ def read_pose_set(
     def refuse(defect: LCollisionError) -> None:
         raise defect
 
-    pose_set = collect_poses(Path(path), refuse, progress, cancel, clip, fps).pose_set
+    pose_set = collect_poses(Path(path), refuse, progress, cancel, clip, fps, topology).pose_set
     if pose_set is None:
         raise MeshFileError("holds no poses", "name another folder or file", where=path)
     require_usable_reference(pose_set)
@@ -272,6 +274,7 @@ def collect_poses(
     cancel: CancelToken | None = None,
     clip: str | None = None,
     fps: float | None = None,
+    topology: Topology | None = None,
 ) -> PoseSetInspection:
     """Read all poses that fit together and report each defect.
 
@@ -279,7 +282,7 @@ def collect_poses(
     ----------
     path : as for `read_pose_set`
     report : called with each defect; when it raises, reading ends there
-    progress, cancel, clip, fps : as for `read_pose_set`
+    progress, cancel, clip, fps, topology : as for `read_pose_set`
     """
     try:
         is_folder, exists = path.is_dir(), path.exists()
@@ -287,10 +290,10 @@ def collect_poses(
         report(MeshFileError.unreadable(path, error, "check the name"))
         return PoseSetInspection(None)
     if is_folder:
-        return _without_outliers(_collect_folder(path, report, progress, cancel), report)
+        return _without_outliers(_collect_folder(path, report, progress, cancel, topology), report)
     suffix = path.suffix.lower()
     if exists and suffix in ANIMATED_SUFFIXES:
-        return _collect_frames(path, report, progress, cancel, clip, fps)
+        return _collect_frames(path, report, progress, cancel, clip, fps, topology)
     if exists and suffix == ".npz":
         return _without_outliers(_collect_npz(path, report, progress), report)
     if not exists:
@@ -345,6 +348,7 @@ def _collect_folder(
     report: Callable[[LCollisionError], None],
     progress: Progress,
     cancel: CancelToken | None,
+    expected: Topology | None,
 ) -> PoseSetInspection:
     try:
         files, others = mesh_files(path)
@@ -369,7 +373,7 @@ def _collect_folder(
         if cancel is not None:
             cancel.raise_if_cancelled()
         try:
-            mesh = read_mesh(file, topology=topology)
+            mesh = read_mesh(file, topology=topology or expected)
         except MeshFileError as error:
             report(error)
         else:
@@ -450,9 +454,10 @@ def _collect_frames(
     cancel: CancelToken | None,
     clip: str | None,
     fps: float | None,
+    topology: Topology | None,
 ) -> PoseSetInspection:
     try:
-        held = read_animated(path, clip, fps, progress, cancel)
+        held = read_animated(path, clip, fps, progress, cancel, topology)
     except MeshFileError as error:
         report(error)
         return PoseSetInspection(None)

@@ -16,6 +16,8 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.characters import read_character
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MeshFileError
+from lcollision_core.learning.sources import gather_poses
+from lcollision_core.learning.summary import summarise_sources
 from lcollision_core.meshes import Topology, read_mesh, read_pose_set
 from lcollision_core.meshes.formats.point_cache import write_point_cache
 from lcollision_core.meshes.formats.polygons import Polygons
@@ -278,6 +280,20 @@ def test_the_reference_of_a_set_decides_for_all_its_poses(tmp_path: Path, suffix
         if suffix == ".fbx":
             assert read_character(files[1], topology=poses.topology).topology == poses.topology
             assert read_character(files[1]).topology == alone[1]
+
+
+def test_several_sources_of_one_body_are_cut_alike(tmp_path: Path) -> None:
+    for name, shapes in (("a", (CLAMP, _closed())), ("b", (_closed(), CLAMP))):
+        (tmp_path / name).mkdir()
+        for number, points in enumerate(shapes):
+            _write_clamp(tmp_path / name / f"{number}.obj", points)
+    _write_clamp(tmp_path / "c.obj", _closed())
+    write_point_cache(tmp_path / "c.mdd", np.stack([_closed(), CLAMP]), 24.0)
+    sources = [tmp_path / name for name in ("a", "b", "c.mdd")]
+    poses = gather_poses(sources, by_rig=0, thin=False)
+    assert len(poses) == 7
+    assert poses.topology == read_pose_set(tmp_path / "a").topology
+    assert poses.topology == summarise_sources(sources).topology
 
 
 def test_a_cache_is_cut_as_its_mesh(tmp_path: Path) -> None:
