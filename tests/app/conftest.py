@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,24 @@ from lcollision_core.model import PoseModel, find_model
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest
-from tests.app.windows import close_window, is_open, open_window, settings_in
+from tests.app.windows import PATIENCE, close_window, is_open, open_window, settings_in
+
+
+class PatientBot(QtBot):
+    """Waits for what never comes in a failure only: as long as a busy machine may take."""
+
+    def waitUntil(self, callback: Any, *, timeout: int = PATIENCE) -> None:  # noqa: N802
+        super().waitUntil(callback, timeout=max(timeout, PATIENCE))
+
+    def waitSignal(self, signal: Any, *, timeout: int = PATIENCE, **rest: Any) -> Any:  # noqa: N802
+        return super().waitSignal(signal, timeout=max(timeout, PATIENCE), **rest)
+
+
+@pytest.fixture
+def qtbot(request: pytest.FixtureRequest) -> QtBot:
+    """Return pytest-qt's robot, of more patience."""
+    request.getfixturevalue("qapp")
+    return PatientBot(request)
 
 
 @pytest.fixture(autouse=True)

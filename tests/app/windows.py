@@ -26,7 +26,7 @@ from app.window.widgets import HANDLE
 SHOTS = Path(__file__).parents[2] / "out" / "screenshots"
 """Where tests leave pictures of the window, for people to look at."""
 
-PATIENCE = 30_000
+PATIENCE = 120_000
 """Milliseconds to wait for a machine that does other things too."""
 
 

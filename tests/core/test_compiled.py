@@ -6,7 +6,7 @@ import importlib.util
 import logging
 import time
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -44,11 +44,12 @@ def test_a_loop_is_cached_beside_its_file(tmp_path: Path) -> None:
 def test_compiling_is_logged_once_until_it_pauses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(compiled, "_PAUSE_SECONDS", 0.5)
+    now = [0.0]
+    monkeypatch.setattr(compiled, "time", SimpleNamespace(monotonic=lambda: now[0]))
     caplog.set_level(logging.INFO, compiled.__name__)
     triangular = _module(tmp_path).triangular
     for kinds, n_logged in (((np.int8, np.int16), 1), ((np.int16,), 1), ((np.int32, np.int64), 2)):
-        time.sleep(0.6)
+        now[0] += 2.0 * compiled._PAUSE_SECONDS
         for kind in kinds:
             assert triangular(kind(4)) == 10
         assert len(caplog.records) == n_logged

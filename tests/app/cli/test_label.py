@@ -22,7 +22,7 @@ from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 from tests.core.labelled import as_bytes
 
-SECONDS_TO_WAIT = 120.0
+SECONDS_TO_WAIT = 600.0
 
 
 @pytest.fixture(scope="module")

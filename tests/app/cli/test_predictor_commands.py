@@ -30,7 +30,7 @@ from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 
 N_ROWS = 2000
-SECONDS_TO_WAIT = 120.0
+SECONDS_TO_WAIT = 600.0
 
 
 @pytest.fixture(scope="module")

@@ -424,7 +424,7 @@ def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
     def save_slowly(*arguments: object, **options: object) -> None:
         save(*arguments, **options)
         packing.set()
-        assert cancelled.wait(20.0)
+        assert cancelled.wait(120.0)
 
     monkeypatch.setattr(Image.Image, "save", save_slowly)
     viewport.pictures.turntable(

@@ -321,7 +321,7 @@ def test_a_card_that_is_being_read_is_given_up_with_its_dialog_and_for_another_r
     runs, asked, shown = watching.learning.runs, threading.Semaphore(0), []
 
     def read(model_file: str, *_: object) -> str:
-        asked.acquire(timeout=30.0)
+        asked.acquire(timeout=120.0)
         return model_file
 
     monkeypatch.setattr(learning_jobs, "read_card", read)

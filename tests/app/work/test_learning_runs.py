@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from lcollision_core.model import PoseModel, model_destination
 from tests.bending_tube import bending_tube
 
 QUICK = (sys.executable, "-P", "-m", "tests.app.quick_learner")
-PATIENCE = 60_000
+PATIENCE = 240_000
 
 
 @pytest.fixture
@@ -258,7 +257,6 @@ def test_the_learner_refuses_a_folder_without_a_request(tmp_path: Path) -> None:
     (other / "__init__.py").write_text("raise SystemExit('a package of the folder')")
     environment = learning_runs._environment()
     names = environment.keys()
-    began = time.monotonic()
     result = subprocess.run(
         [*learning_runs.LEARNER, work.path],
         capture_output=True,
@@ -268,6 +266,8 @@ def test_the_learner_refuses_a_folder_without_a_request(tmp_path: Path) -> None:
         env={name: environment.value(name) for name in names},
     )
     assert result.returncode == 2, result.stderr
-    assert time.monotonic() - began < 60.0
     assert work.status.state == WorkState.FAILED
+    # It began none of its stages.
+    assert not work.status.stage
+    assert not work.status.seconds
     assert "request.json" in work.status.sentence

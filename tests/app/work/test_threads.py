@@ -37,24 +37,21 @@ def test_a_burst_of_changes_is_one_frame(qtbot: QtBot, document: PoseDocument) -
     assert [frame.latent[0] for frame in frames if frame] == [1.0]
 
 
-def test_the_mesh_follows_250_events_in_two_seconds_and_ends_right(
-    qtbot: QtBot, document: PoseDocument
-) -> None:
+def test_the_mesh_follows_250_events_and_ends_right(qtbot: QtBot, document: PoseDocument) -> None:
     values = iter(np.linspace(-1.0, 1.0, 250))
     shown: list[tuple[int, float]] = []
-    last_event = 0.0
+    n_before: list[int] = []
 
     def note() -> None:
         if document.frame is not None:
             shown.append((document.frame.request_id, float(document.frame.latent[0])))
 
     def step() -> None:
-        nonlocal last_event
         value = next(values, None)
         if value is None:
             timer.stop()
             return
-        last_event = time.monotonic()
+        n_before.append(len(shown))
         document.set_code(0, value)
 
     document.frame_changed.connect(note)
@@ -63,15 +60,15 @@ def test_the_mesh_follows_250_events_in_two_seconds_and_ends_right(
     document.begin_gesture("Drag")
     timer.start(8)
     qtbot.waitUntil(lambda: bool(shown) and shown[-1][1] == 1.0, timeout=20_000)
-    lag = time.monotonic() - last_event
     document.end_gesture()
     settle(qtbot, document)
     ids, drawn = zip(*shown, strict=True)
     assert list(ids) == sorted(set(ids))
     # No frame goes back to an earlier pose of a drag in one direction.
     assert list(drawn) == sorted(drawn)
-    assert len(shown) > 20
-    assert lag < 1.0
+    # Frames come while it is dragged, and after the last event only the one in hand and the newest.
+    assert n_before[-1] > 1
+    assert len(shown) - n_before[-1] <= 2
     assert document.frame is not None
     expected = document.model.decode(document.latent).astype(np.float32)
     assert document.frame.vertices.tobytes() == expected.tobytes()
@@ -91,7 +88,7 @@ def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
         begun.append(latent[0])
         frame = compute(evaluator, latent, request_id)
         if latent[0] in held:
-            held[latent[0]].wait(10)
+            held[latent[0]].wait(120)
         return frame
 
     monkeypatch.setattr(FrameEvaluator, "frame", starved)
@@ -121,7 +118,7 @@ def test_a_verdict_of_a_pose_that_has_moved_on_is_not_told(
 
     def slow(evaluator: FrameEvaluator, frame: LiveFrame) -> object:
         checking.set()
-        go_on.wait(10)
+        go_on.wait(120)
         return check(evaluator, frame)
 
     monkeypatch.setattr(FrameEvaluator, "verdict", slow)
@@ -173,14 +170,14 @@ def test_the_window_stays_live_in_a_solve(
     working, ended = endless_resolve(monkeypatch)
     document.resolve()
     qtbot.waitUntil(working.is_set)
-    turns = []
+    turns: list[bool] = []
     timer = QTimer(document)
-    timer.timeout.connect(lambda: turns.append(time.monotonic()))
+    timer.timeout.connect(lambda: turns.append(document.solving))
     timer.start(5)
     qtbot.waitUntil(lambda: len(turns) > 20)
     timer.stop()
+    assert all(turns)
     assert document.solving
-    assert np.median(np.diff(turns)) < 0.05
     document.cancel_resolve()
     qtbot.waitUntil(ended.is_set)
 
@@ -318,7 +315,7 @@ def test_a_frame_of_another_model_is_not_shown(
 
     def slow(evaluator: FrameEvaluator, latent: np.ndarray, request_id: int) -> LiveFrame:
         started.set()
-        go_on.wait(10)
+        go_on.wait(120)
         return compute(evaluator, latent, request_id)
 
     old = document.model
@@ -354,7 +351,7 @@ def test_jobs_run_in_turn_and_a_cancelled_one_is_not_heard_of(qtbot: QtBot) -> N
     qtbot.waitUntil(lambda: done == ["second"])
     assert work.busy == ""
     assert labels == ["first", "first", "second", ""]
-    assert work.close(time.monotonic() + 5)
+    assert work.close(time.monotonic() + 60)
 
 
 def test_who_asks_for_work_is_told_of_its_failure_or_else_all_are(qtbot: QtBot) -> None:
@@ -368,7 +365,7 @@ def test_who_asks_for_work_is_told_of_its_failure_or_else_all_are(qtbot: QtBot) 
     work.start("second", fail, lambda _: None)
     qtbot.waitUntil(lambda: not work.busy)
     assert [failure.headline for failure in (*own, *told)] == ["the disk is full"] * 2
-    assert work.close(time.monotonic() + 5)
+    assert work.close(time.monotonic() + 60)
 
 
 def test_work_is_over_also_where_what_follows_from_it_breaks(qtbot: QtBot) -> None:
@@ -382,7 +379,7 @@ def test_work_is_over_also_where_what_follows_from_it_breaks(qtbot: QtBot) -> No
         work.start("first", lambda *_: None, break_down)
         qtbot.waitUntil(lambda: labels == ["first", ""])
     assert [kind for kind, *_ in raised] == [ValueError]
-    assert work.close(time.monotonic() + 5)
+    assert work.close(time.monotonic() + 60)
 
 
 def test_the_newest_file_wins_and_no_file_waits_for_a_solve(
@@ -431,7 +428,7 @@ def test_an_answer_that_comes_twice_is_not_taken_for_that_of_a_later_request(
 
     def slow(evaluator: FrameEvaluator, latent: np.ndarray, request_id: int) -> LiveFrame:
         started.set()
-        go_on.wait(10)
+        go_on.wait(120)
         return compute(evaluator, latent, request_id)
 
     worker = document._live._worker

@@ -98,7 +98,7 @@ def test_several_threads_may_share_a_detector(
     barrier = threading.Barrier(6)
 
     def work(seed: int) -> list[str]:
-        barrier.wait(timeout=30)
+        barrier.wait(timeout=300)
         wrong = []
         for pose in np.random.default_rng(seed).permutation(len(poses)):
             found = fresh.detect(poses[pose])

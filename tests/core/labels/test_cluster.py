@@ -165,10 +165,11 @@ def test_workers_that_come_late_get_as_much_to_do(labeller: Labeller, tmp_path: 
 def test_no_scheduler_and_no_worker_are_told(
     labeller: Labeller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 1)
-    for address in ("tcp://127.0.0.1:9", "nonsense://nowhere"):
-        with pytest.raises(LCollisionError, match=f"no Dask scheduler answers at {address}"):
-            label_poses(labeller, tmp_path / "store", 10, scheduler=address)
+    with monkeypatch.context() as hasty:
+        hasty.setattr(cluster, "_CONNECT_SECONDS", 1)
+        for address in ("tcp://127.0.0.1:9", "nonsense://nowhere"):
+            with pytest.raises(LCollisionError, match=f"no Dask scheduler answers at {address}"):
+                label_poses(labeller, tmp_path / "store", 10, scheduler=address)
     with (
         LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=":0") as empty,
         pytest.raises(LCollisionError, match="has no workers; start some with `dask worker"),

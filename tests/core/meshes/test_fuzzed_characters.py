@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -112,14 +111,12 @@ def _require_bounded(
 ) -> None:
     """Read the files of n seeds: some must be refused, all in bounded memory."""
     n_refused = 0
-    start = time.perf_counter()
     for seed in range(n_files):
         path = made(seed)
         peak, refused = _peak_of(lambda path=path: read(path), path)  # type: ignore[misc]
         assert peak < MOST_MEMORY, f"seed {seed}"
         n_refused += refused
     assert n_refused > n_files // 10
-    assert time.perf_counter() - start < 60.0
 
 
 def test_glb_of_damaged_bytes(tmp_path: Path) -> None:

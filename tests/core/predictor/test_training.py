@@ -41,7 +41,7 @@ from lcollision_core.predictor.training.status import has_begun, patches_path
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import PAPER, colliding_latent, config, made_up_rows, weights_of
 
-SECONDS_TO_WAIT = 120.0
+SECONDS_TO_WAIT = 600.0
 
 TRAIN = """
 import pickle, sys

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from PySide6.QtWidgets import QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
 from app.window.main_window import MainWindow
+from app.window.panels import resolve as panel
 from app.wording import seconds_text
 from app.work import jobs
 from lcollision_core.model import NamedPose, PoseModel, sample_poses
@@ -89,22 +90,24 @@ def test_the_time_told_is_what_was_waited_as_well(
     real = jobs.resolve
 
     def slow(*arguments: object) -> object:
-        time.sleep(0.8)
+        document._solve_began -= 0.8
         result, ghost = real(*arguments)  # type: ignore[arg-type]
         return replace(result, seconds=0.194), ghost
 
-    card = window.collision.outcome
-    window.document.blend_towards(colliding, 1.0)
-    resolve(qtbot, window)
-    assert not any("of preparation" in text for text in texts(card))
-    window.document.undo()
+    card, document = window.collision.outcome, window.document
+    document.blend_towards(colliding, 1.0)
+    with monkeypatch.context() as soon:
+        soon.setattr(panel, "_WAITED", math.inf)
+        resolve(qtbot, window)
+        assert not any("of preparation" in text for text in texts(card))
+    document.undo()
     monkeypatch.setattr(jobs, "resolve", slow)
     resolve(qtbot, window)
     (told,) = (text for text in texts(card) if "of preparation" in text)
     assert told.startswith("194 ms, after ")
-    assert told.endswith(f" {seconds_text(window.document.outcome_seconds - 0.194)} of preparation")
-    assert window.document.outcome_seconds >= 0.8
+    assert told.endswith(f" {seconds_text(document.outcome_seconds - 0.194)} of preparation")
+    assert document.outcome_seconds >= 0.8
     # Undo and redo bring the same times back.
-    window.document.undo()
-    window.document.redo()
+    document.undo()
+    document.redo()
     assert told in texts(card)
