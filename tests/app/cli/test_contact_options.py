@@ -17,8 +17,9 @@ from lcollision_core.meshes import (
     read_mesh,
     write_pose_set,
 )
-from lcollision_core.model import PoseModel
+from lcollision_core.model import PoseModel, open_body, remember_choices
 from tests.app.support import Lcollision
+from tests.rigged_shapes import head_in_torso, rigged_body, write_gltf
 
 NONE = {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0, "joint": 0, "touching": 0}
 
@@ -114,6 +115,51 @@ def test_dataset_check_names_the_rules(
     assert ("not counted are" in said) == bool(options)
     if excluded == "rest":
         assert "not counted are pairs that touch at rest; at rest that is 1 touching" in said
+
+
+def test_joints_of_a_character_count_or_not_and_what_has_none_is_refused(
+    lcollision: Lcollision, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    path = write_gltf(rigged_body(), tmp_path / "body.glb")
+    said = lcollision("contacts", path).stdout
+    assert "pairs at a joint that links their parts" in said
+    off = json.loads(lcollision("contacts", path, "--json", "--no-joint-exclusion").stdout)
+    assert off["rules"]["joint_exclusion"] is False
+    # It is remembered, as is what an older program remembered, which knows no such rule.
+    assert "at a joint" not in lcollision("contacts", path).stdout
+    (known,) = (tmp_path / "data" / "lcollision" / "characters").iterdir()
+    document = json.loads(known.read_text())
+    del document["rules"]["joint_exclusion"]
+    known.write_text(json.dumps(document))
+    assert "at a joint" not in lcollision("contacts", path).stdout
+    on = json.loads(lcollision("contacts", path, "--json", "--joint-exclusion").stdout)
+    assert on["rules"]["joint_exclusion"] is True
+    bundled = lcollision("contacts", "body", "--joint-exclusion")
+    assert bundled.exit_code == 2
+    assert "body has no joints that its contact rules could leave out" in bundled.stderr
+
+
+def test_places_that_always_touch_are_listed_and_ignored_on_request(
+    lcollision: Lcollision, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    path = write_gltf(head_in_torso(12), tmp_path / "body.glb")
+    # What touches at rest does not count at first.
+    assert json.loads(lcollision("contacts", path, "--json").stdout)["proposed"] is None
+    body = open_body(path)
+    remember_choices(body.with_rules(ContactRules()))
+    proposed = json.loads(lcollision("contacts", path, "--json").stdout)["proposed"]
+    assert proposed["rules"]["ignored"] == []
+    n_places = len(proposed["rules"]["touching"])
+    assert sum(place["n"] for place in proposed["places"]) == n_places > 0
+    said = lcollision("contacts", path).stdout
+    assert f"without {n_places} places that touch in nearly all of them" in said
+    assert f"Head and Torso: {n_places} places" in said
+    done = json.loads(lcollision("contacts", path, "--json", "--ignore-proposed").stdout)
+    assert done["rules"] == proposed["rules"]
+    assert done["excluded_at_rest"]["touching"] > 0
+    assert open_body(path).rules.touching == tuple(map(tuple, proposed["rules"]["touching"]))
 
 
 def test_a_trained_model_keeps_the_rules_and_says_them(
