@@ -143,6 +143,15 @@ class CodeEditing(PoseHistory):
         return NamedPose(self.model.pose_names[number], self.model.training_latent[number])
 
     @property
+    def starter_poses(self) -> list[NamedPose]:
+        """Poses to begin with, none of a body whose joints are not known."""
+        from lcollision_core.model import NamedPose
+
+        return [
+            NamedPose(pose.name, pose.codes, moves=pose.moves) for pose in self.model.starter_poses
+        ]
+
+    @property
     def all_locked(self) -> bool:
         """Whether every domain is locked, so that nothing but a slider can move the pose."""
         return self.has_model and len(self.locked_domains) == len(self.model.domain_names)

@@ -26,6 +26,7 @@ class Source(Enum):
     """Where a pose comes from."""
 
     TRAINING = "training"
+    STARTER = "starter"
     LIBRARY = "library"
     FILE = "file"
     MESH = "mesh"

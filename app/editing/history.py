@@ -213,7 +213,14 @@ class PoseHistory(QObject):
         self.undo_stack.redo()
 
     def load_pose(self, pose: NamedPose) -> None:
-        """Edit a pose of the library, of the file or of the training set, under its name."""
+        """Edit a pose of the library, of the file or of the training set, under its name.
+
+        One that sets some codes only, as of hands, changes those of the pose that is edited.
+        """
+        if pose.moves is not None:
+            self._tell_if_locked()
+            self._edit(pose.name, self._with_locked(pose.applied_to(self.latent)))
+            return
         source = Source.TRAINING
         for held, poses in ((Source.LIBRARY, self.poses), (Source.FILE, self.file_poses)):
             if any(pose is own for own in poses):
@@ -270,7 +277,7 @@ class PoseHistory(QObject):
         added = [p for p in poses if p.name not in known or not known[p.name].same_as(p)]
         names = self._free_names([pose.name for pose in added])
         what = added[0].name if len(added) == 1 else counted(len(added), "pose")
-        new = [replace(p, name=name) for p, name in zip(added, names, strict=True)]
+        new = [replace(p, name=name, moves=None) for p, name in zip(added, names, strict=True)]
         self._step(f"Add {what}", [(None, pose) for pose in new])
         return len(new)
 

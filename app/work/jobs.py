@@ -142,7 +142,7 @@ def warm_up(model: PosableBody) -> None:
     latent.flags.writeable = False
     evaluator.verdict(evaluator.frame(latent, 0))
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
-    _ = model.groups_by_kind, model.appearance
+    _ = model.groups_by_kind, model.appearance, model.starter_poses
 
 
 def _drag_once(model: PosableBody) -> None:

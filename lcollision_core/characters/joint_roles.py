@@ -183,7 +183,7 @@ def joint_sides(rig: Rig, left: FloatArray) -> list[Side]:
     return sides
 
 
-def _next_in_limb(rig: Rig, roles: Sequence[Role]) -> dict[int, int]:
+def next_in_limb(rig: Rig, roles: Sequence[Role]) -> dict[int, int]:
     """Return for thighs, shins and both halves of arms the joint at their bones' other end."""
     found: dict[int, int] = {}
     for joint, role in enumerate(roles):
@@ -209,7 +209,7 @@ def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> Flo
     size = float(np.ptp(origins, axis=0).max()) + float(np.ptp(rig.points, axis=(0, 1)).max())
     directions = np.zeros_like(origins)
     heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
-    next_of = _next_in_limb(rig, roles)
+    next_of = next_in_limb(rig, roles)
     for joint, parent in enumerate(rig.parents):
         following = rig.parents == joint
         if joint in next_of:
@@ -276,7 +276,7 @@ def joint_axes(
     lies along the bone, the third turns it sideways.
     """
     middle = origins.mean(axis=0)
-    above = {hinge: joint for joint, hinge in _next_in_limb(rig, roles).items()}
+    above = {hinge: joint for joint, hinge in next_in_limb(rig, roles).items()}
     axes = np.empty((len(origins), 3, 3))
     for joint, (role, bone) in enumerate(zip(roles, directions, strict=True)):
         towards = front

@@ -39,6 +39,7 @@ from lcollision_core.model.mirror import (
 
 if TYPE_CHECKING:
     from lcollision_core.meshes.appearance import Appearance
+    from lcollision_core.model.starter_poses import StarterPose
     from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
     from lcollision_core.predictor import Prediction
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
@@ -69,9 +70,11 @@ class PosableBody(ABC):
     notes : sentences on what was changed on reading
     frame_rate : of the poses that the body came with, in frames a second; None if they are no
         motion's
+    starter_poses : poses to begin with, of a rig whose joints are known
     """
 
     notes: tuple[str, ...] = ()
+    starter_poses: tuple[StarterPose, ...] = ()
     frame_rate: float | None = None
 
     def __init__(

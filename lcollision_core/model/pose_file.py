@@ -63,6 +63,7 @@ class NamedPose:
     mirror_of : of a mirror image the pose that it was made from, which mirroring it again, while
         it is unchanged, gives back to the bit
     pins : patches that stay in their places while others are dragged
+    moves : (D,) which codes it sets, as of hands alone; None for all. Files do not keep it.
     """
 
     name: str
@@ -73,6 +74,11 @@ class NamedPose:
     tags: tuple[str, ...] = ()
     mirror_of: MirrorSource | None = None
     pins: tuple[Pin, ...] = ()
+    moves: npt.NDArray[np.bool_] | None = None
+
+    def applied_to(self, latent: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Return this pose's codes, and of a pose that sets only some, the others of `latent`."""
+        return self.latent if self.moves is None else np.where(self.moves, self.latent, latent)
 
     def same_as(self, other: NamedPose) -> bool:
         """Whether latents, placements and pins are equal, to the bit, whatever the names."""
@@ -95,6 +101,7 @@ class NamedPose:
             fit_error_max=None if image.restored else image.fit_error_max,
             mirror_of=image.source,
             pins=tuple(map(symmetry.image_of_pin, self.pins)),
+            moves=None,
         )
 
 

@@ -37,6 +37,7 @@ from lcollision_core.model.posable_body import PosableBody, read_only
 from lcollision_core.model.rig_fit import fit_rig
 from lcollision_core.model.rig_mirror import JointSides, RigMirror, find_joint_sides
 from lcollision_core.model.rig_names import motion_names, side_of
+from lcollision_core.model.starter_poses import StarterPose, starter_poses
 from lcollision_core.model_file import digest_of
 
 if TYPE_CHECKING:
@@ -301,6 +302,11 @@ class RigModel(PosableBody):
     @cached_property
     def _sides(self) -> JointSides | None:
         return find_joint_sides(self.space)
+
+    @cached_property
+    def starter_poses(self) -> tuple[StarterPose, ...]:
+        """Poses to begin with: see `starter_poses`."""
+        return starter_poses(self.space)
 
     @cached_property
     def symmetry(self) -> Symmetry | None:

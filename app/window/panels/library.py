@@ -53,8 +53,9 @@ _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
 class LibraryPanel(QWidget):
     """Poses to load by a double click, to blend towards, to keep and to find again.
 
-    Three sources: the poses that the model learned from, or those of the character's file, the
-    user's library, and the poses of the poses file that is open, where it has some.
+    Four sources: the poses that the model learned from, or those of the character's file, poses to
+    begin with for a character whose joints are known, the user's library, and the poses of the
+    poses file that is open, where it has some.
 
     Signals
     -------
@@ -85,6 +86,10 @@ class LibraryPanel(QWidget):
         self.list.setAccessibleName("Poses")
         self._sources = QButtonGroup(self)
         self.training = self._source_button(*_CAME_WITH[True])
+        self.starter = self._source_button(
+            "Starter poses", "Poses to begin with, from how the character's joints turn"
+        )
+        self.starter.setProperty("place", "middle")
         self.own = self._source_button("Library", "Your own poses of this model")
         self.of_file = self._source_button("This file", "The poses of the file that is open")
         self.search = QLineEdit(placeholderText="Find a pose", clearButtonEnabled=True)
@@ -167,6 +172,8 @@ class LibraryPanel(QWidget):
         """The source of the poses shown."""
         if self.own.isChecked():
             return Source.LIBRARY
+        if self.starter.isChecked():
+            return Source.STARTER
         return Source.FILE if self.of_file.isChecked() else Source.TRAINING
 
     def allow_pictures(self) -> None:
@@ -221,6 +228,8 @@ class LibraryPanel(QWidget):
         if self.source is Source.TRAINING:
             numbers = range(len(document.model.pose_names))
             self._poses = [document.training_pose(number) for number in numbers]
+        elif self.source is Source.STARTER:
+            self._poses = document.starter_poses
         else:
             own = self.source is Source.LIBRARY
             self._poses = list(document.poses if own else document.file_poses)
@@ -309,6 +318,10 @@ class LibraryPanel(QWidget):
         text, tip = _CAME_WITH[self._document.model.is_trained]
         self.training.setText(text)
         self.training.setToolTip(tip)
+        has_starters = bool(self._document.model.starter_poses)
+        self.starter.setVisible(has_starters)
+        if self.starter.isChecked() and not has_starters:
+            self.training.setChecked(True)
         self._pictures.clear()
         self._on_source()
 
@@ -369,11 +382,17 @@ class LibraryPanel(QWidget):
         model = self._document.model
         sharpness = self.devicePixelRatioF()
         side = round(THUMBNAIL * sharpness)
-        vertices = model.decode(pose.latent, 1).astype(np.float32)
+        seen = vertices = model.decode(pose.latent, 1).astype(np.float32)
+        faces = model.faces
+        if pose.moves is not None:
+            # Of a pose of hands one hand, large enough to be seen.
+            part = model.code_effects[int(np.flatnonzero(pose.moves)[0])].domain
+            faces = faces[(model.attention_mask[part] > 0.5)[faces].all(axis=1)]
+            seen = vertices[np.unique(faces)]
         pixels = draw_pose(
             vertices,
-            model.faces,
-            preset_view("Three-quarter", vertices, model.up_axis, model.front, 1.0),
+            faces,
+            preset_view("Three-quarter", seen, model.up_axis, model.front, 1.0),
             side,
             _SKIN[current_theme().is_dark],
         )
@@ -403,7 +422,8 @@ class LibraryPanel(QWidget):
     def _on_blend(self, value: int) -> None:
         if self.chosen is None:
             return
-        self._document.blend_towards(self.chosen.latent, value / _BLEND_STEPS)
+        target = self.chosen.applied_to(self._document.latent)
+        self._document.blend_towards(target, value / _BLEND_STEPS)
         self._share.setText(f"{value} %")
         if not self.blend.isSliderDown():
             self._rest_blend()

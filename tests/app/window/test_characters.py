@@ -22,9 +22,21 @@ from app.window.start_up import StartUp
 from app.work.jobs import ExportStyle
 from lcollision_core.model import NamedPose, PoseModel, RigModel, open_body, write_poses
 from tests.app.support import export_pose
-from tests.app.windows import PATIENCE, answer, close_window, drop, rest, settings_in
+from tests.app.windows import (
+    PATIENCE,
+    answer,
+    close_window,
+    drop,
+    rest,
+    settings_in,
+    take_picture,
+)
 from tests.core.gltf_builder import arm
+from tests.core.model.test_starter_poses import WITH_FINGERS
 from tests.rigged_shapes import rigged_body, write_gltf
+from tests.skeletons import character_from
+
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 @pytest.fixture
@@ -300,3 +312,36 @@ def test_a_greyed_action_says_why(qtbot: QtBot, tmp_path: Path, arm_file: Path) 
     assert actions["undo"].isEnabled()
     assert actions["undo"].statusTip() == ACTIONS["undo"].tip
     close_window(window)
+
+
+def test_starter_poses_are_loaded_and_those_of_hands_change_hands_only(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    panel, document = window.library, window.document
+    assert panel.starter.isHidden()
+    person = character_from(WITH_FINGERS, turn=UPRIGHT, up=(0.0, 0.0, 1.0))
+    model = dropped(qtbot, window, write_gltf(person, tmp_path / "person.glb"))
+    assert not panel.starter.isHidden()
+    panel.starter.setChecked(True)
+    names = [panel.list.item(row).text() for row in range(panel.list.count())]
+    assert names[0] == "Stand"
+    assert len(names) == 12
+    panel.list.scrollToItem(panel.list.item(11))
+    qtbot.waitUntil(lambda: not panel.list.item(11).icon().isNull(), timeout=PATIENCE)
+    take_picture(window, "starter poses")
+    panel.list.setCurrentRow(names.index("Sit"))
+    panel.load_chosen()
+    sitting = document.latent.copy()
+    assert document.pose_name == "Sit"
+    panel.list.setCurrentRow(names.index("Fists"))
+    panel.load_chosen()
+    changed = np.flatnonzero(document.latent != sitting)
+    moves = model.starter_poses[-4].moves
+    assert len(changed)
+    assert moves[changed].all()
+    assert document.pose_name == "Sit"
+    document.undo()
+    np.testing.assert_array_equal(document.latent, sitting)
+    assert document.poses == ()
+    assert document.add_to_library(panel.chosen_poses) == 1
+    assert [pose.name for pose in document.poses] == ["Fists"]

@@ -1,0 +1,471 @@
+"""Poses to begin with, for any character whose joints are known: angles of a standing body.
+
+Angles are relative to a body that stands with its arms at its sides, whatever its rest pose is, and
+in degrees. Hands that lie on the body are put there by the lengths of the arms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.characters import RigPoseSpace
+from lcollision_core.characters.joint_roles import Role, Side, next_in_limb
+from lcollision_core.characters.rig_space import ROOT_CODES
+
+FloatArray = npt.NDArray[np.float64]
+
+_FINGERS = {Role.FINGER, Role.THUMB, Role.PALM}
+_ARMS = {Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.HAND, *_FINGERS}
+_NEAR = 0.03
+"""Normalised: what of the skin counts as at one height, or at one place of a bone."""
+
+_SIDES = (Side.LEFT, Side.RIGHT)
+
+
+@dataclass(frozen=True, eq=False)
+class StarterPose:
+    """A pose of one character.
+
+    Attributes
+    ----------
+    name : of the pose
+    codes : (D,) float64 array
+    moves : (D,) which codes it sets, those of fingers alone; None for all
+    """
+
+    name: str
+    codes: FloatArray
+    moves: npt.NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True)
+class _Leg:
+    """Degrees: forward, out, turned out; of the knee; of the foot upwards, of the toes."""
+
+    hip: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    knee: float = 0.0
+    foot: float = 0.0
+    toes: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Arm:
+    """Degrees of the shoulder, forward, out, turned in, of the elbow, of the palm turned back.
+
+    With `wrist` the arm reaches for the trunk, see `_Body._at_trunk`, with `thigh` for that share
+    of the thigh. Directions are out, up and forward: where the elbow tends to be, where the hand
+    points and where its palm looks.
+    """
+
+    shoulder: tuple[float, float, float] = (0.0, 12.0, 0.0)
+    elbow: float = 12.0
+    palm: float = 0.0
+    wrist: tuple[float, float, float] | None = None
+    thigh: float | None = None
+    elbow_towards: tuple[float, float, float] = (1.0, -0.5, -0.5)
+    hand: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    palm_towards: tuple[float, float, float] = (-1.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class _Hand:
+    """Degrees by which the joints of fingers curl, first to last; fans out; the thumb's."""
+
+    curl: tuple[float, float, float] = (18.0, 22.0, 14.0)
+    index: tuple[float, float, float] | None = None
+    spread: float = 0.0
+    thumb: tuple[float, float, float] = (8.0, 8.0, 8.0)
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """A pose of the whole body, left side first.
+
+    Attributes
+    ----------
+    lean : degrees that the hips tilt forward, then the spine, the neck and head
+    """
+
+    legs: tuple[_Leg, _Leg] = (_Leg(), _Leg())
+    arms: tuple[_Arm, _Arm] = (_Arm(), _Arm())
+    hands: tuple[_Hand, _Hand] = (_Hand(), _Hand())
+    lean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    twist: tuple[float, float] = (0.0, 0.0)
+
+
+_FIST = _Hand((82.0, 95.0, 66.0), thumb=(30.0, 36.0, 46.0))
+_OPEN = _Hand((0.0, 0.0, 0.0), spread=7.0, thumb=(-12.0, 0.0, 0.0))
+_POINTING = _Hand((80.0, 95.0, 62.0), index=(4.0, 4.0, 2.0), thumb=(28.0, 32.0, 40.0))
+_CURLED = _Hand((45.0, 50.0, 30.0), thumb=(16.0, 18.0, 18.0))
+_STANDING = _Leg((0.0, 3.0, 6.0))
+_STRAIGHT = _Arm((0.0, 90.0, 0.0), 0.0)
+_ON_HIP = _Arm(
+    wrist=(1.2, 0.28, -0.7),
+    elbow_towards=(1.0, 0.0, -0.4),
+    hand=(-0.12, -0.4, 0.9),
+    palm_towards=(-1.0, 0.0, -0.1),
+)
+_ON_THIGH = _Arm(
+    thigh=0.48,
+    elbow_towards=(1.0, -0.3, -0.5),
+    hand=(0.0, 0.0, 1.0),
+    palm_towards=(0.0, -1.0, -0.1),
+)
+
+BODY_POSES: Mapping[str, _Pose] = {
+    "Stand": _Pose((_STANDING, _STANDING)),
+    "T-pose": _Pose(arms=(_STRAIGHT, _STRAIGHT), hands=(_Hand((0.0, 0.0, 0.0)),) * 2),
+    "Walk": _Pose(
+        legs=(_Leg((24.0, 1.0, 3.0), 6.0, 10.0), _Leg((-18.0, 1.0, 3.0), 18.0, 14.0, 24.0)),
+        arms=(_Arm((-20.0, 12.0, 0.0), 14.0), _Arm((22.0, 11.0, 4.0), 26.0)),
+        lean=(2.0, 2.0, 0.0),
+        twist=(-4.0, 9.0),
+    ),
+    "Run": _Pose(
+        legs=(_Leg((62.0, 2.0, 2.0), 88.0, 5.0), _Leg((-22.0, 2.0, 2.0), 32.0, -28.0, 20.0)),
+        arms=(_Arm((-48.0, 16.0, 0.0), 88.0), _Arm((38.0, 14.0, 8.0), 90.0)),
+        hands=(_CURLED, _CURLED),
+        lean=(9.0, 8.0, -10.0),
+        twist=(-8.0, 18.0),
+    ),
+    "Sit": _Pose(
+        legs=(_Leg((84.0, 7.0, 4.0), 84.0),) * 2, arms=(_ON_THIGH, _ON_THIGH), lean=(-3.0, 6.0, 2.0)
+    ),
+    "Kneel": _Pose(
+        legs=(_Leg((84.0, 6.0, 4.0), 88.0, 4.0), _Leg((-4.0, 3.0, 0.0), 96.0, 25.0, 30.0)),
+        arms=(_ON_THIGH, _Arm()),
+        lean=(2.0, 4.0, 4.0),
+    ),
+    "Arms crossed": _Pose(
+        legs=(_STANDING, _STANDING),
+        arms=(
+            _Arm(
+                wrist=(-0.2, 0.66, 3.4),
+                elbow_towards=(0.9, -1.0, 0.3),
+                hand=(-1.0, 0.25, -0.35),
+                palm_towards=(-0.2, 0.0, -1.0),
+            ),
+            _Arm(
+                wrist=(-0.2, 0.54, 1.5),
+                elbow_towards=(0.9, -1.0, 0.3),
+                hand=(-1.0, 0.0, 0.1),
+                palm_towards=(0.1, 0.0, -1.0),
+            ),
+        ),
+    ),
+    "Hands on hips": _Pose(legs=(_Leg((0.0, 6.0, 8.0)),) * 2, arms=(_ON_HIP, _ON_HIP)),
+}
+HAND_POSES: Mapping[str, _Hand] = {
+    "Fists": _FIST,
+    "Open hands": _OPEN,
+    "Relaxed hands": _Hand(),
+    "Pointing hands": _POINTING,
+}
+
+
+def starter_poses(space: RigPoseSpace) -> tuple[StarterPose, ...]:
+    """Return poses to begin with, none of a character whose joints are not known.
+
+    Poses of hands move only them: see `StarterPose.moves`. Poses may collide.
+    """
+    body, poses = _Body(space), []
+    if body.has_limbs:
+        poses = [StarterPose(name, body.codes(pose)) for name, pose in BODY_POSES.items()]
+    if len(body.fingers):
+        for name, hand in HAND_POSES.items():
+            codes = np.zeros(len(space.low))
+            body.set_hands(codes, (hand, hand))
+            poses.append(StarterPose(name, codes, body.of_fingers))
+    return tuple(poses)
+
+
+class _Body:
+    """A character in axes of its own: left, up and front."""
+
+    def __init__(self, space: RigPoseSpace) -> None:
+        self._space, rig = space, space.rig
+        self._axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+        self._places = space.origins @ self._axes.T
+        self._bones = np.einsum("ij,njk->nik", self._axes, space.axes)
+        """(J, 3, 3) the joints' axes at rest."""
+        self._next = next_in_limb(rig, space.roles)
+        self._limbs = {
+            (role, side): joint
+            for joint in sorted(self._next, reverse=True)
+            for role, side in [(space.roles[joint], space.sides[joint])]
+        }
+        self.has_limbs = all(
+            (role, side) in self._limbs
+            for role in (Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN)
+            for side in _SIDES
+        )
+        rows = np.arange(len(rig.joint_of))
+        self._heaviest = rig.joint_of[rows, rig.weights.argmax(axis=1)]
+        self._points = space.rest_vertices @ self._axes.T
+        turning = set(space.joint_of_code[ROOT_CODES:].tolist())
+        self.fingers = [
+            joint for joint in sorted(turning) if space.roles[joint] in _FINGERS - {Role.PALM}
+        ]
+        self.of_fingers = np.isin(space.joint_of_code, self.fingers)
+        self.of_fingers[:ROOT_CODES] = False
+
+    def codes(self, pose: _Pose) -> FloatArray:
+        """Return the (D,) codes of a pose that stands on the ground of the rest pose."""
+        space, rig = self._space, self._space.rig
+        turns = self._turns(pose)
+        transforms = rig.rest.copy()
+        transforms[:, :3, :3] = (
+            np.einsum("ji,njk,kl->nil", self._axes, turns, self._axes) @ rig.rest[:, :3, :3]
+        )
+        codes = space.codes_of_transforms(transforms)
+        codes[:3] = 0.0
+        codes = np.clip(codes, space.low, space.high)
+        self.set_hands(codes, pose.hands)
+        lowest = [
+            (points @ space.up).min()
+            for points in (space.rest_vertices, space.decode(codes[None])[0])
+        ]
+        codes[1] = lowest[0] - lowest[1]
+        return codes
+
+    def set_hands(self, codes: FloatArray, hands: tuple[_Hand, _Hand]) -> None:
+        """Set the codes of fingers and thumbs."""
+        space = self._space
+        for joint in self.fingers:
+            side = _SIDES.index(space.sides[joint]) if space.sides[joint] in _SIDES else 0
+            turn = np.radians(self._finger_turn(joint, hands[side]))
+            mine = space.joint_of_code == joint
+            mine[:ROOT_CODES] = False
+            codes[mine] = turn[space.axis_of_code[mine]]
+        codes[self.of_fingers] = np.clip(codes, space.low, space.high)[self.of_fingers]
+
+    def _finger_turn(self, joint: int, hand: _Hand) -> FloatArray:
+        """Return the degrees that a joint of a finger turns about its own axes."""
+        roles, parents = self._space.roles, self._space.rig.parents
+        chain = [joint]
+        while roles[parents[chain[-1]]] is roles[joint]:
+            chain.append(int(parents[chain[-1]]))
+        number, first, palm = min(len(chain) - 1, 2), chain[-1], self._hand_of(joint)
+        bone, axes = self._bones[joint][:, 1], self._bones[joint]
+        firsts = [
+            one
+            for one in self.fingers
+            if roles[one] is Role.FINGER
+            and roles[parents[one]] is not Role.FINGER
+            and self._hand_of(one) == palm
+        ]
+        if roles[joint] is Role.THUMB:
+            if not firsts:
+                return np.zeros(3)
+            # Over the palm, to where the fingers curl.
+            middle = self._places[firsts].mean(axis=0)
+            inwards = np.cross(*self._bones[firsts[0]][:, :2].T)
+            inwards *= 0.5 * np.linalg.norm(middle - self._places[palm])
+            axis = np.cross(bone, middle + inwards - self._places[joint])
+            turn: FloatArray = axes.T @ axis * hand.thumb[number] / np.linalg.norm(axis)
+            return turn
+        curl, spread = hand.curl[number], 0.0
+        if hand.index is not None and first == self._index_of(firsts, palm):
+            curl = hand.index[number]
+        if number:
+            # From straight, however it is bent at rest.
+            before = self._bones[chain[1]][:, 1]
+            sine = float(np.cross(before, bone) @ axes[:, 0])
+            curl -= float(np.degrees(np.arctan2(sine, before @ bone)))
+        else:
+            places = self._places[firsts] - self._places[firsts].mean(axis=0)
+            offsets = places @ np.cross(axes[:, 2], bone)
+            widest = float(np.abs(offsets).max())
+            spread = hand.spread * float(offsets[firsts.index(joint)]) / (widest or 1.0)
+        return np.array([curl, 0.0, spread])
+
+    def _hand_of(self, joint: int) -> int:
+        """Return what the fingers of a hand hang on."""
+        while joint >= 0 and self._space.roles[joint] in _FINGERS:
+            joint = int(self._space.rig.parents[joint])
+        return joint
+
+    def _index_of(self, firsts: list[int], hand: int) -> int:
+        """Return the finger nearest to the thumb, -1 without a thumb."""
+        thumbs = [
+            joint
+            for joint in self.fingers
+            if self._space.roles[joint] is Role.THUMB and self._hand_of(joint) == hand
+        ]
+        if not thumbs:
+            return -1
+        gaps = np.linalg.norm(self._places[firsts] - self._places[thumbs[0]], axis=1)
+        return firsts[int(gaps.argmin())]
+
+    def _turns(self, pose: _Pose) -> FloatArray:
+        """Return the (J, 3, 3) rotations from rest of all joints, about left, up and front."""
+        own: dict[int, FloatArray] = {}
+        for side in _SIDES:
+            own |= self._leg(self._limbs[Role.THIGH, side], pose.legs[_SIDES.index(side)])
+        turns, places = self._carried(pose, own)
+        for side in _SIDES:
+            upper = self._limbs[Role.UPPER_ARM, side]
+            chest = turns[self._space.rig.parents[upper]]
+            own |= self._arm(upper, pose.arms[_SIDES.index(side)], chest, places)
+        return self._carried(pose, own)[0]
+
+    def _carried(self, pose: _Pose, own: Mapping[int, FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the turns of all joints, and their places, where some have turns of their own."""
+        roles, places = self._space.roles, self._places.copy()
+        n_spine = max(1, roles.count(Role.SPINE))
+        n_head = max(1, roles.count(Role.NECK) + roles.count(Role.HEAD))
+        spine = _turn(pose.lean[1] / n_spine, pose.twist[1] / n_spine, 0.0)
+        head = _turn(pose.lean[2] / n_head, -(pose.twist[0] + pose.twist[1]) / n_head, 0.0)
+        more = {Role.SPINE: spine, Role.NECK: head, Role.HEAD: head}
+        turns = np.empty((len(roles), 3, 3))
+        for joint, parent in enumerate(self._space.rig.parents.tolist()):
+            turns[joint] = _turn(pose.lean[0], pose.twist[0], 0.0)
+            if parent >= 0:
+                places[joint] = places[parent] + turns[parent] @ (
+                    self._places[joint] - self._places[parent]
+                )
+                turns[joint] = turns[parent]
+            turns[joint] = own.get(joint, turns[joint] @ more.get(roles[joint], np.eye(3)))
+        return turns, places
+
+    def _standing(self, joint: int, hinge: FloatArray, bend: FloatArray) -> FloatArray:
+        """Return the rotation that hangs a limb's bone down, its hinge's axis along `bend`."""
+        bone = self._bones[joint][:, 1]
+        at_rest = _frame(hinge, bone)
+        return _frame(bend, -np.eye(3)[1]) @ at_rest.T
+
+    def _leg(self, thigh: int, leg: _Leg) -> dict[int, FloatArray]:
+        shin = self._next[thigh]
+        side, hinge, left = self._sign(thigh), self._bones[shin][:, 0], np.eye(3)[0]
+        hip = _turn(-leg.hip[0], 0.0, 0.0) @ _turn(0.0, 0.0, side * leg.hip[1])
+        hip = hip @ _turn(0.0, side * leg.hip[2], 0.0)
+        knee = hip @ _turn(leg.knee, 0.0, 0.0)
+        turns = {
+            thigh: hip @ self._standing(thigh, hinge, left),
+            shin: knee @ self._standing(shin, hinge, left),
+        }
+        if shin in self._next:
+            foot = self._next[shin]
+            ankle = knee @ _turn(-leg.foot, 0.0, 0.0)
+            turns[foot] = ankle
+            for toe in np.flatnonzero(self._space.rig.parents == foot).tolist():
+                if self._space.roles[toe] is Role.TOE:
+                    turns[toe] = ankle @ _turn(-leg.toes, 0.0, 0.0)
+        return turns
+
+    def _arm(
+        self, upper: int, arm: _Arm, chest: FloatArray, places: FloatArray
+    ) -> dict[int, FloatArray]:
+        fore = self._next[upper]
+        side, hinge, bend = self._sign(upper), self._bones[fore][:, 0], -np.eye(3)[0]
+        mirror = np.array([side, 1.0, 1.0])
+        hand = self._next.get(fore)
+        if hand is None or (arm.wrist is None and arm.thigh is None):
+            shoulder = _turn(-arm.shoulder[0], 0.0, 0.0) @ _turn(0.0, 0.0, side * arm.shoulder[1])
+            shoulder = chest @ shoulder @ _turn(0.0, -side * arm.shoulder[2], 0.0)
+            elbow = shoulder @ _turn(-arm.elbow, 0.0, 0.0) @ _turn(0.0, -side * arm.palm, 0.0)
+            wrist = elbow
+        else:
+            if arm.wrist is not None:
+                target = self._at_trunk(upper, hand, arm.wrist)
+            else:
+                target = self._on_thigh(upper, hand, arm.thigh or 0.0, places)
+            shoulder, elbow = self._reach(upper, places[upper], target, mirror * arm.elbow_towards)
+            wrist = _frame(mirror * arm.palm_towards, mirror * arm.hand)
+            wrist = wrist @ _frame(np.array([-side, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])).T
+            # The forearm turns as much about itself as the hand needs.
+            x, y, z, w = Rotation.from_matrix(elbow.T @ wrist).as_quat()
+            del x, z
+            elbow = elbow @ _turn(0.0, np.degrees(2.0 * np.arctan2(y, w)), 0.0)
+        turns = {
+            upper: shoulder @ self._standing(upper, hinge, bend),
+            fore: elbow @ self._standing(fore, hinge, bend),
+        }
+        if hand is not None:
+            turns[hand] = wrist @ self._standing(fore, hinge, bend)
+        return turns
+
+    def _reach(
+        self, upper: int, start: FloatArray, target: FloatArray, towards: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return how the two bones of a hanging arm turn so that its wrist is at a place."""
+        fore = self._next[upper]
+        own, hinge, end = (self._places[one] for one in (upper, fore, self._next[fore]))
+        a, b = float(np.linalg.norm(hinge - own)), float(np.linalg.norm(end - hinge))
+        way = target - start
+        length = float(np.clip(np.linalg.norm(way), abs(a - b) * 1.01, (a + b) * 0.999))
+        way /= np.linalg.norm(way)
+        along = (a * a - b * b + length * length) / (2.0 * length)
+        side = towards - (towards @ way) * way
+        elbow = along * way + np.sqrt(max(a * a - along * along, 0.0)) * side / np.linalg.norm(side)
+        bend = np.cross(elbow, length * way - elbow)
+        hanging = _frame(-np.eye(3)[0], -np.eye(3)[1]).T
+        return _frame(bend, elbow) @ hanging, _frame(bend, length * way - elbow) @ hanging
+
+    def _at_trunk(self, upper: int, hand: int, wrist: tuple[float, float, float]) -> FloatArray:
+        """Return where a wrist lies on the trunk, in the rest pose.
+
+        Parameters
+        ----------
+        wrist : shares of half the trunk's width and of the way up from hips to shoulders; then
+            of a forearm's thickness before the trunk, or below 0 of half its depth behind its
+            middle
+        """
+        hips = self._places[[self._limbs[Role.THIGH, side] for side in _SIDES]].mean(axis=0)
+        height = hips[1] + wrist[1] * (self._places[upper][1] - hips[1])
+        of_arms = [joint for joint, role in enumerate(self._space.roles) if role in _ARMS]
+        level = np.abs(self._points[:, 1] - height) < _NEAR
+        trunk = self._points[level & ~np.isin(self._heaviest, of_arms)]
+        wide = float(np.abs(trunk[:, 0] - hips[0]).max(initial=0.0))
+        front = float(trunk[:, 2].max(initial=hips[2]))
+        half = 0.5 * (front - float(trunk[:, 2].min(initial=hips[2])))
+        thick = self._thickness(hand, self._next[upper])
+        deep = (
+            front + thick * (2.0 * wrist[2] - 1.0)
+            if wrist[2] > 0.0
+            else front - half * (1.0 - wrist[2])
+        )
+        return np.array([hips[0] + self._sign(upper) * wrist[0] * (wide + thick), height, deep])
+
+    def _on_thigh(self, upper: int, hand: int, share: float, places: FloatArray) -> FloatArray:
+        """Return where a wrist lies on the thigh of its side, at a share of its length."""
+        thigh = self._limbs[Role.THIGH, self._space.sides[upper]]
+        knee = self._next[thigh]
+        on_bone = self._places[thigh] + share * (self._places[knee] - self._places[thigh])
+        thick = self._thickness(hand, self._next[upper])
+        thick = 1.15 * (thick + self._thickness(thigh, thigh, on_bone))
+        target = places[thigh] + share * (places[knee] - places[thigh])
+        raised: FloatArray = target + [0.0, thick, 0.0]
+        return raised
+
+    def _thickness(self, joint: int, bone: int, place: FloatArray | None = None) -> float:
+        """Return the radius of the skin of a joint at a place, across a bone's direction."""
+        way = self._bones[bone][:, 1]
+        own = self._points[self._heaviest == joint] - (
+            self._places[joint] if place is None else place
+        )
+        near = own[np.abs(own @ way) < _NEAR]
+        across = np.linalg.norm(near - (near @ way)[:, None] * way, axis=1)
+        return float(np.median(across)) if len(near) else _NEAR
+
+    def _sign(self, joint: int) -> float:
+        return 1.0 if self._space.sides[joint] is Side.LEFT else -1.0
+
+
+def _turn(left: float, up: float, front: float) -> FloatArray:
+    """Return the rotation by degrees about one of left, up and front."""
+    matrix: FloatArray = Rotation.from_rotvec([left, up, front], degrees=True).as_matrix()
+    return matrix
+
+
+def _frame(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the rotation whose second column lies along `second`, the first near `first`."""
+    second = second / np.linalg.norm(second)
+    first = first - (first @ second) * second
+    first = first / np.linalg.norm(first)
+    return np.stack([first, second, np.cross(first, second)], axis=1)
