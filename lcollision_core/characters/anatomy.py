@@ -261,7 +261,5 @@ def rig_of(character: Character) -> Rig:
     LCollisionError : it has none.
     """
     if character.rig is None:
-        raise LCollisionError(
-            "has no joints to pose it by", "choose a rigged character", where=character.source
-        )
+        raise LCollisionError(character.no_rig, "choose a rigged character", where=character.source)
     return character.rig

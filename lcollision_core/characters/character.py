@@ -14,6 +14,9 @@ from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.topology import FloatArray, Topology
 
+NO_JOINTS = "has no joints to pose it by"
+"""What is wrong with a file without a skin where a rig is needed."""
+
 
 @dataclass(frozen=True, eq=False)
 class Rig:
@@ -97,6 +100,7 @@ class Character:
     sample : (clip, fps) to its frames; None for the clip's own key frames at at most 30 a second
     look : reads how it looks, which takes long; to None where its file does not say that
     notes : sentences on what was changed on reading
+    no_rig : what is wrong with the file where `rig` is None
     """
 
     name: str
@@ -113,3 +117,4 @@ class Character:
     sample: Callable[[str, float | None], ClipFrames]
     notes: tuple[str, ...] = ()
     look: Callable[[], Appearance | None] = lambda: None
+    no_rig: str = NO_JOINTS

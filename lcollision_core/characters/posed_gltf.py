@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,15 +20,14 @@ from lcollision_core.meshes.contact_rules import STRICT, ContactRules
 from lcollision_core.meshes.formats.gltf_document import GltfDocument, as_float
 from lcollision_core.meshes.formats.gltf_patch import VERTEX_DATA, GltfPatch
 from lcollision_core.meshes.formats.gltf_scene import ShownPrimitive, read_shown, shown_primitives
+from lcollision_core.meshes.formats.hidden_parts import shown_scene
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 from lcollision_core.meshes.formats.scene import (
     Part,
     ScenePoses,
-    character_parts,
     parents_first,
-    with_parts,
 )
-from lcollision_core.meshes.formats.transforms import compose, decompose
+from lcollision_core.meshes.formats.transforms import compose, decompose, is_regular
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.normals import moved_normals
 from lcollision_core.meshes.scene_files import one_sentence
@@ -219,9 +218,10 @@ class CharacterFile:
             data = read_regular(path, MAX_FILE_BYTES)
             self.document = GltfDocument(data, path)
             whole = read_shown(self.document)
-            kept = character_parts(whole)
-            self.scene = scene = with_parts(whole, kept)
+            shown_parts = shown_scene(whole)
+            self.scene = scene = shown_parts.scene
             self.patch = GltfPatch(self.document, path)
+            self._place(shown_parts.revealed)
             self.mesh = join_parts(scene)
             self.rest = self.mesh.posed(scene.rest)[0]
             if not (
@@ -238,9 +238,21 @@ class CharacterFile:
                 slice(end - len(part.points), end)
                 for part, end in zip(scene.parts, ends, strict=True)
             ]
-            shown = [shown[number] for number in kept]
+            shown = [shown[number] for number in shown_parts.kept]
             self.parts = list(zip(scene.parts, shown, rows, strict=True))
         self.character = character
+
+    def _place(self, nodes: Sequence[int]) -> None:
+        """Write where the rest pose has nodes that the file's rest pose hides by scale."""
+        rest = self.scene.rest.transforms[0]
+        for number in nodes:
+            parent = int(self.scene.parents[number])
+            above = rest[parent] if parent >= 0 else _IDENTITY
+            if is_regular(above):
+                node = self.patch.description["nodes"][number]
+                node.pop("matrix", None)
+                held = decompose(np.linalg.solve(above, rest[number]))
+                node |= {name: part.tolist() for name, part in zip(_PARTS, held, strict=True)}
 
     @cached_property
     def stored_normals(self) -> list[FloatArray | None]:

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lcollision_core.characters.character import Character, ClipFrames, Rig
+from lcollision_core.characters.character import NO_JOINTS, Character, ClipFrames, Rig
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.formats.scene import Scene, parents_first
+from lcollision_core.meshes.formats.transforms import is_regular
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, look_of, sample_clip
 from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.scene_files import one_sentence, read_scene
@@ -103,6 +104,7 @@ def character_of(
         sample,
         mesh.notes + notes,
         look,
+        NO_JOINTS if rig is not None or not notes else f"cannot be posed by its rig: {notes[0]}",
     )
 
 
@@ -125,15 +127,15 @@ def _rig(
     rest = scene.rest.transforms[0]
     moving = np.unique(mesh.bone_of[mesh.weights > 0.0])
     used = {anchors[bone] for bone in mesh.bones[moving].tolist()}
+    if -1 in used:
+        flat = min(bone for bone in mesh.bones[moving].tolist() if anchors[bone] < 0)
+        name = scene.node_names[flat] or f"node {flat}"
+        return None, (f"joint {name} is scaled to nothing in its rest pose",)
     order = [
         node
         for node in parents_first(scene.parents)
-        if node in used or (node in in_skins and _is_regular(rest[node]))
+        if node in used or (node in in_skins and is_regular(rest[node]))
     ]
-    flat = [node for node in order if not _is_regular(rest[node])]
-    if flat:
-        name = scene.node_names[flat[0]] or f"node {flat[0]}"
-        return None, (f"joint {name} is scaled to nothing, so its joints make no poses",)
     joint = {node: number for number, node in enumerate(order)}
     # A bone of no weight may be no joint.
     joint_of_bone = np.array([joint.get(anchors[bone], 0) for bone in mesh.bones.tolist()])
@@ -170,13 +172,6 @@ def _stretch(scene: Scene, order: list[int]) -> FloatArray | None:
     return None if is_even.all() else (axes * sizes[:, None]) @ np.swapaxes(axes, 1, 2)
 
 
-def _is_regular(transform: FloatArray) -> bool:
-    """Whether a transform can be inverted: its columns span a volume."""
-    columns = transform[:3, :3]
-    lengths = np.linalg.norm(columns, axis=0)
-    return bool(abs(np.linalg.det(columns)) > 1e-9 * np.prod(lengths))
-
-
 def _parent_joint(scene: Scene, node: int, joint: dict[int, int]) -> int:
     parent = int(scene.parents[node])
     while parent >= 0 and parent not in joint:
@@ -188,16 +183,14 @@ def _anchors(scene: Scene, in_skins: set[int]) -> dict[int, int]:
     """Return for each node that moves vertices the one that is to be the joint.
 
     What hangs on a joint of a skin without moving in any clip is part of that joint, and so is what
-    a joint scaled to nothing moves, as accessories are hidden.
+    a node scaled to nothing moves, as accessories are hidden.
     """
     moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
     rest = scene.rest.transforms[0]
     anchors = {}
     for bone in {bone for part in scene.parts for bone in part.bones.tolist()}:
-        node = bone
-        while node >= 0 and node not in in_skins and node not in moved:
+        node, carriers = bone, in_skins if bone in in_skins else in_skins | moved
+        while node >= 0 and not (node in carriers and is_regular(rest[node])):
             node = int(scene.parents[node])
-        while node in in_skins and not _is_regular(rest[node]):
-            node = int(scene.parents[node])
-        anchors[bone] = node if node in in_skins else bone
+        anchors[bone] = node if node in in_skins or not is_regular(rest[bone]) else bone
     return anchors

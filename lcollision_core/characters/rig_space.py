@@ -31,6 +31,9 @@ _SHIFTS = 3
 _SHIFT, _TURN = 1.0, np.pi
 """Most that the whole body is moved, normalised, and turned about an axis."""
 
+_HIDDEN = 1e-6
+"""Of its scale in the rest pose: what is scaled to less along an axis is turned to nowhere."""
+
 _SLACK = np.radians(5.0)
 """By which joints may turn further than in any frame of the character's clips."""
 
@@ -507,6 +510,10 @@ class RigPoseSpace:
             before = axes if parent < 0 else linear[:, parent] @ axes
             # A root that is no joint stays.
             wanted = moved[:, joint, :3, :3] if joint >= 0 else np.eye(3)[None]
+            if joint >= 0 and parent >= 0:
+                # What a frame hides by its scale goes with its parent.
+                is_hidden = np.linalg.norm(wanted, axis=1).min(axis=1) < _HIDDEN
+                wanted = np.where(is_hidden[:, None, None], linear[:, parent], wanted)
             local = _nearest_rotations(np.linalg.inv(before) @ wanted @ axes)
             places = slice(3 + 3 * bone, 6 + 3 * bone)
             numbers[:, places] = np.where(

@@ -264,7 +264,12 @@ def join_parts(scene: Scene) -> JoinedMesh:
 
 
 def _topology(faces: IntArray, is_left_out: npt.NDArray[np.bool_], n_vertices: int) -> Topology:
-    if is_left_out.all():
+    if len(faces) and is_left_out.all():
+        raise MeshFileError(
+            "none of its faces has an area in its rest pose",
+            "check the scale of what it holds, and export it again",
+        )
+    if not len(faces):
         raise MeshFileError("it holds vertices but no faces", "export it as a triangle mesh")
     return Topology(faces[~is_left_out], n_vertices)
 

@@ -12,7 +12,8 @@ from typing import BinaryIO
 from lcollision_core.errors import MeshFileError, PoseSetError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.formats import fbx, gltf
-from lcollision_core.meshes.formats.scene import Scene, character_parts, with_parts
+from lcollision_core.meshes.formats.hidden_parts import shown_scene
+from lcollision_core.meshes.formats.scene import Scene
 from lcollision_core.regular_files import open_regular
 
 SCENE_SUFFIXES = (".glb", ".gltf", ".vrm", ".fbx")
@@ -70,7 +71,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 def scene_of(file: BinaryIO, path: Path, cancel: CancelToken | None = None) -> Scene:
     """Read an open file at its start, as `read_scene`; the sentence does not name it."""
     scene = fbx.read_scene(file, path, cancel) if _is_fbx(path) else gltf.read_scene(file, path)
-    return with_parts(scene, character_parts(scene))
+    return shown_scene(scene).scene
 
 
 def _is_fbx(path: str | os.PathLike[str]) -> bool:

@@ -147,7 +147,7 @@ def _span(stack: Any) -> tuple[float, float]:
 
 def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
     part = {
-        "name": np.array(mesh.name or node.name),
+        "name": np.array(node.name or mesh.name),
         "points": _array(mesh.vertices, np.float64, 3).reshape(-1, 3),
         "corners": _array(mesh.vertex_indices, np.int64),
         "faces": _array(mesh.faces, np.int64, 2).reshape(-1, 2),

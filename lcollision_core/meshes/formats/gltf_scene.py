@@ -245,7 +245,7 @@ def _part(
         named = element(document.objects("materials"), number, "a material")
         materials = (str(named.get("name") or f"material {number}"),)
     return Part(
-        str(mesh.get("name") or node.get("name") or where),
+        str(node.get("name") or mesh.get("name") or where),
         materials,
         np.zeros(len(faces), dtype=np.int64),
         shown.node,

@@ -53,7 +53,7 @@ class Part:
 
     Attributes
     ----------
-    mesh : its name
+    mesh : its name: of the node that shows it, as artists see it, else of the mesh
     materials : names
     material_of : (F,) int64 array, each face's material; what is no index is none
     node : the node that shows it
@@ -209,8 +209,8 @@ def character_parts(scene: Scene) -> list[int]:
     ]
 
 
-def with_parts(scene: Scene, kept: Sequence[int]) -> Scene:
-    """Return a scene with some of its parts, and a note on the others."""
+def with_parts(scene: Scene, kept: Sequence[int], why: str) -> Scene:
+    """Return a scene with some of its parts, and a note on why the others are left out."""
     if len(kept) == len(scene.parts):
         return scene
 
@@ -221,7 +221,7 @@ def with_parts(scene: Scene, kept: Sequence[int]) -> Scene:
         return replace(clip, sample=lambda times: of_kept(clip.sample(times)))
 
     others = [part.mesh for number, part in enumerate(scene.parts) if number not in kept]
-    note = left_out_note("left out, as no joint carries it", others)
+    note = left_out_note(f"left out, {why}", others)
     return replace(
         scene,
         parts=tuple(scene.parts[number] for number in kept),

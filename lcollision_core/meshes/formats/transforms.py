@@ -60,6 +60,13 @@ def decompose(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return matrix[:3, 3].copy(), Rotation.from_matrix(matrix[:3, :3] / scale).as_quat(), scale
 
 
+def is_regular(transform: FloatArray) -> bool:
+    """Whether a (4, 4) transform can be inverted: its columns span a volume."""
+    columns = transform[:3, :3]
+    lengths = np.linalg.norm(columns, axis=0)
+    return bool(abs(np.linalg.det(columns)) > 1e-9 * np.prod(lengths))
+
+
 def slerp(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
     """Interpolate (..., 4) unit quaternions along the shorter arc by (...) shares of it."""
     cosine = np.einsum("...i,...i->...", start, end)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.characters import Character, Rig, joint_parts, read_character
+from lcollision_core.characters import Character, Rig, RigPoseSpace, joint_parts, read_character
 from lcollision_core.characters.joint_roles import Role, joint_roles
-from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.meshes.scene_files import has_skin
 from tests.core.gltf_builder import arm, moved, rotation, tube
 
@@ -126,7 +126,7 @@ def test_what_the_file_says_of_axes_units_and_groups(tmp_path: Path) -> None:
     assert character.up_is_sure
     assert character.metres == 1.0
     assert character.clips == {"wave": pytest.approx(1.0)}
-    assert [group.name for group in character.groups] == ["Arm", "Skin"]
+    assert [group.name for group in character.groups] == ["Body", "Skin"]
     assert all(len(group.faces) == character.topology.n_faces for group in character.groups)
     assert read_character(path, up="z").up.tolist() == [0.0, 0.0, 1.0]
     assert read_character(path, up=0).up.tolist() == [1.0, 0.0, 0.0]
@@ -204,7 +204,9 @@ def test_a_root_scaled_to_nothing_leaves_no_rig_and_a_sentence(tmp_path: Path) -
     builder.description["nodes"][1]["scale"] = [1.0, 0.0, 1.0]
     character = read_character(builder.write(tmp_path / "arm.glb"))
     assert character.rig is None
-    assert any("LeftArm is scaled to nothing" in note for note in character.notes)
+    assert "joint rig:LeftArm is scaled to nothing in its rest pose" in character.notes
+    with pytest.raises(LCollisionError, match="be posed by its rig: joint rig:LeftArm is scaled"):
+        RigPoseSpace(character)
     assert np.isfinite(character.sample("wave", None).vertices).all()
 
 
