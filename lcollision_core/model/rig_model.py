@@ -36,7 +36,7 @@ from lcollision_core.model.naming import MAX_NAME_LENGTH, MAX_POSE_NAME_LENGTH, 
 from lcollision_core.model.posable_body import PosableBody, read_only
 from lcollision_core.model.rig_fit import fit_rig
 from lcollision_core.model.rig_mirror import JointSides, RigMirror, find_joint_sides
-from lcollision_core.model.rig_names import motion_names, side_of
+from lcollision_core.model.rig_names import motion_names
 from lcollision_core.model.starter_poses import StarterPose, starter_poses
 from lcollision_core.model_file import digest_of
 
@@ -367,11 +367,9 @@ class RigModel(PosableBody):
     @cached_property
     def code_words(self) -> tuple[str, ...]:
         """Also by what the joints are and on which side, in whatever language they are named."""
-        left = np.cross(self.space.up, self.space.front)
-        places = (self.space.origins - self.space.origins.mean(axis=0)) @ left
         kinds = [
-            f"{role.name.lower().replace('_', ' ')} {side_of(place)}"
-            for role, place in zip(self.space.roles, places, strict=True)
+            f"{role.name.lower().replace('_', ' ')} {side.value}"
+            for role, side in zip(self.space.roles, self.space.sides, strict=True)
         ]
         return tuple(
             words if joint < 0 else with_regions(f"{words} {kinds[joint]}")

@@ -7,15 +7,12 @@ import re
 import numpy as np
 
 from lcollision_core.characters import RigPoseSpace
-from lcollision_core.characters.joint_roles import Role
+from lcollision_core.characters.joint_roles import Role, Side
 from lcollision_core.model.code_names import way_in_words
 
 _WHOLE_BODY = ("move left", "move up", "move forward", "tilt forward", "turn left", "lean right")
 
 _HINGES = {Role.FOREARM, Role.SHIN, Role.FINGER, Role.THUMB, Role.TOE}
-
-_MIDDLE = 0.02
-"""Normalised: joints this near to the middle plane are on neither side."""
 
 
 def motion_names(space: RigPoseSpace) -> list[str]:
@@ -44,10 +41,8 @@ def motion_names(space: RigPoseSpace) -> list[str]:
 def _words(name: str) -> list[str]:
     """Return a joint's name in words, without its prefix: "left", "hand", "index", "1"."""
     last = re.split("[:|]", name)[-1]
-    return [
-        word.lower()
-        for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+|[^\W\da-zA-Z_]+", last)
-    ]
+    words = re.findall(r"[A-Z]?[^\W\dA-Z_]+|[A-Z]+(?![a-z])|\d+", last)
+    return [word.lower() for word in words]
 
 
 def _motion(space: RigPoseSpace, code: int) -> str:
@@ -58,11 +53,5 @@ def _motion(space: RigPoseSpace, code: int) -> str:
         return "sideways" if axis else "bend"
     left = np.cross(space.up, space.front)
     way = np.cross(space.axes[joint][:, axis], space.axes[joint][:, 1])
-    place = float(left @ (space.origins[joint] - space.origins.mean(axis=0)))
-    side = {"left": 1.0, "right": -1.0}.get(side_of(place), 0.0)
+    side = {Side.LEFT: 1.0, Side.RIGHT: -1.0}.get(space.sides[joint], 0.0)
     return way_in_words(np.array([way @ space.up, way @ space.front, way @ left]), side)
-
-
-def side_of(place: float) -> str:
-    """Name the side of the body, "" in the middle, by the normalised way to its left."""
-    return ("left" if place > 0.0 else "right") if abs(place) > _MIDDLE else ""
