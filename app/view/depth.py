@@ -13,7 +13,7 @@ _MOST_THICK = 0.12
 """Of the body size: no limb that is held is thicker."""
 
 _CLEAR = 0.01
-"""Of the body size: from the surface to what is dragged over it, so as not to catch on it."""
+"""Of the body size: from the surface to what is dragged over it, which would catch on it."""
 
 _WIDE = 0.06
 """Of the body size: half as wide is a hand, which goes round what it would run into."""
