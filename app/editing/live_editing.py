@@ -317,9 +317,14 @@ class LiveEditing(CodeEditing):
         return any(pin.vertex == vertex for pin in self.pins)
 
     def toggle_pin(self, vertex: int, oriented: bool = False) -> None:
-        """Pin the patch round a vertex, of the present radius, or remove such a pin on it."""
+        """Pin the patch round a vertex, of the present radius, or remove the pin on it.
+
+        Parameters
+        ----------
+        oriented : its body part keeps its orientation too, also where it is pinned already
+        """
         index = next((i for i, pin in enumerate(self.pins) if pin.vertex == vertex), None)
-        if index is None or bool(self.pins[index].frame) is not oriented:
+        if index is None or (oriented and not self.pins[index].frame):
             self.pin(self.grip_at(vertex), oriented)
         else:
             self.unpin(index)

@@ -102,8 +102,10 @@ class BodyMenus(QObject):
     def _add_hold(self, menu: QMenu, vertex: int) -> None:
         """Add what can be done with the patch round a vertex."""
         document = self._document
-        text = "Un&pin" if document.is_pinned(vertex) else "&Pin"
-        self._add(menu, text, document.toggle_pin, vertex)
+        is_pinned = document.is_pinned(vertex)
+        self._add(menu, "Un&pin" if is_pinned else "&Pin", document.toggle_pin, vertex)
+        if not is_pinned:
+            self._add(menu, "Pin with &orientation", document.toggle_pin, vertex, True)
         menu.addAction(self._actions["unpin_all"])
         sizes = menu.addMenu("Patch si&ze")
         for text, radius in _RADII.items():

@@ -105,8 +105,8 @@ class DragActions(QObject):
         if document.has_model:
             vertex = self._viewport.pointed_vertex
             frames = [bool(pin.frame) for pin in document.pins if pin.vertex == vertex]
-            for key, is_turned in (("pin", False), ("pin_turn", True)):
-                actions[key].setText("Un&pin" if is_turned in frames else ACTIONS[key].text)
+            for key, is_pinned in (("pin", bool(frames)), ("pin_turn", any(frames))):
+                actions[key].setText("Un&pin" if is_pinned else ACTIONS[key].text)
             pointed = "Point at the body first" if vertex is None else ""
             why_not |= dict.fromkeys(("pin", "pin_turn", "arrows"), pointed)
             why_not["unpin_all"] = "" if document.pins else "Nothing is pinned"

@@ -151,6 +151,8 @@ def test_feet_and_hands_are_pinned_in_one_step(qtbot: QtBot, body_window: MainWi
         body_window.actions_by_key[key].trigger()
         pinned = {names[space.vertex_domain[pin.vertex]] for pin in document.pins}
         assert pinned == {name for name in names if word in name}
+        # Heels do not swing through the floor: two vertices more keep the orientation.
+        assert all(len(pin.frame) == 2 for pin in document.pins)
         assert document.undo_stack.count() == 1
         document.undo()
         assert document.pins == ()
@@ -295,3 +297,30 @@ def test_the_whole_body_is_shown_from_the_same_side(qtbot: QtBot, window: MainWi
         np.testing.assert_allclose(
             getattr(viewport.scene.view, name), getattr(back, name), atol=1e-6
         )
+
+
+def test_feet_stay_and_the_whole_body_helps_as_the_menu_says(window: MainWindow) -> None:
+    document = window.document
+    for key, at_first in (("standing", True), ("whole_body", False)):
+        action = window.actions_by_key[key]
+        assert action in window.menus["&Pose"].actions()
+        assert action.isChecked() is getattr(document, key) is at_first
+        action.trigger()
+        assert getattr(document, key) is window.settings[key] is not at_first
+    document.begin_drag(document.grip_at(0), "Drag")
+    drag = document._drag
+    assert drag is not None
+    assert drag.session.options.whole_body
+    assert not drag.session.options.standing
+    document.cancel_drag()
+
+
+def test_a_pin_is_made_to_keep_the_orientation_by_a_key(qtbot: QtBot, window: MainWindow) -> None:
+    document = window.document
+    point_at(qtbot, window.viewport, seen_vertex(window.viewport, 1))
+    QTest.keyClick(window, Qt.Key.Key_P)
+    assert [len(pin.frame) for pin in document.pins] == [0]
+    QTest.keyClick(window, Qt.Key.Key_O)
+    assert [len(pin.frame) for pin in document.pins] == [2]
+    QTest.keyClick(window, Qt.Key.Key_O)
+    assert document.pins == ()

@@ -308,8 +308,11 @@ def test_a_file_of_poses_remembers_what_they_were_mirrored_from(
 def test_pins_are_mirrored_to_the_other_side(body: PoseModel, samples: np.ndarray) -> None:
     symmetry, vertices = body.pose_mirror.symmetry, body.decode(samples[0])
     grips = [make_grip(body.pose_space, vertex) for vertex in (5, 1200)]
-    pose = NamedPose("pinned", samples[0], pins=tuple(Pin.of(grip, vertices) for grip in grips))
+    pose = NamedPose(
+        "pinned", samples[0], pins=tuple(Pin.of(grip, vertices, [7]) for grip in grips)
+    )
     image = mirror_image(body, pose)
+    assert {pin.frame[0][0] for pin in image.pins} == {int(symmetry.partner[7])}
     reflected = symmetry.image(vertices)
     for pin, grip in zip(image.pins, grips, strict=True):
         partner = make_grip(body.pose_space, pin.vertex, pin.radius)

@@ -42,7 +42,10 @@ def model(tube_model: PoseModel) -> PoseModel:
     return tube_model
 
 
-PINS = (Pin(3, 0.03, (0.1, 1.0 / 3.0, -2e5)), Pin(0, 0.25, (0.0, -1e-9, 7.0)))
+PINS = (
+    Pin(3, 0.03, (0.1, 1.0 / 3.0, -2e5)),
+    Pin(0, 0.25, (0.0, -1e-9, 7.0), ((4, (1.0, 0.1, 0.0)), (5, (0.0, 1.0, 1.0 / 7.0)))),
+)
 
 
 def _poses(model: PoseModel) -> list[NamedPose]:
@@ -206,6 +209,11 @@ def _broken(document: Any, n_vertices: int) -> list[tuple[str, Any]]:
         ("pose 0.*position", with_pin(position=[0.0, 0.0])),
         ("pose 0.*position", with_pin(position=[0.0, 0.0, 1e31])),
         ("pose 0.*position", with_pin(position=None)),
+        ("pose 0.*frame", with_pin(frame={})),
+        ("pose 0.*frame", with_pin(frame=[[1, [0.0, 0.0, 0.0]]] * 3)),
+        ("pose 0.*frame", with_pin(frame=[[1]])),
+        ("pose 0.*vertex", with_pin(frame=[[n_vertices, [0.0, 0.0, 0.0]]])),
+        ("pose 0.*position", with_pin(frame=[[1, [0.0, 0.0]]])),
         ("not an LCollision pose file", []),
         ("not an LCollision pose file", {"poses": []}),
         ("not an LCollision pose file", {**document, "format": "other"}),
