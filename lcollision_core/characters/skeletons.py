@@ -38,6 +38,9 @@ _FOUR_FINGER_JOINTS = 4
 _MOST_JOINTS = 16
 """Of a limb's chain, among which its hinge is sought."""
 
+_MOST_PAIRS = 32
+"""Pairs of branches among which legs and arms are sought."""
+
 _LEAST_VOTE = 0.15
 """Of signs that a body faces one way and not the other."""
 
@@ -97,9 +100,11 @@ class Skeleton:
         self, rig: Rig, named: Sequence[Role], lefts: Sequence[int], up: FloatArray
     ) -> None:
         self._named, self._lefts, self._up = named, lefts, up
-        self._parents: list[int] = rig.parents.tolist()
-        self._places: FloatArray = rig.rest[:, :3, 3]
-        n_joints, rows = len(self._parents), np.arange(len(rig.joint_of))
+        n_joints, rows = len(rig.parents), np.arange(len(rig.joint_of))
+        # The last one stands for what all roots hang on.
+        self._parents: list[int] = [*rig.parents.tolist(), -1]
+        places, roots = rig.rest[:, :3, 3], rig.parents < 0
+        self._places: FloatArray = np.concatenate([places, [places[roots].mean(axis=0)]])
         largest = rig.weights.argmax(axis=1)
         heaviest = rig.joint_of[rows, largest]
         self._skin = np.bincount(heaviest, minlength=n_joints)
@@ -108,9 +113,9 @@ class Skeleton:
         self._tips = self._places.copy()
         for joint in np.flatnonzero(self._skin).tolist():
             self._tips[joint] = rig.points[rows, largest][heaviest == joint].mean(axis=0)
-        self._children: list[list[int]] = [[] for _ in range(n_joints)]
-        self._reach, self._next = np.zeros(n_joints), [-1] * n_joints
-        self._shares = self._skin / max(1, len(rows))
+        self._children: list[list[int]] = [[] for _ in self._parents]
+        self._reach, self._next = np.zeros(n_joints + 1), [-1] * (n_joints + 1)
+        self._shares = np.append(self._skin, 0) / max(1, len(rows))
         for joint in range(n_joints - 1, -1, -1):
             below, parent = self._children[joint], self._parents[joint]
             reaches = [self._reach[child] + self._distance(joint, child) for child in below]
@@ -118,7 +123,7 @@ class Skeleton:
             if reaches:
                 self._reach[joint] = max(reaches)
                 self._next[joint] = below[int(np.argmax(reaches))]
-            if parent >= 0 and (used[joint] or below):
+            if used[joint] or below:
                 self._children[parent].insert(0, joint)
                 self._shares[parent] += self._shares[joint]
         moving = [joint for joint in range(n_joints) if used[joint] or self._children[joint]]
@@ -161,12 +166,12 @@ class Skeleton:
             trunk = fore.middle - hind.middle
             shorter, longer = sorted((hind.reach, fore.reach))
             if (
-                not self._overlap(hind, fore)
-                and 2.0 * shorter > longer
+                2.0 * shorter > longer
                 and 0.3 * longer < np.linalg.norm(trunk)
                 and abs(_unit(trunk) @ self._up) < 0.5
                 and min(hind.direction @ -self._up, fore.direction @ -self._up) > 0.7
                 and abs(_unit(hind.across) @ _unit(fore.across)) > 0.8
+                and not self._overlap(hind, fore)
             ):
                 neck = max(float(self._tips[joint] @ self._up) for joint in self.below(fore.trunk))
                 found.append((neck, _unit(trunk - (trunk @ self._up) * self._up)))
@@ -177,9 +182,10 @@ class Skeleton:
 
     def below(self, joint: int) -> Iterator[int]:
         """Iterate over a joint and those of its branch that move a skin."""
-        yield joint
-        for child in self._children[joint]:
-            yield from self.below(child)
+        waiting = [joint]
+        while waiting:
+            yield (joint := waiting.pop())
+            waiting += self._children[joint]
 
     def above(self, joint: int) -> Iterator[int]:
         """Iterate over what a joint hangs on, from near to far."""
@@ -219,7 +225,9 @@ class Skeleton:
                 ):
                     middle = 0.5 * (places[0][0] + places[1][0])
                     pairs.append(_Pair(trunk, chains, reach, middle, across, _unit(sum(ways))))
-        return pairs
+        # Limbs have more skin than strands of hair and the pleats of a skirt.
+        pairs.sort(key=lambda pair: -sum(self._shares[chain[0]] for chain in pair.chains))
+        return pairs[:_MOST_PAIRS]
 
     def _overlap(self, a: _Pair, b: _Pair) -> bool:
         """Whether one pair hangs on the other, or is in part the same."""
@@ -234,7 +242,7 @@ class Skeleton:
         if (
             not 0.2 * legs.reach < length < 1.6 * legs.reach
             or not 0.3 * legs.reach < arms.reach < 2.0 * legs.reach
-            or legs.direction @ -way < 0.7
+            or legs.direction @ -way < 0.5
             or arms.direction @ way > 0.7
             or abs(_unit(legs.across) @ _unit(arms.across)) < 0.8
             or abs(_unit(legs.across) @ way) > 0.4
@@ -259,7 +267,8 @@ class Skeleton:
         for child in self._children[arms.trunk]:
             way = self._places[child] - arms.middle
             aside = abs(way @ _unit(arms.across)) > 0.2 * np.linalg.norm(arms.across)
-            rises = (self._tips[self._chain(child)[-1]] - self._places[arms.trunk]) @ up > 0.0
+            top = (self._places[list(self.below(child))] @ up).max()
+            rises = top > self._places[arms.trunk] @ up
             if child not in taken and not aside and rises:
                 best = max(best, self._chain(child), key=lambda one: self._shares[one[:1]].sum())
         return best
@@ -352,6 +361,7 @@ class Skeleton:
         hips = {legs.trunk, *self.above(legs.trunk)}
         spine = [arms.trunk, *self.above(arms.trunk)]
         roles.update((joint, Role.SPINE) for joint in spine if joint not in hips)
+        roles.pop(len(self._parents) - 1, None)
         chain = self._head_chain(arms, _unit(arms.middle - legs.middle))
         if chain:
             # Of the joints in the middle the head leads most.
@@ -374,7 +384,7 @@ class Skeleton:
         middle = float(np.mean([hinge[0] @ left for hinge in hinges]))
         for number, (start, hinge, end, tip) in enumerate(hinges):
             line, is_leg = end - start, number < 2
-            bend = float((hinge - 0.5 * (start + end)) @ front / np.linalg.norm(line))
+            bend = float((hinge - 0.5 * (start + end)) @ front) / (np.linalg.norm(line) or 1.0)
             vote += float(np.clip(10.0 * bend, -0.5, 0.5)) * (1.0 if is_leg else -1.0)
             if is_leg and (tip != end).any():
                 vote += float(_unit(tip - end) @ front)

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import Character, RigPoseSpace, read_character
+from lcollision_core.characters.anatomy import anatomy_of
 from lcollision_core.characters.joint_roles import Role
 from lcollision_core.characters.random_poses import HumanDraws, random_codes
 from tests.skeletons import HORSE, PERSON, SNAKE, character_from
@@ -189,3 +190,32 @@ def test_one_body_with_two_namings_has_the_same_limits() -> None:
 
 def _read(name: str) -> Character:
     return read_character(CASES / f"{name}.glb")
+
+
+def test_limbs_without_a_common_root_and_long_chains_are_read() -> None:
+    apart = {
+        name: ("" if parent in ("hips", "chest") and name[:2] in ("L ", "R ") else parent, place)
+        for name, (parent, place) in PERSON.items()
+    }
+    space = RigPoseSpace(character_from(apart, NAMINGS["numbers"]))
+    roles = dict(zip(PERSON, space.roles, strict=True))
+    assert [roles[f"L {name}"] for name in ("thigh", "shin", "forearm")] == [
+        Role.THIGH, Role.SHIN, Role.FOREARM
+    ]  # fmt: skip
+    worm = {
+        f"{number}": (f"{number - 1}" if number else "", (0.0, 0.0, 0.01 * number))
+        for number in range(1100)
+    }
+    assert set(anatomy_of(character_from(worm)).roles) == {Role.OTHER}
+
+
+def test_many_strands_of_hair_are_no_limbs() -> None:
+    joints = dict(PERSON)
+    for strand in range(40):
+        angle = 2.0 * np.pi * (strand + 0.5) / 40
+        for number in range(3):
+            place = (0.1 * np.sin(angle), 1.6 - 0.25 * number, 0.1 * np.cos(angle))
+            parent = f"hair {strand} {number - 1}" if number else "head"
+            joints[f"hair {strand} {number}"] = parent, place
+    roles = RigPoseSpace(character_from(joints, NAMINGS["numbers"])).roles
+    assert roles[: len(PERSON)] == RigPoseSpace(character_from(PERSON)).roles
