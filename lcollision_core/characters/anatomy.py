@@ -95,7 +95,6 @@ class Anatomy:
     ----------
     roles, sides : of each joint
     labels : J names of body parts
-    directions : (J, 3) unit vectors along the joints' bones at rest
     front : (3,) level unit vector
     axes : (J, 3, 3): see `joint_roles.joint_axes`
     notes : sentences on what is not known
@@ -132,6 +131,8 @@ def anatomy_of(character: Character) -> Anatomy:
     skeleton = Skeleton(rig, named, lefts, up)
     person, notes = skeleton.person(), []
     roles, by_name = _merged(named, person, skeleton)
+    for joint, (role, _) in chosen.items():
+        roles[joint] = role
     directions = joint_roles.bone_directions(rig, rig.rest[:, :3, 3], roles)
     front = joint_roles.front_of(roles, rig.rest[:, :3, 3], directions, up)
     if person is not None and person.front is not None:
@@ -145,10 +146,11 @@ def anatomy_of(character: Character) -> Anatomy:
         upwards = int(np.abs(up).argmax())
         front = front_direction(character.rest_vertices * up[upwards], upwards) * up[upwards]
     if animal is not None:
-        roles = [Role.OTHER if role in _LIMBS else role for role in roles]
+        roles = [
+            Role.OTHER if role in _LIMBS and joint not in chosen else role
+            for joint, role in enumerate(roles)
+        ]
         notes.append(_FOUR_LEGS)
-    for joint, (role, _) in chosen.items():
-        roles[joint] = role
     if not notes and len(roles) > 1 and not _LIMBS.intersection(roles):
         notes.append(_UNKNOWN)
     own_up, own_front = (up, front)
