@@ -113,9 +113,7 @@ def mirrored(body: PosableBody, pairs: Iterable[FacePair]) -> list[FacePair]:
     if symmetry is None:
         return []
     middles = body.reference[body.faces].mean(axis=1)
-    image = middles.copy()
-    image[:, symmetry.axis] = 2.0 * symmetry.offset - image[:, symmetry.axis]
-    away, partner = cKDTree(middles).query(image)
+    away, partner = cKDTree(middles).query(symmetry.reflect(middles))
     is_there = away <= TOUCHING_RADIUS * body.body_size
     return [
         (int(min(partner[a], partner[b])), int(max(partner[a], partner[b])))
