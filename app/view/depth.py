@@ -115,9 +115,10 @@ def _distances(start: FloatArray, way: FloatArray, corners: npt.NDArray[np.float
     a = (offset * across).sum(axis=1) / scale
     turned = np.cross(offset, first)
     b = turned @ way / scale
-    distances: FloatArray = (second * turned).sum(axis=1) / scale
-    hit &= (a >= 0.0) & (b >= 0.0) & (a + b <= 1.0) & (distances > 0.0)
-    return distances[hit]
+    far = (second * turned).sum(axis=1) / scale
+    hit &= (a >= 0.0) & (b >= 0.0) & (a + b <= 1.0) & (far > 0.0)
+    distances: FloatArray = far[hit]
+    return distances
 
 
 def along_axis(

@@ -171,7 +171,8 @@ class Mouse(QObject):
 
     @property
     def _up(self) -> FloatArray:
-        return np.eye(3)[self._document.model.up_axis]
+        up: FloatArray = np.eye(3)[self._document.model.up_axis]
+        return up
 
     @property
     def _axes(self) -> FloatArray:
