@@ -86,7 +86,7 @@ class IndependentRules:
             rules["near_exclusion"] * size,
             rules["tolerated_depth"] * size,
         )
-        self._ignored = rules["ignored"]
+        self._ignored, self._left_out = rules["ignored"], rules["left_out"]
         self._of_rest = None if rules["rest_exclusion"] is None else rules["rest_exclusion"] * size
         self._neighbours: dict[int, set[int]] = {}
         self._faces_of: dict[int, set[int]] = {}
@@ -122,6 +122,8 @@ class IndependentRules:
             first, second = self._groups[one], self._groups[two]
             if (a in first and b in second) or (b in first and a in second):
                 return "ignored"
+        if any(face in self._groups[name] for name in self._left_out for face in (a, b)):
+            return "ignored"
         if depth <= self._tolerated:
             return "tolerated"
         if any(a in about and b in about for about in self._joints):

@@ -11,6 +11,7 @@ import typer
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import (
     IgnoreOption,
+    LeaveOutOption,
     NearExclusionOption,
     NoRulesOption,
     RestExclusionOption,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.meshes import Mesh
+    from lcollision_core.meshes import FaceGroup, Mesh, Topology
     from lcollision_core.model import RigModel
 
 _NO_OPTIONS = RuleOptions()
@@ -42,6 +43,7 @@ def check(
     rest: RestOption = None,
     rest_exclusion: RestExclusionOption = None,
     ignore: IgnoreOption = None,
+    leave_out: LeaveOutOption = None,
     tolerated_depth: ToleratedDepthOption = None,
     no_rules: NoRulesOption = False,
 ) -> None:
@@ -59,7 +61,9 @@ def check(
     rest_mesh = None if rest is None else read_mesh(rest)
     if rest is not None and rest_exclusion is None:
         rest_exclusion = CHARACTER_REST_EXCLUSION
-    options = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth)
+    options = RuleOptions(
+        near_exclusion, rest_exclusion, ignore, tolerated_depth, leave_out=leave_out
+    )
     reports: list[dict[str, Any]] = []
     failed = False
     for path in expanded(meshes):
@@ -107,7 +111,8 @@ def check_mesh(
             rules, detector, topology = body.rules, body.detector, body.topology
         else:
             vertices, topology = mesh.vertices, mesh.topology
-            rules, groups = options.applied(STRICT, (), topology)
+            groups = _groups(path, topology) if options.leave_out or options.ignore else ()
+            rules, groups = options.applied(STRICT, groups, topology)
             reference = vertices if rest is None else rest.vertices
             detector = CollisionDetector(topology, reference, rules, groups)
         with progress_bar("Finding self-collisions") as progress:
@@ -138,6 +143,17 @@ def check_mesh(
         "colliding": found.colliding,
         "seconds": time.perf_counter() - start,
     }
+
+
+def _groups(path: Path, topology: Topology) -> tuple[FaceGroup, ...]:
+    """Return the meshes and materials that a file of a scene names, if its faces are these."""
+    from lcollision_core.meshes.joined import join_parts
+    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
+
+    if path.suffix.lower() not in SCENE_SUFFIXES:
+        return ()
+    joined = join_parts(read_scene(path))
+    return joined.groups if joined.topology == topology else ()
 
 
 def _known(path: Path, mesh: Mesh) -> tuple[RigModel, npt.NDArray[np.float64]] | None:

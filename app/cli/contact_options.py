@@ -56,6 +56,14 @@ IgnoreOption = Annotated[
         "components, as in 'component 1:component 2', of which 1 has most faces. May be repeated.",
     ),
 ]
+LeaveOutOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        help="Leave a mesh, material, body part or component out of the check, such as a weapon "
+        "that another one stands for. It is posed and exported all the same. May be repeated.",
+    ),
+]
 JointExclusionOption = Annotated[
     bool | None,
     typer.Option(
@@ -82,6 +90,7 @@ class RuleOptions:
     ignore: Sequence[str] | None = None
     tolerated_depth: float | None = None
     joint_exclusion: bool | None = None
+    leave_out: Sequence[str] | None = None
 
     def applied(
         self,
@@ -99,33 +108,34 @@ class RuleOptions:
 
         Raises
         ------
-        LCollisionError : an ignored pair is not two names of groups.
+        LCollisionError : an ignored pair is not two names of groups, or an unknown one is left out.
         """
         from lcollision_core.meshes import groups_by_kind, with_named_groups
 
-        kinds = groups_by_kind(groups, topology, vertex_labels) if self.ignore else {}
+        names_groups = self.ignore or self.leave_out
+        kinds = groups_by_kind(groups, topology, vertex_labels) if names_groups else {}
         names = {group.name for kind in kinds.values() for group in kind}
         changed = self._changed(rules, names)
-        return changed, with_named_groups(groups, kinds, changed.ignored)
+        return changed, with_named_groups(groups, kinds, changed.named_groups)
 
     def applied_to(self, body: PosableBody) -> PosableBody:
         """Return a body with these options added to its rules.
 
         Raises
         ------
-        LCollisionError : an ignored pair is not two names of its groups, it has no joints to leave
+        LCollisionError : an ignored or left out group is unknown, it has no joints to leave
             out pairs at, or a predictor depends on its rules.
         """
         if self.joint_exclusion and not body.has_joints:
             what = "has no joints that its contact rules could leave out pairs at"
             next_step = "leave out --joint-exclusion, or learn it again from a rigged character"
             raise LCollisionError(what, next_step, where=body.name)
-        groups = body.groups_by_kind.values() if self.ignore else ()
+        groups = body.groups_by_kind.values() if self.ignore or self.leave_out else ()
         rules = self._changed(body.rules, {group.name for kind in groups for group in kind})
         return body if rules == body.rules else body.with_rules(rules)
 
     def _changed(self, rules: ContactRules, names: Collection[str]) -> ContactRules:
-        from lcollision_core.meshes import named_pair
+        from lcollision_core.meshes import named_group, named_pair
 
         options = {
             "near_exclusion": self.near_exclusion,
@@ -135,7 +145,13 @@ class RuleOptions:
         }
         chosen: dict[str, Any] = {name: to for name, to in options.items() if to is not None}
         pairs = (named_pair(entry, names) for entry in self.ignore or ())
-        return replace(rules, **chosen, ignored=tuple(dict.fromkeys((*rules.ignored, *pairs))))
+        left_out = (named_group(entry, names) for entry in self.leave_out or ())
+        return replace(
+            rules,
+            **chosen,
+            ignored=tuple(dict.fromkeys((*rules.ignored, *pairs))),
+            left_out=tuple(dict.fromkeys((*rules.left_out, *left_out))),
+        )
 
 
 def note_rules(body: PosableBody) -> None:

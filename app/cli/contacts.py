@@ -10,6 +10,7 @@ from app.cli.console import JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import (
     IgnoreOption,
     JointExclusionOption,
+    LeaveOutOption,
     NearExclusionOption,
     RestExclusionOption,
     RuleOptions,
@@ -31,6 +32,7 @@ def contacts(
     rest_exclusion: RestExclusionOption = None,
     joint_exclusion: JointExclusionOption = None,
     ignore: IgnoreOption = None,
+    leave_out: LeaveOutOption = None,
     tolerated_depth: ToleratedDepthOption = None,
     ignore_proposed: Annotated[
         bool,
@@ -55,7 +57,9 @@ def contacts(
 
     before = open_body(model_name)
     body = before.with_rules(before.own_rules) if defaults else before
-    options = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth, joint_exclusion)
+    options = RuleOptions(
+        near_exclusion, rest_exclusion, ignore, tolerated_depth, joint_exclusion, leave_out
+    )
     body = options.applied_to(body)
     proposed = None
     if not body.has_predictor:

@@ -10,6 +10,7 @@ import typer
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import (
     IgnoreOption,
+    LeaveOutOption,
     NearExclusionOption,
     RestExclusionOption,
     RuleOptions,
@@ -49,6 +50,7 @@ def check(
     near_exclusion: NearExclusionOption = None,
     rest_exclusion: RestExclusionOption = None,
     ignore: IgnoreOption = None,
+    leave_out: LeaveOutOption = None,
     tolerated_depth: ToleratedDepthOption = None,
 ) -> None:
     """Report the topology, size, defects and self-collisions of a pose set.
@@ -68,7 +70,9 @@ def check(
     for remark in poses.notes:
         note(f"{path}: {remark}")
     poses = with_rules_of_character(poses, path)
-    options = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth)
+    options = RuleOptions(
+        near_exclusion, rest_exclusion, ignore, tolerated_depth, leave_out=leave_out
+    )
     try:
         rules, groups = options.applied(
             poses.rules, poses.groups, poses.topology, poses.vertex_labels

@@ -11,6 +11,7 @@ import typer
 from app.cli.console import JsonOption, note, print_json, status_bar, tell
 from app.cli.contact_options import (
     IgnoreOption,
+    LeaveOutOption,
     NearExclusionOption,
     RestExclusionOption,
     ToleratedDepthOption,
@@ -76,6 +77,7 @@ def new(
     near_exclusion: NearExclusionOption = None,
     rest_exclusion: RestExclusionOption = None,
     ignore: IgnoreOption = None,
+    leave_out: LeaveOutOption = None,
     tolerated_depth: ToleratedDepthOption = None,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal models.")] = 0,
     licence: Annotated[str, typer.Option(help="Under which the model may be used.")] = "unknown",
@@ -105,6 +107,7 @@ def new(
         None if ignore is None else tuple(ignore),
         seed,
         licence,
+        left_out=tuple(leave_out or ()),
     )
     work = WorkFolder(model_destination(output))
     work.prepare(request)

@@ -14,6 +14,7 @@ import typer
 from app.cli.console import note, status_bar
 from app.cli.contact_options import (
     IgnoreOption,
+    LeaveOutOption,
     NearExclusionOption,
     RestExclusionOption,
     RuleOptions,
@@ -72,6 +73,7 @@ def embedding(
     near_exclusion: NearExclusionOption = None,
     rest_exclusion: RestExclusionOption = None,
     ignore: IgnoreOption = None,
+    leave_out: LeaveOutOption = None,
     tolerated_depth: ToleratedDepthOption = None,
     up: Annotated[
         Axis | None,
@@ -109,7 +111,9 @@ def embedding(
     poses = replace(poses, up_axis=guess.axis if up is None else "xyz".index(up))
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
-    options = RuleOptions(near_exclusion, rest_exclusion, ignore, tolerated_depth)
+    options = RuleOptions(
+        near_exclusion, rest_exclusion, ignore, tolerated_depth, leave_out=leave_out
+    )
     rules, groups = options.applied(poses.rules, poses.groups, poses.topology, poses.vertex_labels)
     poses = replace(poses, rules=rules, groups=groups)
     config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)

@@ -100,7 +100,7 @@ def with_other_rules(
     """
     n_faces = topology.n_faces
     require_groups(rules, groups, n_faces)
-    region, ignored = _regions(rules.ignored, without_joints(groups), n_faces)
+    region, ignored = _regions(rules, without_joints(groups), n_faces)
     joints = [group.faces for group in groups if group.about_joint and rules.joint_exclusion]
     by_joint = lists_of(joints, n_faces) if joints else no_lists(0)
     pairs = np.array(rules.touching, dtype=np.int64).reshape(-1, 2)
@@ -171,12 +171,12 @@ def require_room(n_excluded: int, rule: str) -> None:
 
 
 def _regions(
-    ignored: tuple[tuple[str, str], ...], groups: Sequence[FaceGroup], n_faces: int
+    rules: ContactRules, groups: Sequence[FaceGroup], n_faces: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_]]:
     """Return (F,) regions of faces of the same groups, and (R, R) which of them are ignored."""
-    if not ignored:
+    names = rules.named_groups
+    if not names:
         return np.empty(0, dtype=np.int32), np.zeros((0, 0), dtype=np.bool_)
-    names = list(dict.fromkeys(name for pair in ignored for name in pair))
     is_of = np.zeros((len(names), n_faces), dtype=np.bool_)
     for group in groups:
         if group.name in names:
@@ -188,7 +188,10 @@ def _regions(
         )
     of_region = np.unpackbits(packed, axis=0, count=len(names)).astype(np.bool_)
     table = np.zeros(2 * (packed.shape[1],), dtype=np.bool_)
-    for a, b in ignored:
+    for name in rules.left_out:
+        is_left_out = of_region[names.index(name)]
+        table[is_left_out] = table[:, is_left_out] = True
+    for a, b in rules.ignored:
         one_way = np.outer(of_region[names.index(a)], of_region[names.index(b)])
         table |= one_way | one_way.T
     return region.ravel().astype(np.int32), table

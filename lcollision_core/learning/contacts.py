@@ -13,7 +13,14 @@ from lcollision_core.contact import CollisionDetector, ContactRules, touching_pa
 from lcollision_core.contact.rules import near_pairs_estimate
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.learning.request import LearningRequest
-from lcollision_core.meshes import PoseSet, body_size, groups_by_kind, named_pair, with_named_groups
+from lcollision_core.meshes import (
+    PoseSet,
+    body_size,
+    groups_by_kind,
+    named_group,
+    named_pair,
+    with_named_groups,
+)
 from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 
@@ -65,11 +72,14 @@ def with_proposed_rules(
         rules = replace(rules, near_exclusion=near)
     kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
     names = {group.name for kind in kinds.values() for group in kind}
+    left_out = (named_group(entry, names) for entry in request.left_out)
+    rules = replace(rules, left_out=tuple(dict.fromkeys((*rules.left_out, *left_out))))
 
     def ignoring(pairs: Iterable[tuple[str, str]]) -> PoseSet:
         ignored = tuple(dict.fromkeys((*rules.ignored, *pairs)))
-        groups = with_named_groups(poses.groups, kinds, ignored)
-        return replace(poses, rules=replace(rules, ignored=ignored), groups=groups)
+        ruled = replace(rules, ignored=ignored)
+        groups = with_named_groups(poses.groups, kinds, ruled.named_groups)
+        return replace(poses, rules=ruled, groups=groups)
 
     if request.ignored == ():
         return ignoring(())

@@ -36,6 +36,7 @@ class LearningRequest:
     licence : under which the model may be used
     stamps : of the sources, so that a file that has changed is not taken for the one that was read:
         see `stamped`
+    left_out : names of groups of faces that take no part in the check
 
     Raises
     ------
@@ -56,6 +57,7 @@ class LearningRequest:
     seed: int = 0
     licence: str = "unknown"
     stamps: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.sources:
@@ -86,7 +88,8 @@ class LearningRequest:
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON values of `of_json`, lists as they come back from a file."""
-        values = asdict(self) | {"sources": list(self.sources), "stamps": list(self.stamps)}
+        lists = ("sources", "stamps", "left_out")
+        values = asdict(self) | {name: list(getattr(self, name)) for name in lists}
         return values if self.ignored is None else values | {"ignored": list(self.ignored)}
 
     @classmethod

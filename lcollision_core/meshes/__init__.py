@@ -19,6 +19,7 @@ from lcollision_core.meshes.face_groups import (
     FaceGroup,
     component_groups,
     groups_by_kind,
+    named_group,
     named_pair,
     part_groups,
     with_named_groups,

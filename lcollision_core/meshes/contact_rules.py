@@ -98,10 +98,13 @@ class ContactRules:
         faces do not count of which one is within the touching radius of one of such a pair and the
         other within it of the other
     touching_radius : of these patches
+    left_out : names of groups of faces of which no pair counts; they are posed, shown and exported
+        all the same
 
     Raises
     ------
-    ShapeError : a length is negative or not finite, or an ignored pair is not two names.
+    ShapeError : a length is negative or not finite, an ignored pair is not two names, or what is
+        left out is no name.
     """
 
     near_exclusion: float = 0.0
@@ -111,6 +114,7 @@ class ContactRules:
     joint_exclusion: bool = False
     touching: tuple[tuple[int, int], ...] = ()
     touching_radius: float = 0.0
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for what, length in (
@@ -135,6 +139,17 @@ class ContactRules:
                     "an ignored pair", "two names of groups", repr(pair)[:MAX_NAME_LENGTH]
                 )
 
+        for name in self.left_out:
+            if not _is_name(name):
+                shown = repr(name)[:MAX_NAME_LENGTH]
+                raise ShapeError.must_be("what is left out", "the name of a group", shown)
+
+    @property
+    def named_groups(self) -> tuple[str, ...]:
+        """The different names of groups of faces that the rules hold."""
+        ignored = (name for pair in self.ignored for name in pair)
+        return tuple(dict.fromkeys((*ignored, *self.left_out)))
+
     @property
     def exclude_nothing(self) -> bool:
         """Whether all colliding pairs count."""
@@ -143,7 +158,7 @@ class ContactRules:
     def to_json(self) -> dict[str, Any]:
         """Return JSON values for `from_json`."""
         pairs = {name: [list(pair) for pair in getattr(self, name)] for name in _PAIRS}
-        return asdict(self) | pairs
+        return asdict(self) | pairs | {"left_out": list(self.left_out)}
 
     @classmethod
     def from_json(cls, values: Any) -> ContactRules:
@@ -165,7 +180,9 @@ class ContactRules:
         groups = ", ".join(map(pair_in_words, self.ignored[:_NAMED_PAIRS]))
         more = len(self.ignored) - _NAMED_PAIRS
         around = f" or within {self.rest_exclusion:g} of such a pair" if self.rest_exclusion else ""
+        left_out = self._left_out_in_words().removeprefix("without ")
         said = (
+            left_out and f"pairs of what is left out ({left_out})",
             self.near_exclusion and f"pairs within {self.near_exclusion:g} along the surface",
             self.rest_exclusion is not None and f"pairs that touch at rest{around}",
             groups and f"pairs of {groups}{f' and {more} more' if more > 0 else ''}",
@@ -186,12 +203,20 @@ class ContactRules:
             "joint": self.joint_exclusion,
             "touching": self.touching,
         }
-        return ", ".join(_SHORTLY[name] for name, does in applies.items() if does)
+        said = (_SHORTLY[name] for name, does in applies.items() if does)
+        return ", ".join(filter(None, (self._left_out_in_words(), *said)))
+
+    def _left_out_in_words(self) -> str:
+        names, more = self.left_out[:_NAMED_PAIRS], len(self.left_out) - _NAMED_PAIRS
+        listed = ", ".join(names) + (f" and {more} more" if more > 0 else "")
+        return f"without {listed}" if names else ""
 
     def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
         """Say how many pairs are not counted, and by which rules; empty if there are none."""
         counts = counts if isinstance(counts, RuleCounts) else RuleCounts(**counts)
-        groups = " or ".join(map(pair_in_words, self.ignored[:_NAMED_PAIRS]))
+        left_out = self._left_out_in_words()
+        pairs = map(pair_in_words, self.ignored[:_NAMED_PAIRS])
+        groups = " or ".join((*pairs, *("what is left out",) * bool(left_out)))
         if len(self.ignored) > _NAMED_PAIRS:
             groups = f"{len(self.ignored)} ignored pairs of groups"
         said = [
@@ -207,9 +232,10 @@ class ContactRules:
             if number
         ]
         if not said:
-            return ""
+            return left_out
         listed = " and ".join(filter(None, [", ".join(said[:-1]), said[-1]]))
-        return f"{listed} {'is' if counts.total == 1 else 'are'} not counted"
+        not_counted = f"{listed} {'is' if counts.total == 1 else 'are'} not counted"
+        return ", ".join(filter(None, (left_out, not_counted)))
 
 
 def pair_in_words(pair: tuple[str, str]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 import numpy as np
 import numpy.typing as npt
@@ -105,18 +106,18 @@ def groups_by_kind(
 def with_named_groups(
     groups: Sequence[FaceGroup],
     kinds: Mapping[str, Sequence[FaceGroup]],
-    ignored: Iterable[tuple[str, str]],
+    names: Iterable[str],
 ) -> tuple[FaceGroup, ...]:
-    """Return the groups of a mesh, and of those found on it the ones that ignored pairs name.
+    """Return the groups of a mesh, and of those found on it the ones that rules name.
 
     Parameters
     ----------
     groups : that the mesh has
     kinds : all groups by kind: see `groups_by_kind`
-    ignored : pairs of names
+    names : see `ContactRules.named_groups`
     """
     named = {group.name for group in without_joints(groups)}
-    wanted = {name for pair in ignored for name in pair} - named
+    wanted = {*names} - named
     return (*groups, *(one for kind in kinds.values() for one in kind if one.name in wanted))
 
 
@@ -145,8 +146,28 @@ def named_pair(entry: str, names: Collection[str]) -> tuple[str, str]:
     raise LCollisionError(what, next_step, where=where)
 
 
+def named_group(entry: str, names: Collection[str]) -> str:
+    """Return the name of a group as people write it.
+
+    Raises
+    ------
+    LCollisionError : there is no such group; the sentence lists names that are like it.
+    """
+    if entry in names:
+        return entry
+    by_small = {name.lower(): name for name in sorted(names)}
+    near = get_close_matches(entry.lower(), by_small, _LISTED, 0.5)
+    near += [small for small in by_small if entry.lower() in small and small not in near]
+    listed = ", ".join([by_small[small] for small in near or by_small][:_LISTED])
+    raise LCollisionError(
+        "is no group of faces of this mesh",
+        f"name one of {listed}" if listed else "",
+        where=repr(entry),
+    )
+
+
 def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: int) -> None:
-    """Refuse groups of other faces than there are, and ignored pairs of groups that are not there.
+    """Refuse groups of other faces than there are, and rules for groups that are not there.
 
     Raises
     ------
@@ -168,7 +189,7 @@ def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: in
             outside = faces[0] if faces[0] < 0 else faces[-1]
             raise ShapeError.must_be(where, f"of faces from 0 to {n_faces - 1}", int(outside))
     known = dict.fromkeys(group.name for group in named)
-    for name in (name for pair in rules.ignored for name in pair):
+    for name in rules.named_groups:
         if name not in known:
             listed = ", ".join(map(repr, list(known)[:8])) or "none: the mesh has no groups"
             raise ShapeError("is unknown", where=f"the group {name!r}", expected=listed)
@@ -176,7 +197,7 @@ def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: in
 
 def ignored_faces_digest(rules: ContactRules, groups: Iterable[FaceGroup]) -> str:
     """Return a digest of the groups that the rules leave out pairs of; empty if there are none."""
-    names = {name for pair in rules.ignored for name in pair}
+    names = rules.named_groups
     used = [
         group
         for group in groups

@@ -408,8 +408,8 @@ class PosableBody(ABC):
         ShapeError : an ignored group is unknown, or too many pairs are excluded.
         ModelFileError : a predictor depends on the rules that there are.
         """
-        kinds = self.groups_by_kind if rules.ignored else {}
-        groups = with_named_groups(self.groups, kinds, rules.ignored)
+        kinds = self.groups_by_kind if rules.named_groups else {}
+        groups = with_named_groups(self.groups, kinds, rules.named_groups)
         detector = self.detector.with_rules(rules, groups)
         other = self.with_card(replace(self.card, rules=rules, groups=groups))
         for cached in ("pose_mirror", "resolver", "free_latent"):

@@ -43,6 +43,9 @@ _MOST = {"near": 50.0, "rest": 50.0, "tolerated": 10.0}
 _DEFAULT_REST = 2.0
 """Per cent that a rest exclusion begins with."""
 
+_FEWEST_PARTS = 2
+"""Of which one can be left out."""
+
 _LIST_HEIGHT = 112
 _ROW = QSize(0, 20)
 _OTHERS = "other pairs"
@@ -68,7 +71,8 @@ class ContactsDialog(QDialog):
     ----------
     near, rest, tolerated : fields, in per cent of the body size
     at_rest, at_joints : whether there are a rest exclusion and a joint exclusion
-    ignored : pairs of groups by kind of group, ticked where they are ignored
+    ignored : pairs of groups by kind of group, ticked where they are ignored; and the meshes and
+        materials, ticked where they are left out whole
     first, second, add, propose : what adds to these
     apply, restore : buttons; the latter brings back the rules that a character starts with
     total : says how many pairs count at rest
@@ -173,6 +177,7 @@ class ContactsDialog(QDialog):
         self.ignored = QTreeWidget()
         self._pairs: dict[tuple[str, str], QTreeWidgetItem] = {}
         self._kinds: dict[str, QTreeWidgetItem] = {}
+        self._left_out: dict[str, QTreeWidgetItem] = {}
         self.ignored.setHeaderHidden(True)
         self.ignored.setUniformRowHeights(True)
         self.ignored.setIndentation(NORMAL + TIGHT)
@@ -224,6 +229,7 @@ class ContactsDialog(QDialog):
             _length(self.tolerated, held.tolerated_depth),
             self.at_joints.isChecked(),
             *(self._patches() if self.always.isChecked() else ((), 0.0)),
+            tuple(name for name, item in self._left_out.items() if item.checkState(0) is _CHECKED),
         )
 
     def _patches(self) -> tuple[tuple[tuple[int, int], ...], float]:
@@ -264,6 +270,7 @@ class ContactsDialog(QDialog):
         for pair in rules.ignored:
             self._list(pair, _CHECKED)
         self._name_kinds()
+        self._list_parts(rules)
         names = list(dict.fromkeys(group.name for group in without_joints(model.groups)))
         for box in (self.first, self.second):
             box.clear()
@@ -380,7 +387,8 @@ class ContactsDialog(QDialog):
     @Slot(QTreeWidgetItem)
     def _name_item(self, item: QTreeWidgetItem | None) -> None:
         pairs = [pair for pair, own in self._pairs.items() if item in (own, own.parent())]
-        self._name(*(name for pair in pairs for name in pair))
+        whole = [name for name, own in self._left_out.items() if item is own]
+        self._name(*whole, *(name for pair in pairs for name in pair))
 
     def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QTreeWidgetItem:
         """Return the item of a pair, which is listed now if it was not."""
@@ -397,6 +405,25 @@ class ContactsDialog(QDialog):
         item.setSizeHint(0, _ROW)
         item.setToolTip(0, "Ticked: contacts between these two are not counted")
         return item
+
+    def _list_parts(self, rules: ContactRules) -> None:
+        """List the meshes and materials, of which any can be left out whole."""
+        from lcollision_core.meshes.face_groups import GROUP_KINDS
+
+        self._left_out.clear()
+        own = self._document.model.groups_by_kind[GROUP_KINDS[0]]
+        names = dict.fromkeys((*rules.left_out, *(group.name for group in own)))
+        if len(names) < _FEWEST_PARTS:
+            return
+        parts = QTreeWidgetItem(self.ignored, [f"Leave out whole ({len(names)})"])
+        parts.setToolTip(0, "Ticked: takes no part in the check; it is posed and exported as ever")
+        for name in names:
+            item = self._left_out[name] = QTreeWidgetItem(parts, [name])
+            item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
+            item.setCheckState(0, _CHECKED if name in rules.left_out else _UNCHECKED)
+            item.setSizeHint(0, _ROW)
+        parts.setSizeHint(0, _ROW)
+        parts.setExpanded(bool(rules.left_out))
 
     def _kind(self, pair: tuple[str, str]) -> QTreeWidgetItem:
         """Return the item under which the pairs of a kind of group are listed."""

@@ -19,6 +19,7 @@ from lcollision_core.meshes import (
 )
 from lcollision_core.model import PoseModel, open_body, remember_choices
 from tests.app.support import Lcollision
+from tests.core.gltf_builder import arm, rotation, tube
 from tests.rigged_shapes import head_in_torso, rigged_body, write_gltf
 
 NONE = {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0, "joint": 0, "touching": 0}
@@ -62,6 +63,37 @@ def test_components_and_depths_are_left_out_by_check(lcollision: Lcollision, sta
     assert tolerated.exit_code == 0
     assert "; 1 pair not deeper than 0.11 is not counted" in tolerated.stdout
     assert lcollision("check", stabbed, "--tolerated-depth", 0.09).exit_code == 1
+
+
+def test_a_part_is_left_out_whole_and_stays_so(lcollision: Lcollision, tmp_path: Path) -> None:
+    builder = arm(split=False)
+    vertices, faces = tube()
+    primitive = {
+        "attributes": {"POSITION": builder.array(vertices)},
+        "indices": builder.array(faces.reshape(-1), "u2"),
+    }
+    axe = builder.add("meshes", name="Cube.160", primitives=[primitive])
+    turn, place = rotation(2, 1.5), [1.0, -1.5, 0.0]
+    builder.add("nodes", name="2H_Axe", mesh=axe, rotation=turn, translation=place)
+    builder.description["nodes"][3]["children"] = [5]
+    path = builder.write(tmp_path / "hero.glb")
+    strict = lcollision("check", path)
+    assert strict.exit_code == 1, strict.stderr
+    without = lcollision("check", path, "--leave-out", "2H_Axe")
+    assert without.exit_code == 0, without.stderr
+    assert "no collisions; without 2H_Axe, " in without.stdout
+    assert "pairs of what is left out are not counted" in without.stdout
+    unknown = lcollision("check", path, "--leave-out", "2h axe")
+    assert unknown.exit_code == 2
+    assert "'2h axe' is no group of faces of this mesh; name one of 2H_Axe" in unknown.stderr
+    kept = lcollision("contacts", path, "--leave-out", "2H_Axe")
+    assert kept.exit_code == 0, kept.stderr
+    assert "pairs of what is left out (2H_Axe)" in kept.stdout
+    body = open_body(path)
+    assert body.rules.left_out == ("2H_Axe",)
+    # It is still there, and later commands know the rule.
+    assert body.n_vertices == 2 * len(vertices)
+    assert "without 2H_Axe" in lcollision("check", path).stdout
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,7 @@ def ruled_meshes(draw: st.DrawFn) -> tuple[Mesh, np.ndarray, ContactRules, tuple
         near_exclusion=draw(st.sampled_from([0.0, 0.1, 0.31])),
         rest_exclusion=draw(st.sampled_from([None, 0.0, 0.03, 0.31])),
         ignored=tuple(draw(st.lists(st.tuples(names, names), max_size=2))),
+        left_out=tuple(draw(st.lists(names, max_size=1))),
         tolerated_depth=draw(st.sampled_from([0.0, 0.02])),
         joint_exclusion=draw(st.booleans()),
         touching=tuple(map(tuple, rng.integers(len(mesh.faces), size=(3, 2)).tolist())),
@@ -113,6 +114,20 @@ def test_each_rule_is_the_first_for_some_pair() -> None:
     assert min(found.excluded.to_json().values()) > 0
     without = CollisionDetector(rest.topology, rest.vertices).detect(pose)
     assert len(without.pairs) == len(found.pairs) + found.excluded.total
+
+
+def test_what_is_left_out_takes_part_in_no_pair() -> None:
+    groups = (FaceGroup("floor", np.array([0])), FaceGroup("blade", np.array([1])))
+    for name in ("floor", "blade"):
+        rules = ContactRules(left_out=(name,))
+        found = check_by_the_text(CROSSING, CROSSING.vertices, rules, groups)
+        assert not found.colliding
+        assert found.excluded == RuleCounts(ignored=1)
+        said = rules.sentence(found.excluded)
+        assert said == f"without {name}, 1 pair of what is left out is not counted"
+        assert rules.sentence(RuleCounts()) == rules.in_short() == f"without {name}"
+    with pytest.raises(ShapeError, match="the group 'hilt' is unknown, expected 'floor', 'blade'"):
+        check_by_the_text(CROSSING, CROSSING.vertices, ContactRules(left_out=("hilt",)), groups)
 
 
 def test_face_0_is_excluded_like_any_other() -> None:

@@ -50,12 +50,13 @@ def test_a_pose_set_of_a_character_is_stored_whole(tmp_path: Path) -> None:
     assert again.up_axis == 1
     assert again.vertex_labels is not None
     assert np.array_equal(again.vertex_labels, poses.vertex_labels)
-    assert [group.name for group in again.groups] == ["Arm", "Skin"]
+    assert [group.name for group in again.groups] == ["Body", "Skin"]
 
 
 def test_names_of_groups_are_made_printable(tmp_path: Path) -> None:
     builder = arm()
-    builder.description["meshes"][0]["name"] = "Arm\n" + "x" * 5000
+    (shown,) = (node for node in builder.description["nodes"] if "mesh" in node)
+    shown["name"] = "Arm\n" + "x" * 5000
     builder.description["materials"][0]["name"] = "\x00"
     (group,) = read_pose_set(builder.write(tmp_path / "arm.glb")).groups
     assert group.name.startswith("Armxxx")

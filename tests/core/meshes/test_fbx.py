@@ -102,7 +102,7 @@ def test_a_character_of_fbx_has_its_rig_parts_and_clips(tmp_path: Path) -> None:
     vertices, faces = tube()
     assert np.array_equal(character.joined, np.arange(len(vertices)))
     assert np.array_equal(character.topology.faces, faces)
-    assert [group.name for group in character.groups] == ["Tube", "Skin"]
+    assert [group.name for group in character.groups] == ["Body", "Skin"]
     assert character.clips == {"wave": pytest.approx(1.0)}
     rig = character.rig
     assert rig is not None
@@ -173,7 +173,7 @@ def test_without_ufbx_a_sentence_says_what_to_install(
 
 def test_hidden_meshes_lower_levels_of_detail_and_scenery_are_left_out(tmp_path: Path) -> None:
     scene = read_scene(arm_fbx(tmp_path / "a.fbx", others=["Floor", "hidden floor"]))
-    assert [part.mesh for part in scene.parts] == ["Tube"]
+    assert [part.mesh for part in scene.parts] == ["Body"]
     why = "left out, as its file hides it or shows a finer level of detail"
     assert scene.notes == (f"{why}: hidden floor", "left out, as no joint carries it: Floor")
     path = arm_fbx(tmp_path / "levels.fbx", others=["level 0", "level 1", "level 2"])

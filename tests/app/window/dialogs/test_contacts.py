@@ -134,6 +134,30 @@ def test_joints_count_by_a_tick_and_the_groups_that_are_chosen_are_tinted(
     assert scene.named.n_faces == 0
 
 
+def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: RigModel) -> None:
+    dialog = dialog_of(qtbot, window)
+    document = window.document
+    top = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
+    (parts,) = [item for item in top if item is not None and "Leave out whole" in item.text(0)]
+    names = [parts.child(row).text(0) for row in range(parts.childCount())]
+    assert names == list(dict.fromkeys(group.name for group in body.character.groups))
+    limb = parts.child(names.index("LeftArm"))
+    with qtbot.waitSignal(dialog.faces_named) as named:
+        dialog.ignored.setCurrentItem(limb)
+    assert named.args is not None
+    (group,) = (group for group in body.character.groups if group.name == "LeftArm")
+    assert np.array_equal(named.args[0], group.faces)
+    limb.setCheckState(0, Qt.CheckState.Checked)
+    QTest.mouseClick(dialog.apply, LEFT)
+    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    rest(qtbot, window)
+    assert document.model.rules == ContactRules(left_out=("LeftArm",))
+    assert document.exact is not None
+    assert not document.exact.colliding
+    assert "without LeftArm" in window.collision.exact.details.text()
+    take_picture(window, "left-out")
+
+
 def test_rules_that_a_predictor_was_trained_by_stay(qtbot: QtBot, window: MainWindow) -> None:
     dialog = dialog_of(qtbot, window)
     fields = (dialog.near, dialog.at_rest, dialog.rest, dialog.tolerated, dialog.add, dialog.apply)
