@@ -13,7 +13,7 @@ from app.view.shading import rgb
 
 if TYPE_CHECKING:
     import pyvista as pv
-    from vtkmodules.vtkRenderingOpenGL2 import vtkUniforms
+    from vtkmodules.vtkRenderingCore import vtkUniforms
 
     from lcollision_core.posing import Grip, PoseSpace
 

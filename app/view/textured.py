@@ -44,7 +44,8 @@ class TexturedBody:
         polydata.active_texture_coordinates = appearance.uv
         patch.lie_on(polydata, self._vertices)
         textures: dict[Texture, vtkTexture] = {}
-        blended, self.actors = [], []
+        blended: list[pv.Actor] = []
+        self.actors: list[pv.Actor] = []
         for number, material in enumerate(appearance.materials):
             faces = appearance.faces[appearance.material_of == number]
             if not len(faces):

@@ -103,7 +103,7 @@ class FbxLooks:
         raise MeshFileError("is not beside the file", where=f"the texture {quoted(name)}")
 
     def appearance(self, laid: Laid) -> Appearance:
-        """Read how a mesh looks, each corner of its polygons a point."""
+        """Read how a mesh looks."""
         found, (materials, notes) = self._found, self._materials
         faces = laid.faces_of_corners()
         prefix, n = f"{laid.number} ", len(laid.corners)
@@ -126,11 +126,15 @@ class FbxLooks:
         colours[:, :3] = colours[:, :3] * base[of_corner]
         finite = np.isfinite(uv).all() and np.isfinite(colours).all()
         uv, colours = (uv, colours) if finite else (np.zeros_like(uv), np.ones_like(colours))
+        painted = np.rint(255.0 * np.clip(colours, 0.0, 1.0))
+        # What corners have in common is drawn once.
+        alike = np.column_stack([laid.corners, uv, painted])
+        _, kept, point_of = np.unique(alike, axis=0, return_index=True, return_inverse=True)
         return Appearance(
-            laid.corners,
-            faces,
-            uv.astype(np.float32),
-            np.rint(255.0 * np.clip(colours, 0.0, 1.0)).astype(np.uint8),
+            laid.corners[kept],
+            point_of.reshape(-1)[faces],
+            uv[kept].astype(np.float32),
+            painted[kept].astype(np.uint8),
             material_of,
             tuple(materials),
             tuple(notes),

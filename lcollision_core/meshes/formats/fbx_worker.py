@@ -189,7 +189,10 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
 
 def _looks(scene: Any) -> dict[str, np.ndarray]:
     """Return the materials, what they and their textures are, and what lies on the corners."""
-    colours, texture_of, names, clamps = [], [], [], []
+    colours: list[np.ndarray] = []
+    texture_of: list[int] = []
+    names: list[str] = []
+    clamps: list[list[bool]] = []
     found: dict[str, np.ndarray] = {}
     known: dict[int, int] = {}
     for material in _items(scene.materials):

@@ -171,7 +171,8 @@ class GltfLooks:
     def _texture(self, index: object) -> Texture:
         document = self._document
         texture = element(document.objects("textures"), index, "a texture")
-        source, others = texture.get("source"), _inner(texture, "extensions")
+        source: Any = texture.get("source")
+        others = _inner(texture, "extensions")
         if source is None:
             # Of the formats that extensions add, those that can be read.
             source = next((_inner(others, name).get("source") for name in others), None)

@@ -86,7 +86,7 @@ def _in_8_bits(image: Image) -> Image:
 
 def _shrunk(image: Image) -> npt.NDArray[np.uint8]:
     scale = _MOST_SIDE / max(image.size)
-    size = tuple(max(1, round(scale * side)) for side in image.size)
+    size = max(1, round(scale * image.width)), max(1, round(scale * image.height))
     # Band by band: where nothing is opaque, colours would be lost, which some materials show.
     bands = [band if scale >= 1.0 else band.resize(size) for band in image.split()]
     return np.stack([np.asarray(band) for band in bands], axis=-1)
