@@ -115,9 +115,12 @@ def _triangles_of_strips(
     begin = np.maximum.accumulate(np.where(corners == -1, places + 1, begin))
     first = np.flatnonzero(begin[2:] <= places[:-2])
     is_odd = (first - begin[first]) % 2
-    triangles = corners[np.stack([first + is_odd, first + 1 - is_odd, first + 2], axis=1)]
+    triangles: npt.NDArray[np.int64] = corners[
+        np.stack([first + is_odd, first + 1 - is_odd, first + 2], axis=1)
+    ]
     is_flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    return triangles[~is_flat].reshape(-1)
+    triangles = triangles[~is_flat]
+    return triangles.reshape(-1)
 
 
 def _as_double(item: _Property) -> _Property:

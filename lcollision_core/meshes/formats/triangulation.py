@@ -210,7 +210,7 @@ def _doubts(polygons: IntArray) -> list[str]:
             f"{len(polygons)} polygons, the first of which is {first}, cross themselves, have no "
             "area or are far from flat"
         )
-    return [f"{what}: triangulate it as you want it before you export it"]
+    return [f"{what}: triangulate the mesh as you want it before you export it"]
 
 
 @compiled
