@@ -96,7 +96,8 @@ def test_poses_of_a_renamed_model_are_still_its_own(model: PoseModel, path: Path
 
 def test_poses_of_another_model_are_refused(model: PoseModel, path: Path) -> None:
     document = json.loads(path.read_text())
-    assert document["model"] == {"name": "tube", "fingerprint": model.fingerprint}
+    owner = {"name": "tube", "fingerprint": model.fingerprint, "vertices": model.n_vertices}
+    assert document["model"] == owner | {"codes": model.latent_size}
     document["model"] = {"name": "dancer", "fingerprint": "0123456789abcdef"}
     path.write_text(json.dumps(document))
     with pytest.raises(OtherModelError, match=rf"{path} holds poses of the model 'dancer'.*'tube'"):
