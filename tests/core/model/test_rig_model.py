@@ -12,12 +12,13 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lcollision_core.characters import Character
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.face_groups import without_joints
 from lcollision_core.model import PosableBody, RigModel, open_body, propose_rules, sample_poses
 from lcollision_core.model.pose_file import NamedPose, read_poses, write_poses
-from lcollision_core.model.rig_mirror import named_pairs
+from lcollision_core.model.rig_mirror import find_joint_sides, named_pairs
 from lcollision_core.posing import DragOptions, Pin, Twist, make_grip
 from lcollision_core.resolve import PoseResolver, ResolveOptions, Step
 from tests.core.gltf_builder import arm, rotation
@@ -305,13 +306,12 @@ def test_a_limb_of_one_side_alone_keeps_its_turn() -> None:
     assert mirrored[code_of(model, "RightForeArm", 0)] == pytest.approx(1.0, abs=0.02)
 
 
-def test_an_arm_that_hangs_at_rest_is_mirrored_to_one_that_is_stretched_out() -> None:
-    """What is posed is mirrored, not the turn from a rest pose that has no two sides."""
+def hanging_arm() -> Character:
+    """Return the body with its left arm down at rest, the right one stretched out."""
     body = rigged_body()
     rig = body.rig
     assert rig is not None
-    arm = [n for n, name in enumerate(rig.joint_names) if name.startswith("LeftArm")]
-    arm += [n for n, name in enumerate(rig.joint_names) if re.match("Left(Fore|Hand)", name)]
+    arm = [n for n, name in enumerate(rig.joint_names) if re.match("Left(Arm|Fore|Hand)", name)]
     down = Rotation.from_euler("y", 60.0, degrees=True).as_matrix()
     shoulder = rig.rest[arm[0], :3, 3].copy()
     rest, points, vertices = rig.rest.copy(), rig.points.copy(), body.rest_vertices.copy()
@@ -319,8 +319,27 @@ def test_an_arm_that_hangs_at_rest_is_mirrored_to_one_that_is_stretched_out() ->
     led = np.isin(rig.joint_of[:, 0], arm)
     vertices[led] = (vertices[led] - shoulder) @ down.T + shoulder
     points[led] = vertices[led, None]
-    hanging = replace(body, rest_vertices=vertices, rig=replace(rig, rest=rest, points=points))
-    model = RigModel.of(hanging)
+    return replace(body, rest_vertices=vertices, rig=replace(rig, rest=rest, points=points))
+
+
+def test_joints_without_names_are_paired_by_what_they_are() -> None:
+    """Where the rest pose is not symmetric, places do not tell."""
+    hanging = hanging_arm()
+    rig = hanging.rig
+    assert rig is not None
+    numbered = tuple(f"Bone.{joint:03d}" for joint in range(len(rig.joint_names)))
+    model = RigModel.of(replace(hanging, rig=replace(rig, joint_names=numbered)))
+    sides = find_joint_sides(model.space)
+    assert sides is not None
+    for limb in ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot"):
+        left, right = (rig.joint_names.index(side + limb) for side in ("Left", "Right"))
+        assert (sides.partner[left], sides.partner[right]) == (right, left), limb
+
+
+def test_an_arm_that_hangs_at_rest_is_mirrored_to_one_that_is_stretched_out() -> None:
+    """What is posed is mirrored, not the turn from a rest pose that has no two sides."""
+    model = RigModel.of(hanging_arm())
+    rig = model.space.rig
     posed = np.zeros(model.latent_size)
     posed[code_of(model, "RightForeArm", 0)] = 1.0
     mirrored = model.mirror(posed)
