@@ -7,7 +7,8 @@ from itertools import combinations
 import numpy as np
 
 from lcollision_core.characters.character import Character, Rig
-from lcollision_core.meshes.face_groups import MAX_GROUPS, MAX_NAME_LENGTH, FaceGroup, part_groups
+from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH
+from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, part_groups
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import body_size
 
@@ -58,7 +59,8 @@ def joint_groups(character: Character) -> tuple[FaceGroup, ...]:
     faces_of = {int(part.name): part.faces for part in part_groups(topology, main.astype(np.str_))}
     parents = _linked_parents(rig, set(faces_of), _SAME_PLACE * size)
     middles = rest[topology.faces].mean(axis=1)
-    thickness, groups = {}, []
+    thickness: dict[int, float] = {}
+    groups: list[FaceGroup] = []
 
     def add(faces: list[int], joints: tuple[int, ...], share: float) -> None:
         about = np.sort(np.concatenate([faces_of[joint] for joint in faces]))
@@ -82,9 +84,10 @@ def joint_groups(character: Character) -> tuple[FaceGroup, ...]:
         thickness[joint] = min(2.0 * radius, _MOST_THICK * size)
         add(_linked(joint, parents, centres, _ON_BONE * thickness[joint]), (joint,), 1.0)
     for one, other in combinations(linked, 2):
-        apart = float(np.linalg.norm(centres[one] - centres[other]))
-        if parents[one] == parents[other] and apart < thickness[one] + thickness[other]:
-            add([one, other], (one, other), _BETWEEN)
+        if parents[one] == parents[other]:
+            apart = float(np.linalg.norm(centres[one] - centres[other]))
+            if apart < thickness[one] + thickness[other]:
+                add([one, other], (one, other), _BETWEEN)
     # Where there are that many, the small ones are strands of hair.
     return tuple(sorted(groups, key=lambda group: -len(group.faces))[:MAX_GROUPS])
 

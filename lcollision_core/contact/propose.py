@@ -104,7 +104,8 @@ def _patches(
     def within(some: npt.NDArray[np.int32], share: float) -> Lists:
         return faces_within(surface, some, share * radius * detector.body_size, require)
 
-    close, chosen = within(faces, _SEARCHED_SHARE), []
+    close = within(faces, _SEARCHED_SHARE)
+    chosen: list[int] = []
     is_covered = np.zeros(detector.topology.n_faces, dtype=np.bool_)
     for place, face in enumerate(faces.tolist()):
         if not is_covered[face]:

@@ -107,8 +107,10 @@ def with_other_rules(
     if len(pairs) and pairs.max() >= n_faces:
         whose = "of faces of this mesh"
         raise ShapeError.must_be("the pairs that nearly always touch", whose, int(pairs.max()))
-    radius = rules.touching_radius * body_size
-    by_touch = _about(surface_of(topology, reference), pairs, radius, _TOUCHING)
+    by_touch = no_lists(0)
+    if len(pairs):
+        radius = rules.touching_radius * body_size
+        by_touch = _about(surface_of(topology, reference), pairs, radius, _TOUCHING)
     return exclusions._replace(
         region=region,
         ignored=ignored,

@@ -46,7 +46,7 @@ _DEFAULT_REST = 2.0
 _FEWEST_PARTS = 2
 """Of which one can be left out."""
 
-_LIST_HEIGHT = 112
+_LIST_HEIGHT = 64
 _ROW = QSize(0, 20)
 _OTHERS = "other pairs"
 _MEANINGS = {
@@ -368,8 +368,8 @@ class ContactsDialog(QDialog):
         def left_out(kind: str) -> int:
             return sum(size[pair.groups[0]] * size[pair.groups[1]] for pair in proposals[kind])
 
-        least = min((kind for kind in proposals if proposals[kind]), key=left_out)
-        begin = f"Begin with {least}, which leaves out least; what is selected is tinted."
+        first = min((kind for kind in proposals if proposals[kind]), key=left_out)
+        begin = f"Begin with {first}, which leaves out least; what is selected is tinted."
         self._write(self.total, begin)
 
     def _groups(self) -> list[FaceGroup]:
