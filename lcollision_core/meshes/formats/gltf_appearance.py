@@ -67,6 +67,7 @@ class GltfLooks:
         self._document = document
         self._images = ImageReader()
         self._pixels: dict[int, npt.NDArray[np.uint8]] = {}
+        self._textures: dict[int, Texture] = {}
         self._finishes: dict[int, _Finish] = {}
 
     def appearance(
@@ -168,9 +169,11 @@ class GltfLooks:
             offset=numbers(moved.get("offset", [0.0, 0.0]), "its texture's offset", 2),
         )
 
-    def _texture(self, index: object) -> Texture:
+    def _texture(self, index: Any) -> Texture:
         document = self._document
         texture = element(document.objects("textures"), index, "a texture")
+        if index in self._textures:
+            return self._textures[index]
         source: Any = texture.get("source")
         others = _inner(texture, "extensions")
         if source is None:
@@ -184,12 +187,13 @@ class GltfLooks:
         if "sampler" in texture:
             sampler = element(document.objects("samplers"), texture["sampler"], "a sampler")
         u, v = (_WRAPS.get(_code(sampler, key), Wrap.REPEAT) for key in ("wrapS", "wrapT"))
-        return Texture(
+        self._textures[index] = Texture(
             self._pixels[source],
             (u, v),
             is_smooth=_code(sampler, "magFilter") != _NEAREST,
             has_mipmaps=_code(sampler, "minFilter") not in (_NEAREST, _LINEAR),
         )
+        return self._textures[index]
 
 
 def _code(sampler: dict[str, Any], key: str) -> int:

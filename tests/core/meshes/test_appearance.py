@@ -315,9 +315,14 @@ def test_coordinates_and_colours_that_are_none_are_noted(tmp_path: Path) -> None
     assert "mesh 0 is shown without its texture" in look_of(cubes, tmp_path).notes[-1]
 
 
-def test_materials_and_images_are_read_once(tmp_path: Path) -> None:
+def test_materials_and_textures_are_read_once(tmp_path: Path) -> None:
     builder = textured()
-    builder.description["meshes"][0]["primitives"] *= 2
+    primitive = builder.description["meshes"][0]["primitives"][0]
+    builder.description["materials"] *= 2
+    builder.description["meshes"][0]["primitives"] = [primitive, primitive | {"material": 1}]
+    first, second = look_of(builder, tmp_path).materials
+    assert first.texture is second.texture is not None
+    builder.description["meshes"][0]["primitives"] = [primitive] * 2
     look = look_of(builder, tmp_path)
     assert len(look.materials) == 1
     assert len(look.vertices) == 48
