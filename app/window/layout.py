@@ -120,7 +120,8 @@ class Layout(QObject):
     def _limit(self) -> None:
         """Let the window be narrower than with the poses between the panels at its sides."""
         sides = [self._docks[key].minimumSizeHint().width() + _LINE for key in self._widths()]
-        self._window.setMinimumWidth(sum(sides) + self._window.centralWidget().minimumWidth())
+        view = self._window.centralWidget()
+        self._window.setMinimumWidth(sum(sides) + (view.minimumWidth() if view else 0))
 
     def _fit_poses(self) -> None:
         library = self._docks["library"]

@@ -37,14 +37,11 @@ class Mnemonics(QObject):
         # The text of a button that a label names is a value, such as a colour.
         named = {held.buddy() for held in labels}
         buttons = [held for held in self._dialog.findChildren(QAbstractButton) if held.text()]
-        items = [
-            held
-            for held in (*(held for held in buttons if held not in named), *labels)
-            if held.isVisibleTo(self._dialog)
-        ]
+        items: list[QAbstractButton | QLabel] = [held for held in buttons if held not in named]
+        items += labels
         taken = set[str]()
-        new = []
-        for item in items:
+        new: list[QAbstractButton | QLabel] = []
+        for item in (held for held in items if held.isVisibleTo(self._dialog)):
             letter = mnemonic(item.text())
             if letter and letter not in taken:
                 taken.add(letter)

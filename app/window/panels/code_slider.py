@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _OF_CODES = 1000.0
 """What a bare code counts in its slider's whole numbers, which assistive technologies read."""
 
-_KEYS = {
+_KEYS: dict[int, float] = {
     **dict.fromkeys((Qt.Key.Key_Right, Qt.Key.Key_Up), 0.01),
     **dict.fromkeys((Qt.Key.Key_Left, Qt.Key.Key_Down), -0.01),
     Qt.Key.Key_PageUp: 0.1,
