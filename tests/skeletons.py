@@ -91,7 +91,8 @@ def character_from(
     names = list(joints)
     places = np.array([place for _, place in joints.values()])
     parents = np.array([names.index(parent) if parent else -1 for parent, _ in joints.values()])
-    points, faces = [], []
+    points: list[FloatArray] = []
+    faces: list[npt.NDArray[np.int64]] = []
     for joint, place in enumerate(places):
         child = next(iter(np.flatnonzero(parents == joint)), -1)
         before = places[parents[joint]] if parents[joint] >= 0 else place - [0.0, 0.1, 0.0]

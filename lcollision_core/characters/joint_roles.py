@@ -232,7 +232,7 @@ def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> Flo
 
 
 def front_of(
-    roles: tuple[Role, ...], origins: FloatArray, directions: FloatArray, up: FloatArray
+    roles: Sequence[Role], origins: FloatArray, directions: FloatArray, up: FloatArray
 ) -> FloatArray | None:
     """Return the horizontal unit vector along which a body faces; None if its joints do not tell.
 

@@ -150,7 +150,7 @@ class Skeleton:
             hinge = self._hinge(min(pair.chains, key=lambda chain: self._reach[chain[0]]), end)
             hinges += [self._name_limb(roles, chain, hinge, end) for chain in pair.chains]
         self._name_trunk(roles, legs, arms)
-        limbs = {chain[0]: LEG for chain in legs.chains}
+        limbs: dict[int, tuple[Role, ...]] = {chain[0]: LEG for chain in legs.chains}
         limbs |= {chain[0]: (*ARM, *FINGERS) for chain in arms.chains}
         trunk = _unit(arms.middle - legs.middle)
         up = self._up if trunk @ self._up > 0.5 else trunk
@@ -224,7 +224,9 @@ class Skeleton:
                     and np.linalg.norm(across) > _APART * reach
                 ):
                     middle = 0.5 * (places[0][0] + places[1][0])
-                    pairs.append(_Pair(trunk, chains, reach, middle, across, _unit(sum(ways))))
+                    pairs.append(
+                        _Pair(trunk, chains, reach, middle, across, _unit(ways[0] + ways[1]))
+                    )
         # Limbs have more skin than strands of hair and the pleats of a skirt.
         pairs.sort(key=lambda pair: -sum(self._shares[chain[0]] for chain in pair.chains))
         return pairs[:_MOST_PAIRS]
@@ -251,7 +253,7 @@ class Skeleton:
             return 0.0
         roots = [chain[0] for pair in (legs, arms) for chain in pair.chains]
         score = float(self._shares[roots].sum()) + (legs.reach + 0.5 * arms.reach) / self._size
-        score += 0.5 * (way @ self._up) + 0.5 * bool(self._head_chain(arms, way))
+        score += 0.5 * float(way @ self._up) + 0.5 * bool(self._head_chain(arms, way))
         score += 0.25 * sum(
             any(len(self._children[joint]) > 2 for joint in chain) for chain in arms.chains
         )

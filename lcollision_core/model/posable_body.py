@@ -70,11 +70,9 @@ class PosableBody(ABC):
     notes : sentences on what was changed on reading
     frame_rate : of the poses that the body came with, in frames a second; None if they are no
         motion's
-    starter_poses : poses to begin with, of a rig whose joints are known
     """
 
     notes: tuple[str, ...] = ()
-    starter_poses: tuple[StarterPose, ...] = ()
     frame_rate: float | None = None
 
     def __init__(
@@ -104,6 +102,11 @@ class PosableBody(ABC):
         Bodies with one fingerprint can exchange poses: it depends on neither names nor anything
         that is trained on the pose space.
         """
+
+    @property
+    def starter_poses(self) -> tuple[StarterPose, ...]:
+        """Poses to begin with, of a rig whose joints are known."""
+        return ()
 
     @property
     @abstractmethod

@@ -101,18 +101,18 @@ class _Pose:
 _FIST = _Hand((82.0, 95.0, 66.0), thumb=(30.0, 36.0, 46.0))
 _OPEN = _Hand((0.0, 0.0, 0.0), spread=7.0, thumb=(-12.0, 0.0, 0.0))
 _POINTING = _Hand((80.0, 95.0, 62.0), index=(4.0, 4.0, 2.0), thumb=(28.0, 32.0, 40.0))
-_CURLED = _Hand((45.0, 50.0, 30.0), thumb=(16.0, 18.0, 18.0))
+_CURLED = _Hand((40.0, 45.0, 26.0), thumb=(8.0, 10.0, 10.0))
 _STANDING = _Leg((0.0, 3.0, 6.0))
 _STRAIGHT = _Arm((0.0, 90.0, 0.0), 0.0)
 _ON_HIP = _Arm(
-    wrist=(1.2, 0.28, -0.7),
+    wrist=(1.28, 0.3, -0.7),
     elbow_towards=(1.0, 0.0, -0.4),
     hand=(-0.12, -0.4, 0.9),
     palm_towards=(-1.0, 0.0, -0.1),
 )
 _ON_THIGH = _Arm(
     thigh=0.48,
-    elbow_towards=(1.0, -0.3, -0.5),
+    elbow_towards=(1.3, -0.3, -0.4),
     hand=(0.0, 0.0, 1.0),
     palm_towards=(0.0, -1.0, -0.1),
 )
@@ -145,14 +145,14 @@ BODY_POSES: Mapping[str, _Pose] = {
         legs=(_STANDING, _STANDING),
         arms=(
             _Arm(
-                wrist=(-0.2, 0.66, 3.4),
-                elbow_towards=(0.9, -1.0, 0.3),
+                wrist=(-0.2, 0.68, 3.8),
+                elbow_towards=(1.1, -0.9, 0.4),
                 hand=(-1.0, 0.25, -0.35),
                 palm_towards=(-0.2, 0.0, -1.0),
             ),
             _Arm(
-                wrist=(-0.2, 0.54, 1.5),
-                elbow_towards=(0.9, -1.0, 0.3),
+                wrist=(-0.2, 0.54, 1.8),
+                elbow_towards=(1.1, -0.9, 0.4),
                 hand=(-1.0, 0.0, 0.1),
                 palm_towards=(0.1, 0.0, -1.0),
             ),
@@ -438,7 +438,7 @@ class _Body:
         knee = self._next[thigh]
         on_bone = self._places[thigh] + share * (self._places[knee] - self._places[thigh])
         thick = self._thickness(hand, self._next[upper])
-        thick = 1.15 * (thick + self._thickness(thigh, thigh, on_bone))
+        thick = 1.3 * (thick + self._thickness(thigh, thigh, on_bone))
         target = places[thigh] + share * (places[knee] - places[thigh])
         raised: FloatArray = target + [0.0, thick, 0.0]
         return raised

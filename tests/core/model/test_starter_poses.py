@@ -54,7 +54,7 @@ def with_arms_down(degrees: float) -> Character:
             lowered = (np.cos(turn) * x, y - np.sin(turn) * sign * x, z)
             joints[f"{side} {name}"] = (
                 PERSON[f"{side} {name}"][0],
-                tuple(shoulder + lowered),  # type: ignore[assignment]
+                tuple(shoulder + lowered),
             )
     return character_from(joints, numbered)
 
