@@ -282,7 +282,7 @@ class Session(QObject):
                 document.resolve()
 
         def mirror() -> None:
-            if document.can_mirror:
+            if not document.why_not_mirrored:
                 document.mirror()
 
         def keep() -> None:

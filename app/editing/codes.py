@@ -47,6 +47,14 @@ class CodeEditing(PoseHistory):
             raise LCollisionError("no model is open yet", "open one first")
         return self._model
 
+    def load_pose(self, pose: NamedPose) -> None:
+        """Edit a pose under its name; one of some codes only, as of hands, leaves the others."""
+        if pose.moves is None:
+            super().load_pose(pose)
+            return
+        self._tell_if_locked()
+        self._edit(pose.name, self._with_locked(pose.applied_to(self.latent)))
+
     def set_code(self, index: int, value: float) -> None:
         """Set one number of the latent; a number that is not finite is ignored.
 

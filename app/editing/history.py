@@ -213,14 +213,7 @@ class PoseHistory(QObject):
         self.undo_stack.redo()
 
     def load_pose(self, pose: NamedPose) -> None:
-        """Edit a pose of the library, of the file or of the training set, under its name.
-
-        One that sets some codes only, as of hands, changes those of the pose that is edited.
-        """
-        if pose.moves is not None:
-            self._tell_if_locked()
-            self._edit(pose.name, self._with_locked(pose.applied_to(self.latent)))
-            return
+        """Edit a pose of the library, of the file or of the training set, under its name."""
         source = Source.TRAINING
         for held, poses in ((Source.LIBRARY, self.poses), (Source.FILE, self.file_poses)):
             if any(pose is own for own in poses):

@@ -142,21 +142,27 @@ def _fill_depths(left: IntArray, right: IntArray, depth: IntArray) -> None:
 
 
 @compiled
-def _mark(start: npt.NDArray[np.int64], entry: IntArray, of: int, mask, bit) -> None:  # type: ignore[no-untyped-def]
+def _mark(
+    start: npt.NDArray[np.int64],
+    entry: IntArray,
+    of: int,
+    mask: npt.NDArray[np.uint8],
+    bit: np.uint8,
+) -> None:
     """Set a bit of everything in one list."""
     for k in range(start[of], start[of + 1]):
         mask[entry[k]] |= bit
 
 
 @compiled
-def _mark_both_ways(lists: _BothWays, of: int, mask, bit) -> None:  # type: ignore[no-untyped-def]
+def _mark_both_ways(lists: _BothWays, of: int, mask: npt.NDArray[np.uint8], bit: np.uint8) -> None:
     if len(lists.start) > 1:
         _mark(lists.start, lists.entry, of, mask, bit)
         _mark(lists.start_before, lists.entry_before, of, mask, bit)
 
 
 @compiled
-def _fill_leaves(  # type: ignore[no-untyped-def]
+def _fill_leaves(
     tree: FaceTree,
     exclusions: Exclusions,
     near: _BothWays,
@@ -234,7 +240,7 @@ def _has(made: UncountedNodes, a: int, b: int) -> bool:
         return False
     column = made.number[b]
     row = made.start[level] + made.number[a] * made.stride[level]
-    return ((made.bits[row + (column >> 3)] >> (column & 7)) & 1) != 0
+    return bool((made.bits[row + (column >> 3)] >> (column & 7)) & 1)
 
 
 @compiled
