@@ -180,7 +180,7 @@ class ContactRules:
         groups = ", ".join(map(pair_in_words, self.ignored[:_NAMED_PAIRS]))
         more = len(self.ignored) - _NAMED_PAIRS
         around = f" or within {self.rest_exclusion:g} of such a pair" if self.rest_exclusion else ""
-        left_out = self._left_out_in_words().removeprefix("without ")
+        left_out = self.left_out_in_words().removeprefix("without ")
         said = (
             left_out and f"pairs of what is left out ({left_out})",
             self.near_exclusion and f"pairs within {self.near_exclusion:g} along the surface",
@@ -204,9 +204,10 @@ class ContactRules:
             "touching": self.touching,
         }
         said = (_SHORTLY[name] for name, does in applies.items() if does)
-        return ", ".join(filter(None, (self._left_out_in_words(), *said)))
+        return ", ".join(filter(None, (self.left_out_in_words(), *said)))
 
-    def _left_out_in_words(self) -> str:
+    def left_out_in_words(self) -> str:
+        """Name what is left out, as in "without Axe, Cape"; empty where nothing is."""
         names, more = self.left_out[:_NAMED_PAIRS], len(self.left_out) - _NAMED_PAIRS
         listed = ", ".join(names) + (f" and {more} more" if more > 0 else "")
         return f"without {listed}" if names else ""
@@ -214,7 +215,7 @@ class ContactRules:
     def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
         """Say how many pairs are not counted, and by which rules; empty if there are none."""
         counts = counts if isinstance(counts, RuleCounts) else RuleCounts(**counts)
-        left_out = self._left_out_in_words()
+        left_out = self.left_out_in_words()
         pairs = map(pair_in_words, self.ignored[:_NAMED_PAIRS])
         groups = " or ".join((*pairs, *("what is left out",) * bool(left_out)))
         if len(self.ignored) > _NAMED_PAIRS:

@@ -71,8 +71,8 @@ class ContactsDialog(QDialog):
     ----------
     near, rest, tolerated : fields, in per cent of the body size
     at_rest, at_joints : whether there are a rest exclusion and a joint exclusion
-    ignored : pairs of groups by kind of group, ticked where they are ignored; and the meshes and
-        materials, ticked where they are left out whole
+    ignored : pairs of groups by kind of group, ticked where they are ignored; and meshes, materials
+        and body parts, ticked where they are left out whole
     first, second, add, propose : what adds to these
     apply, restore : buttons; the latter brings back the rules that a character starts with
     total : says how many pairs count at rest
@@ -407,12 +407,13 @@ class ContactsDialog(QDialog):
         return item
 
     def _list_parts(self, rules: ContactRules) -> None:
-        """List the meshes and materials, of which any can be left out whole."""
+        """List meshes, materials and body parts, of which any can be left out whole."""
         from lcollision_core.meshes.face_groups import GROUP_KINDS
 
         self._left_out.clear()
-        own = self._document.model.groups_by_kind[GROUP_KINDS[0]]
-        names = dict.fromkeys((*rules.left_out, *(group.name for group in own)))
+        kinds = self._document.model.groups_by_kind
+        own = (group.name for kind in GROUP_KINDS[:2] for group in kinds[kind])
+        names = dict.fromkeys((*rules.left_out, *own))
         if len(names) < _FEWEST_PARTS:
             return
         parts = QTreeWidgetItem(self.ignored, [f"Leave out whole ({len(names)})"])

@@ -14,7 +14,7 @@ from app.window.widgets import (
     show_verdict,
     title_row,
 )
-from app.wording import counted, overlap_text
+from app.wording import counted, overlap_text, with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -100,8 +100,10 @@ class ExactCard(Card):
             said.append(_HELD)
         else:
             said.append(f"No {'other ' if left_out else ''}triangle crosses another")
+        rules = document.model.rules
+        if rules.left_out:
+            said.append(with_capital(rules.left_out_in_words()))
         if left_out:
-            rules = document.model.rules
             if excluded is None:
                 what, sentence = rules.in_short(), f"{rules.described()} are not counted"
             else:

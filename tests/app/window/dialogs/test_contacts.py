@@ -140,7 +140,7 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     top = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
     (parts,) = [item for item in top if item is not None and "Leave out whole" in item.text(0)]
     names = [parts.child(row).text(0) for row in range(parts.childCount())]
-    assert names == list(dict.fromkeys(group.name for group in body.character.groups))
+    assert {group.name for group in body.character.groups} <= set(names)
     limb = parts.child(names.index("LeftArm"))
     with qtbot.waitSignal(dialog.faces_named) as named:
         dialog.ignored.setCurrentItem(limb)
@@ -154,7 +154,7 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     assert document.model.rules == ContactRules(left_out=("LeftArm",))
     assert document.exact is not None
     assert not document.exact.colliding
-    assert "without LeftArm" in window.collision.exact.details.text()
+    assert "Without LeftArm" in window.collision.exact.details.text()
     take_picture(window, "left-out")
 
 
