@@ -44,7 +44,7 @@ def test_a_loop_is_cached_beside_its_file(tmp_path: Path) -> None:
 def test_compiling_is_logged_once_until_it_pauses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    now = [0.0]
+    now = [time.monotonic()]
     monkeypatch.setattr(compiled, "time", SimpleNamespace(monotonic=lambda: now[0]))
     caplog.set_level(logging.INFO, compiled.__name__)
     triangular = _module(tmp_path).triangular

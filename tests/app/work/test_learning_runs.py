@@ -267,7 +267,6 @@ def test_the_learner_refuses_a_folder_without_a_request(tmp_path: Path) -> None:
     )
     assert result.returncode == 2, result.stderr
     assert work.status.state == WorkState.FAILED
-    # It began none of its stages.
-    assert not work.status.stage
+    # It finished none of its stages.
     assert not work.status.seconds
     assert "request.json" in work.status.sentence
