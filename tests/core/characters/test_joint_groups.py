@@ -100,6 +100,11 @@ def bent(body: Character, **degrees: tuple[float, float, float]) -> np.ndarray:
     return skinned(rig, turned(rig, turns))
 
 
+def faces_of_part(body: RigModel, *names: str) -> np.ndarray:
+    parts = body.groups_by_kind["body parts"]
+    return np.concatenate([part.faces for part in parts if part.name in names])
+
+
 def detectors(body: Character) -> tuple[CollisionDetector, CollisionDetector]:
     groups = joint_groups(body)
     strict = CollisionDetector(body.topology, body.rest_vertices, ContactRules(), groups)
@@ -164,3 +169,11 @@ def test_the_real_robot_s_shells_overlap_at_joints_and_the_mannequin_s_limbs_els
         assert len(poses) == 31
         assert off.detector.are_colliding(poses).sum() == without
         assert body.detector.are_colliding(poses).sum() == then
+        # An arm turned down into the trunk, far from its shoulder, is a collision all the same.
+        space, latent = body.space, np.zeros(body.latent_size)
+        (arm,) = (k for k, n in enumerate(space.rig.joint_names) if n.endswith("LeftArm"))
+        codes = np.flatnonzero(space.joint_of_code == arm)
+        latent[next(code for code in codes if body.code_names[code] == "up")] = -1.6
+        found = body.detector.detect(body.decode(latent))
+        of_arm = np.isin(found.pairs, faces_of_part(body, "Left upper arm", "Left forearm"))
+        assert (of_arm.sum(axis=1) == 1).sum() > 50
