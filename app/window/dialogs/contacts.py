@@ -264,8 +264,9 @@ class ContactsDialog(QDialog):
         rest = rules.rest_exclusion
         self.rest.setValue(_DEFAULT_REST if rest is None else _PERCENT * rest)
         self.tolerated.setValue(_PERCENT * rules.tolerated_depth)
-        self._pairs.clear()
-        self._kinds.clear()
+        # Before the items go, as listing others already asks what is ticked.
+        for items in (self._pairs, self._kinds, self._left_out):
+            items.clear()
         self.ignored.clear()
         for pair in rules.ignored:
             self._list(pair, _CHECKED)
@@ -410,7 +411,6 @@ class ContactsDialog(QDialog):
         """List meshes, materials and body parts, of which any can be left out whole."""
         from lcollision_core.meshes.face_groups import GROUP_KINDS
 
-        self._left_out.clear()
         kinds = self._document.model.groups_by_kind
         own = (group.name for kind in GROUP_KINDS[:2] for group in kinds[kind])
         names = dict.fromkeys((*rules.left_out, *own))

@@ -197,6 +197,7 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     expected = propose_by_kind(body.detector, typical_poses(body), body.groups_by_kind)
     assert proposed.args[0] == expected
     kinds = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
+    kinds = [kind for kind in kinds if not kind.text(0).startswith("Leave out whole")]
     shown = {kind.text(0): kind for kind in kinds}
     assert list(shown) == [
         f"{kind.capitalize()} ({len(pairs)}): in all of the poses"
