@@ -463,9 +463,9 @@ def _pins(value: Any, n_vertices: int) -> tuple[Pin, ...]:
             )
         frame = held.get("frame", [])
         if not (
-            isinstance(frame, list)
+            isinstance(frame, list | tuple)
             and len(frame) <= _MOST_OF_FRAME
-            and all(isinstance(corner, list) and len(corner) == 2 for corner in frame)
+            and all(isinstance(corner, list | tuple) and len(corner) == 2 for corner in frame)
         ):
             raise ValueError(
                 f"the frame of each of its pins must be at most {_MOST_OF_FRAME} pairs of a vertex "
