@@ -106,6 +106,10 @@ class MeshFileError(LCollisionError):
     """A file cannot be read as a mesh or a pose set, or cannot be written."""
 
 
+class UnwritablePoseError(MeshFileError):
+    """A form of a character's file cannot hold a pose."""
+
+
 class ModelFileError(LCollisionError):
     """A file cannot be read as a model or as poses of a model, or cannot be written."""
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from lcollision_core.characters.character import Character, Rig
 from lcollision_core.characters.own_files import sign
-from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.errors import MeshFileError, ShapeError, UnwritablePoseError
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules
 from lcollision_core.meshes.formats.gltf_document import GltfDocument, as_float
 from lcollision_core.meshes.formats.gltf_patch import VERTEX_DATA, GltfPatch
@@ -144,7 +144,7 @@ def posed_gltf(
             else:
                 stored = source.bake(pose)
             source.require_near(stored, pose)
-        except _NotHeldError as error:
+        except UnwritablePoseError as error:
             source = _Source(file)
             stored = source.bake(pose)
             notes.append(f"{error.what}, so it is written as a static mesh")
@@ -194,10 +194,6 @@ def animated_gltf(
         data = source.signed(rules)
     notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in clips))
     return tuple(PosedFile(data, stored, notes) for stored in frames)
-
-
-class _NotHeldError(MeshFileError):
-    """A form of a character's file cannot hold a pose."""
 
 
 class CharacterFile:
@@ -328,7 +324,7 @@ class _Source:
         """Refuse a form whose vertices are not those that were asked for."""
         error = float(np.abs(stored - wanted).max()) / self.size
         if not error <= _LARGEST_ERROR:
-            raise _NotHeldError(
+            raise UnwritablePoseError(
                 "its joints cannot hold this pose (vertices would be off by "
                 f"{error:.2g} of the body size)",
                 _OTHER_FORM,
@@ -503,7 +499,7 @@ class _Source:
             try:
                 own = np.linalg.solve(turns[:, :, :3], wanted[:, :, None])[:, :, 0]
             except np.linalg.LinAlgError as error:
-                raise _NotHeldError(
+                raise UnwritablePoseError(
                     "its joints flatten vertices at rest, which no morph target undoes"
                 ) from error
             deltas = (own - base).astype(np.float32)
@@ -631,7 +627,7 @@ def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
     try:
         return np.linalg.solve(above, transform).astype(np.float64)
     except np.linalg.LinAlgError as error:
-        raise _NotHeldError(
+        raise UnwritablePoseError(
             "a joint hangs on a node that is scaled to nothing", _OTHER_FORM
         ) from error
 

@@ -14,6 +14,7 @@ from lcollision_core.errors import (
     ModelFileError,
     PoseSetError,
     ShapeError,
+    UnwritablePoseError,
     WrongScaleError,
 )
 from lcollision_core.model.pose_file import DamagedPosesError, OtherModelError
@@ -57,6 +58,10 @@ SENTENCES = [
     (LabelStoreError("has no rows", where="store", got=0), "store has no rows, got 0"),
     (HeldElsewhereError("is being written", "wait", where="m"), "m is being written; wait"),
     (DamagedPosesError("is not JSON", where="p.json"), "p.json is not JSON"),
+    (
+        UnwritablePoseError("cannot hold this pose", where="hero.glb"),
+        "hero.glb cannot hold this pose",
+    ),
     (
         OtherModelError("holds poses of another model", where="p.json", model=None),
         "p.json holds poses of another model",

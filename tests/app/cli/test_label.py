@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.contact import RuleCounts
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.labels import ROWS_PER_CHUNK, LabelStore
@@ -104,7 +105,7 @@ def test_json_is_one_document_and_a_second_run_has_nothing_to_do(
             "level1_codes": 2,
             "domain_codes": [3, 3],
             "near_exclusion": 0.0,
-            "excluded_at_rest": {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0},
+            "excluded_at_rest": RuleCounts().to_json(),
         }
         assert result.stderr == ""
 

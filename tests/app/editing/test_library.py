@@ -128,8 +128,8 @@ def test_the_library_is_undone_like_the_pose(document: PoseDocument) -> None:
     assert names(document) == ["kick", "kick 2"]
     assert document.pose_name == "kick 2"
     for name, sentence in (
-        ("kick", "has a pose “kick” already"),
-        ("KICK", "has a pose “kick” already"),
+        ("kick", "already has a pose “kick”"),
+        ("KICK", "already has a pose “kick”"),
         ("", "needs a name"),
         ("x" * 201, "at most 200 characters"),
     ):

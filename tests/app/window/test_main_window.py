@@ -471,7 +471,7 @@ def test_changes_are_saved_kept_or_given_up_as_the_user_says(
     assert not asked.isActive()
     # Save writes the file, not the pose of the library that this one began as.
     assert questions[1:] == [
-        f"Save the pose “{document.pose_name}” of “{document.model.name}” to “mine.json”?"
+        f"Save the pose “{document.pose_name} changed” of “{document.model.name}” to “mine.json”?"
     ]
     assert read_poses(path, document.model)[0].latent.tobytes() == latent.tobytes()
 

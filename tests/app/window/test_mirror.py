@@ -15,7 +15,7 @@ from app.editing.document import PoseDocument
 from app.view.theme import DARK, LIGHT, apply_theme
 from app.window.main_window import MainWindow
 from app.wording import mirrored_name
-from lcollision_core.model import PoseModel
+from lcollision_core.model import PoseModel, RigModel
 from tests.app.windows import (
     PATIENCE,
     close_window,
@@ -25,6 +25,7 @@ from tests.app.windows import (
     shown,
     take_picture,
 )
+from tests.rigged_shapes import rigged_tube
 
 FREE_THAT_COLLIDES_MIRRORED = 1
 """As in the core's tests: the second sample of generator 0."""
@@ -193,6 +194,7 @@ def test_a_mirrored_pose_is_called_after_its_other_side() -> None:
 def test_a_model_without_two_sides_offers_no_mirror(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
+    document.set_model(RigModel.of(rigged_tube(frames=True)))
     held = open_window(qtbot, document, settings_in(tmp_path))
     held.library.list.selectAll()
     assert held.library.chosen_poses

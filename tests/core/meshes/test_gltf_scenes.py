@@ -274,8 +274,8 @@ def test_scenery_about_a_character_is_left_out(tmp_path: Path) -> None:
     builder.animation("hum", engine | {"values": [[0.0, 9.0, 0.0], [0.0, 9.1, 0.0]]})
     path = builder.write(tmp_path / "arm.glb")
     scene = read_scene(path)
-    assert [part.mesh for part in scene.parts] == ["Arm", "Tube", "Tube"]
-    assert scene.notes == ("left out, as no joint carries it: Floor",)
+    assert [part.mesh for part in scene.parts] == ["Body", "Tube", "Engine"]
+    assert scene.notes == ("left out, as no joint carries it: Floor, Carried floor",)
     frames = scene.clips[0].sample(np.array([0.0, 0.5]))
     assert len(frames.weights) == len(scene.rest.weights) == 3
     assert join_parts(scene).posed(frames).shape[0] == 2

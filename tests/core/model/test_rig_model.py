@@ -140,7 +140,9 @@ def test_a_body_part_without_codes_of_its_own_can_be_locked_and_twisted(model: R
         model.pose_space.codes_of([hips]), np.arange(model.latent_size) < 6
     )
     dragger = model.dragger()
-    dragger.begin(np.zeros(model.latent_size), Twist(hips), (), DragOptions(solid=False))
+    dragger.begin(
+        np.zeros(model.latent_size), Twist(hips), (), DragOptions(solid=False, standing=False)
+    )
     for angle in np.linspace(0.0, 0.4, 12)[1:]:
         step = dragger.move([angle])
     assert step.miss < 0.1

@@ -274,9 +274,10 @@ def test_a_slider_says_what_it_does_and_its_number_in_the_tool_tip(window: MainW
     for code, name in enumerate(model.code_names):
         row = window.sliders.row_of(code)
         shown = row.slider.accessibleName()
-        assert shown == name[:1].upper() + name[1:]
-        assert "motion" not in shown.casefold()
         group = next(g for g in model.latent_space.groups if code < g.codes.stop)
+        whole = name if group.colour is None else f"{group.name}, {name}"
+        assert shown == whole[:1].upper() + whole[1:]
+        assert "motion" not in shown.casefold()
         assert f"(motion {code - group.codes.start + 1})" in row.slider.toolTip()
     # By either it is found.
     group = model.latent_space.groups[1]

@@ -89,7 +89,7 @@ def test_questions_too(window: MainWindow) -> None:
         dialog.reject()
 
     for ask in (
-        lambda: questions.ask_about_changes(window, "pose"),
+        lambda: questions.ask_about_changes(window, "pose", "body"),
         lambda: questions.ask_about_library(window, "body"),
         lambda: questions.ask_about_another_s(window, "poses.json"),
         lambda: questions.ask_to_switch(window, "poses.json", "A & B"),

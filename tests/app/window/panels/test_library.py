@@ -255,7 +255,7 @@ def test_a_taken_name_is_refused_with_its_text_or_replaced_when_confirmed(
     QTest.mouseClick(window.library.list.viewport(), LEFT, pos=place_of(window, "B"))
     press(window, Qt.Key.Key_F2, Qt.KeyboardModifier.NoModifier, try_taken)
     assert [text for text, _ in heard] == ["a", "", "x" * 201]
-    assert "has a pose “A” already" in heard[0][1]
+    assert "already has a pose “A”" in heard[0][1]
     assert "needs a name" in heard[1][1]
     assert "at most 200 characters" in heard[2][1]
     assert list(own(window)) == ["A", "C"]
@@ -391,14 +391,15 @@ def test_the_context_menu_has_the_menu_s_own_actions(qtbot: QtBot, window: MainW
     assert library.chosen.name == "bend 2"
     at_training = opened_at(place_of(window, "bend 2"))
     assert at_training == [
-        *("load", "blend", "add", "keep", "import_poses", "export_poses", "export_motion"),
-        "find_pose",
+        *("load", "blend", "mirror_poses", "add", "keep"),
+        *("import_poses", "export_poses", "export_motion", "find_pose"),
     ]
     document.add_pose_to_library("mine")
     library.choose_own("mine")
     document.set_code(0, 0.5)
     assert opened_at(place_of(window, "mine")) == [
-        *("load", "blend", "rename", "tags", "duplicate", "remove", "keep", "update"),
+        *("load", "blend", "mirror_poses", "rename", "tags", "duplicate", "remove"),
+        *("keep", "update"),
         *("import_poses", "export_poses", "export_motion", "export_library", "find_pose"),
     ]
     empty = library.list.viewport().rect().bottomRight() - QPoint(3, 3)
