@@ -37,6 +37,9 @@ ROUNDS = 3
 CUTS = (0.5, 0.25, 0.1)
 """Fractions of a step that are tried where it still collides after the last round."""
 
+LEAST_PACE, FASTER = 0.125, 1.5
+"""Of the longest step: what is tried at least, and the factor after a step that came nearer."""
+
 KEPT_CONTACTS = 18
 
 DAMPING = 0.02
@@ -167,7 +170,7 @@ class PoseDragger:
         self._least = self._low = np.where(locked, start, np.minimum(space.low, start))
         self._most = self._high = np.where(locked, start, np.maximum(space.high, start))
         self._reaches: list[frozenset[int]] = []
-        self._contacts = Contacts(check)
+        self._contacts, self._pace = Contacts(check), 1.0
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
         self._allowed: dict[int, tuple[float, float]] = {}
@@ -262,6 +265,10 @@ class PoseDragger:
                 gain = 0.0
                 break
             left = goal.miss(self._here, aim)
+            if miss > goal.reach:
+                # Long steps along bent contacts would swing about the nearest place for ever.
+                pace = self._pace * (0.5 if left > miss else FASTER)
+                self._pace = min(max(pace, LEAST_PACE), 1.0)
             miss, gain = left, miss - left
             # Further steps are for a pointer that leapt, not for one that is out of reach.
             if left < _NEAR * goal.reach or gain < _WORTHWHILE * goal.reach:
@@ -321,7 +328,7 @@ class PoseDragger:
             length = float(np.sqrt(way @ space.metric @ way))
             if length < _STILL:
                 return False
-            way *= min(1.0, goal.longest_step / length)
+            way *= min(1.0, self._pace * goal.longest_step / length)
             if self._goes(here + way):
                 return True
             if len(self._contacts.offsets) == n_contacts:
