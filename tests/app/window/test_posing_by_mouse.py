@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pytest
-from PySide6.QtCore import QPoint, Qt, QTimer
+from PySide6.QtCore import QPoint, QPointF, Qt, QTimer
 from PySide6.QtGui import QAction
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QMenu, QToolButton
@@ -17,8 +17,10 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.view.camera import places_of
+from app.view.shading import Shading
 from app.window.main_window import MainWindow
 from lcollision_core.model import open_body
+from lcollision_core.posing import long_axis
 from tests.app.views import place_of
 from tests.app.windows import (
     PATIENCE,
@@ -68,6 +70,13 @@ CROSSED: tuple[tuple[bool, Point], ...] = (
     (False, (-0.20, -0.20, 1.14)),
 )
 """Drags from the front that cross the arms: whether of the right hand, and where to."""
+
+
+PAST_MIDDLE = 0.04
+"""Normalised: the same of the middles of the hands of a character."""
+
+RIGHT_ANGLE = 0.35
+"""Cosine of 70 degrees: between thigh and shin of who sits there are 70 to 110."""
 
 
 class Hand:
@@ -211,34 +220,55 @@ def test_arms_are_crossed_by_mouse_alone(qtbot: QtBot, body_window: MainWindow) 
 class Puppeteer(Hand):
     """Drags a character by the middles of its body parts, seen from the front or the side."""
 
-    def part(self, name: str) -> npt.NDArray[np.floating]:
+    def part(self, name: str) -> npt.NDArray[np.float64]:
         """Return the (3,) middle of a body part as it is shown."""
-        model = self._document.model
-        (domain,) = (k for k, n in enumerate(model.domain_names) if n.casefold() == name)
-        return shown(self._window)[model.pose_space.vertex_domain == domain].mean(axis=0)
+        return shown(self._window)[self.inside(name)].astype(np.float64).mean(axis=0)
 
     def drag(
         self, name: str, to: npt.NDArray[np.floating], key: Qt.KeyboardModifier = NO_KEY
     ) -> None:
         """Drag what is seen of a body part to where a (3,) point is seen."""
         self.n_drags += 1
-        canvas, viewport = self._canvas, self._window.viewport
-        assert viewport.scene is not None
-        ends = places_of(
-            viewport.scene.view,
-            np.array([self.part(name), to], dtype=np.float64),
-            (canvas.width(), canvas.height()),
-        )
-        places = [QPoint(*np.round(p).astype(int).tolist()) for p in np.linspace(*ends, 30)]
-        QTest.mousePress(canvas, LEFT, key, places[0])
+        canvas, (end,) = self._canvas, self._places(to[None])
+        places = np.linspace(self._seen(name), end, 30)
+        QTest.mousePress(canvas, LEFT, key, _pixel(places[0]))
         for place in places[1:]:
-            move_held(canvas, place, key)
+            move_held(canvas, _pixel(place), key)
             self._pause(20)
         assert self._document.dragging
         self._pause(200)
         take_picture(self._window, f"{self._document.model.name}, dragging {name}")
-        QTest.mouseRelease(canvas, LEFT, key, places[-1])
+        QTest.mouseRelease(canvas, LEFT, key, _pixel(end))
         self._pause(100)
+
+    def inside(self, name: str) -> npt.NDArray[np.bool_]:
+        """Return which vertices a body part leads: (V,)."""
+        model = self._document.model
+        (domain,) = (k for k, n in enumerate(model.domain_names) if n.casefold() == name)
+        inside: npt.NDArray[np.bool_] = model.pose_space.vertex_domain == domain
+        return inside
+
+    def _places(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        scene, canvas = self._window.viewport.scene, self._canvas
+        assert scene is not None
+        size = canvas.width(), canvas.height()
+        return places_of(scene.view, points.astype(np.float64), size)
+
+    def _seen(self, name: str) -> npt.NDArray[np.float64]:
+        """Return the (2,) place nearest to the middle of a body part where nothing hides it."""
+        scene, inside = self._window.viewport.scene, self.inside(name)
+        assert scene is not None
+        (middle,) = self._places(self.part(name)[None])
+        places = self._places(shown(self._window)[inside])
+        for place in places[np.linalg.norm(places - middle, axis=1).argsort()]:
+            picked = self._canvas.pick(QPointF(_pixel(place)), scene.body)
+            if picked is not None and inside[picked[0]]:
+                return place
+        raise AssertionError(f"{name} is not in sight")
+
+
+def _pixel(place: npt.NDArray[np.floating]) -> QPoint:
+    return QPoint(*np.round(place).astype(int).tolist())
 
 
 @pytest.fixture
@@ -275,50 +305,73 @@ def test_a_character_is_posed_by_mouse_in_four_drags_each(
     hand = Puppeteer(qtbot, window)
     name = model.name
 
-    def begin(camera: str) -> None:
+    def begin() -> None:
         document.reset_all()
         rest(qtbot, window)
-        hand.look_from(camera)
         hand.n_drags = 0
+
+    def drag(camera: str, part: str, to: npt.NDArray[np.floating]) -> None:
+        hand.look_from(camera)
+        hand.drag(part, size * to)
 
     def done(pose: str) -> npt.NDArray[np.float64]:
         rest(qtbot, window)
-        take_picture(window, f"{name}, {pose}")
+        for shading in (Shading.TEXTURED, Shading.DOMAINS):
+            window.viewport.set_shading(shading)
+            for camera in ("Three-quarter", "Front", "Left"):
+                hand.look_from(camera)
+                take_picture(window, f"{name}, {pose}, {shading.value}, {camera}")
         assert hand.n_drags <= MOST_DRAGS
         assert document.exact is not None
         assert not document.exact.colliding
         return shown(window).astype(np.float64) / size
 
+    def way(part: str, since: npt.NDArray[np.floating]) -> list[float]:
+        """Return how far left, in front and above a point a body part is."""
+        arm = hand.part(part) / size - since
+        return [float(arm @ axis) for axis in (left, front, up)]
+
     hips, head = space.origins[space.joint_of_code[0]], hand.part("head") / size
-    begin("Front")
-    hand.drag("right hand", size * (hips + 0.07 * left))
-    hand.drag("right hand", size * (hips + 0.07 * left))
+    hip, chin = hips + 0.08 * left, head - 0.06 * up
+    begin()
+    # The hand comes forward, goes across, and is laid on the hip from the side.
+    drag("Right", "right hand", hips + 0.25 * front + 0.1 * up)
+    drag("Front", "right hand", hip)
+    drag("Front", "right hand", hip)
+    drag("Left", "right hand", hip + 0.05 * front)
     done("right hand on left hip")
-    assert (hand.part("right hand") / size - hips) @ front > 0.03
+    # The hips are 0.08 to 0.09 wide on each side, and 0.06 deep in front.
+    assert way("right hand", hip) == pytest.approx([0.0, 0.06, 0.0], abs=0.03)
 
-    begin("Front")
-    hand.drag("right hand", size * (head - 0.06 * up))
+    begin()
+    drag("Front", "right hand", chin)
     done("hand on chin")
-    way = hand.part("right hand") / size - head
-    assert way @ front > 0.03
-    assert abs(way @ left) < 0.05
+    # The face is 0.05 to 0.06 before the middle of the head.
+    assert way("right hand", chin) == pytest.approx([0.0, 0.07, 0.0], abs=0.03)
 
-    begin("Front")
+    begin()
     chest = 0.6 * hips + 0.4 * head
-    hand.drag("right hand", size * (chest + 0.10 * left + 0.05 * up))
-    hand.drag("left hand", size * (chest - 0.10 * left))
+    for _ in range(2):
+        drag("Front", "right hand", chest + 0.10 * left + 0.05 * up)
+        drag("Front", "left hand", chest - 0.10 * left)
     done("arms crossed")
-    ways = {side: hand.part(f"{side} hand") / size - chest for side in ("left", "right")}
-    assert min(way @ front for way in ways.values()) > 0.02
-    if name.startswith("mannequin"):
-        # X Bot's shells catch on each other at the elbows before the hands are across.
-        assert ways["left"] @ left < 0.0
+    rights, lefts = way("right hand", chest), way("left hand", chest)
+    assert rights[0] > PAST_MIDDLE
+    assert lefts[0] < -PAST_MIDDLE
+    assert min(rights[1], lefts[1]) > 0.06
+    assert max(abs(rights[2]), abs(lefts[2])) < 0.1
 
-    begin("Left")
-    before = shown(window)
-    hand.drag("hips", hand.part("hips") - size * (0.2 * up + 0.12 * front))
-    moved = (done("sit") - before / size) @ up
-    for part, way in (("hips", -0.19), ("head", -0.19), ("left foot", 0.0), ("right foot", 0.0)):
-        (domain,) = (k for k, n in enumerate(model.domain_names) if n.casefold() == part)
-        inside = space.vertex_domain == domain
-        assert moved[inside].mean() == pytest.approx(way, abs=0.005 if way == 0.0 else 0.03)
+    begin()
+    before = shown(window) / size
+    drag("Left", "hips", hand.part("hips") / size - 0.2 * up - 0.12 * front)
+    after = done("sit")
+    for side in ("left", "right"):
+        stood = hand.inside(f"{side} foot")
+        drift = np.linalg.norm(after[stood] - before[stood], axis=1)
+        assert np.sqrt((drift**2).mean()) < 0.005
+        thigh, shin = (
+            long_axis(after[hand.inside(f"{side} {part}")]) for part in ("thigh", "shin")
+        )
+        assert abs(thigh @ shin) < RIGHT_ANGLE
+    assert way("hips", hips)[2] == pytest.approx(-0.2, abs=0.03)
+    assert way("head", head)[2] == pytest.approx(-0.2, abs=0.04)
