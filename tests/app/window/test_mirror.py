@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -194,10 +195,16 @@ def test_a_mirrored_pose_is_called_after_its_other_side() -> None:
 def test_a_model_without_two_sides_offers_no_mirror(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
-    document.set_model(RigModel.of(rigged_tube(frames=True)))
+    character = rigged_tube(n_joints=5, frames=True)
+    assert character.rig is not None
+    rest = character.rig.rest.copy()
+    rest[1:, [0, 2], 3] += [[0.3, 0.1], [0.0, -0.4], [-0.2, 0.3], [0.1, 0.25]]
+    winding = replace(character, rig=replace(character.rig, rest=rest))
+    document.set_model(RigModel.of(winding))
     held = open_window(qtbot, document, settings_in(tmp_path))
     held.library.list.selectAll()
     assert held.library.chosen_poses
     for key in ("mirror", "mirror_poses"):
         assert not held.actions_by_key[key].isEnabled()
+        assert "not named after left and right" in held.actions_by_key[key].toolTip()
     close_window(held)
