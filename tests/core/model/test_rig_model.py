@@ -143,9 +143,10 @@ def test_a_body_part_without_codes_of_its_own_can_be_locked_and_twisted(model: R
     dragger.begin(
         np.zeros(model.latent_size), Twist(hips), (), DragOptions(solid=False, standing=False)
     )
-    for angle in np.linspace(0.0, 0.4, 12)[1:]:
+    # The last target is gone on to until it is reached, as in the window.
+    for angle in (*np.linspace(0.0, 0.4, 12)[1:], *[0.4] * 10):
         step = dragger.move([angle])
-    assert step.miss < 0.1
+    assert step.miss < 0.05
 
 
 def test_a_hand_is_dragged_while_the_feet_stay(model: RigModel) -> None:
