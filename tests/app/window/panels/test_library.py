@@ -398,7 +398,7 @@ def test_the_context_menu_has_the_menu_s_own_actions(qtbot: QtBot, window: MainW
     library.choose_own("mine")
     document.set_code(0, 0.5)
     assert opened_at(place_of(window, "mine")) == [
-        *("load", "blend", "mirror_poses", "rename", "tags", "duplicate", "remove"),
+        *("load", "blend", "rename", "tags", "duplicate", "mirror_poses", "remove"),
         *("keep", "update"),
         *("import_poses", "export_poses", "export_motion", "export_library", "find_pose"),
     ]
