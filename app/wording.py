@@ -66,7 +66,7 @@ def one_line(text: str) -> str:
 def fit_error(mean: float | None, most: float | None) -> str:
     """Describe the fit error of a mesh, normalised; None for an exact pose."""
     mean, most = mean or 0.0, most or 0.0
-    far = ", which is far: is it this body, in the model's vertex order?" if mean > _FAR else ""
+    far = ", which is large: is it this body, in the model's vertex order?" if mean > _FAR else ""
     return f"fit error of {100.0 * mean:.3f} % of the body size, at most {100.0 * most:.2f} %{far}"
 
 
@@ -92,7 +92,7 @@ def mirrored_text(mirrored: MirroredPose) -> str:
     pairs = counted(mirrored.pairs_after, "pair of faces", "pairs of faces")
     if mirrored.pairs_after == 0 < mirrored.pairs_mirrored:
         resolved = counted(mirrored.pairs_mirrored, "pair of faces", "pairs of faces")
-        state = f"no collisions (checked), as {resolved} of the mirror image were resolved"
+        state = f"no collisions (checked), after {resolved} of the mirror image were resolved"
     elif mirrored.lost_freedom:
         state = f"colliding: {pairs} that the original doesn't have"
     elif mirrored.pairs_after:

@@ -20,7 +20,7 @@ app = typer.Typer(help="Measure what docs/results.md quotes.", no_args_is_help=T
 
 ModelOption = Annotated[str, typer.Option("--model", metavar="M", help="A model with a predictor.")]
 
-_MISSING = "is not installed and left out; pip install 'lcollision[bench]' brings it"
+_MISSING = "is not installed, so it is skipped; pip install 'lcollision[bench]' installs it"
 _PREDICTOR_IN_PAPER = (
     "the paper, on other machines: SCAPE 83 s by FCL on 15 threads, 3.99 s predicted on 4 cores, "
     "1.02 s on a GTX 1080 Ti; jumping 319 s, 4.23 s and 1.13 s"
@@ -118,9 +118,9 @@ def resolve(
     ] = "eye",
     solvers: Annotated[
         list[str] | None,
-        typer.Option("--solver", metavar="NAME", help="Only this; may be repeated."),
+        typer.Option("--solver", metavar="NAME", help="Use only this solver; may be repeated."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the samples.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Seed of the samples.")] = 0,
     figure: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Draw the paper's histograms into this folder."),
@@ -171,7 +171,7 @@ def resolve(
     if figure is not None:
         for run in runs:
             draw_histograms(run, figure)
-        note(f"drew {2 * len(runs)} histograms into {figure}")
+        note(f"saved {2 * len(runs)} histograms to {figure}")
     if as_json:
         print_json([row | {"near_exclusion": model.near_exclusion} for row in rows])
         return

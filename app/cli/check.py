@@ -50,14 +50,13 @@ def check(
     """Find the exact self-collisions of any triangle mesh.
 
     A pose of a character that was exported from here, or that was opened before, is checked by
-    that character's contact rules. Exits with 0 when all meshes are free of them, with 1 when one
-    is not.
+    that character's contact rules. Exits with 0 if no mesh has collisions, with 1 if any has.
     """
     from lcollision_core.meshes import read_mesh
     from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 
     if rest_exclusion is not None and rest is None:
-        raise LCollisionError("--rest-exclusion needs a rest pose", "name it with --rest MESH")
+        raise LCollisionError("--rest-exclusion needs a rest pose", "give one with --rest MESH")
     rest_mesh = None if rest is None else read_mesh(rest)
     if rest is not None and rest_exclusion is None:
         rest_exclusion = CHARACTER_REST_EXCLUSION
@@ -100,7 +99,7 @@ def check_mesh(
     mesh = read_mesh(path, topology=None if rest is None else rest.topology)
     if rest is not None and rest.topology != mesh.topology:
         raise MeshFileError(
-            "has other faces than the rest pose", "name a rest pose of this mesh", where=path
+            "does not have the faces of the rest pose", "name a rest pose of this mesh", where=path
         )
     for remark in (*mesh.notes, *audit_mesh(mesh.topology, mesh.vertices)):
         note(f"{path}: {remark}")
@@ -120,8 +119,10 @@ def check_mesh(
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
     if found.n_coincident_pairs:
-        pairs = counted(found.n_coincident_pairs, "pair of faces lies", "pairs of faces lie")
-        note(f"{path}: {pairs} exactly on each other; touching is no collision")
+        pairs = counted(
+            found.n_coincident_pairs, "pair of faces coincides", "pairs of faces coincide"
+        )
+        note(f"{path}: {pairs}; touching is not a collision")
     return {
         "file": str(path),
         "vertices": topology.n_vertices,

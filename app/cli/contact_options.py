@@ -25,8 +25,8 @@ NearExclusionOption = Annotated[
         min=0.0,
         max=1.0,
         metavar="X",
-        help="Count pairs within X body sizes along the surface separately. Default: what its "
-        "own rules say, else 0.",
+        help="Count pairs within X body sizes along the surface separately. Default: what the "
+        "character's own rules say, else 0.",
     ),
 ]
 RestExclusionOption = Annotated[
@@ -52,8 +52,9 @@ IgnoreOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="A:B",
-        help="Do not count pairs of these groups of faces: meshes, materials, body parts, or "
-        "components, as in 'component 1:component 2', of which 1 has most faces. May be repeated.",
+        help="Do not count pairs between these two groups of faces: meshes, materials, body "
+        "parts or components, as in 'component 1:component 2' (component 1 has the most "
+        "faces). May be repeated.",
     ),
 ]
 LeaveOutOption = Annotated[
@@ -61,15 +62,15 @@ LeaveOutOption = Annotated[
     typer.Option(
         metavar="NAME",
         help="Leave a mesh, material, body part or component out of the check, such as a weapon "
-        "that another one stands for. It is posed and exported all the same. May be repeated.",
+        "that has a stand-in. It is still posed and exported. May be repeated.",
     ),
 ]
 JointExclusionOption = Annotated[
     bool | None,
     typer.Option(
         "--joint-exclusion/--no-joint-exclusion",
-        help="Do not count pairs of parts that a joint links where both faces are within the "
-        "limb's thickness of it. On by default for a character with joints.",
+        help="Do not count pairs of parts linked by a joint where both faces are within a limb's "
+        "thickness of it. On by default for a character with joints.",
     ),
 ]
 ToleratedDepthOption = Annotated[
@@ -77,7 +78,7 @@ ToleratedDepthOption = Annotated[
     typer.Option(min=0.0, max=1.0, metavar="D", help="Do not count pairs up to D body sizes deep."),
 ]
 NoRulesOption = Annotated[
-    bool, typer.Option("--no-rules", help="Count all pairs, whatever rules its character has.")
+    bool, typer.Option("--no-rules", help="Count all pairs and ignore the character's rules.")
 ]
 
 
@@ -127,8 +128,8 @@ class RuleOptions:
             out pairs at, or a predictor depends on its rules.
         """
         if self.joint_exclusion and not body.has_joints:
-            what = "has no joints that its contact rules could leave out pairs at"
-            next_step = "leave out --joint-exclusion, or learn it again from a rigged character"
+            what = "has no joints, which --joint-exclusion needs"
+            next_step = "leave the option out, or learn the model again from a rigged character"
             raise LCollisionError(what, next_step, where=body.name)
         groups = body.groups_by_kind.values() if self.ignore or self.leave_out else ()
         rules = self._changed(body.rules, {group.name for kind in groups for group in kind})
@@ -157,7 +158,7 @@ class RuleOptions:
 def note_rules(body: PosableBody) -> None:
     """Report the pairs of faces that the figures leave out, and how many that is at rest."""
     if body.rules_are_chosen:
-        note(f"the contact rules of {body.name} are those that you chose")
+        note(f"{body.name} uses the contact rules that you chose")
     if not body.rules.exclude_nothing:
         note(rules_sentence(body.rules, excluded_at_rest(body)))
 
@@ -167,7 +168,7 @@ def rules_sentence(rules: ContactRules, at_rest: dict[str, int]) -> str:
     from lcollision_core.meshes import RuleCounts
 
     said = RuleCounts(**at_rest).described()
-    return f"not counted are {rules.described()}; at rest that is {said or 'no pair'}"
+    return f"not counted: {rules.described()}; at rest: {said or 'no pair'}"
 
 
 def excluded_at_rest(body: PosableBody) -> dict[str, int]:

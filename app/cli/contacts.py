@@ -38,19 +38,19 @@ def contacts(
         bool,
         typer.Option(
             "--ignore-proposed",
-            help="Do not count patches that touch in nearly every pose, and what is near to both.",
+            help="Do not count patches that touch in nearly every pose, nor faces close to them.",
         ),
     ] = False,
     defaults: Annotated[
         bool,
-        typer.Option("--defaults", help="Begin with the rules that a character starts with."),
+        typer.Option("--defaults", help="Start from the character's default rules."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say which pairs of faces a model or a character does not count, or change that.
+    """Show which pairs of faces a model or a character does not count, or change that.
 
-    Options add to the rules that apply, and are kept: of a character in your data folder, where the
-    editor finds them too; of a model without a predictor in its file.
+    Options add to the current rules and are stored: a character's in your data folder, where the
+    editor finds them too; those of a model without a predictor in its file.
     """
     from lcollision_core.meshes.contact_rules import pair_in_words
     from lcollision_core.model import open_body, propose_rules
@@ -70,7 +70,7 @@ def contacts(
     if body.rules != before.rules:
         kept = body.rules
         changed_body(model_name, body, lambda held: held.with_rules(kept))
-        note(f"the contact rules of {body.name} are changed")
+        note(f"the contact rules of {body.name} have changed")
     if as_json:
         print_json({"name": body.name, **rules_json(body), "proposed": _proposed_json(proposed)})
         return

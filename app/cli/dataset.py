@@ -55,8 +55,8 @@ def check(
 ) -> None:
     """Report the topology, size, defects and self-collisions of a pose set.
 
-    Exits with 1 when the set cannot be trained on as it is: a pose is unusable, or a face of
-    the first has no area.
+    Exits with 1 if the set cannot be trained on: a pose is unusable, or a face of the first has
+    no area.
     """
     from lcollision_core.contact import CollisionDetector, RuleCounts, propose_by_kind
     from lcollision_core.errors import MeshFileError, ShapeError
@@ -122,7 +122,7 @@ def check(
             tell(f"  {rules_sentence(rules, report['excluded_at_rest'])}")
         _print_proposed(proposed, rules)
         if not guess.is_sure:
-            note("`train embedding` takes that, unless --up x|y|z says otherwise")
+            note("`train embedding` uses it unless --up x|y|z is given")
     flat = degenerate_faces(poses.topology, poses.vertices[0])
     if len(poses) < inspection.n_found or len(flat):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
@@ -187,8 +187,9 @@ def make(
             min=1,
             max=_MOST_BY_RIG,
             metavar="N",
-            help="Let the rig of a character make N random poses within human limits, free of "
-            "collisions where it can; near-duplicates of what else the files hold are left out.",
+            help="Add N random poses of a character's rig within human limits, free of "
+            "collisions where possible; near-duplicates of the files' own poses are left "
+            "out.",
         ),
     ] = None,
     seed: Annotated[
@@ -196,23 +197,24 @@ def make(
         typer.Option(
             min=0,
             metavar="S",
-            help="Of the built-in body 0 gives the authored poses, others vary them; of --by-rig "
-            "equal seeds give equal poses.",
+            help="For the built-in body, 0 gives the authored poses and other seeds vary them; "
+            "for --by-rig, the same seed gives the same poses.",
         ),
     ] = 0,
     clip: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="The animation of the files. Default: all of them."),
+        typer.Option(metavar="NAME", help="The animation to read. Default: all."),
     ] = None,
     fps: Annotated[
         float | None,
         typer.Option(
-            metavar="X", help="Frames a second. Default: the animation's keys, at most 30 a second."
+            metavar="X",
+            help="Frames per second. Default: the animation's keys, at most 30 a second.",
         ),
     ] = None,
     up: Annotated[
         Axis | None,
-        typer.Option(help="The axis that is up. Default: what the files say, else a guess."),
+        typer.Option(help="The up axis. Default: what the files say, else a guess."),
     ] = None,
 ) -> None:
     """Make a pose set of the built-in body, or of a character's animations and its rig."""
@@ -231,10 +233,10 @@ def make(
             poses = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)
     else:
         if n_vertices is not None:
-            raise LCollisionError("--vertices is for the built-in body", "leave it out")
+            raise LCollisionError("--vertices applies only to the built-in body", "leave it out")
         if seed and by_rig is None:
             raise LCollisionError(
-                "--seed is for the built-in body and for poses by the rig",
+                "--seed applies only to the built-in body and to poses by the rig",
                 "leave it out, or add --by-rig N",
             )
         poses = _gathered(sources, clip, fps, up, by_rig, seed)
@@ -251,7 +253,7 @@ def _require_only_body(sources: list[str], **options: object) -> None:
         )
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
     if given:
-        raise LCollisionError(f"{given[0]} is for files, not for {sources[0]}", "leave it out")
+        raise LCollisionError(f"{given[0]} applies to files, not to {sources[0]}", "leave it out")
 
 
 def _gathered(
@@ -279,7 +281,9 @@ def _gathered(
         note(remark)
     if by_rig is not None:
         made = poses.provenance["sources"][-1]["by_rig"]
-        note(f"{made['free']} of {counted(made['drawn'], 'pose')} by the rig are free")
+        note(
+            f"{made['free']} of {counted(made['drawn'], 'pose')} by the rig are free of collisions"
+        )
     if not (guess := poses.up).is_sure:
-        note(f"{up_sentence(guess)}; --up x|y|z says otherwise")
+        note(f"{up_sentence(guess)}; --up x|y|z overrides it")
     return poses

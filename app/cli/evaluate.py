@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from lcollision_core.predictor import CollisionPredictor, PredictorMetrics
 
 StoreArgument = Annotated[
-    Path, typer.Argument(metavar="STORE", help="Samples of the model, by `lcollision label`.")
+    Path, typer.Argument(metavar="STORE", help="Samples of the model, from `lcollision label`.")
 ]
 
 
@@ -43,9 +43,9 @@ def evaluate(
 ) -> None:
     """Score a model's predictor against exact labels.
 
-    On the store that it was trained on only rows that neither trained it nor chose anything for it
-    count, on any other store of the model every row does. MSE and RANK are in energies divided
-    by the mean of the colliding training samples.
+    On the store that it was trained on, only rows that took no part in its training count; on any
+    other store of the model, every row does. MSE and RANK are in energies divided by the mean of
+    the colliding training samples.
     """
     from lcollision_core.model import PoseModel
     from lcollision_core.predictor import evaluate_predictor

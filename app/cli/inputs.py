@@ -43,15 +43,15 @@ RowsOption = Annotated[
 ]
 ThreadsOption = Annotated[
     int | None,
-    typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one for each core."),
+    typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one per core."),
 ]
 ScaleOption = Annotated[
     float,
     typer.Option(
         "--scale",
         metavar="S",
-        help="Brings the meshes into the model's unit: 0.001 from millimetres to metres. What "
-        "comes back is in their own.",
+        help="Converts the meshes to the model's unit: 0.001 takes millimetres to metres. "
+        "Results are in the meshes' own unit.",
     ),
 ]
 
@@ -73,7 +73,7 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
         held, _ = mesh_files(path)
         if not held:
             raise MeshFileError(
-                "holds no mesh",
+                "contains no mesh",
                 f"name a folder of {', '.join(READABLE_SUFFIXES)} files",
                 where=path,
             )
@@ -102,4 +102,4 @@ def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
 
 def up_sentence(guess: UpGuess) -> str:
     """Report which axis was taken as up, and why."""
-    return f"{'xyz'[guess.axis]} is {'' if guess.is_sure else 'perhaps '}up: {guess.reason}"
+    return f"{'xyz'[guess.axis]} is {'' if guess.is_sure else 'probably '}up: {guess.reason}"

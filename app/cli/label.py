@@ -34,29 +34,33 @@ def label(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="STORE", help="The folder of labels to make or to go on with."
+            "--output", "-o", metavar="STORE", help="The folder of labels to create or continue."
         ),
     ],
     count: Annotated[
         int | None,
-        typer.Option("-n", min=1, max=1_000_000_000, help="Samples the store is to hold."),
+        typer.Option(
+            "-n", min=1, max=1_000_000_000, help="Number of samples in the finished store."
+        ),
     ] = None,
     check: Annotated[
         bool,
-        typer.Option("--check", help="Label nothing: read the store, and tell what is damaged."),
+        typer.Option("--check", help="Label nothing; only verify the store and report damage."),
     ] = False,
     workers: ThreadsOption = None,
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Label on the workers of this Dask scheduler."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal rows.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, metavar="S", help="The same seed gives the same rows.")
+    ] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Draw poses from the model's latent box and find their exact collisions.
 
-    However it is stopped, the store keeps the chunks that are finished, and the same command goes
-    on from there. The rows do not depend on who labels them. Rows that are damaged are labelled
+    You can stop it at any time: the store keeps the finished chunks, and the same command
+    continues from there. The rows do not depend on who labels them. Damaged rows are labelled
     again.
     """
     from lcollision_core.labels import LabelStore, label_poses
@@ -64,10 +68,10 @@ def label(
 
     if workers is not None and scheduler is not None:
         raise LCollisionError(
-            "--workers and --scheduler exclude each other", "the cluster has its own workers"
+            "--workers and --scheduler can't be used together", "the cluster has its own workers"
         )
     if check == (count is not None):
-        raise LCollisionError("give either -n N, the samples that the store is to hold, or --check")
+        raise LCollisionError("give either -n N, the number of samples in the store, or --check")
     model = PoseModel.load(model_name)
     if count is None:
         _check(model, output, as_json)
@@ -90,7 +94,7 @@ def label(
     except CancelledError:
         with suppress(LabelStoreError):
             kept = counted(LabelStore.open(output).n_rows, "row")
-            note(f"stopped; {output} keeps {kept}, run the same command again to go on")
+            note(f"stopped; {output} has {kept}; run the same command again to continue")
         raise
     seconds = time.monotonic() - started
     report: dict[str, Any] = {
@@ -104,7 +108,7 @@ def label(
         "seconds": seconds,
     }
     if status.done > count:
-        note(f"{output} has more than the {count} asked for, and keeps them")
+        note(f"{output} already has more than {count} rows; kept")
     if as_json:
         print_json(report)
         return
@@ -137,7 +141,7 @@ def _check(model: PoseModel, path: Path, as_json: bool) -> None:
         more = f" and {len(damaged) - _LISTED} more" if damaged[_LISTED:] else ""
         tell(f"{path}: damaged, rows {listed}{more}; {store.repair_advice}")
     else:
-        tell(f"{path}: sound, {counted(n_sound, 'row')} of {model.name}")
+        tell(f"{path}: intact, {counted(n_sound, 'row')} of {model.name}")
     if damaged:
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 

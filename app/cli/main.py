@@ -72,7 +72,7 @@ class _Commands(TyperGroup):
         except MemoryError:
             sentence = "out of memory; give it smaller meshes or fewer poses"
         except OSError as error:
-            sentence = f"{error.filename}: {error.strerror}; choose another name or place"
+            sentence = f"{error.filename}: {error.strerror}; choose another name or folder"
             if error.errno == errno.ENOSPC:
                 _drop_what_is_buffered()
                 sentence = "the answer cannot be written: the disk is full"

@@ -26,12 +26,11 @@ def mirror(
     output: PosesOutput,
     as_json: JsonOption = False,
 ) -> None:
-    """Exchange left and right of poses, and mirror where they belong.
+    """Exchange left and right of poses, and mirror their placement.
 
-    What comes back is the pose nearest to each mirror image, with its fit error, under the same
-    name. A pose that was mirrored before, and not changed since, comes back to the bit. A pose
-    that is free of collisions by the exact check, and whose image is not, is resolved; exits with
-    1 where that fails.
+    Writes the pose nearest to each mirror image, with its fit error, under the same name.
+    Mirroring a pose twice restores it exactly. If a pose is free of collisions by the exact check
+    and its image is not, the image is resolved; exits with 1 if that fails.
     """
     from lcollision_core.model import open_body, read_poses
 
@@ -39,7 +38,7 @@ def mirror(
     model = open_body(model_name)
     named = read_poses(poses, model)
     if not named:
-        raise ModelFileError("has no poses in it", "name a file that has some", where=poses)
+        raise ModelFileError("contains no poses", "name a file with poses", where=poses)
     # Asked first: a model without two sides is refused before the work.
     _ = model.pose_mirror
     found: list[MirroredPose] = []
@@ -66,7 +65,7 @@ def mirror(
             "`lcollision train predictor`"
         )
         count = counted(len(colliding), "free pose collides", "free poses collide")
-        note(f"{count} in the mirror, such as {colliding[0]}; {offer}")
+        note(f"{count} when mirrored, such as {colliding[0]}; {offer}")
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 

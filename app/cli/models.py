@@ -56,7 +56,7 @@ def models(
             tell(f"{listed.name}: damaged ({_origin(listed.bundled)})")
         if not reports and not damaged:
             tell(
-                f"there are no models yet; `lcollision train embedding` makes one, and those in "
+                f"there are no models yet; `lcollision new` makes one, and models in "
                 f"{user_models_folder()} are listed here"
             )
     if damaged:
@@ -72,10 +72,13 @@ def info(
     as_json: JsonOption = False,
     figure: Annotated[
         Path | None,
-        typer.Option(metavar="MASKS.png", help="Draw the domains, darker where they own more."),
+        typer.Option(
+            metavar="MASKS.png",
+            help="Save a picture of the domains, darker where their weight is higher.",
+        ),
     ] = None,
 ) -> None:
-    """Say what a model or a character holds, and how exact it is; lengths are normalised."""
+    """Show what a model or a character contains and how exact it is; lengths are normalised."""
     from lcollision_core.model import open_body
 
     if figure is not None:
@@ -86,7 +89,7 @@ def info(
         from app.view.masks_figure import draw_masks
 
         draw_masks(model, figure)
-        note(f"drew the domains of {model.name} to {figure}")
+        note(f"saved a picture of the domains of {model.name} to {figure}")
     if as_json:
         print_json(report)
         return
@@ -108,18 +111,18 @@ def domains(
     model_name: ModelArgument,
     names: Annotated[
         list[str] | None,
-        typer.Option("--name", metavar="K=NAME", help="Call domain K (from 1) NAME."),
+        typer.Option("--name", metavar="K=NAME", help="Rename domain K (from 1) to NAME."),
     ] = None,
     roles: Annotated[
         list[str] | None,
         typer.Option(
             "--role",
             metavar="JOINT=ROLE",
-            help="Say what a character's joint is, such as knee-left; auto takes that back.",
+            help="Set the role of a character's joint, such as knee-left; auto resets it.",
         ),
     ] = None,
 ) -> None:
-    """List the domains of a model or a character, rename them, or say what its joints are."""
+    """List the domains of a model or a character, rename them, or set the roles of its joints."""
     from lcollision_core.characters import role_name
     from lcollision_core.model import RigModel, open_body, remember_roles
 
@@ -159,10 +162,12 @@ def upright(
     model_name: ModelArgument,
     up: Annotated[
         Axis | None,
-        typer.Option(help="The axis that is up; kept in a model's file, beside a character's."),
+        typer.Option(
+            help="The up axis; stored in a model's file or, for a character, in your data folder."
+        ),
     ] = None,
 ) -> None:
-    """Say which axis of a model or a character is up, or change it."""
+    """Show which axis of a model or a character is up, or change it."""
     from lcollision_core.model import PoseModel, open_body, remember_up
 
     body, axis = open_body(model_name), None if up is None else "xyz".index(up)
@@ -197,7 +202,7 @@ def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> 
     path = find_model(name)
     if path.is_file() and is_bundled(path):
         raise LCollisionError(
-            "is a bundled model and stays as it is",
+            "is a bundled model and can't be changed",
             f"copy {path} and name the copy",
             where=path.stem,
         )
@@ -271,7 +276,7 @@ def measured_model_sentence(model: PoseModel) -> str:
     near = model.near_exclusion
     rule = f"near exclusion {near:g}" if near else "no near exclusion"
     if model.rules != replace(STRICT, near_exclusion=near):
-        rule = f"not counted are {model.rules.described()}"
+        rule = f"not counted: {model.rules.described()}"
     return f"|Z_0| = {first}, |Z_k| = {each} for {counted(len(others), 'domain')}, {rule}"
 
 
@@ -279,8 +284,8 @@ def note_if_beside(written: Path, destination: Path) -> None:
     """Explain why a trained model was written to another path."""
     if written != destination:
         note(
-            f"{destination} was replaced by another model during the training and stays as it "
-            f"is; the trained one is {written}"
+            f"{destination} was replaced by another model during training and was left alone; the "
+            f"trained model is {written}"
         )
 
 
@@ -306,7 +311,7 @@ def _predictor_sentence(report: dict[str, Any]) -> str:
     """Put what `describe` says of the predictor into words."""
     predictor = report["predictor"]
     if predictor is None:
-        return "no predictor yet; `lcollision label` and `lcollision train predictor` make one"
+        return "no predictor yet; `lcollision label` and `lcollision train predictor` add one"
     metrics = predictor["metrics"]
     if metrics is None:
         return f"predictor {predictor['preset']}, not measured"

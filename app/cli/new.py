@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 
 _QUALITY = (
-    "How much time is spent: quick, 100 poses of a rig and 20 000 samples; good, 150 and 50 000, "
+    "Time spent against accuracy: quick, 100 poses of a rig and 20 000 samples; good, 150 and "
+    "50 000, "
     "with errors of poses left out; best, 300 and 300 000, with three times the epochs of level 2."
 )
 
@@ -49,7 +50,7 @@ def new(
             "--output",
             "-o",
             metavar="NAME",
-            help="The model's name, which stores it with yours, or a .safetensors file.",
+            help="A name, to store the model with yours, or a .safetensors file.",
         ),
     ],
     quality: Annotated[Literal["quick", "good", "best"], typer.Option(help=_QUALITY)] = "good",
@@ -59,34 +60,37 @@ def new(
             min=0,
             max=10_000,
             metavar="N",
-            help="Poses drawn by the rig. Default: as many as the clips lack.",
+            help="Number of random poses made by the rig. Default: as many as the clips lack.",
         ),
     ] = None,
     clip: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The animation to take. Default: all.")
+        str | None, typer.Option(metavar="NAME", help="The animation to read. Default: all.")
     ] = None,
     fps: Annotated[
-        float | None, typer.Option(metavar="X", help="Frames a second. Default: the keys.")
+        float | None,
+        typer.Option(metavar="X", help="Frames per second. Default: the animation's keys."),
     ] = None,
     up: Annotated[
-        Axis | None, typer.Option(help="The axis that is up. Default: what the files say.")
+        Axis | None, typer.Option(help="The up axis. Default: what the files say, else a guess.")
     ] = None,
     scale: Annotated[
-        float, typer.Option(metavar="S", help="Brings the files into the model's unit.")
+        float, typer.Option(metavar="S", help="Factor from the files' unit to the model's.")
     ] = 1.0,
     near_exclusion: NearExclusionOption = None,
     rest_exclusion: RestExclusionOption = None,
     ignore: IgnoreOption = None,
     leave_out: LeaveOutOption = None,
     tolerated_depth: ToleratedDepthOption = None,
-    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal models.")] = 0,
-    licence: Annotated[str, typer.Option(help="Under which the model may be used.")] = "unknown",
+    seed: Annotated[
+        int, typer.Option(min=0, metavar="S", help="The same seed gives the same models.")
+    ] = 0,
+    licence: Annotated[str, typer.Option(help="Licence of the model.")] = "unknown",
     as_json: JsonOption = False,
 ) -> None:
     """Make a model of a character or of a body's poses: poses, latent space, labels, predictor.
 
-    The contact rules are proposed from the poses unless options give them. However it is stopped,
-    the same command goes on where it was.
+    The contact rules are proposed from the poses unless options give them. You can stop it at any
+    time; the same command resumes.
     """
     from app.work.learner import STOP, obeying
     from lcollision_core.learning import LearningRequest, WorkFolder, learn_model
@@ -119,7 +123,7 @@ def new(
             card = learn_model(work, progress, cancel)
     except CancelledError:
         if work.path.is_dir():
-            note(f"stopped; run the same command again to go on from {work.path}")
+            note(f"stopped; run the same command again to continue from {work.path}")
         raise
     except LCollisionError:
         if not work.poses.exists() and not work.is_held:
@@ -140,7 +144,7 @@ def new(
         print_json(asdict(card) | {"picture": str(picture), "rules": model.rules.to_json()})
         return
     _print(card)
-    tell(f"  its parts are drawn in {picture}")
+    tell(f"  picture of its parts: {picture}")
     tell(f"  `lcollision edit --model {card.name}` opens it")
 
 

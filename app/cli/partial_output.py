@@ -56,7 +56,7 @@ class UnfinishedPoses:
     def stop(self) -> None:
         """Write what is done, and say how to go on."""
         if self.finished and self._write():
-            again = "run the same command again to go on"
+            again = "run the same command again to continue"
             if len(self.finished) == self._total:
                 again = "run the command again when they can be written"
             note(f"stopped; {self.path} has {self._told}, {again}")
@@ -95,7 +95,7 @@ class UnfinishedPoses:
         record = json.loads(self.path.read_bytes()).get("unfinished")
         if not isinstance(record, dict) or record.get("key") != self._key:
             raise LCollisionError(
-                "has poses of another run (its model, options, inputs or program differ)",
+                "has poses of another run (model, options, inputs or program differ)",
                 "move or delete it, or name another output",
                 where=self.path,
             )
@@ -104,7 +104,7 @@ class UnfinishedPoses:
                 self.finished[int(facts.pop("place"))] = (pose, facts)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise self.damaged() from error
-        note(f"going on from {self.path}, which has {self._told}")
+        note(f"continuing from {self.path}, which has {self._told}")
 
     @property
     def _told(self) -> str:

@@ -38,9 +38,10 @@ def encode(
     output: PosesOutput,
     scale: ScaleOption = 1.0,
 ) -> None:
-    """Turn meshes of the model's topology into latent poses, and say how well each fits.
+    """Turn meshes of the model's topology into latent poses, and report how well each fits.
 
-    What is done when it is stopped is kept beside the output, and the same command goes on.
+    You can stop it at any time: finished poses are kept beside the output, and the same command
+    continues.
     """
     import numpy as np
 
@@ -91,15 +92,15 @@ def decode(
     form: PoseFormOption = None,
     fps: FpsOption = 30.0,
 ) -> None:
-    """Turn latent poses into meshes; one that was imported returns to its placement.
+    """Turn latent poses into meshes; an imported pose returns to its placement.
 
-    With --axes they come in upright, facing the front, with the settings that the program's own
-    importer begins with: y-up; blender; maya and unreal, in centimetres. A GLB file is y up and
-    in the model's unit whatever is asked for, as its standard fixes both.
+    With --axes, meshes import upright and facing the front with the program's default settings:
+    y-up; blender; maya and unreal, in centimetres. A GLB file is always y up and in the model's
+    unit, as its standard requires.
 
-    With --like FILE what comes is your own file with the pose in it: an OBJ file with its UVs,
+    With --like FILE, the output is your own file in the new pose: an OBJ file with its UVs,
     groups, materials and quads; a GLB with its textures, UVs and vertex order, without the clips
-    that would hide the pose. FBX files are not written: name a .glb, .obj, .pc2 or .mdd file.
+    that would hide the pose. FBX files can't be written: name a .glb, .obj, .pc2 or .mdd file.
     """
     from lcollision_core.model import open_body, read_poses
 
@@ -115,13 +116,15 @@ def decode(
 
 def sample(
     model_name: ModelArgument,
-    count: Annotated[int, typer.Option("-n", min=1, max=1_000_000, help="How many poses.")],
+    count: Annotated[int, typer.Option("-n", min=1, max=1_000_000, help="Number of poses.")],
     output: PosesOutput,
     colliding: Annotated[
         bool | None,
-        typer.Option("--colliding/--free", help="Keep only those poses, by the exact check."),
+        typer.Option("--colliding/--free", help="Keep only such poses, by the exact check."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal poses.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, metavar="S", help="The same seed gives the same poses.")
+    ] = 0,
 ) -> None:
     """Draw random poses: of a model from its latent box, of a character within human limits."""
     from lcollision_core.model import NamedPose, open_body, sample_poses

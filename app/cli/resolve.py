@@ -74,35 +74,39 @@ def resolve(
     ] = 0.5,
     margin: Annotated[
         float | None,
-        typer.Option(metavar="X", help="How far below the threshold's logit to go at first."),
+        typer.Option(metavar="X", help="How far below the threshold's logit the first step aims."),
     ] = None,
     lock: Annotated[
         list[str] | None,
-        typer.Option(metavar="DOMAIN", help="A domain, by name or number, that keeps its codes."),
+        typer.Option(
+            metavar="DOMAIN", help="A domain, by name or number, whose codes stay as they are."
+        ),
     ] = None,
     weight: Annotated[
         list[str] | None,
-        typer.Option(metavar="DOMAIN=W", help="Let a move of this domain cost W times as much."),
+        typer.Option(metavar="DOMAIN=W", help="Make moving this domain cost W times as much."),
     ] = None,
     sequence: Annotated[
         bool, typer.Option("--sequence", help="The poses are frames of a motion, in order.")
     ] = False,
     keep_detail: Annotated[
         bool,
-        typer.Option("--keep-detail", help="Give meshes back what encoding lost, if still free."),
+        typer.Option("--keep-detail", help="Restore the detail that encoding lost, if still free."),
     ] = False,
     scale: ScaleOption = 1.0,
     no_verify: Annotated[
-        bool, typer.Option("--no-verify", help="Stop at the solver's answer, unchecked.")
+        bool, typer.Option("--no-verify", help="Return the solver's answer, unchecked.")
     ] = False,
     time_budget: Annotated[
         float | None,
         typer.Option(
-            metavar="SECONDS", help="Search time per pose; then a known free pose is taken."
+            metavar="SECONDS", help="Search time per pose; after that, a known free pose is used."
         ),
     ] = None,
     workers: ThreadsOption = None,
-    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the solver's restarts.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, metavar="S", help="Seed of the solver's restarts.")
+    ] = 0,
     mesh_format: FormatOption = None,
     like: LikeOption = None,
     form: PoseFormOption = None,
@@ -111,16 +115,16 @@ def resolve(
 ) -> None:
     """Move poses to the nearest ones that are free of self-collisions.
 
-    Exits with 0 when every pose ends free by the exact check (with --no-verify: by the
-    prediction), with 1 when one does not. A pose that is free already comes back unchanged. Of a
-    mesh, what comes back is its nearest pose; --keep-detail adds what that lacks. What is done
-    when it is stopped is kept in a file beside the output, and the same command goes on from there.
+    Exits with 0 if every pose ends free by the exact check (with --no-verify: by the prediction),
+    else with 1. A pose that is already free is not changed. A mesh is written as the nearest
+    model pose; --keep-detail adds what that lacks. You can stop it at any time: finished poses are
+    kept beside the output, and the same command continues.
 
     The step that resolved a pose is one of: solver, the paper's problem; margin, the same with more
-    distance from collision; polish, of shallow contacts; start, a restart elsewhere; towards, from
-    a free pose as near as contacts let it (of characters, which have no predictor); walk-back,
-    falling back to a pose known to be free; neighbour, the correction of the frame before
-    (--sequence).
+    distance from collision; polish, for shallow contacts; start, a restart elsewhere; towards, from
+    a free pose as near to the target as contacts allow (for characters, which have no predictor);
+    walk-back, along the way to a pose known to be free; neighbour, the correction of the previous
+    frame (--sequence).
     """
     import numpy as np
 
@@ -144,7 +148,7 @@ def resolve(
     style = MeshStyle(mesh_format, like=like, form=form, fps=fps)
     if keep_detail and target.form == "poses":
         raise LCollisionError(
-            "would hold codes, which cannot keep detail",
+            "would contain codes; --keep-detail applies only to meshes",
             "name a mesh or a folder, or leave out --keep-detail",
             where=output,
         )
@@ -211,7 +215,7 @@ def resolve(
         change = largest_correction_change(model.pose_space.decode, before, results)
         note(
             f"from frame to frame the correction changes by at most {100.0 * change:.3f} % of "
-            f"the body size, in the mean over vertices"
+            f"the body size, averaged over the vertices"
         )
     if failed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
@@ -283,7 +287,7 @@ def _requests_of(model: PosableBody, path: Path, scale: float) -> Iterator[_Requ
     if path.suffix.lower() == ".json":
         poses = read_poses(path, model)
         if not poses:
-            raise ModelFileError("has no poses in it", "name a file that has some", where=path)
+            raise ModelFileError("contains no poses", "name a file with poses", where=path)
         for pose in poses:
             yield _Request(f"{path}: {pose.name}", pose)
         return
@@ -361,7 +365,10 @@ def _detailed(
         mesh = request.mesh
         detailed.append(None if mesh is None else with_detail(model, mesh, request.pose, result))
         if mesh is not None and detailed[-1] is None:
-            note(f"{request.source}: with its detail the fixed mesh would collide, so it has none")
+            note(
+                f"{request.source}: its detail was left out, as the fixed mesh would collide with "
+                "it"
+            )
     return detailed
 
 
@@ -381,7 +388,7 @@ def _stay_free(
                 pairs = counted(n_pairs, "pair of faces collides", "pairs of faces collide")
                 note(
                     f"{request.source}: in {file.path}, {pairs} after rounding; --form mesh "
-                    f"holds the vertices that were checked"
+                    f"writes the vertices that were checked"
                 )
     return stay_free
 
@@ -402,14 +409,14 @@ def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str
     elif not result.exactly_free:
         said = ["still colliding", counted_pairs]
     elif result.step == Step.UNCHANGED:
-        said = ["free as it is"]
+        said = ["already free"]
     else:
         said = [f"resolved {counted_pairs} by the step {result.step!s}", "checked", moved]
     if has_detail:
         said.append("with its detail")
     elif request.mesh is not None:
         fit = f"{100.0 * (request.pose.fit_error_mean or 0.0):.2f} % of the body size off"
-        said.append(f"given back as its fit, {fit}")
+        said.append(f"written as the nearest model pose, {fit}")
     elif result.step == Step.UNCHANGED:
         said.append("unchanged")
     return f"{', '.join(said)} ({result.seconds:.2f} s)"

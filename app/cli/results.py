@@ -46,7 +46,7 @@ FormatOption = Annotated[
     MeshFormat | None,
     typer.Option(
         "--format",
-        help="Of the meshes in a folder. Default: obj; glb by --like and of a character.",
+        help="Format of the meshes in a folder. Default: obj; glb with --like and for a character.",
     ),
 ]
 LikeOption = Annotated[
@@ -55,20 +55,21 @@ LikeOption = Annotated[
         "--like",
         metavar="FILE",
         readable=False,
-        help="Your own OBJ, GLB or VRM file of this body: the output is that file with another "
-        "pose in it, or point caches of its meshes. A character's is its own by default.",
+        help="Your own OBJ, GLB or VRM file of this body: the output is that file in another "
+        "pose, or point caches of its meshes. Default for a character: its own file.",
     ),
 ]
 PoseFormOption = Annotated[
     PoseForm | None,
     typer.Option(
         "--form",
-        help="How a GLB holds the pose: its joints turned, a static mesh or a morph target; or all "
-        "poses as the frames of a clip. Default: joints where the pose came from them, else mesh.",
+        help="How a GLB stores the pose: turned joints, a static mesh or a morph target; or all "
+        "poses as the frames of a clip. Default: joints if the pose came from joints, else "
+        "mesh.",
     ),
 ]
 AxesOption = Annotated[
-    MeshAxes, typer.Option(help="For which program: its axes, and its unit for a model in metres.")
+    MeshAxes, typer.Option(help="Use this program's axes, and its unit if the model is in metres.")
 ]
 UnitOption = Annotated[
     float | None,
@@ -77,13 +78,13 @@ UnitOption = Annotated[
         min=1e-6,
         max=1e6,
         metavar="X",
-        help="The file's units in one of the model's. By default 100 for maya and unreal.",
+        help="File units per model unit. Default: 100 for maya and unreal, else 1.",
     ),
 ]
 FpsOption = Annotated[
     float,
     typer.Option(
-        min=0.01, max=1000.0, metavar="N", help="Frames a second of a clip or an .mdd file."
+        min=0.01, max=1000.0, metavar="N", help="Frames per second of a clip or an .mdd file."
     ),
 ]
 
@@ -221,7 +222,7 @@ def require_one_mesh(output: Output, n_poses: int) -> None:
     """
     if output.form == "mesh" and n_poses != 1:
         raise LCollisionError(
-            f"is one mesh, but there are {n_poses} poses", "name a folder", where=output.path
+            f"is one mesh file, but there are {n_poses} poses", "name a folder", where=output.path
         )
 
 
@@ -234,7 +235,7 @@ def require_mesh_style(output: Output, style: MeshStyle) -> None:
     """
     if output.form == "poses" and style != MeshStyle(style.mesh_format, fps=style.fps):
         raise LCollisionError(
-            "would hold codes, which have neither --axes nor --scale, --like or --form",
+            "would contain codes; --axes, --scale, --like and --form apply only to meshes",
             "name a mesh or a folder",
             where=output.path,
         )
@@ -342,8 +343,8 @@ def write_result(
         if n_replaced and file_stamp(path) != output.before:
             path, n_replaced = unused_name(path), 0
             note(
-                f"{output.path} was changed by another command meanwhile and stays as it is; the "
-                f"result goes to {path}"
+                f"{output.path} was changed by another command in the meantime and was left "
+                f"alone; the result is in {path}"
             )
         meshes: list[WrittenPose] = []
         if output.form == "poses":
@@ -392,5 +393,5 @@ def _tell_written(
     told = f"wrote {counted(n_poses, 'pose')} to {output}"
     if n_replaced:
         replaced = counted(n_replaced, "file of the same name", "files of the same names")
-        told += f", in place of {replaced}"
+        told += f", replacing {replaced}"
     note(told)

@@ -64,11 +64,13 @@ def embedding(
     dataset: PoseSetArgument,
     output: OutputOption,
     n_domains: Annotated[
-        int, typer.Option("--domains", min=1, max=64, metavar="K", help="Domains of the body.")
+        int, typer.Option("--domains", min=1, max=64, metavar="K", help="Number of domains.")
     ] = 10,
     n_codes: Annotated[
         int,
-        typer.Option("--domain-codes", min=1, max=64, metavar="k", help="Codes of each domain."),
+        typer.Option(
+            "--domain-codes", min=1, max=64, metavar="k", help="Number of codes per domain."
+        ),
     ] = 10,
     near_exclusion: NearExclusionOption = None,
     rest_exclusion: RestExclusionOption = None,
@@ -77,22 +79,24 @@ def embedding(
     tolerated_depth: ToleratedDepthOption = None,
     up: Annotated[
         Axis | None,
-        typer.Option(help="The axis that is up. Default: what the set says, else a guess."),
+        typer.Option(help="The up axis. Default: what the set says, else a guess."),
     ] = None,
     scale: Annotated[
         float,
-        typer.Option(metavar="S", help="Brings the poses into the unit that the model is to have."),
+        typer.Option(metavar="S", help="Factor from the poses' unit to the model's."),
     ] = 1.0,
-    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Equal seeds, equal models.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, metavar="S", help="The same seed gives the same models.")
+    ] = 0,
     source: Annotated[
-        str | None, typer.Option(help="What the poses are. Default: the dataset's name.")
+        str | None, typer.Option(help="Description of the poses. Default: the dataset's name.")
     ] = None,
-    licence: Annotated[str, typer.Option(help="Under which the model may be used.")] = "unknown",
+    licence: Annotated[str, typer.Option(help="Licence of the model.")] = "unknown",
 ) -> None:
     """Learn the latent space of a pose set.
 
-    A checkpoint beside the output lets a run that was stopped or killed go on where it was when it
-    is started again; it is removed at the end.
+    You can stop it at any time; the same command resumes from a checkpoint beside the output, which
+    is removed at the end.
     """
     from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
@@ -107,7 +111,7 @@ def embedding(
         poses = poses.scaled(scale)
     guess = poses.up
     if up is None and not guess.is_sure:
-        note(f"{up_sentence(guess)}; --up x|y|z says otherwise, now or by `lcollision upright`")
+        note(f"{up_sentence(guess)}; --up x|y|z overrides it, now or by `lcollision upright`")
     poses = replace(poses, up_axis=guess.axis if up is None else "xyz".index(up))
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
@@ -140,29 +144,29 @@ def predictor(
     output: OutputOption,
     preset: Annotated[
         Literal["default", "paper"],
-        typer.Option(help="What measures best, or the paper's network and training."),
+        typer.Option(help="The best-measured network, or the paper's network and training."),
     ] = "default",
     loss: Annotated[
         Literal["full", "no-rank", "no-depth", "entropy"],
-        typer.Option(help="Of the paper's losses, leave out ranking, depth, or both."),
+        typer.Option(help="Leave out the paper's ranking loss, depth loss, or both."),
     ] = "full",
     no_domains: Annotated[
-        bool, typer.Option("--no-domains", help="Predict the whole body's energy alone (ND).")
+        bool, typer.Option("--no-domains", help="Predict only the energy of the whole body (ND).")
     ] = False,
     n_rows: RowsOption = None,
     seed: Annotated[
-        int, typer.Option(min=0, metavar="S", help="Equal seeds, equal predictors.")
+        int, typer.Option(min=0, metavar="S", help="The same seed gives the same predictors.")
     ] = 0,
     device: Annotated[
         Literal["auto", "cpu", "cuda"],
-        typer.Option(help="Where to train; auto takes a GPU when there is one."),
+        typer.Option(help="Device to train on; auto uses a GPU if there is one."),
     ] = "auto",
 ) -> None:
     """Learn to predict collisions from labelled samples.
 
     Three tenths of the rows are held out to measure the predictor; from 170 000 rows on, a tenth of
-    these sets the decision threshold of the preset default. A checkpoint beside the output lets a
-    run that was stopped or killed go on when it is started again; it is removed at the end. To use
+    these sets the decision threshold of the preset default. You can stop it at any time; the same
+    command resumes from a checkpoint beside the output, which is removed at the end. To use
     several devices or machines, start it with `torchrun -m app train predictor ...`.
     """
     from lcollision_core.jobs import no_progress
@@ -199,8 +203,8 @@ def predictor(
         free_latent = find_free_poses(model.embedding, model.exact_check())
         if not len(free_latent):
             note(
-                "no pose of this body that was tried is free of collision; Resolve has nowhere "
-                "to fall back to and may leave poses colliding"
+                "no tried pose of this body is free of collisions; Resolve has no pose to fall "
+                "back to and may leave poses colliding"
             )
         written = save_trained(
             destination,
@@ -224,7 +228,7 @@ def _resumable(
     from lcollision_core.meshes import locked
 
     if leads and has_begun(checkpoint):
-        note(f"going on from {checkpoint}")
+        note(f"continuing from {checkpoint}")
     try:
         with (
             locked(checkpoint, wait=0.0) if leads else nullcontext(),
@@ -233,7 +237,7 @@ def _resumable(
             yield cancel
     except CancelledError:
         if leads and has_begun(checkpoint):
-            note(f"stopped; run the same command again to go on from {checkpoint}")
+            note(f"stopped; run the same command again to continue from {checkpoint}")
         raise
 
 

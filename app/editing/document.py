@@ -463,7 +463,7 @@ class PoseDocument(LiveEditing):
 
         if not self.can_resolve:
             raise ModelFileError(
-                "cannot resolve, as it has no predictor", "train one for it", where=self.model.name
+                "has no predictor, which Resolve needs", "train one for it", where=self.model.name
             )
         self._close_gesture()
         self.cancel_resolve()

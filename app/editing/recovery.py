@@ -82,7 +82,7 @@ class Session:
         except FileNotFoundError:
             pass
         except OSError as error:
-            _log.warning("%s is no session: %s", folder, error)
+            _log.warning("%s is not a session: %s", folder, error)
             return None
         lock = QLockFile(str(folder / _LOCK))
         # A lock never grows too old: it is released only when its process ends.

@@ -76,8 +76,8 @@ class TurntableStyle:
             next_step = "choose fewer, WebP or PNG"
         elif suffix != ".png" and n_bytes > _MOST_BYTES:
             size = f"{self.n_frames} frames of {self.width} by {self.height} pixels"
-            what = f"would have {size}, which is too much for one file"
-            next_step = "choose less or a PNG sequence"
+            what = f"would take {size}, which is too much for one file"
+            next_step = "choose a smaller size or a PNG sequence"
         else:
             return None
         return MeshFileError(what, next_step, where=where)
@@ -137,7 +137,7 @@ class TurntableVideo:
     def close(self) -> None:
         """Stop drawing, and delete an incomplete PNG sequence."""
         self._renderer.close()
-        incomplete = CancelledError("the video is not complete")
+        incomplete = CancelledError("the video is incomplete")
         self._unfinished.__exit__(CancelledError, incomplete, None)
 
     def pack(self, _: Progress, cancel: CancelToken) -> str:

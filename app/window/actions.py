@@ -51,7 +51,9 @@ ACTIONS: dict[str, Spec] = {
     "save": Spec("&Save", "Ctrl+S", "Save the pose to its file", "save"),
     "save_as": Spec("Save &as…", "Ctrl+Shift+S", "Save under another name"),
     "import": Spec("&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import"),
-    "export": Spec("&Export mesh…", "Ctrl+E", "Save the pose as a mesh or in your file", "export"),
+    "export": Spec(
+        "&Export mesh…", "Ctrl+E", "Save the pose as a mesh or in your own file", "export"
+    ),
     "upright": Spec(
         "Turn &upright",
         "",
@@ -61,7 +63,7 @@ ACTIONS: dict[str, Spec] = {
     "turntable": Spec("&Turntable…", "Ctrl+T", "Save a video of one full turn", "turntable"),
     "quit": Spec("&Quit", "Ctrl+Q", "Close the editor"),
     "undo": Spec("&Undo", "Ctrl+Z", "Undo the last change", "undo"),
-    "redo": Spec("&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Repeat the change that was undone", "redo"),
+    "redo": Spec("&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Redo the change that was undone", "redo"),
     "reset": Spec(
         "Reset &all",
         "Ctrl+Backspace",
@@ -70,7 +72,7 @@ ACTIONS: dict[str, Spec] = {
     ),
     "randomise": Spec("Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random"),
     "mirror": Spec(
-        "&Mirror pose", "Ctrl+M", "Swap left and right, also of locked body parts", "mirror"
+        "&Mirror pose", "Ctrl+M", "Swap left and right, including locked body parts", "mirror"
     ),
     "filter": Spec("&Find a slider", "Ctrl+F", "Type part of a slider's name", "search"),
     "unlock": Spec("Un&lock all", "Ctrl+L", "Unlock all body parts"),
@@ -84,7 +86,7 @@ ACTIONS: dict[str, Spec] = {
     "standing": Spec(
         "Keep feet on the &ground",
         "Ctrl+Alt+G",
-        "Keep what stands on the ground there while other parts are dragged",
+        "Keep what stands on the ground in place while other parts are dragged",
         checkable=True,
     ),
     "whole_body": Spec(
@@ -96,23 +98,21 @@ ACTIONS: dict[str, Spec] = {
     "arrows": Spec(
         "Show a&xes", "A", "Show arrows to drag the patch under the pointer along the body's axes"
     ),
-    "pin": Spec("&Pin", "P", "Hold the patch under the pointer in its place"),
+    "pin": Spec("&Pin", "P", "Hold the patch under the pointer in place"),
     "pin_turn": Spec(
         "Pin with &orientation",
         "O",
-        "Hold the patch under the pointer, and keep its body part's tilt",
+        "Hold the patch under the pointer in place and keep its body part's orientation",
     ),
     "unpin_all": Spec("&Unpin all", "Shift+P", "Remove all pins"),
-    "pin_feet": Spec("Pin &feet", "Ctrl+Alt+F", "Hold the feet in their places, flat as they are"),
+    "pin_feet": Spec("Pin &feet", "Ctrl+Alt+F", "Hold the feet in place, at their current angle"),
     "pin_hands": Spec(
-        "Pin &hands", "Ctrl+Alt+H", "Hold the hands in their places, turned as they are"
+        "Pin &hands", "Ctrl+Alt+H", "Hold the hands in place, at their current angle"
     ),
-    "smaller": Spec(
-        "S&maller patch", "[", "Drag a smaller patch; a small one takes a single finger"
-    ),
+    "smaller": Spec("S&maller patch", "[", "Drag a smaller patch, as small as a single finger"),
     "larger": Spec("&Larger patch", "]", "Drag a larger patch of the body"),
     "resolve": Spec("&Resolve", "Ctrl+R", "Find the nearest pose without collisions", "resolve"),
-    "cancel": Spec("&Cancel", "Escape", "Stop what is being computed", "cancel"),
+    "cancel": Spec("&Cancel", "Escape", "Stop the current computation", "cancel"),
     "resolve_options": Spec("Resolve &options…", "Ctrl+Shift+R", "Choose how Resolve works"),
     "keep": Spec("Add &to library…", "Ctrl+K", "Add this pose to your library", "add"),
     "update": Spec("&Update pose", "Ctrl+U", "Replace the library's pose with this one"),
@@ -154,7 +154,9 @@ ACTIONS: dict[str, Spec] = {
         "Show the &whole body", "Ctrl+Home", "Fit the whole body into the view, from the same side"
     ),
     "full_screen": Spec("&Full screen", "F11", "Use the whole screen", "", True),
-    "reset_layout": Spec("Reset la&yout", "Ctrl+Alt+0", "Put all panels back in their places"),
+    "reset_layout": Spec(
+        "Reset la&yout", "Ctrl+Alt+0", "Put all panels back in their default places"
+    ),
     "shortcuts": Spec("&Keyboard and mouse", "F1", "All shortcuts", "info"),
     "log": Spec("Open &log file", "Ctrl+Shift+L", "Open the log with the details of errors"),
     "about": Spec("&About LCollision", "Shift+F1", "Version, licence and model"),

@@ -161,8 +161,8 @@ class BodyMenus(QObject):
         joint = joints.pop()
         name = model.space.rig.joint_names[joint]
         now = role_name(model.space.roles[joint], model.space.sides[joint])
-        roles = menu.addMenu(f"{menu_text(name)} &is")
-        known = self._add(roles, "As its rig says", self._say_role, name, None)
+        roles = menu.addMenu(f"Joint &role of {menu_text(name)}")
+        known = self._add(roles, "From the rig", self._say_role, name, None)
         known.setEnabled(name in model.space.rig.chosen)
         roles.addSeparator()
         for role in ROLE_NAMES:

@@ -130,16 +130,16 @@ class EditActions(QObject):
     def _update_actions(self) -> None:
         document, stack = self._document, self._document.undo_stack
         unable = "" if document.can_resolve else "This model has no predictor to resolve with"
-        waits = "Wait until Resolve has ended" if document.solving else ""
+        waits = "Wait for Resolve to finish" if document.solving else ""
         if document.incoming:
-            waits = f"{document.incoming}, which replaces this pose"
+            waits = f"{document.incoming}, which will replace this pose"
         is_busy = document.busy or self._pictures.busy
         why_not = {
             "undo": "" if stack.canUndo() else "There is nothing to undo",
             "redo": "" if stack.canRedo() else "There is nothing to redo",
             "mirror": document.why_not_mirrored,
             "unlock": "" if document.locked_domains else "No body part is locked",
-            "parts": "Wait until the model is changed" if document.changing_model else "",
+            "parts": "Wait for the model to be changed" if document.changing_model else "",
             "resolve": unable or waits,
             "resolve_options": unable,
             "cancel": "" if is_busy else "Nothing is being computed",

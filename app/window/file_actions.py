@@ -170,7 +170,9 @@ class FileActions(QObject):
         from lcollision_core.model import is_bundled
 
         if is_bundled(self._document.model_file):
-            return "This model came with the program: copy its file, open the copy and turn that"
+            return (
+                "This model is bundled with the program: copy its file, open the copy and turn that"
+            )
         return ""
 
     def _turn_upright(self) -> None:
@@ -233,8 +235,8 @@ class FileActions(QObject):
     def _require_model(self, path: Path) -> None:
         if not self._document.has_model:
             raise LCollisionError(
-                "can only be opened once a body is there",
-                "wait until one is open, or open a model or a character first",
+                "can only be opened once a body is open",
+                "open a model or a character first",
                 where=path.name,
             )
 

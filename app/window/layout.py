@@ -76,7 +76,7 @@ class Layout(QObject):
         self._settings["window_layout"] = self._window.saveState(_VERSION)
 
     def reset(self) -> None:
-        """Put all panels back in their places, as wide as they were at first."""
+        """Put all panels back in their default places, as wide as they were at first."""
         for key, dock in self._docks.items():
             dock.setFloating(False)
             self._window.addDockWidget(_AREAS[key], dock)

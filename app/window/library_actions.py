@@ -97,9 +97,9 @@ class LibraryActions(QObject):
         select = "" if chosen else "Select poses in the Poses panel first"
         select_one = "" if one else "Select one pose in the Poses panel first"
         select_own = "" if own else "Select poses of your library first"
-        update_first = "Load a pose of your library to change it later"
+        update_first = "Load a pose from your library first"
         if has_model and document.library_pose is not None:
-            update_first = "The pose is as in your library"
+            update_first = "The pose is the same as in your library"
         why_not = {
             "update": "" if has_model and document.can_update else update_first,
             "load": select_one,

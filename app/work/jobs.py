@@ -198,7 +198,7 @@ def read_poses(
         return error
     cancel.raise_if_cancelled()
     if not held.all_poses:
-        raise ModelFileError("holds no poses", "open a file that has some", where=path)
+        raise ModelFileError("contains no poses", "open a file with poses", where=path)
     return ReadPoses(path, held, stamp, opened)
 
 
@@ -476,7 +476,7 @@ def edit_parts(
         with locked(path):
             if path.exists():
                 raise ModelFileError(
-                    f"there is a model {edits.copy_name!r} already", "choose another name"
+                    f"a model {edits.copy_name!r} already exists", "choose another name"
                 )
             written = change(model)
             written.save(path)
@@ -487,5 +487,7 @@ def edit_parts(
 def _require_same(held: PosableBody, model: PosableBody, model_file: str, what: str) -> None:
     if held.fingerprint != model.fingerprint:
         raise ModelFileError(
-            "holds another model by now", f"open it again to change {what}", where=model_file
+            "has been replaced by another model",
+            f"open that one to change {what}",
+            where=model_file,
         )

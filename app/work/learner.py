@@ -35,9 +35,7 @@ _NICENESS = 10
 _BELOW_NORMAL_PRIORITY_CLASS = 0x4000
 _SECONDS_BETWEEN_LOOKS = 0.25
 _BUG = "the program has failed ({0}: {1}); continue, or see the log file in {2}"
-_NO_MEMORY = (
-    "there is not enough memory; close other programs and continue, or learn a lighter mesh"
-)
+_NO_MEMORY = "out of memory; close other programs and continue, or use a lighter mesh"
 _FULL = "{0}; free some space on the disk of {1}, then continue"
 _UNUSABLE = "{0}; check the files and the folder {1}, then continue"
 _FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT)

@@ -138,7 +138,7 @@ class LearningRuns(QObject):
 
         destination = model_destination(name)
         if destination.exists():
-            raise LCollisionError(f"there is a model {name!r} already", "choose another name")
+            raise LCollisionError(f"a model {name!r} already exists", "choose another name")
         work = WorkFolder(destination)
         work.prepare(request)
         self.resume(work.path)

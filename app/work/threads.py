@@ -105,7 +105,7 @@ def guarded(
         _log.exception("%s failed", label)
         failure = Failure(
             f"{label} failed ({type(error).__name__}: {error})",
-            "try again, or look into the log",
+            "try again, or see the log",
             traceback.format_exc(),
         )
         return Response(request_id, failure=failure)

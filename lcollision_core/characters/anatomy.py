@@ -81,10 +81,10 @@ _SAME_WAY = 0.9
 """Cosine to which feet point to where the body faces."""
 
 _UNKNOWN = (
-    "its joints are not known as those of a person, so random poses turn them little; "
-    "say what they are in the menus of their sliders, or by domains --role"
+    "its joints are not recognised as a person's, so random poses turn them little; set their "
+    "roles in the menus of their sliders, or with `lcollision domains --role`"
 )
-_FOUR_LEGS = "it stands on four legs, so random poses turn its limbs little, and not as a person's"
+_FOUR_LEGS = "it stands on four legs, so random poses turn its limbs only a little"
 
 
 @dataclass(frozen=True, eq=False)

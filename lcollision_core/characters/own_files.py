@@ -118,7 +118,7 @@ def read_own_file(path: Path) -> OwnFile | None:
     ------
     MeshFileError : it was changed since, by another program, or is of a later version.
     """
-    with one_sentence(path, "is not checked by the rules that it was written with"):
+    with one_sentence(path, "can't be checked by the rules that it was exported with"):
         document = GltfDocument(read_regular(path, MAX_FILE_BYTES), path)
         asset = document.description.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None

@@ -325,7 +325,7 @@ class _Source:
         error = float(np.abs(stored - wanted).max()) / self.size
         if not error <= _LARGEST_ERROR:
             raise UnwritablePoseError(
-                "its joints cannot hold this pose (vertices would be off by "
+                "its joints cannot reproduce this pose (vertices would be off by "
                 f"{error:.2g} of the body size)",
                 _OTHER_FORM,
             )
@@ -500,7 +500,7 @@ class _Source:
                 own = np.linalg.solve(turns[:, :, :3], wanted[:, :, None])[:, :, 0]
             except np.linalg.LinAlgError as error:
                 raise UnwritablePoseError(
-                    "its joints flatten vertices at rest, which no morph target undoes"
+                    "its joints flatten vertices at rest, which a morph target cannot undo"
                 ) from error
             deltas = (own - base).astype(np.float32)
             stored[self._joined[rows]] = _moved(turns, base + deltas)
@@ -577,7 +577,7 @@ class _Source:
         if shown.n_instances > 1:
             raise MeshFileError(
                 f"its node {node.get('name', shown.node)} shows a mesh {shown.n_instances} times, "
-                "which cannot be given as many shapes",
+                "which cannot take as many shapes",
                 f"choose {CharacterForm.JOINTS}, or a file of meshes",
             )
         if sum(other.get("mesh") == node["mesh"] for other in self._nodes) > 1:
@@ -627,9 +627,7 @@ def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
     try:
         return np.linalg.solve(above, transform).astype(np.float64)
     except np.linalg.LinAlgError as error:
-        raise UnwritablePoseError(
-            "a joint hangs on a node that is scaled to nothing", _OTHER_FORM
-        ) from error
+        raise UnwritablePoseError("a joint's parent has zero scale", _OTHER_FORM) from error
 
 
 def _stored_transform(node: dict[str, Any]) -> FloatArray:

@@ -163,7 +163,7 @@ class HumanDraws:
         n_limbs = int(self._limb.max(initial=-1)) + 1
         if not n_limbs:
             raise LCollisionError(
-                "has no joints that turn, apart from the one that moves all of it",
+                "has no joints that turn, apart from its root",
                 "leave out poses by the rig",
                 where=self.space.rig.joint_names[0],
             )

@@ -130,7 +130,7 @@ def _rig(
     if -1 in used:
         flat = min(bone for bone in mesh.bones[moving].tolist() if anchors[bone] < 0)
         name = scene.node_names[flat] or f"node {flat}"
-        return None, (f"joint {name} is scaled to nothing in its rest pose",)
+        return None, (f"joint {name} has zero scale in its rest pose",)
     order = [
         node
         for node in parents_first(scene.parents)
@@ -146,7 +146,9 @@ def _rig(
     notes: tuple[str, ...] = ()
     if mesh.dual.any():
         at_rest[mesh.dual > 0.0] = rest_vertices[mesh.dual > 0.0, None]
-        notes = ("its skin is blended by dual quaternions, in poses by its joints linearly",)
+        notes = (
+            "its file blends the skin by dual quaternions, but its poses are blended linearly",
+        )
     return Rig(
         tuple(numbered_where_equal(scene.node_names[node] or f"node {node}" for node in order)),
         np.array([_parent_joint(scene, node, joint) for node in order], dtype=np.int64),

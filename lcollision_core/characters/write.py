@@ -94,7 +94,7 @@ def _require_written(path: str | os.PathLike[str], character: Character) -> None
     if suffix not in PATCHED_SUFFIXES:
         raise MeshFileError.unwritable(
             path,
-            f"the character is from {suffix}, whose skin and textures are not written",
+            f"the character is from {suffix}, whose skin and textures can't be written",
             "write .obj, .pc2 or .mdd",
         )
     if target not in _WRITTEN_SUFFIXES or (target == ".vrm" and suffix != ".vrm"):

@@ -206,7 +206,7 @@ class CollisionDetector:
         self.rules, self.groups, self.reference = rules, tuple(groups), vertices
         self.body_size = body_size(vertices, topology)
         if self.body_size == 0.0:
-            raise ShapeError("all vertices are in one point", "give it a mesh with an extent")
+            raise ShapeError("all vertices coincide", "use a mesh that has an extent")
         if not 1.0 / MAX_BODY_SIZE <= self.body_size <= MAX_BODY_SIZE:
             needed = f"{1.0 / MAX_BODY_SIZE:.0e} to {MAX_BODY_SIZE:.0e}"
             raise ShapeError.must_be("the body size", needed, f"{self.body_size:.1e}", "scale it")

@@ -291,7 +291,8 @@ class Embedding:
             support = need(f"{name}_support", np.int32, (None,))
             if not 0 <= support[0] <= support[-1] < n_vertices or (np.diff(support) <= 0).any():
                 raise ValueError(
-                    f"its array {name}_support is no ascending list of its {n_vertices} vertices"
+                    f"its array {name}_support is not an ascending list of its {n_vertices} "
+                    "vertices"
                 )
             level2.append(_read_autoencoder(arrays, name, support))
             share = need(f"{name}_mask", np.float32, support.shape)

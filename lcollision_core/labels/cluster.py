@@ -110,7 +110,7 @@ def label_on_cluster(
         except (KilledWorker, LostError) as error:
             raise LCollisionError(
                 f"the workers of {scheduler} died while labelling",
-                "give them more memory, then run the same command again to go on",
+                "give them more memory, then run the same command again to continue",
             ) from error
 
 

@@ -86,7 +86,7 @@ class LabelStore:
             )
         if (target / "zarr.json").is_file():
             raise LabelStoreError(
-                "was made by an older version of this program and is not read any more",
+                "was made by an older version of this program and can no longer be read",
                 "run `lcollision label` again, into another folder",
                 where=path,
             )
@@ -97,7 +97,7 @@ class LabelStore:
             is_ours = False
         if not is_ours:
             raise LabelStoreError(
-                "is no label store", "name one that `lcollision label` made", where=path
+                "is not a label store", "name one that `lcollision label` made", where=path
             )
         version = manifest.get("format_version")
         if isinstance(version, int) and version > FORMAT_VERSION:

@@ -57,7 +57,7 @@ def card_of(model: PoseModel, path: str) -> LearnedCard:
     """
     record, metrics = model.predictor_record, model.metrics
     if record is None or record.metrics is None or metrics is None:
-        raise ValueError(f"{path} was not learned to its end")
+        raise ValueError(f"{path} was not trained to its end")
     scores = record.metrics
     spent = model.card.provenance.get("seconds", {})
     return LearnedCard(

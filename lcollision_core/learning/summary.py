@@ -154,9 +154,7 @@ def _of_poses(
 ) -> SourcesSummary:
     poses = read_pose_set(path, progress, cancel, topology=topology)
     if len(poses) < 2:
-        raise LCollisionError(
-            "holds a single pose, of which nothing can be learned", "add more poses", where=path
-        )
+        raise LCollisionError("contains only one pose", "add more", where=path)
     return SourcesSummary(
         poses.topology,
         _some(poses.vertices, _MOST_SHOWN).astype(np.float32),

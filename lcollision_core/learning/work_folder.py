@@ -182,9 +182,11 @@ class WorkFolder:
         return model
 
     def _taken(self) -> ModelFileError:
-        what = f"there is a model {self.name!r} already"
+        what = f"a model {self.name!r} already exists"
         if not self.destination.exists():
-            return ModelFileError(f"{what}, which comes with the program", "choose another name")
+            return ModelFileError(
+                f"{what}, which is bundled with the program", "choose another name"
+            )
         return ModelFileError(what, "choose another name, or remove it", where=self.destination)
 
     @property

@@ -83,9 +83,9 @@ def read_animated(
     """
     if path.suffix.lower() not in POINT_CACHE_SUFFIXES:
         return _read_clips(path, clip, fps, progress, cancel, topology)
-    for value, option in ((clip, "a clip"), (fps, "frames a second")):
+    for value, option in ((clip, "clips"), (fps, "frame rate")):
         if value is not None:
-            raise MeshFileError(f"is a point cache, of which {option} cannot be chosen", where=path)
+            raise MeshFileError(f"is a point cache, which has no {option}", where=path)
     return _read_cache(path, topology)
 
 
@@ -101,7 +101,7 @@ def _read_clips(
     with one_sentence(path):
         if not scene.clips:
             raise MeshFileError(
-                "it holds no animation, so it is one mesh, not a pose set",
+                "it contains no animation, so it is one mesh, not a pose set",
                 "name its folder, export it with its animation, or let its rig pose it",
             )
         mesh = join_parts(scene).cut_as(topology)
@@ -154,7 +154,7 @@ def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
     found = [file for file in beside if file.is_file()]
     if not found:
         raise MeshFileError(
-            "is a point cache, which holds no faces, and its mesh is not beside it",
+            "is a point cache, which has no faces, and its mesh is not beside it",
             f"put it there as {beside[0].name}, or with another extension of a mesh",
             where=path,
         )
@@ -171,7 +171,7 @@ def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
             frames = frames[:, np.unique(joined, return_index=True)[1]]
     if mesh.topology.n_vertices != frames.shape[1]:
         raise MeshFileError(
-            f"holds {n_vertices} vertices a frame, its mesh {found[0].name} has "
+            f"holds {n_vertices} vertices per frame, its mesh {found[0].name} has "
             f"{mesh.topology.n_vertices}",
             "export both from the same mesh, without modifiers that add vertices",
             where=path,
@@ -203,7 +203,7 @@ def _require_same_body(path: Path, file: Path, mesh: Mesh, frame: FloatArray) ->
     # Whichever of the two has the vertices in the order of the faces.
     if is_torn(lengths, known) or is_torn(known, lengths):
         raise MeshFileError(
-            f"has its vertices in another order than {file.name}",
+            f"has a different vertex order from {file.name}",
             "export both from the same mesh, the mesh with its vertex order kept",
             where=path,
         )

@@ -142,7 +142,7 @@ def named_pair(entry: str, names: Collection[str]) -> tuple[str, str]:
         what = "is not A:B with the names of two groups of faces"
         raise LCollisionError(what, next_step, where=where)
     unknown = next(name for name in splits[0] if name not in names)
-    what = f"names {unknown!r}, which is no group of faces of this mesh"
+    what = f"names {unknown!r}, which is not a group of faces of this mesh"
     raise LCollisionError(what, next_step, where=where)
 
 
@@ -160,7 +160,7 @@ def named_group(entry: str, names: Collection[str]) -> str:
     near += [small for small in by_small if entry.lower() in small and small not in near]
     listed = ", ".join([by_small[small] for small in near or by_small][:_LISTED])
     raise LCollisionError(
-        "is no group of faces of this mesh",
+        "is not a group of faces of this mesh",
         f"name one of {listed}" if listed else "",
         where=repr(entry),
     )

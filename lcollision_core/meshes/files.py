@@ -175,9 +175,9 @@ def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
 
 def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> None:
     if len(vertices) == 0:
-        raise MeshFileError("it holds no vertices")
+        raise MeshFileError("it contains no vertices")
     if len(faces) == 0:
-        raise MeshFileError("it holds vertices but no faces", "export it as a triangle mesh")
+        raise MeshFileError("it contains vertices but no faces", "export it as a triangle mesh")
     for count, what in ((len(faces), "faces"), (len(vertices), "vertices")):
         if count > MAX_FACES:
             raise MeshFileError(

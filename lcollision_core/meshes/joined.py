@@ -270,7 +270,7 @@ def _topology(faces: IntArray, is_left_out: npt.NDArray[np.bool_], n_vertices: i
             "check the scale of what it holds, and export it again",
         )
     if not len(faces):
-        raise MeshFileError("it holds vertices but no faces", "export it as a triangle mesh")
+        raise MeshFileError("it contains vertices but no faces", "export it as a triangle mesh")
     return Topology(faces[~is_left_out], n_vertices)
 
 

@@ -223,7 +223,7 @@ def read_pose_set(
 
     pose_set = collect_poses(Path(path), refuse, progress, cancel, clip, fps, topology).pose_set
     if pose_set is None:
-        raise MeshFileError("holds no poses", "name another folder or file", where=path)
+        raise MeshFileError("contains no poses", "name another folder or file", where=path)
     require_usable_reference(pose_set)
     return pose_set
 
@@ -358,9 +358,9 @@ def _collect_folder(
     formats = Counter(file.suffix.lower() for file in files)
     if len(formats) != 1:
         held = ", ".join(f"{count} {suffix}" for suffix, count in sorted(formats.items()))
-        what, next_step = "holds no mesh", "name a folder of .obj, .ply, .off or .stl files"
+        what, next_step = "contains no mesh", "name a folder of .obj, .ply, .off or .stl files"
         if formats:
-            what = f"holds meshes of several formats ({held})"
+            what = f"contains meshes of several formats ({held})"
             next_step = "keep one format in a folder"
         report(MeshFileError(what, next_step, where=path))
         return PoseSetInspection(None, len(files))
@@ -519,7 +519,7 @@ def _meshes_of(
     for name, short_name in _MESH_ARRAYS:
         if name not in arrays:
             others = ", ".join(sorted(held)[:8])[:_MAX_TEXT_LENGTH] or "nothing"
-            raise MeshFileError(f"it has no array {name!r} or {short_name!r}, it holds {others}")
+            raise MeshFileError(f"it has no array {name!r} or {short_name!r}, only {others}")
         found.append(arrays[name])
     vertices, faces = found
     if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:

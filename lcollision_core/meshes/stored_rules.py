@@ -117,7 +117,7 @@ def texts_of(value: npt.NDArray[np.str_], name: str, most: int) -> tuple[str, ..
     """
     native = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("="))
     if (native.view(np.uint32) > sys.maxunicode).any():
-        raise MeshFileError("holds a character that does not exist", where=name)
+        raise MeshFileError("contains a character that does not exist", where=name)
     # A lone surrogate, from an undecodable file name, cannot be printed.
     return tuple(text[:most].encode(errors="replace").decode() for text in native.tolist())
 

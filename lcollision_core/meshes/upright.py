@@ -69,7 +69,9 @@ def guess_up(topology: Topology, vertices: npt.NDArray[Any]) -> UpGuess:
     is_sure = bool(scores[first] > 0.0 and scores[first] - scores[second] >= _SURE)
     if not is_sure:
         axis = longest if longest != side else int(first)
-        return UpGuess(axis, False, "what it stands on does not tell, so the longest side decides")
+        return UpGuess(
+            axis, False, "what it stands on doesn't show it, so the longest side decides"
+        )
     return UpGuess(int(first), True, "it stands on that end in most poses")
 
 

@@ -82,7 +82,7 @@ def known_character(fingerprint: str) -> KnownCharacter | None:
     try:
         document = parse_json(read_regular(path, _MAX_BYTES))
         if not isinstance(document, dict) or document.get("format") != _FORMAT:
-            raise ValueError("it holds something else")
+            raise ValueError("it contains something else")
         version = document.get("format_version")
         if isinstance(version, int) and version > _VERSION:
             raise ModelFileError.too_new(path, quoted(version), _VERSION)

@@ -255,7 +255,7 @@ def why_no_name(name: str) -> str:
     if not 0 < len(name) <= MAX_POSE_NAME_LENGTH:
         return f"its name must be a text of 1 to {MAX_POSE_NAME_LENGTH} characters"
     if any("\ud800" <= character <= "\udfff" for character in name):
-        return "its name has half a character, which no text file holds"
+        return "its name contains invalid Unicode"
     return ""
 
 
@@ -308,23 +308,24 @@ def _other_model(
     listed, character = find_latent_space(fingerprint, name), find_character(fingerprint)
     known = listed or character
     if known is not None and known.name == model.name:
-        what = f"holds poses of another {name!r}, {known.path}: {_difference(owner, model)}"
+        what = f"contains poses of another {name!r}, {known.path}: {_difference(owner, model)}"
         next_step = f"use them with {known.path}"
     elif listed is not None:
-        what = f"holds poses of the model {listed.name!r}, not of {model.name!r}"
+        what = f"contains poses of the model {listed.name!r}, not of {model.name!r}"
         next_step = f"use them with {listed.name!r}"
     elif character is not None:
-        what = f"holds poses of the character {character.name!r}, not of {model.name!r}"
+        what = f"contains poses of the character {character.name!r}, not of {model.name!r}"
         next_step = f"use them with {character.path}"
     elif name == model.name:
         what = (
-            f"holds poses of another model called {name!r} too, which is not among the models "
+            f"contains poses of another model called {name!r} too, which is not among the models "
             f"here: {_difference(owner, model)}"
         )
         next_step = "use them with the model that they were made with"
     else:
         what = (
-            f"holds poses of the model {name!r}, not of {model.name!r}, and {name!r} is not among "
+            f"contains poses of the model {name!r}, not of {model.name!r}, and {name!r} is not "
+            "among "
             f"the models here"
         )
         next_step = f"copy its file to {user_models_folder()}, or name it"

@@ -427,7 +427,7 @@ def write_pose(
     if source is None:
         if form is not None:
             raise MeshFileError.unwritable(
-                path, f"the form {form} is one of a character's file", "name that, with --like"
+                path, f"the form {form} applies only to a character's file", "name one with --like"
             )
         return WrittenPose(export_mesh(path, body, vertices, placement, frame), unit)
     chosen = source.require_form(path, form)
@@ -507,7 +507,7 @@ def sequence_files(
         return {target: np.arange(body.n_vertices)}
     if target.suffix.lower() not in POINT_CACHE_SUFFIXES:
         raise MeshFileError.unwritable(
-            path, "it is no point cache", f"use one of {', '.join(POINT_CACHE_SUFFIXES)}"
+            path, "it is not a point cache", f"use one of {', '.join(POINT_CACHE_SUFFIXES)}"
         )
     objects = [("", np.arange(body.n_vertices))] if source is None else source.objects
     if len(objects) == 1:

@@ -34,7 +34,7 @@ _REMEMBERED, _POLISHED = 8, 3
 
 _ITERATIONS_ALONE = 60
 
-ALL_LOCKED = "all body parts are locked, so the pose stays as it is; unlock one"
+ALL_LOCKED = "all body parts are locked, so the pose was not changed; unlock one"
 """The note of a result whose pose had no code that may move."""
 
 _Tried = tuple[Step, FloatArray | None]
@@ -204,7 +204,7 @@ class Ladder:
                 "collides"
             )
         if self.problem.movable.all():
-            return "the poses that the model knows as free collide, so the pose still collides"
+            return "the model's known free poses collide, so the pose still collides"
         return "no free pose was found that keeps the locked body parts; unlock one"
 
     def _result(

@@ -82,7 +82,7 @@ class PoseResolver:
         chosen = options or ResolveOptions()
         if self._predictor is None and not chosen.verify:
             raise LCollisionError(
-                "has no predictor whose answer could stay unchecked",
+                "has no predictor, so its answer can't be left unchecked",
                 "resolve with the exact check",
                 where="the body",
             )

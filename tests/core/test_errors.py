@@ -63,8 +63,8 @@ SENTENCES = [
         "hero.glb cannot hold this pose",
     ),
     (
-        OtherModelError("holds poses of another model", where="p.json", model=None),
-        "p.json holds poses of another model",
+        OtherModelError("contains poses of another model", where="p.json", model=None),
+        "p.json contains poses of another model",
     ),
 ]
 

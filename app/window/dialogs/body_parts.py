@@ -77,13 +77,13 @@ class BodyPartsDialog(QDialog):
         for button in sides:
             button.setAutoDefault(False)
         note = (
-            f"“{model.name}” came with the program and stays as it is: the changes go to a copy "
-            "among your models, which opens in its place with this pose."
+            f"“{model.name}” is bundled with the program and can't be changed: your changes go to "
+            f"a copy among your models, which opens in its place with this pose."
             if copies
             else "The changes are saved in the model's file. Undo does not revert them."
         )
         if not model.is_trained:
-            note = "The changes are remembered for this character: its file stays as it is."
+            note = "The changes are remembered for this character; its file is not changed."
         self.copy_name = QLineEdit(free_model_name(model.name, 2))
         self.copy_name.setAccessibleName("Name of the copy")
         copy_row = QWidget()
@@ -180,7 +180,7 @@ class BodyPartsDialog(QDialog):
             if shared:
                 return f"Two body parts are called “{sorted(shared)[0]}”; give each its own name."
             if any(not n or len(n) > 60 for n in edits.names.values()):
-                return "A body part needs a name of 1 to 60 letters."
+                return "A body part needs a name of 1 to 60 characters."
             return str(error)
         return ""
 

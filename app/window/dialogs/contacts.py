@@ -50,7 +50,7 @@ _LIST_HEIGHT = 64
 _ROW = QSize(0, 20)
 _OTHERS = "other pairs"
 _MEANINGS = {
-    "meshes and materials": "As the file has them",
+    "meshes and materials": "As named in the file",
     "body parts": "Such as an upper arm and its forearm, which cross at the elbow",
     "components": "Connected pieces of the surface, such as shells and buttons",
     _OTHERS: "Groups of two kinds",
@@ -123,10 +123,10 @@ class ContactsDialog(QDialog):
     def _lay_out(self) -> None:
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         self.apply = buttons.addButton("Apply", QDialogButtonBox.ButtonRole.ApplyRole)
-        self.apply.setToolTip("Check the pose, drag and resolve by these rules from now on")
+        self.apply.setToolTip("Use these rules from now on to check, drag and resolve")
         self.apply.clicked.connect(self._apply)
         self.restore = buttons.addButton("Defaults", QDialogButtonBox.ButtonRole.ResetRole)
-        self.restore.setToolTip("Go back to the rules that the character starts with")
+        self.restore.setToolTip("Restore the character's default rules")
         self.restore.clicked.connect(self._restore)
         for button in (self.restore, buttons.button(QDialogButtonBox.StandardButton.Close)):
             button.setAutoDefault(False)
@@ -135,16 +135,18 @@ class ContactsDialog(QDialog):
         near.setBuddy(self.near)
         tolerated.setBuddy(self.tolerated)
         page = dialog_vbox(
-            self._note("Crossing triangles that a rule leaves out are no collisions."),
-            self._row(near, "near", self.near, "Pairs this near along the surface"),
+            self._note("Crossing triangles that a rule leaves out don't count as collisions."),
+            self._row(near, "near", self.near, "Pairs this close along the surface"),
             self._row(
                 self.at_rest,
                 "rest",
                 self.rest,
-                "Belts, cloth, eyelids: pairs that touch in the rest pose, and what is this "
-                "near to them along the surface",
+                "Belts, cloth, eyelids: pairs that touch in the rest pose, and pairs this close "
+                "to them along the surface",
             ),
-            self._row(tolerated, "tolerated", self.tolerated, "Pairs no deeper, for soft bodies"),
+            self._row(
+                tolerated, "tolerated", self.tolerated, "Pairs up to this deep, for soft bodies"
+            ),
             hbox(self.at_joints, None, self.counts["joint"]),
             hbox(self.always, None, self.counts["touching"]),
             self._ignored_part(),
@@ -244,11 +246,11 @@ class ContactsDialog(QDialog):
         model = self._document.model
         if model.has_predictor:
             return (
-                f"“{model.name}” has a predictor that was trained by these rules: train a model "
-                "by other rules to change them."
+                f"“{model.name}” has a predictor that was trained with these rules: to change "
+                f"them, train a model with other rules."
             )
         if not model.is_trained:
-            return "What you apply is remembered for this character: its file stays as it is."
+            return "The rules are remembered for this character; its file is not changed."
         return ""
 
     @Slot()
@@ -295,7 +297,7 @@ class ContactsDialog(QDialog):
         left = counted(found.n_counted, "pair")
         said = f"At rest {counted(found.excluded.total, 'pair')} not counted, {left} counted."
         if found.n_counted:
-            said += " While pairs count at rest no pose is free: widen a rule."
+            said += " While pairs count at rest, no pose is free: widen a rule."
         self._write(self.total, said)
 
     @Slot()
@@ -307,13 +309,16 @@ class ContactsDialog(QDialog):
             widget.setEnabled(can_change)
         self.rest.setEnabled(can_change and self.at_rest.isChecked())
         self.at_joints.setEnabled(can_change and model.has_joints)
-        tip = "Pairs of parts that a joint links, both within the limb's thickness of it"
+        tip = "Pairs of parts linked by a joint, within a limb's thickness of it"
         if not model.has_joints:
             tip = "For rigged characters, and models learned from them"
         self.at_joints.setToolTip(tip)
         found = len(self._patches()[0])
         self.always.setEnabled(can_change and found > 0)
-        tip = f"{counted(found, 'place')} found that touch in nearly every pose, and what is near"
+        tip = (
+            f"{counted(found, 'place')} found that touch in nearly every pose, with the faces "
+            "close to them"
+        )
         self.always.setToolTip(tip if found else "No place is known to touch in nearly every pose")
         several = can_change and self.first.count() > 1
         for choice in (self.first, self.second, self.add):
@@ -370,7 +375,7 @@ class ContactsDialog(QDialog):
             return sum(size[pair.groups[0]] * size[pair.groups[1]] for pair in proposals[kind])
 
         first = min((kind for kind in proposals if proposals[kind]), key=left_out)
-        begin = f"Begin with {first}, which leaves out least; what is selected is tinted."
+        begin = f"Begin with {first}, which leaves out the least; the selection is tinted."
         self._write(self.total, begin)
 
     def _groups(self) -> list[FaceGroup]:
@@ -417,7 +422,7 @@ class ContactsDialog(QDialog):
         if len(names) < _FEWEST_PARTS:
             return
         parts = QTreeWidgetItem(self.ignored, [f"Leave out whole ({len(names)})"])
-        parts.setToolTip(0, "Ticked: takes no part in the check; it is posed and exported as ever")
+        parts.setToolTip(0, "Ticked: left out of the check; still posed and exported")
         for name in names:
             item = self._left_out[name] = QTreeWidgetItem(parts, [name])
             item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lcollision_core.model import ExportForm, PosableBody
 
 EXPORT_NAMES = {
-    "model": "As the model's",
+    "model": "Same as the model",
     "y-up": "Y up",
     "blender": "Blender",
     "maya": "Maya",
@@ -83,7 +83,9 @@ class ExportDialog(_FrameForm):
         if self._character is None:
             self.source = QPushButton()
             self.source.setAutoDefault(False)
-            self.source.setToolTip("Your OBJ or GLB file of this body, whose UVs and groups stay")
+            self.source.setToolTip(
+                "Your OBJ or GLB file of this body, whose UVs and groups are kept"
+            )
             self.source.clicked.connect(self._ask_for_source)
             self.add_widget("Write into a copy of", self.source)
         self.form = self.add_choice("export_form", "Form", {MESH: "Mesh"}, "What is written")
@@ -124,7 +126,7 @@ class ExportDialog(_FrameForm):
         masks = " ".join(f"*{suffix}" for suffix in suffixes)
         folder = self._settings["last_folder"]
         name, _ = QFileDialog.getOpenFileName(
-            self, "Keep the form of", folder, f"Files of this body ({masks})"
+            self, "Write into a copy of", folder, f"Files of this body ({masks})"
         )
         self.like = Path(name) if name else None
         self._offer()
@@ -164,7 +166,9 @@ class ExportDialog(_FrameForm):
         mesh = _GLB if ".glb" in self.kinds.values() else _FOLLOWS
         if self._character is not None and not self._forms:
             suffix = self._character.suffix.removeprefix(".").upper()
-            mesh = f"{suffix} files aren't written: this is the pose as a plain mesh, without "
+            mesh = (
+                f"{suffix} files can't be written: this exports the pose as a plain mesh, without "
+            )
             mesh += f"joints and textures. {_GLB}"
         self.explain(self._about, mesh if form is None else form.explanation)
         meaning = self._meanings[self.axes.currentData()]
@@ -206,7 +210,7 @@ class MotionDialog(_FrameForm):
             self.rate.setValue(rate)
             self._readers["export_rate"] = self._remembered_rate
             own = self.rate.textFromValue(rate)
-            self.add_note(f"At {own}, poses of a clip last as long as the clip.")
+            self.add_note(f"At {own}, the poses of a clip play at the clip's own speed.")
         self._own_rate = None if rate is None else self.rate.value()
         self.axes, self._scale = self._add_frame(model)
         self._about, self._meaning = self.add_note(""), self.add_note("")
@@ -235,13 +239,13 @@ class MotionDialog(_FrameForm):
         form = self._forms[self.form.currentData()]
         for field in (self.axes, self._scale):
             field.setEnabled(form.has_axes)
-        order = " It has the vertex order of your mesh: keep it beside that." * form.has_axes
+        order = " It has your mesh's vertex order: keep it beside the mesh." * form.has_axes
         self.explain(self._about, f"{form.explanation}{order} Each frame is checked.")
         meaning = self._meanings[self.axes.currentData()]
         self.explain(self._meaning, meaning if form.has_axes else _STAY)
 
 
-_GLB = "A GLB file is always y up and in metres, as its standard fixes both."
+_GLB = "A GLB file is always y up and in metres, as its standard requires."
 
 
 def _meanings(model: PosableBody) -> dict[str, str]:
@@ -252,10 +256,10 @@ def _meanings(model: PosableBody) -> dict[str, str]:
     sign = "-" if model.front[looks] < 0.0 else "+"
     own = f"{'xyz'[model.up_axis]} is up, front is {sign}{'xyz'[looks]}"
     return {
-        ExportAxes.MODEL: f"As the model's: {own}.",
+        ExportAxes.MODEL: f"Same as the model: {own}.",
         ExportAxes.Y_UP: "y is up, front is +z, in the model's unit.",
-        ExportAxes.BLENDER: "Upright and facing you in Blender's front view, with the settings "
-        "that its importers begin with, in metres.",
+        ExportAxes.BLENDER: "Upright and facing you in Blender's front view, with its "
+        "importers' default settings, in metres.",
         ExportAxes.MAYA: "y is up, front is +z, in centimetres.",
         ExportAxes.UNREAL: "z is up, front is +x once imported, in centimetres.",
     }

@@ -201,7 +201,7 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
     form.add_number("turntable_height", "Height", " px")
     backgrounds = {"shown": "As shown", "plain": "One colour", "transparent": "Transparent"}
     behind = form.add_choice(
-        "turntable_background", "Background", backgrounds, "What stands behind the body"
+        "turntable_background", "Background", backgrounds, "What is shown behind the body"
     )
     colour = form.add_colour("turntable_colour", "Colour")
     note = form.add_note("")
@@ -209,7 +209,7 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
     meanings = {
         "gif": f"256 colours, at most {FASTEST_GIF} frames per second, never transparent.",
         "webp": "All colours, smaller than a GIF.",
-        "png": "A new folder of numbered pictures, as for making an MP4.",
+        "png": "A new folder of numbered pictures, for example to make an MP4.",
     }
 
     def follow() -> None:
@@ -238,7 +238,10 @@ def resolve_form(settings: Settings, parent: QWidget, has_predictor: bool = True
     tip = "What Resolve tries to change as little as possible"
     form.add_choice("resolve_metric", "Keep close to", metrics, tip)
     if has_predictor:
-        tip = "Below it the estimate calls a pose clear; lower is safer but moves the pose more"
+        tip = (
+            "Below this probability the estimate calls a pose clear; lower is safer but moves "
+            "the pose more"
+        )
         label = "Decision threshold"
         form.add_number("resolve_threshold", label, "", 0.05, tip, decimals=2)
     tip = "After this time Resolve falls back to a known pose without collisions"

@@ -63,8 +63,8 @@ _ENDED = (RunPhase.STOPPED, RunPhase.FAILED, RunPhase.KILLED)
 _WIDTH, _SIGN, _STAGE_SIGN, _BOLD_WIDTH = 560, 32, 18, 92
 _PICTURE, _VALUE_WIDTH = QSize(300, 236), 200
 _GOES_ON = (
-    "It goes on while you pose, when you close this dialog, and when you close the editor, with "
-    "low priority. “Learning” in the File menu brings this dialog back."
+    "Learning runs on with low priority while you pose, after you close this dialog, and after "
+    "you close the editor. File > Learning shows this dialog again."
 )
 
 
@@ -142,7 +142,7 @@ class LearningDialog(QDialog):
         self.discard = QPushButton("Discard…")
         self.open_model, self.dismiss = QPushButton("Open"), QPushButton("Dismiss")
         self.open_model.setToolTip("Open the model in the editor")
-        self.dismiss.setToolTip("Keep the model for later: it is in File, Models")
+        self.dismiss.setToolTip("Keep the model for later: it is under File > Models")
         close = self._close = QPushButton("Close")
         for button in (self.resume, self.open_model):
             # Their bold letters take more than Qt reckons with.
@@ -249,7 +249,9 @@ class LearningDialog(QDialog):
         if phase in (RunPhase.FAILED, RunPhase.KILLED):
             return f"{with_capital(one_line(run.sentence))}."
         if phase is RunPhase.DONE:
-            return f"It is among your models. It took {spent_text(sum(status.seconds.values()))}."
+            return (
+                f"It is one of your models now. It took {spent_text(sum(status.seconds.values()))}."
+            )
         if phase is RunPhase.WAITING:
             others = [held.name for held in self._runs.runs if held.phase is RunPhase.RUNNING]
             when = f"after “{one_line(others[0])}”" if others else "in a moment"
@@ -258,7 +260,7 @@ class LearningDialog(QDialog):
         if phase is RunPhase.RUNNING and status.seconds_left is not None and status.done > 0.0:
             words.append(f"{duration_text(status.seconds_left)} left")
         if phase is RunPhase.STOPPED:
-            words = [f"{words[0]} is done: Continue goes on from there."]
+            words = [f"{words[0]} is done: Continue resumes from there."]
         return ", ".join((*words, *(status.facts if run.is_active else ())))
 
     def _fit(self) -> None:

@@ -110,7 +110,7 @@ def why_no_model_name(name: str) -> str:
     from lcollision_core.model import list_models
 
     if not name or len(name) > 60 or NO_FILE_NAME & set(name) or file_stem(name) != name:
-        return "A model needs a name of up to 60 letters, without a dot or a slash."
+        return "A model needs a name of up to 60 characters, without a dot or a slash."
     if name.casefold() in {model.name.casefold() for model in list_models()}:
         return f"A model “{name}” already exists; choose another name."
     if name.casefold() in {work.name.casefold() for work in list_work()}:

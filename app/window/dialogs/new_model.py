@@ -167,7 +167,7 @@ class NewModelDialog(QDialog):
 
     def _why_not(self) -> str:
         """Say why there is no next page, "" if there is one."""
-        unread = "" if self._summary is not None else "Wait until the files are read."
+        unread = "" if self._summary is not None else "Wait for the files to be read."
         return self.page.why_not() or unread
 
     @Slot()

@@ -109,7 +109,7 @@ class FilesPage(Page):
             "What should the model learn from?",
             "A rigged character (GLB, glTF, VRM, FBX), or one body in many poses: a folder of "
             "meshes, a PC2 or MDD cache beside its mesh, or an .npz pose set. Drop files here, or "
-            "add them. Several of the same body are learned from together.",
+            "add them. Several files of the same body are used together.",
         )
         self.list = QListWidget()
         self.list.setAccessibleName("Files to learn from")
@@ -205,7 +205,7 @@ class PosesPage(Page):
         self.clip.setAccessibleName("Animation")
         self.clip.setMinimumContentsLength(12)
         self.rate.setSpecialValueText("as in the file")
-        self.rate.setToolTip("How many frames of each second are taken as poses")
+        self.rate.setToolTip("How many frames per second become poses")
         self._from_clips = labelled("", "caption", wraps=True)
         form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
         form.addRow("Animation", self.clip)
@@ -214,7 +214,7 @@ class PosesPage(Page):
         self.by_rig, self.number = QComboBox(), NumberBox(0, 1, _MOST_BY_RIG)
         for key, text in (
             (_BY_QUALITY, "As many as the quality needs"),
-            (_NO_POSES, "None, only those of the files"),
+            (_NO_POSES, "None, only those in the files"),
             (_OWN_NUMBER, "This many:"),
         ):
             self.by_rig.addItem(text, key)
@@ -301,7 +301,7 @@ class PosesPage(Page):
     def why_not(self) -> str:
         """Say that there are too few poses."""
         if self._summary is not None and self.n_poses(10) < 2:
-            return "One pose is too few: let the rig make some."
+            return "One pose is too few: let the rig make more."
         return ""
 
     @Slot()
@@ -340,19 +340,20 @@ class ContactsPage(Page):
     def __init__(self) -> None:
         super().__init__(
             "What doesn't count?",
-            "Most characters touch themselves before they move. What a rule leaves out is no "
-            "collision, every check says so, and the finished model shows it under Contacts.",
+            "Most characters touch themselves before they move. What a rule leaves out doesn't "
+            "count as a collision: every check says so, and the finished model lists it under "
+            "Contacts.",
         )
         self._near = _Rule(
             "Skin folds",
-            "At elbows and knees skin presses into itself. How near along the surface that is "
-            "follows from the rig, or without one from the poses.",
+            "At elbows and knees the skin presses into itself. How far along the surface is "
+            "measured from the rig or, without one, from the poses.",
             50.0,
             5.0,
         )
         self._rest = _Rule(
             "Touching at rest",
-            "Belts, cloth, eyelids: what touches in the rest pose, and what is close to it.",
+            "Belts, cloth, eyelids: what touches in the rest pose, and what lies close to it.",
             50.0,
             2.0,
         )
@@ -439,7 +440,7 @@ class QualityPage(Page):
         self.name, self.licence = QLineEdit(), QLineEdit()
         self.name.setMaxLength(60)
         self.licence.setPlaceholderText("unknown")
-        self.licence.setToolTip("Under which the character may be used; it is kept in the model")
+        self.licence.setToolTip("The licence of the character, stored in the model")
         form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
         form.addRow("Name", self.name)
         form.addRow("Licence", self.licence)

@@ -63,8 +63,8 @@ def ask_about_library(parent: QWidget, model: str) -> Choice:
     """
     text = f"Your library of poses of “{model}” couldn't be saved."
     note = (
-        "Its latest changes will be lost. To keep them in another place, cancel and choose "
-        "Library > Export library."
+        "Its latest changes will be lost. To save them elsewhere, cancel and choose Library > "
+        "Export library."
     )
     return _ask(parent, "Unsaved library", text, note, ("Try again", "Discard", "Cancel"))
 
@@ -115,7 +115,7 @@ def ask_to_switch(parent: QWidget, file: str, model: str, differs: str = "") -> 
     ----------
     differs : the sentence for a model of the same name as the one that is open
     """
-    text = f"{file} {differs or f'holds poses of the model “{model}”'}."
+    text = f"{file} {differs or f'contains poses of the model “{model}”'}."
     note = f"Open “{model}” with these poses?"
     buttons = (f"Open “{menu_text(model)}”", "", "Cancel")
     return _ask(parent, "Poses of another model", text, note, buttons) is Choice.SAVE
@@ -125,8 +125,8 @@ def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
     """Offer to import a mesh that is in another unit; whether it is to be scaled."""
     text = f"“{file}” seems to be in another unit."
     note = (
-        f"{with_capital(found.headline)}. Scaled by {found.factor:.6g} it fits; exported, it has "
-        f"its own size again."
+        f"{with_capital(found.headline)}. Scaled by {found.factor:.6g} it fits; an export "
+        f"restores its own size."
     )
     buttons = ("Scale and import", "", "Cancel")
     return _ask(parent, "Another unit", text, note, buttons) is Choice.SAVE
@@ -135,7 +135,7 @@ def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
 def ask_to_discard(parent: QWidget, name: str) -> bool:
     """Ask whether what a run of learning has done is to be thrown away."""
     text = f"Discard the unfinished model “{name}”?"
-    note = "The files it learns from stay as they are."
+    note = "The files it learns from are not changed."
     buttons = ("Discard", "", "Cancel")
     answer = _ask(parent, "Discard a model", text, note, buttons, Choice.CANCEL)
     return answer is Choice.SAVE
@@ -177,7 +177,7 @@ def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:
     names = ", ".join(f"“{file.name}”" for file in files[:_NAMED])
     more = f" and {len(files) - _NAMED} more" if len(files) > _NAMED else ""
     text = "Replace existing files?"
-    note = f"Each mesh of the character gets a file of its own, in place of {names}{more}."
+    note = f"Each mesh of the character gets a file of its own, replacing {names}{more}."
     buttons = ("Replace", "", "Cancel")
     answer = _ask(parent, "Replace files", text, note, buttons, Choice.CANCEL)
     return answer is Choice.SAVE
@@ -186,7 +186,7 @@ def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:
 def ask_to_turn(parent: QWidget, model: str) -> bool:
     """Ask whether a model is to be turned in its file."""
     text = f"Turn the model “{model}” to its next axis?"
-    note = "This changes the model's file: it stands like that from now on. Undo doesn't revert it."
+    note = "This changes the model's file for good. Undo doesn't revert it."
     return _ask(parent, "Turn upright", text, note, ("Turn", "", "Cancel")) is Choice.SAVE
 
 

@@ -99,7 +99,7 @@ class ExactCard(Card):
         elif is_held:
             said.append(_HELD)
         else:
-            said.append(f"No {'other ' if left_out else ''}triangle crosses another")
+            said.append(f"No {'other ' if left_out else ''}triangles cross")
         rules = document.model.rules
         if rules.left_out:
             said.append(with_capital(rules.left_out_in_words()))

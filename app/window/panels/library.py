@@ -87,7 +87,7 @@ class LibraryPanel(QWidget):
         self._sources = QButtonGroup(self)
         self.training = self._source_button(*_CAME_WITH[True])
         self.starter = self._source_button(
-            "Starter poses", "Poses to begin with, from how the character's joints turn"
+            "Starter poses", "Poses to start from, made by turning the character's joints"
         )
         self.starter.setProperty("place", "middle")
         self.own = self._source_button("Library", "Your own poses of this model")
@@ -110,7 +110,8 @@ class LibraryPanel(QWidget):
         self.blend.setEnabled(False)
         self.blend.setAccessibleName("Blend towards the selected pose")
         self.blend.setToolTip(
-            "Drag to blend the pose towards the selected one; the next begins where this one ends"
+            "Drag to blend the pose towards the selected one; the next drag starts where this one "
+            "ends"
         )
         self._lay_out()
         self.training.setChecked(True)

@@ -67,8 +67,9 @@ class ProposalCard(Card):
         self.show()
         then = proposed.n_colliding_then
         self.text.setText(
-            f"{proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, as the same "
-            f"places touch in nearly all of them. With {counted(len(proposed.new), 'such place')} "
+            f"{proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, because the "
+            f"same places touch in nearly all of them. With "
+            f"{counted(len(proposed.new), 'such place')} "
             f"not counted, {then or 'none'} would."
         )
         for widget, shown in ((self.show_them, True), (self.ignore, False), (self.listed, False)):

@@ -173,8 +173,8 @@ class OutcomeCard(Card):
             "collides"
         )
         self.predicted_free = Fact(
-            "The model's instant estimate of the pose: where the exact check finds otherwise, the "
-            "check is right",
+            "The model's instant estimate of the pose: where the exact check disagrees, the check "
+            "is right",
             is_aside=True,
         )
         self.exactly_free = Fact(
@@ -182,7 +182,7 @@ class OutcomeCard(Card):
         )
         self._energy, self._moved, self._took = (labelled("", wraps=True) for _ in range(3))
         self._took.setToolTip(
-            "The search, and the wait before it: what it needs is loaded and compiled once"
+            "The search and, the first time, the wait while it is loaded and compiled"
         )
         self._note = labelled("", "caption", wraps=True)
         top = Qt.AlignmentFlag.AlignTop

@@ -291,7 +291,7 @@ def _parsed(text: bytes) -> dict[str, Any]:
     try:
         values = parse_json(text)
     except ValueError as error:
-        raise MeshFileError("it holds no readable glTF description") from error
+        raise MeshFileError("it contains no readable glTF description") from error
     if b"null" in text:
         _remove_nulls(values)
     _require_kind(values, _STRUCTURE, "")
@@ -338,7 +338,7 @@ def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer")
         if uri.startswith("data:"):
             head, comma, content = uri.partition(",")
             if not comma or not head.endswith(";base64"):
-                raise ValueError("it is no base64 data")
+                raise ValueError("it is not base64 data")
             return base64.b64decode(content, validate=True)
         name = unquote(uri)
         # Other drives, and addresses, which some systems would look for on the network.

@@ -92,10 +92,7 @@ class GltfPatch:
             (t for magic, t in _MEDIA_TYPES.items() if content.startswith(magic)), None
         )
         if media_type is None:
-            self.notes += (
-                f"its picture {quoted(uri)} is not in the written file, which looks for it beside "
-                "itself",
-            )
+            self.notes += (f"texture {quoted(uri)} was not embedded; keep it beside the export",)
             return
         del image["uri"]
         image["bufferView"] = self._view(content)

@@ -59,7 +59,7 @@ def shown_scene(scene: Scene) -> ShownScene:
     kept = character_parts(scene)
     scene = with_parts(scene, kept, "as no joint carries it")
     seen = _seen_parts(scene)
-    scene = with_parts(scene, seen, "as it is scaled to nothing")
+    scene = with_parts(scene, seen, "as its scale is zero")
     return ShownScene(scene, [kept[number] for number in seen], revealed)
 
 

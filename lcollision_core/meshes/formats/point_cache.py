@@ -153,7 +153,7 @@ def _suffix(path: str | os.PathLike[str]) -> str:
     suffix = Path(path).suffix.lower()
     if suffix not in POINT_CACHE_SUFFIXES:
         raise MeshFileError(
-            "is no point cache",
+            "is not a point cache",
             where=path,
             expected=" or ".join(POINT_CACHE_SUFFIXES),
             got=suffix or "a name without extension",

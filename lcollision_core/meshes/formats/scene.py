@@ -24,7 +24,7 @@ _NAMED = 3
 """Meshes that a note names."""
 
 NO_MESH = (
-    "it holds an animation, but no mesh",
+    "it contains an animation, but no mesh",
     "export it with its mesh, which some sites call skin",
 )
 """What is wrong with a file of an animation alone, and what helps."""

@@ -130,7 +130,7 @@ def test_surfaces_that_coincide_are_free_with_a_warning(
     twice.write_text("OFF\n6 2 0\n" + "0 0 0\n1 0 0\n0 1 0\n" * 2 + "3 0 1 2\n3 3 4 5\n")
     result = lcollision("check", "--json", twice)
     assert result.exit_code == 0
-    assert f"{twice}: 1 pair of faces lies exactly on each other" in result.stderr
+    assert f"{twice}: 1 pair of faces coincides" in result.stderr
     (report,) = json.loads(result.stdout)
     assert (report["coincident_pairs"], report["pairs"], report["deepest"]) == (1, 0, [])
 

@@ -182,7 +182,7 @@ def test_a_set_whose_up_axis_is_not_sure_asks_for_it(
     output = tmp_path / "tube.npz"
     result = lcollision("dataset", "make", tmp_path / "tube.mdd", "-o", output)
     assert result.exit_code == 0
-    assert "--up x|y|z says otherwise" in result.stderr
+    assert "--up x|y|z overrides it" in result.stderr
     result = lcollision("dataset", "make", tmp_path / "tube.mdd", "-o", output, "--up", "y")
     assert "--up" not in result.stderr
     assert read_pose_set(output).up_axis == 1
@@ -191,11 +191,14 @@ def test_a_set_whose_up_axis_is_not_sure_asks_for_it(
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["body", "--clip", "wave"], "--clip is for files, not for body"),
+        (["body", "--clip", "wave"], "--clip applies to files, not to body"),
         (["body", "body-jump"], "body can't be combined with other sources, got body, body-jump"),
-        (["body", "--by-rig", "5"], "--by-rig is for files, not for body"),
-        (["arm.glb", "--vertices", "600"], "--vertices is for the built-in body"),
-        (["arm.glb", "--seed", "1"], "--seed is for the built-in body and for poses by the rig"),
+        (["body", "--by-rig", "5"], "--by-rig applies to files, not to body"),
+        (["arm.glb", "--vertices", "600"], "--vertices applies only to the built-in body"),
+        (
+            ["arm.glb", "--seed", "1"],
+            "--seed applies only to the built-in body and to poses by the rig",
+        ),
         (["arm.glb", "--clip", "run"], "arm.glb cannot be read: it has no clip 'run'"),
         (["none.glb"], "none.glb does not exist"),
         (["arm.glb", "other.glb"], "has another number of vertices than the set"),
@@ -234,7 +237,7 @@ def test_a_rig_makes_the_poses_of_a_set(lcollision: Lcollision, tmp_path: Path) 
     poses = read_pose_set(first)
     assert len(poses) == 7
     made = poses.provenance["sources"][1]["by_rig"]
-    assert f"{made['free']} of 6 poses by the rig are free" in result.stderr
+    assert f"{made['free']} of 6 poses by the rig are free of collisions" in result.stderr
     assert f"wrote 7 poses of {poses.topology.n_vertices} vertices" in result.stderr
     lcollision("dataset", "make", file, "--by-rig", 6, "--seed", 2, "-o", again)
     assert again.read_bytes() == first.read_bytes()
@@ -243,7 +246,7 @@ def test_a_rig_makes_the_poses_of_a_set(lcollision: Lcollision, tmp_path: Path) 
     # What has no animation is no pose set by itself.
     result = lcollision("dataset", "make", file, "-o", tmp_path / "none.npz")
     assert result.exit_code == 2
-    assert "it holds no animation" in result.stderr
+    assert "it contains no animation" in result.stderr
     result = lcollision("dataset", "make", first, "--by-rig", 6, "-o", tmp_path / "none.npz")
     assert result.exit_code == 2
     assert "one.npz has no joints to pose it by" in result.stderr

@@ -117,7 +117,7 @@ def test_fewer_than_there_are_takes_none_away(
     assert lcollision("label", model, "-n", 300, "-o", store).exit_code == 0
     result = lcollision("label", model, "-n", 200, "-o", store)
     assert result.exit_code == 0
-    assert result.stderr == f"lcollision: {store} has more than the 200 asked for, and keeps them\n"
+    assert result.stderr == f"lcollision: {store} already has more than 200 rows; kept\n"
     assert result.stdout.startswith(f"{store}: 300 rows of tube, ")
 
 
@@ -156,7 +156,8 @@ def test_ctrl_c_keeps_what_is_there_and_says_so(model: Path, tmp_path: Path) -> 
     n_rows = LabelStore.open(store).n_rows
     assert n_rows >= ROWS_PER_CHUNK
     assert stderr == (
-        f"lcollision: stopped; {store} keeps {n_rows} rows, run the same command again to go on\n"
+        f"lcollision: stopped; {store} keeps {n_rows} rows, run the same command again to "
+        f"continue\n"
     )
 
 
@@ -169,7 +170,7 @@ def test_damage_is_told_found_by_check_and_repaired(
     whole = LabelStore.open(store).load()
     result = lcollision("label", model, "-o", store, "--check")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert result.stdout == f"{store}: sound, 2100 rows of tube\n"
+    assert result.stdout == f"{store}: intact, 2100 rows of tube\n"
 
     chunk = store / "0000001024-0000002047.npz"
     content = bytearray(chunk.read_bytes())
@@ -222,7 +223,7 @@ def test_what_cannot_be_labelled_is_refused(
         lcollision, "label", other, "-n", 40, "-o", store
     )
     both = ("--workers", 2, "--scheduler", "tcp://127.0.0.1:9")
-    assert "exclude each other" in _refusal(
+    assert "can't be used together" in _refusal(
         lcollision, "label", model, "-n", 40, "-o", store, *both
     )
     assert "there is no model or file 'nobody'" in _refusal(
@@ -230,5 +231,5 @@ def test_what_cannot_be_labelled_is_refused(
     )
     shutil.rmtree(store)
     store.write_text("a letter")
-    assert "is no label store" in _refusal(lcollision, "label", model, "-n", 40, "-o", store)
+    assert "is not a label store" in _refusal(lcollision, "label", model, "-n", 40, "-o", store)
     assert store.read_text() == "a letter"

@@ -139,8 +139,8 @@ def test_resolve_writes_what_it_checked(
         ("out.obj", ("--like", "none.obj"), "there is no such file"),
         ("out.obj", ("--like", "poses.json"), "has a form that is not written (.json)"),
         ("out.obj", ("--like", "other.obj"), "has 3 vertices"),
-        ("out.json", ("--like", "own.obj"), "would hold codes"),
-        ("out.glb", ("--form", "morph"), "is one of a character's file"),
+        ("out.json", ("--like", "own.obj"), "would contain codes"),
+        ("out.glb", ("--form", "morph"), "applies only to a character's file"),
         ("out.fbx", (), ".fbx is not a known format; use one of"),
     ],
 )
@@ -233,7 +233,7 @@ def test_poses_of_a_character_become_a_clip_of_its_file(
     words = ("decode", own, tmp_path / "poses.json", "-o", out)
     refused = lcollision(*words)
     assert refused.exit_code == 2
-    assert "is one mesh, but there are 3 poses" in refused.stderr
+    assert "is one mesh file, but there are 3 poses" in refused.stderr
     done = lcollision(*words, "--form", "clip", "--fps", 10)
     assert done.exit_code == 0, done.output
     frames = read_character(out).sample("poses", None)
@@ -261,7 +261,7 @@ def test_resolve_frees_a_character_in_its_own_file(
     if form == "mesh":
         assert is_free
     elif not is_free:
-        assert "after rounding; --form mesh holds the vertices that were checked" in done.stderr
+        assert "after rounding; --form mesh writes the vertices that were checked" in done.stderr
 
 
 def _joined(path: Path) -> np.ndarray:

@@ -159,7 +159,7 @@ def test_commands_apply_the_rules_that_were_chosen_for_a_character_and_say_so(
     remember_choices(body.with_rules(ContactRules(tolerated_depth=0.5)))
     words = lcollision("info", file).stdout
     assert "its contact rules are those that you chose for it" in words
-    assert "not counted are pairs not deeper than 0.5" in words
+    assert "not counted: pairs not deeper than 0.5" in words
     assert json.loads(lcollision("info", file, "--json").stdout)["rules"]["tolerated_depth"] == 0.5
     sampled = lcollision("sample", file, "-n", "1", "-o", tmp_path / "poses.json")
     assert sampled.exit_code == 0
@@ -334,7 +334,7 @@ def test_a_model_renamed_while_another_is_trained_to_its_file_stays(
     result = lcollision("train", "embedding", dataset, "-o", tube, "--domains", 1, "--seed", 2)
     assert result.exit_code == 0, result.output
     beside = tube.with_name("tube 2.safetensors")
-    assert f"stays as it is; the trained one is {beside}" in result.stderr
+    assert f"was left alone; the trained model is {beside}" in result.stderr
     assert PoseModel.load(tube).domain_names == ("neck", "part 2")
     assert PoseModel.load(beside).domain_names == ("part 1",)
 
@@ -429,7 +429,7 @@ def test_poses_of_another_model_are_refused_with_its_name(
     poses = bundled_file("poses", "body.json")
     for command in (("decode", tube, poses), ("mirror", tube, poses)):
         sentence = _refusal(lcollision, *command, "-o", tmp_path / "out.json")
-        assert "holds poses of the model 'body', not of 'tube'; use them with 'body'" in sentence
+        assert "contains poses of the model 'body', not of 'tube'; use them with 'body'" in sentence
         assert PoseModel.load("body").fingerprint not in sentence
     assert not user_models.exists()
 
@@ -601,7 +601,7 @@ def test_an_interrupted_training_goes_on_and_ends_with_the_same_model(
     assert sorted(tmp_path.iterdir()) == [output, checkpoint][1:]
     result = CliRunner().invoke(app, [str(argument) for argument in command[3:]])
     assert result.exit_code == 0, result.output
-    assert f"going on from {checkpoint}" in result.stderr
+    assert f"continuing from {checkpoint}" in result.stderr
     assert list(tmp_path.iterdir()) == [output]
     assert output.read_bytes() == trained.read_bytes()
 
@@ -618,7 +618,7 @@ def test_a_mesh_far_from_every_pose_is_doubted(
     assert result.exit_code == 0
     assert result.stdout.rstrip().endswith("is it this body, in the model's vertex order?")
     write_mesh(mesh, model.reference, model.faces)
-    assert "which is far" not in lcollision("encode", tube, mesh, "-o", out).stdout
+    assert "which is large" not in lcollision("encode", tube, mesh, "-o", out).stdout
 
 
 def test_glb_is_upright_whatever_is_up_in_the_model(

@@ -103,7 +103,7 @@ def test_what_cannot_be_learned_from_is_one_sentence(
 def test_a_bundled_model_is_not_hidden(tube: Path, lcollision: Lcollision) -> None:
     result = lcollision("new", tube, "-o", "body", "--quality", "quick")
     assert result.exit_code == 2
-    assert "there is a model 'body' already" in result.stderr
+    assert "a model 'body' already exists" in result.stderr
 
 
 def test_a_model_that_is_there_is_not_replaced(
@@ -114,6 +114,6 @@ def test_a_model_that_is_there_is_not_replaced(
     before = held.read_bytes()
     result = lcollision("new", tube, "-o", held, "--quality", "quick", "--seed", "1")
     assert result.exit_code == 2
-    assert "there is a model 'held' already" in result.stderr
+    assert "a model 'held' already exists" in result.stderr
     assert held.read_bytes() == before
     assert not (tmp_path / "held.safetensors.work").exists()

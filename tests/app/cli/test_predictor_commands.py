@@ -205,7 +205,7 @@ def test_a_killed_training_goes_on_to_the_same_model(
         lcollision("train", "predictor", model, store, "-o", path, *options)
         for path in (killed, whole)
     ]
-    assert results[0].stderr.startswith(f"lcollision: going on from {checkpoint}\n")
+    assert results[0].stderr.startswith(f"lcollision: continuing from {checkpoint}\n")
     wrote, measured = _without_progress(results[1].stderr).splitlines()[:2]
     assert wrote.startswith(f"lcollision: wrote {whole}: ")
     share = 100.0 * LabelStore.open(store).load(600).colliding.mean()
@@ -247,7 +247,7 @@ def test_ctrl_c_keeps_a_checkpoint_and_says_so(
     checkpoint = output.with_name(output.name + ".checkpoint")
     assert result.returncode == 130
     assert _without_progress(result.stderr) == (
-        f"lcollision: stopped; run the same command again to go on from {checkpoint}\n"
+        f"lcollision: stopped; run the same command again to continue from {checkpoint}\n"
     )
     assert [path.name for path in tmp_path.iterdir()] == [f"{checkpoint.name}{kept}"]
 
@@ -309,7 +309,7 @@ def test_what_replaced_the_model_during_the_training_stays(
         return
     beside = tmp_path / "tube 2.safetensors"
     assert f"{path} was replaced" in result.stderr
-    assert f"the trained one is {beside}" in result.stderr
+    assert f"the trained model is {beside}" in result.stderr
     assert PoseModel.load(beside).has_predictor
     stays = find_model("body").read_bytes() if change == "another body" else b"another program's"
     assert path.read_bytes() == stays

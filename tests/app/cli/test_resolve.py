@@ -145,7 +145,7 @@ def test_every_solver_by_its_name(
     result = lcollision("resolve", model_file, poses, "-o", out, *options)
     assert result.exit_code == 0, result.stderr
     assert result.stdout.count(": resolved ") == 4
-    assert "mean: free as it is, unchanged" in result.stdout
+    assert "mean: already free, unchanged" in result.stdout
 
 
 def test_a_mesh_comes_back_in_its_place(
@@ -185,7 +185,7 @@ def test_detail_is_kept_where_it_stays_free(
         assert result.exit_code == 0
         fixed, bare = read_mesh(detailed).vertices, read_mesh(plain).vertices
         assert n_pairs(model, fixed) == 0
-        if "with its detail the fixed mesh would collide" in result.stderr:
+        if "its detail was left out, as the fixed mesh would collide" in result.stderr:
             assert np.array_equal(fixed, bare)
             continue
         n_kept += 1
@@ -265,13 +265,15 @@ def test_a_folder_stands_for_its_meshes(
     result = lcollision("resolve", model_file, folder, "-o", out)
     assert result.exit_code == 0, result.stderr
     first, second = result.stdout.splitlines()
-    assert first.startswith(f"{folder / 'scan2.obj'}: free as it is, given back as its fit, ")
+    assert first.startswith(
+        f"{folder / 'scan2.obj'}: already free, written as the nearest model pose, "
+    )
     assert second.startswith(f"{folder / 'scan10.obj'}: resolved ")
-    assert ", given back as its fit, " in second
+    assert ", written as the nearest model pose, " in second
     assert "unchanged" not in result.stdout
     assert {file.name for file in out.iterdir()} == {"scan2.obj", "scan10.obj"}
     result = lcollision("resolve", model_file, folder / "scan2.obj", "-o", out, "--keep-detail")
-    assert ": free as it is, with its detail (" in result.stdout
+    assert ": already free, with its detail (" in result.stdout
     poses = tmp_path / "scans.json"
     assert lcollision("encode", model_file, folder, "-o", poses).exit_code == 0
     assert [pose.name for pose in read_poses(poses, model)] == ["scan2", "scan10"]
@@ -284,12 +286,12 @@ def test_a_folder_of_nothing_and_one_mesh_for_several_are_refused_at_once(
     folder.mkdir()
     result = lcollision("resolve", model_file, folder, "-o", tmp_path / "free")
     assert result.exit_code == 2
-    assert f"{folder} holds no mesh; name a folder of .obj" in result.stderr
+    assert f"{folder} contains no mesh; name a folder of .obj" in result.stderr
     for name in "ab":
         colliding_mesh(model, np.zeros(model.latent_size), folder / f"{name}.obj")
     result = lcollision("resolve", model_file, folder, "-o", tmp_path / "one.obj")
     assert result.exit_code == 2
-    assert "one.obj is one mesh, but there are 2 poses; name a folder" in result.stderr
+    assert "one.obj is one mesh file, but there are 2 poses; name a folder" in result.stderr
     assert "encoded" not in result.stderr
 
 
@@ -301,7 +303,7 @@ def test_the_near_exclusion_is_stated(
     assert model.predictor is not None
     near.with_predictor(model.predictor).with_free_poses(model.free_latent).save(path)
     write_poses(poses, model, [NamedPose("bent", colliding[0])])
-    sentence = "not counted are pairs within 0.05 along the surface; at rest that is no pair"
+    sentence = "not counted: pairs within 0.05 along the surface; at rest: no pair"
     assert sentence in lcollision("resolve", path, poses, "-o", out).stderr
     rows = json.loads(lcollision("resolve", path, poses, "-o", out, "--json").stdout)
     assert [row["near_exclusion"] for row in rows] == [0.05]
@@ -402,7 +404,7 @@ def test_a_sequence_reports_its_largest_change(
         (("--weight", "1"), "--weight '1' is not DOMAIN=W"),
         (("--weight", "1=-3"), "--weight '1=-3' is not DOMAIN=W"),
         (("--time-budget", "0"), "the time budget must be more than 0 seconds, got 0"),
-        (("--keep-detail",), "cannot keep detail"),
+        (("--keep-detail",), "--keep-detail applies only to meshes"),
     ],
 )
 def test_bad_options_are_one_sentence(
@@ -443,7 +445,7 @@ def test_bad_inputs_are_one_sentence_each_and_the_rest_is_done(
         assert str(path) in sentence
     assert "is not JSON" in sentences[0]
     assert "which is not" in sentences[1]
-    assert "has no poses in it" in sentences[3]
+    assert "contains no poses" in sentences[3]
     assert len(read_poses(out, model)) == 5
     alone = lcollision("resolve", model_file, empty, "-o", tmp_path / "other.json")
     assert alone.exit_code == 2
@@ -463,7 +465,7 @@ def test_an_output_that_cannot_be_is_refused_first(
         (tmp_path / ("x" * 300), "File name too long"),
         (f"{tmp_path / 'free'}/", "cannot be made: it is a file; name another"),
         (tmp_path / "free", "cannot be made: it is a file; name another"),
-        (tmp_path / "free.obj", "is one mesh, but there are 5 poses"),
+        (tmp_path / "free.obj", "is one mesh file, but there are 5 poses"),
     ):
         result = lcollision("resolve", model_file, poses, "-o", out)
         assert result.exit_code == 2
@@ -547,10 +549,10 @@ def test_a_stopped_run_replaces_nothing_and_goes_on(
     done = read_poses(kept, model)
     assert len(done) == 2
     if how != "SIGKILL":
-        assert f"stopped; {kept} has 2 of 5 poses, run the same command again to go on" in said
+        assert f"stopped; {kept} has 2 of 5 poses, run the same command again to continue" in said
     result = lcollision("resolve", model_file, poses, "-o", out, *options)
     assert result.exit_code == 0, result.stderr
-    assert f"going on from {kept}, which has 2 of 5 poses" in result.stderr
+    assert f"continuing from {kept}, which has 2 of 5 poses" in result.stderr
     assert contents(out) == contents(whole.with_suffix(out.suffix))
     assert not list(tmp_path.glob("*partial*"))
 
@@ -639,7 +641,7 @@ def test_an_output_that_others_wrote_meanwhile_stays(
     result = lcollision("resolve", model_file, poses, "-o", poses, "--json")
     assert result.exit_code == 0, result.stderr
     beside = poses.with_name("poses 2.json")
-    assert f"stays as it is; the result goes to {beside}" in result.stderr
+    assert f"was left alone; the result is in {beside}" in result.stderr
     assert [row["output"] for row in json.loads(result.stdout)] == [str(beside)] * 5
     assert [pose.name for pose in read_poses(poses, model)] == ["saved meanwhile"]
     assert len(read_poses(beside, model)) == 5

@@ -40,7 +40,7 @@ def test_dataset_check_says_which_way_is_up(lcollision: Lcollision, tmp_path: Pa
     vertices = np.stack([ball.vertices, 1.01 * ball.vertices])
     write_pose_set(path, PoseSet(vertices, ball.topology, ("a", "b")))
     result = lcollision("dataset", "check", path)
-    assert "is perhaps up: what it stands on does not tell" in result.stdout
+    assert "is probably up: what it stands on doesn't show it" in result.stdout
     assert "--up x|y|z" in result.stderr
     report = json.loads(lcollision("dataset", "check", path, "--json").stdout)
     assert report["up_is_sure"] is False

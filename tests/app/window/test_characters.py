@@ -250,7 +250,7 @@ def test_poses_of_a_character_bring_it_back_over_another_body(
     with qtbot.waitSignal(document.opened, timeout=PATIENCE):
         drop(window, poses)
     timer.stop()
-    assert asked == ["poses.json holds poses of the model “arm”."]
+    assert asked == ["poses.json contains poses of the model “arm”."]
     assert document.model.fingerprint == model.fingerprint
     assert Path(document.model_file) == arm_file
     np.testing.assert_allclose(document.latent, model.training_latent[2])
@@ -282,7 +282,7 @@ def test_a_joint_is_what_the_menu_of_its_slider_says(
     (roles,) = (a.menu() for a in menu.actions() if a.text().endswith("&is"))
     texts = {action.text(): action for action in roles.actions()}
     assert [text for text, action in texts.items() if action.isChecked()] == ["Left elbow"]
-    assert not texts["As its rig says"].isEnabled()
+    assert not texts["From the rig"].isEnabled()
     with qtbot.waitSignal(document.opened, timeout=PATIENCE):
         texts["Right knee"].trigger()
     changed = document.model

@@ -255,7 +255,7 @@ def test_what_cannot_be_learned_from_stays_on_the_first_page(
     qtbot.waitUntil(lambda: wizard.files.paths == (tubes,), timeout=PATIENCE)
     wizard.files.paths_changed.emit()
     wizard.next.click()
-    assert wizard.refusal.text() == "Wait until the files are read."
+    assert wizard.refusal.text() == "Wait for the files to be read."
     qtbot.waitUntil(lambda: wizard.preview.has_body, timeout=PATIENCE)
     assert not wizard.files.found.text()
     for _ in range(3):

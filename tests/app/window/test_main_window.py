@@ -630,7 +630,7 @@ def test_files_dropped_while_the_first_model_loads_wait_for_it_or_are_refused(
         drop(window, tmp_path / name)
         qtbot.waitUntil(lambda: bool(failures(window)), timeout=PATIENCE)
         (told,) = failures(window)
-        assert told.what.text() == f"{name} can only be opened once a body is there"
+        assert told.what.text() == f"{name} can only be opened once a body is open"
         told.reject()
     drop(window, tmp_path / "bent.glb")
     qtbot.waitUntil(lambda: len(document._long._jobs) == 2, timeout=PATIENCE)

@@ -87,4 +87,4 @@ def test_a_model_is_turned_upright_in_its_file_where_the_user_agrees(
 def test_a_bundled_model_cannot_be_turned_and_the_tip_says_why(window: MainWindow) -> None:
     upright = window.actions_by_key["upright"]
     assert not upright.isEnabled()
-    assert upright.toolTip().startswith("This model came with the program: copy its file")
+    assert upright.toolTip().startswith("This model is bundled with the program: copy its file")

@@ -242,7 +242,7 @@ def test_a_program_that_never_begins_does_not_wait_for_ever(
 
 def test_names_that_are_taken_are_refused(runs: LearningRuns, editor_model: PoseModel) -> None:
     editor_model.save(model_destination("hero"))
-    with pytest.raises(LCollisionError, match="there is a model 'hero' already"):
+    with pytest.raises(LCollisionError, match="a model 'hero' already exists"):
         runs.start(LearningRequest(("/nowhere.npz",)), "hero")
     folder_of("villain", WorkState.STOPPED).poses.touch()
     with pytest.raises(LCollisionError, match="being learned from other files"):

@@ -355,8 +355,8 @@ def test_gltf_with_its_data_beside_it_becomes_one_file(tmp_path: Path) -> None:
     assert image["mimeType"] == "image/png"
     assert binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]] == PNG
     assert after["images"][1] == {"uri": "missing.png"}
-    (note,) = [note for note in posed.notes if "picture" in note]
-    assert note.startswith("its picture 'missing.png' is not in the written file")
+    (note,) = [note for note in posed.notes if "texture" in note]
+    assert note.startswith("texture 'missing.png' was not embedded")
 
 
 def test_vrm_stays_vrm(tmp_path: Path) -> None:
@@ -506,7 +506,7 @@ def test_what_joints_cannot_hold_is_written_as_a_mesh_and_said(tmp_path: Path) -
     character = read_character(builder.write(tmp_path / "figure.glb"))
     path = tmp_path / "posed.glb"
     vertices, posed = _written(character, CharacterForm.JOINTS, path)
-    assert "its joints cannot hold this pose (vertices would be off by 0." in posed.notes[0]
+    assert "its joints cannot reproduce this pose (vertices would be off by 0." in posed.notes[0]
     assert posed.notes[0].endswith("of the body size), so it is written as a static mesh")
     assert np.array_equal(posed.vertices, vertices)
     again = read_character(path)

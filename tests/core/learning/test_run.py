@@ -208,7 +208,7 @@ def test_what_another_request_made_or_makes_is_not_touched(
     learn_model(work)
     work.remove()
     before = (tmp_path / "tube.safetensors").read_bytes()
-    with pytest.raises(ModelFileError, match=r"there is a model 'tube' already"):
+    with pytest.raises(ModelFileError, match=r"a model 'tube' already exists"):
         work_in(tmp_path, other)
     assert (tmp_path / "tube.safetensors").read_bytes() == before
 

@@ -30,7 +30,7 @@ def moving(tmp_path: Path) -> Path:
 
 
 def test_a_rigged_file_without_animation_is_posed_by_its_rig(still: Path) -> None:
-    with pytest.raises(MeshFileError, match="holds no animation"):
+    with pytest.raises(MeshFileError, match="contains no animation"):
         gather_poses([still], by_rig=0)
     said: list[tuple[int, int]] = []
     poses = gather_poses([still], by_rig=9, seed=3, progress=lambda *counts: said.append(counts))
@@ -94,7 +94,7 @@ def test_a_character_and_its_animation_may_be_two_files(still: Path, moving: Pat
         assert len(poses) == 13
         assert poses.names[0] == f"{files[0].stem} rest"
         assert "moving moves 11" in poses.names
-    with pytest.raises(MeshFileError, match="holds no animation"):
+    with pytest.raises(MeshFileError, match="contains no animation"):
         gather_poses([still], by_rig=3, clip="moves")
 
 

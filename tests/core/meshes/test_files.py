@@ -373,8 +373,8 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
     ("name", "content", "message"),
     [
         ("a.obj", "", "is empty"),
-        ("a.obj", "hello\n", "holds no vertices"),
-        ("a.obj", TRIANGLE, "holds vertices but no faces"),
+        ("a.obj", "hello\n", "contains no vertices"),
+        ("a.obj", TRIANGLE, "contains vertices but no faces"),
         ("a.obj", TRIANGLE + "f 1 2 3\nf 1 2 4\n", "face 1 names vertices"),
         ("a.obj", TRIANGLE + "f 1 2 0\n", "face 0 .* names vertex 0, but OBJ counts"),
         ("a.obj", TRIANGLE + "f 1 2 -4\n", "face 0 .* names vertex -4"),

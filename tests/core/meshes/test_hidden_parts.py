@@ -122,7 +122,7 @@ def test_a_prop_that_is_never_seen_is_left_out_and_said(
 ) -> None:
     builder = _with_shield(HIDDEN, *scales, parent=parent)
     character = read_character(builder.write(tmp_path / "hero.glb"))
-    why = "as it is scaled to nothing" if scales or parent else "as no joint carries it"
+    why = "as its scale is zero" if scales or parent else "as no joint carries it"
     assert f"left out, {why}: Shield" in character.notes
     assert character.rig is not None
     assert len(character.rest_vertices) == N

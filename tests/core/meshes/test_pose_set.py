@@ -218,7 +218,7 @@ def test_triangle_without_area_is_refused_in_the_reference(tmp_path: Path) -> No
 
 
 def test_folders_that_are_no_pose_set(tmp_path: Path) -> None:
-    with pytest.raises(MeshFileError, match="holds no mesh"):
+    with pytest.raises(MeshFileError, match="contains no mesh"):
         read_pose_set(tmp_path)
     _write_folder(tmp_path, 3)
     _write_folder(tmp_path, 2, ".ply")
@@ -357,7 +357,7 @@ def _with_nan() -> np.ndarray:
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"vertices": _poses(2)}, "no array 'faces' or 'F', it holds vertices"),
+        ({"vertices": _poses(2)}, "no array 'faces' or 'F', only vertices"),
         ({"faces": FACES}, "no array 'vertices' or 'V'"),
         ({"vertices": VERTICES, "faces": FACES}, r"must be \(N, V, 3\) .* got \(4, 3\)"),
         ({"vertices": _poses(2)[:0], "faces": FACES}, r"got \(0, 4, 3\)"),

@@ -102,7 +102,7 @@ def test_another_rig_gets_nothing_of_it(path: Path) -> None:
     ("change", "why"),
     [
         ({"format_version": 2}, "2"),
-        ({"format": "poses"}, "it holds something else"),
+        ({"format": "poses"}, "it contains something else"),
         ({"rules": {"near_exclusion": -1.0}}, "near exclusion"),
         ({"rules": {"ignored": [["hair", "hat"]]}}, "the group 'hair' is unknown"),
         ({"domain_names": ["one"]}, "colour for each domain"),

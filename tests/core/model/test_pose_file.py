@@ -100,7 +100,9 @@ def test_poses_of_another_model_are_refused(model: PoseModel, path: Path) -> Non
     assert document["model"] == owner | {"codes": model.latent_size}
     document["model"] = {"name": "dancer", "fingerprint": "0123456789abcdef"}
     path.write_text(json.dumps(document))
-    with pytest.raises(OtherModelError, match=rf"{path} holds poses of the model 'dancer'.*'tube'"):
+    with pytest.raises(
+        OtherModelError, match=rf"{path} contains poses of the model 'dancer'.*'tube'"
+    ):
         read_poses(path, model)
 
 
@@ -122,7 +124,7 @@ def test_poses_of_another_model_name_it_and_never_its_fingerprint(
     with pytest.raises(OtherModelError) as caught:
         read_poses(path, body)
     assert str(caught.value) == (
-        f"{path} holds poses of the model 'snake', not of 'body'; use them with 'snake'"
+        f"{path} contains poses of the model 'snake', not of 'body'; use them with 'snake'"
     )
     assert caught.value.model == ListedModel("snake", folder / "snake.safetensors", False)
     (folder / "snake.safetensors").unlink()
@@ -227,7 +229,7 @@ def _broken(document: Any, n_vertices: int) -> list[tuple[str, Any]]:
         ("pose 0.*name", with_first(name="")),
         ("pose 0.*name", with_first(name=5)),
         ("pose 0.*name", with_first(name="x" * 201)),
-        ("pose 0.*half a character", with_first(name="\ud800")),
+        ("pose 0.*invalid Unicode", with_first(name="\ud800")),
         ("pose 0.*latent", with_first(latent=first["latent"][:-1])),
         ("pose 0.*latent", with_first(latent=["1"] * len(first["latent"]))),
         ("pose 0.*latent", with_first(latent=[True] * len(first["latent"]))),
@@ -320,7 +322,7 @@ def test_refused_poses_leave_the_old_file(model: PoseModel, path: Path) -> None:
     for change, sentence in (
         ({"name": ""}, "1 to 200 characters"),
         ({"name": "x" * 201}, "1 to 200 characters"),
-        ({"name": "\udcff"}, "half a character"),
+        ({"name": "\udcff"}, "invalid Unicode"),
         ({"latent": np.full(model.latent_size, np.nan)}, "not finite"),
         ({"latent": pose.latent[1:]}, "latent must be"),
     ):
@@ -369,5 +371,7 @@ def test_of_two_characters_of_one_name_it_is_said_what_differs(
     assert isinstance(known, RigModel)
     remember_file(known, file)
     write_poses(poses, known, [NamedPose("rest", known.training_latent[0])])
-    with pytest.raises(OtherModelError, match=r"holds poses of another 'ely', .*ely\.glb: it has"):
+    with pytest.raises(
+        OtherModelError, match=r"contains poses of another 'ely', .*ely\.glb: it has"
+    ):
         read_poses(poses, shorter)

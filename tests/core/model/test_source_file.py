@@ -115,7 +115,7 @@ def test_a_character_s_own_file_is_the_source_where_it_can_be(
     assert source_for(".vrm", model) is None
     written = write_pose(tmp_path / "a.stl", model, latent, model.exported_vertices(latent))
     np.testing.assert_array_equal(written.vertices, model.exported_vertices(latent))
-    with pytest.raises(MeshFileError, match="the form morph is one of a character's file"):
+    with pytest.raises(MeshFileError, match="the form morph applies only to a character's file"):
         write_pose(tmp_path / "a.obj", model, latent, model.reference, form="morph")
 
 
@@ -225,7 +225,7 @@ def test_a_model_s_own_order_needs_no_source(
     assert files == [tmp_path / "run.pc2"]
     np.testing.assert_array_equal(read_point_cache(files[0])[0], vertices)
     np.testing.assert_array_equal(written.vertices, vertices)
-    with pytest.raises(MeshFileError, match="is no point cache; use one of"):
+    with pytest.raises(MeshFileError, match="is not a point cache; use one of"):
         write_sequence(tmp_path / "run.glb", model, [latent], [model.reference])
     with pytest.raises(MeshFileError, match=r"\.pc2 rounds coordinates"):
         write_sequence(tmp_path / "far.pc2", model, [latent], [model.reference + 1e6])

@@ -290,7 +290,7 @@ def test_all_domains_locked_is_a_statement(
     result = resolver.resolve(colliding[0], options)
     assert (result.step, result.exactly_free) == (Step.NONE, False)
     assert result.latent.tobytes() == colliding[0].tobytes()
-    assert result.note == "all body parts are locked, so the pose stays as it is; unlock one"
+    assert result.note == "all body parts are locked, so the pose was not changed; unlock one"
     free = resolver.resolve(free_latents[2], options)
     assert (free.step, free.exactly_free, free.note) == (Step.UNCHANGED, True, None)
     for solver in Solver:
@@ -602,7 +602,7 @@ def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
     nothing = PoseResolver(tube_model.exact_check(), None, np.empty((0, 8))).resolve(deep)
     assert (nothing.step, nothing.exactly_free) == (Step.NONE, False)
     assert "no known collision-free pose" in (nothing.note or "")
-    with pytest.raises(LCollisionError, match="has no predictor whose answer"):
+    with pytest.raises(LCollisionError, match="has no predictor, so its answer"):
         resolver.resolve(deep, ResolveOptions(verify=False))
     token = CancelToken()
     token.cancel()

@@ -129,7 +129,7 @@ def test_a_bundled_model_is_edited_in_a_copy_that_opens_in_its_place(
     rest(qtbot, window)
     pose = document.latent
     dialog = dialog_of(window)
-    assert "stays as it is" in " ".join(label.text() for label in dialog.findChildren(QLabel))
+    assert "can't be changed" in " ".join(label.text() for label in dialog.findChildren(QLabel))
     assert dialog.copy_name.text() == f"{document.model.name}-2"
     type_name(dialog, "knee")
     for name, word in (("Body", "already"), ("", "needs a name"), ("a/b", "slash"), ("a.b", "dot")):
@@ -159,7 +159,10 @@ def test_names_that_cannot_be_are_said_and_stay_to_be_put_right(own: MainWindow)
     before = Path(own.document.model_file).read_bytes()
     dialog = dialog_of(own)
     other = own.document.model.domain_names[1]
-    for name, word in ((other, f"Two body parts are called “{other}”"), (" ", "1 to 60 letters")):
+    for name, word in (
+        (other, f"Two body parts are called “{other}”"),
+        (" ", "1 to 60 characters"),
+    ):
         type_name(dialog, name)
         QTest.mouseClick(dialog.save, LEFT)
         assert dialog.isVisible()
@@ -200,7 +203,7 @@ def test_a_file_that_holds_another_model_by_now_is_left_alone(
         document.edit_parts(PartEdits({0: "knee"}, {}))
     assert file.read_bytes() == written
     (told,) = [held for held in own.findChildren(FailureDialog) if held.isVisible()]
-    assert "holds another model by now" in told.what.text()
+    assert "has been replaced by another model" in told.what.text()
     told.reject()
 
 

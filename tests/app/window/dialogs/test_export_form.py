@@ -344,7 +344,9 @@ def test_a_character_whose_format_is_not_written_is_given_as_a_mesh_and_that_is_
     assert form.form.currentData() == MESH
     assert not form.form.isEnabled()
     assert form.kinds == {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
-    assert form._about.text().startswith("FBX files aren't written: this is the pose as a plain")
+    assert form._about.text().startswith(
+        "FBX files can't be written: this exports the pose as a plain"
+    )
     motion = MotionDialog(window.settings, window, RigModel.of(character))
     qtbot.addWidget(motion)
     assert motion.form.findData("clip") < 0

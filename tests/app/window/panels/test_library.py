@@ -461,7 +461,9 @@ def test_a_file_of_another_model_is_offered_with_its_model(
     asked = answer(cancel)
     drop(window, path)
     qtbot.waitUntil(lambda: not asked.isActive(), timeout=PATIENCE)
-    assert heard == ["snake.json holds poses of the model “snake”. Open “snake” with these poses?"]
+    assert heard == [
+        "snake.json contains poses of the model “snake”. Open “snake” with these poses?"
+    ]
     assert document.model.name == "tube"
     asked = answer(pressing("Open “snake”"))
     with qtbot.waitSignal(document.opened, timeout=PATIENCE):

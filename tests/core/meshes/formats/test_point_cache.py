@@ -134,7 +134,9 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.pc2").write_bytes(head + FRAMES.tobytes())
     with pytest.raises(MeshFileError, match="its version is 2"):
         read_point_cache(tmp_path / "m.pc2")
-    with pytest.raises(MeshFileError, match=r"m\.abc is no point cache, expected \.pc2 or \.mdd"):
+    with pytest.raises(
+        MeshFileError, match=r"m\.abc is not a point cache, expected \.pc2 or \.mdd"
+    ):
         write_point_cache(tmp_path / "m.abc", FRAMES)
     with pytest.raises(MeshFileError, match=r"none\.pc2 cannot be read: No such file"):
         read_point_cache(tmp_path / "none.pc2")
