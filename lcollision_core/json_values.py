@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
-from functools import cache
-from types import NoneType, UnionType
-from typing import (
-    Any,
-    Literal,
-    NoReturn,
-    TypeVar,
-    Union,
-    cast,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from dataclasses import asdict
+from typing import Any, NoReturn, TypeVar
+
+from msgspec import ValidationError, convert
 
 MAX_MEMORY = 2**29
 """Most bytes of memory for the values of one document."""
@@ -27,6 +18,7 @@ _BYTES_EACH = {b"{": 232, b"[": 88, b",": 40, b'"': 30}
 """Most bytes of memory per such character of the text."""
 
 _QUOTED_LENGTH = 60
+_BEYOND = {bool: 2, int: 2**63, float: math.inf}
 
 T = TypeVar("T")
 
@@ -55,24 +47,35 @@ def from_json(cls: type[T], values: Any, name: str) -> T:
 
     Parameters
     ----------
-    cls : a dataclass whose fields are bool, int, float, str, Any, Mapping, Literal, dataclasses,
-        tuples of one of these, or one of these or None
+    cls : a dataclass or a `msgspec.Struct`; its types may have limits, as `msgspec.Meta`
     values : the parsed JSON
     name : what the sentence calls the object
 
     Raises
     ------
-    ValueError : a value is missing, of another type, not finite, or beyond 64 bits.
+    ValueError : a value is missing, of another type, beyond its limits, not finite, or beyond 64
+        bits; or what the class itself raises.
     """
-    if not isinstance(values, Mapping):
-        raise ValueError(f"{name} must be an object, got {quoted(values)}")
-    given = {}
-    for field_name, (hint, required) in _field_hints(cast(Any, cls)).items():
-        if field_name in values:
-            given[field_name] = _converted(values[field_name], hint, f"{name}.{field_name}")
-        elif required:
-            raise ValueError(f"{name} lacks {field_name}")
-    return cls(**given)
+    try:
+        return typed(cls, _storable(values, name), name)
+    except RecursionError as error:
+        raise ValueError(f"{name} is nested too deeply") from error
+
+
+def typed(cls: type[T], values: Any, name: str) -> T:
+    """Do as `from_json` for a class whose limits refuse what is not finite or has no characters."""
+    try:
+        return convert(values, cls)
+    except ValidationError as error:
+        if isinstance(error.__cause__, ValueError):
+            raise error.__cause__ from None
+        raise ValueError(_sentence(str(error), values, name)) from error
+
+
+def to_json(value: Any) -> dict[str, Any]:
+    """Return the JSON values of a dataclass, lists for tuples as they come back from a file."""
+    values: dict[str, Any] = json.loads(json.dumps(asdict(value)))
+    return values
 
 
 def quoted(value: object) -> str:
@@ -81,58 +84,50 @@ def quoted(value: object) -> str:
     return text if len(text) <= _QUOTED_LENGTH else f"{text[: _QUOTED_LENGTH - 3]}..."
 
 
-@cache
-def _field_hints(cls: type[Any]) -> dict[str, tuple[Any, bool]]:
-    """Return each field's type, and whether it has no default."""
-    hints = get_type_hints(cls)
-    return {
-        field.name: (
-            hints[field.name],
-            field.default is MISSING and field.default_factory is MISSING,
-        )
-        for field in fields(cls)
-    }
-
-
-def _converted(value: Any, hint: Any, name: str) -> Any:
-    origin, arguments = get_origin(hint), get_args(hint)
-    if hint is Any:
-        return value
-    if origin in (Union, UnionType):
-        if value is None and NoneType in arguments:
-            return None
-        (hint,) = (argument for argument in arguments if argument is not NoneType)
-        return _converted(value, hint, name)
-    if origin is tuple and isinstance(value, list | tuple):
-        return tuple(_converted(one, arguments[0], f"{name}[{i}]") for i, one in enumerate(value))
-    if origin is Literal and isinstance(value, str) and value in arguments:
-        return value
-    if origin is Mapping and isinstance(value, Mapping):
-        return value
-    if is_dataclass(hint):
-        return from_json(cast(type[Any], hint), value, name)
-    if hint is bool and isinstance(value, bool):
-        return value
-    if hint is int and type(value) is int and -(2**63) <= value < 2**63:
-        return value
-    if hint is float and type(value) in (int, float) and abs(value) < math.inf:
-        # Whole numbers of JSON have any length.
-        return float(value) if abs(value) < 2**1023 else _refuse(value, hint, name)
-    if hint is str and isinstance(value, str):
+def _storable(value: Any, name: str) -> Any:
+    """Return a value of which all texts can be printed; refuse numbers that no type holds."""
+    if isinstance(value, str):
         # A lone surrogate, from an undecodable file name, cannot be printed.
         return value.encode(errors="replace").decode()
-    return _refuse(value, hint, name)
+    if isinstance(value, Mapping):
+        return {key: _storable(one, f"{name}.{key}") for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_storable(one, name) for one in value]
+    if isinstance(value, int | float) and not abs(value) < _BEYOND[type(value)]:
+        raise ValueError(f"{name} must be a finite number of 64 bits, got {quoted(value)}")
+    return value
 
 
-_WORDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a text"}
+def _sentence(message: str, values: Any, name: str) -> str:
+    """Say in our words what msgspec says, with the value that was found.
+
+    Its messages are "Expected `int`, got `str` - at `$.rules.ignored[0]`" and the like.
+    """
+    what, _, path = message.partition(" - at `$")
+    for key, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):
+        values = values[key or int(index)]
+    place = name + path.removesuffix("`")
+    if missing := re.fullmatch("Object missing required field `(.+)`", what):
+        return f"{place} lacks {missing[1]}"
+    expected = re.match(r"Expected `([^`]+)`([^,]*)", what)
+    if isinstance(values, float) and not math.isfinite(values):
+        return f"{place} is not finite"
+    if expected is None:  # the message quotes the value itself
+        return f"{place} must be a known value, got {quoted(values)}"
+    kinds = " or ".join(_WORDS.get(kind, kind) for kind in expected[1].split(" | "))
+    limits = expected[2].replace("<=", "at most").replace(">=", "at least")
+    return f"{place} must be {kinds}{limits}, got {quoted(values)}"
 
 
-def _refuse(value: Any, hint: Any, name: str) -> NoReturn:
-    if get_origin(hint) is Literal:
-        needed = f"one of {', '.join(map(repr, get_args(hint)))}"
-    else:
-        needed = _WORDS.get(hint) or ("a list" if get_origin(hint) is tuple else "an object")
-    raise ValueError(f"{name} must be {needed}, got {quoted(value)}")
+_WORDS = {
+    "bool": "true or false",
+    "int": "a whole number",
+    "float": "a finite number",
+    "str": "a text",
+    "array": "a list",
+    "object": "an object",
+    "null": "null",
+}
 
 
 def _refuse_constant(word: str) -> NoReturn:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.json_values import from_json
+from lcollision_core.json_values import from_json, to_json
 from lcollision_core.learning.effort import Quality
 from lcollision_core.meshes import file_stamp
 from lcollision_core.model_file import digest_of
@@ -88,9 +88,7 @@ class LearningRequest:
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON values of `of_json`, lists as they come back from a file."""
-        lists = ("sources", "stamps", "left_out")
-        values = asdict(self) | {name: list(getattr(self, name)) for name in lists}
-        return values if self.ignored is None else values | {"ignored": list(self.ignored)}
+        return to_json(self)
 
     @classmethod
     def of_json(cls, values: Mapping[str, Any]) -> LearningRequest:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError
-from lcollision_core.json_values import from_json
+from lcollision_core.json_values import from_json, to_json
 
 CHARACTER_REST_EXCLUSION = 0.02
 """Normalised length: the rest exclusion of characters, by measurement on some of them."""
@@ -157,8 +157,7 @@ class ContactRules:
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values for `from_json`."""
-        pairs = {name: [list(pair) for pair in getattr(self, name)] for name in _PAIRS}
-        return asdict(self) | pairs | {"left_out": list(self.left_out)}
+        return to_json(self)
 
     @classmethod
     def from_json(cls, values: Any) -> ContactRules:
@@ -170,8 +169,6 @@ class ContactRules:
         """
         try:
             return from_json(cls, values, "rules")
-        except ShapeError:
-            raise
         except ValueError as error:
             raise ShapeError(str(error)) from error
 
@@ -256,9 +253,6 @@ _SHORTLY = {
     "joint": "at joints",
     "touching": "at places that nearly always touch",
 }
-
-_PAIRS = ("ignored", "touching")
-"""Fields that are pairs."""
 
 _NAMED_PAIRS = 3
 """Most pairs of groups that a sentence names one by one."""

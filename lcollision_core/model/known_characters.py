@@ -10,7 +10,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -304,15 +304,8 @@ def _change(model: RigModel, change: Callable[[KnownCharacter], KnownCharacter])
             known = replace(known, mesh=_digest(model.topology))
             if known == before:
                 return
-            document: dict[str, Any] = {
-                "format": _FORMAT,
-                "format_version": _VERSION,
-                "file": known.file,
-            }
-            if known.rules is not None:
-                document["rules"] = known.rules.to_json()
-            held = {name: getattr(known, name) for name in (*_PARTS, "up_axis", "roles", "mesh")}
-            document |= {name: value for name, value in held.items() if value is not None}
+            chosen = {name: one for name, one in asdict(known).items() if one is not None}
+            document = {"format": _FORMAT, "format_version": _VERSION, **chosen}
             with atomic_write(path) as file:
                 file.write(json.dumps(document, indent=1).encode() + b"\n")
     except (OSError, MeshFileError) as error:

@@ -6,15 +6,17 @@ import json
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
+from msgspec.structs import astuple
 
 from lcollision_core.errors import MeshFileError, ModelFileError
-from lcollision_core.json_values import parse_json, quoted
+from lcollision_core.json_values import parse_json, quoted, typed
 from lcollision_core.meshes import RigidTransform, atomic_write
 from lcollision_core.model.known_characters import find_character
 from lcollision_core.model.latent_identity import find_latent_space
@@ -353,149 +355,122 @@ def _difference(owner: dict[str, Any], model: PosableBody) -> str:
     return f"it {alike} its codes were learned in another training"
 
 
+_Code = Annotated[float, Meta(ge=-_LARGEST_CODE, le=_LARGEST_CODE)]
+_Place = Annotated[float, Meta(ge=-_LARGEST_PLACE, le=_LARGEST_PLACE)]
+_Cosine = Annotated[float, Meta(ge=-2.0, le=2.0)]
+_Point = tuple[_Place, _Place, _Place]
+_Row = tuple[_Cosine, _Cosine, _Cosine]
+
+
+class _StoredPlacement(Struct, omit_defaults=True):
+    rotation: tuple[_Row, _Row, _Row]
+    translation: _Point
+    scale: Annotated[float, Meta(ge=_LEAST_SCALE, le=1.0 / _LEAST_SCALE)] = 1.0
+
+
+class _StoredErrors(Struct):
+    mean: _Place
+    max: _Place
+
+
+class _StoredSource(Struct, omit_defaults=True):
+    latent: list[_Code]
+    image: str
+    placement: _StoredPlacement | UnsetType = UNSET
+
+
+class _StoredPin(Struct, omit_defaults=True):
+    """A pin; one without a frame is what older programs know."""
+
+    vertex: int
+    radius: float
+    position: _Point
+    frame: Annotated[tuple[tuple[int, _Point], ...], Meta(max_length=_MOST_OF_FRAME)] = ()
+
+
+class _StoredPose(Struct, omit_defaults=True):
+    """A pose as files hold it."""
+
+    name: str
+    latent: list[_Code]
+    placement: _StoredPlacement | UnsetType = UNSET
+    fit_error: _StoredErrors | UnsetType = UNSET
+    tags: Annotated[tuple[str, ...], Meta(max_length=MAX_TAGS)] = ()
+    pins: Annotated[tuple[_StoredPin, ...], Meta(max_length=MAX_PINS)] = ()
+    mirror_of: _StoredSource | UnsetType = UNSET
+
+
 def to_json(pose: NamedPose) -> dict[str, Any]:
     """Return the JSON record of a pose; equal for equal poses, to the bit."""
-    entry: dict[str, Any] = {"name": pose.name} | _placed_to_json(pose)
+    stored = _StoredPose(
+        pose.name,
+        pose.latent.tolist(),
+        _stored_placement(pose.placement),
+        tags=pose.tags,
+        pins=tuple(_StoredPin(**vars(pin)) for pin in pose.pins),
+    )
     if pose.fit_error_mean is not None and pose.fit_error_max is not None:
-        entry["fit_error"] = {"mean": pose.fit_error_mean, "max": pose.fit_error_max}
-    if pose.tags:
-        entry["tags"] = list(pose.tags)
-    if pose.pins:
-        # A pin without a frame is what older programs know.
-        entry["pins"] = [
-            {name: value for name, value in asdict(pin).items() if value or name != "frame"}
-            for pin in pose.pins
-        ]
+        stored.fit_error = _StoredErrors(pose.fit_error_mean, pose.fit_error_max)
     source = pose.mirror_of
     if source is not None and source.is_of(pose.latent, pose.placement):
-        entry["mirror_of"] = _placed_to_json(source) | {"image": source.image}
-    return entry
+        placement = _stored_placement(source.placement)
+        stored.mirror_of = _StoredSource(source.latent.tolist(), source.image, placement)
+    record: dict[str, Any] = to_builtins(stored)
+    return record
 
 
-def _placed_to_json(pose: NamedPose | MirrorSource) -> dict[str, Any]:
-    entry: dict[str, Any] = {"latent": pose.latent.tolist()}
-    if pose.placement is not None:
-        entry["placement"] = {
-            "rotation": pose.placement.rotation.tolist(),
-            "translation": pose.placement.translation.tolist(),
-        }
-        if pose.placement.scale != 1.0:
-            entry["placement"]["scale"] = pose.placement.scale
-    return entry
+def _stored_placement(placement: RigidTransform | None) -> _StoredPlacement | UnsetType:
+    if placement is None:
+        return UNSET
+    return _StoredPlacement(
+        placement.rotation.tolist(), placement.translation.tolist(), placement.scale
+    )
 
 
 def _from_json(entry: Any, model: PosableBody) -> NamedPose:
-    pose = _object(entry, "entry")
-    name = pose.get("name")
-    reason = why_no_name(name if isinstance(name, str) else "")
-    if reason or not isinstance(name, str):
-        raise ValueError(reason)
-    latent, placement = _placed_from_json(pose, model.latent_size)
+    pose = typed(_StoredPose, entry, "pose")
+    for name in (pose.name, *pose.tags):
+        if reason := why_no_name(name):
+            raise ValueError(reason if name is pose.name else f"of its tag {name!r}, {reason}")
+    latent, placement = _latent(pose.latent, model), _placement(pose.placement)
     mean = largest = source = None
-    if "fit_error" in pose:
-        errors = _object(pose["fit_error"], "fit error")
-        both = [errors.get("mean"), errors.get("max")]
-        mean, largest = map(float, _numbers(both, (2,), "fit error", _LARGEST_PLACE))
-    if "mirror_of" in pose:
-        held = _object(pose["mirror_of"], "mirror_of")
-        if not isinstance(held.get("image"), str):
-            raise ValueError("its mirror_of must have an image, which is a text")
-        found = MirrorSource(*_placed_from_json(held, model.latent_size), held["image"])
+    if pose.fit_error:
+        mean, largest = pose.fit_error.mean, pose.fit_error.max
+    if held := pose.mirror_of:
+        found = MirrorSource(_latent(held.latent, model), _placement(held.placement), held.image)
         # A pose that was changed by hand is no longer that image.
         source = found if found.is_of(latent, placement) else None
-    tags = _tags(pose.get("tags", []))
-    pins = _pins(pose.get("pins", []), model.n_vertices)
-    return NamedPose(name, latent, placement, mean, largest, tags, source, pins)
+    tags, pins = tuple(dict.fromkeys(pose.tags)), _pins(pose.pins, model.n_vertices)
+    return NamedPose(pose.name, latent, placement, mean, largest, tags, source, pins)
 
 
-def _placed_from_json(
-    pose: dict[str, Any], latent_size: int
-) -> tuple[npt.NDArray[np.float64], RigidTransform | None]:
-    latent = _numbers(pose.get("latent"), (latent_size,), "latent", _LARGEST_CODE)
-    if "placement" not in pose:
-        return latent, None
-    held = _object(pose["placement"], "placement")
-    rotation = _numbers(held.get("rotation"), (3, 3), "rotation", 2.0)
-    translation = _numbers(held.get("translation"), (3,), "translation", _LARGEST_PLACE)
-    turned = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
-        raise ValueError("its rotation is not a rotation matrix")
-    scale = float(_numbers(held.get("scale", 1.0), (), "scale", 1.0 / _LEAST_SCALE))
-    if not _LEAST_SCALE <= scale <= 1.0 / _LEAST_SCALE:
-        raise ValueError(f"its scale must be {_LEAST_SCALE:g} to {1.0 / _LEAST_SCALE:g}")
-    return latent, RigidTransform(rotation, translation, scale)
-
-
-def _tags(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list) or len(value) > MAX_TAGS:
-        raise ValueError(f"its tags must be a list of at most {MAX_TAGS} texts")
-    for tag in value:
-        if not isinstance(tag, str) or why_no_name(tag):
-            raise ValueError(
-                f"each of its tags must be a text of 1 to {MAX_POSE_NAME_LENGTH} characters"
-            )
-    return tuple(dict.fromkeys(value))
-
-
-def _pins(value: Any, n_vertices: int) -> tuple[Pin, ...]:
-    if not isinstance(value, list) or len(value) > MAX_PINS:
-        raise ValueError(f"its pins must be a list of at most {MAX_PINS}")
-    if not value:
+def _pins(stored: tuple[_StoredPin, ...], n_vertices: int) -> tuple[Pin, ...]:
+    if not stored:
         return ()
     from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Pin
 
-    def vertex_of(number: Any) -> int:
-        if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < n_vertices:
-            raise ValueError(f"the vertex of each of its pins must be 0 to {n_vertices - 1}")
-        return number
-
-    def place_of(numbers: Any) -> tuple[float, float, float]:
-        x, y, z = _numbers(numbers, (3,), "pin's position", _LARGEST_PLACE).tolist()
-        return x, y, z
-
-    pins = []
-    for entry in value:
-        held = _object(entry, "pin")
-        vertex = vertex_of(held.get("vertex"))
-        radius = float(_numbers(held.get("radius"), (), "pin's radius", LARGEST_RADIUS))
-        if radius < LEAST_RADIUS:
+    for pin in stored:
+        for vertex in (pin.vertex, *(vertex for vertex, _ in pin.frame)):
+            if not 0 <= vertex < n_vertices:
+                raise ValueError(f"a vertex of its pins must be 0 to {n_vertices - 1}")
+        if not LEAST_RADIUS <= pin.radius <= LARGEST_RADIUS:
             raise ValueError(
-                f"the radius of each of its pins must be {LEAST_RADIUS:g} to {LARGEST_RADIUS:g}"
+                f"the radius of its pins must be {LEAST_RADIUS:g} to {LARGEST_RADIUS:g}"
             )
-        frame = held.get("frame", [])
-        if not (
-            isinstance(frame, list | tuple)
-            and len(frame) <= _MOST_OF_FRAME
-            and all(isinstance(corner, list | tuple) and len(corner) == 2 for corner in frame)
-        ):
-            raise ValueError(
-                f"the frame of each of its pins must be at most {_MOST_OF_FRAME} pairs of a vertex "
-                "and a position"
-            )
-        corners = tuple((vertex_of(at), place_of(place)) for at, place in frame)
-        pins.append(Pin(vertex, radius, place_of(held.get("position")), corners))
-    return tuple(pins)
+    return tuple(Pin(*astuple(pin)) for pin in stored)
 
 
-def _object(value: Any, name: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError(f"its {name} must be a JSON object")
-    return value
+def _latent(codes: list[float], model: PosableBody) -> npt.NDArray[np.float64]:
+    if len(codes) != model.latent_size:
+        raise ValueError(f"its latent must be {model.latent_size} numbers, got {len(codes)}")
+    return np.array(codes)
 
 
-def _numbers(
-    value: Any, shape: tuple[int, ...], name: str, largest: float
-) -> npt.NDArray[np.float64]:
-    try:
-        array = np.array(value)
-    except ValueError:
-        array = np.array(None)
-    if array.shape != shape or array.dtype.kind not in "iuf":
-        wanted = f"{' by '.join(map(str, shape))} numbers" if shape else "a number"
-        raise ValueError(f"its {name} must be {wanted}")
-    numbers = array.astype(np.float64)
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"its {name} has a number that is not finite")
-    if np.abs(numbers).max() > largest:
-        raise ValueError(f"its {name} has a number beyond {largest:g}")
-    return numbers
+def _placement(stored: _StoredPlacement | UnsetType) -> RigidTransform | None:
+    if not stored:
+        return None
+    rotation = np.array(stored.rotation)
+    turned = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
+        raise ValueError("its rotation is not a rotation matrix")
+    return RigidTransform(rotation, np.array(stored.translation), stored.scale)
