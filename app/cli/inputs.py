@@ -83,12 +83,13 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
 
 def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
     """Give the frames of a rigged character the contact rules by which it is posed as well."""
-    from lcollision_core.meshes.scene_files import is_character
+    from lcollision_core.meshes.scene_files import open_rigged
     from lcollision_core.model import open_body
 
-    if not is_character(path):
+    document = open_rigged(path)
+    if document is None:
         return poses
-    body = open_body(path)
+    body = open_body(document)
     return replace(poses, rules=body.rules, groups=body.groups)
 
 

@@ -168,14 +168,14 @@ def upright(
     ] = None,
 ) -> None:
     """Show which axis of a model or a character is up, or change it."""
-    from lcollision_core.model import PoseModel, open_body, remember_up
+    from lcollision_core.model import PoseModel, RigModel, open_body, remember_up
 
     body, axis = open_body(model_name), None if up is None else "xyz".index(up)
     if axis is not None and isinstance(body, PoseModel):
         body = changed_body(model_name, body, lambda held: held.turned_upright(axis))
-    elif axis is not None:
-        remember_up(model_name, axis)
-        body = open_body(model_name)
+    elif axis is not None and isinstance(body, RigModel):
+        remember_up(body, axis)
+        body = open_body(body.character)
     typer.echo(f"{body.name}: {'xyz'[body.up_axis]} is up")
 
 

@@ -25,6 +25,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleEr
 if TYPE_CHECKING:
     from lcollision_core.contact import ContactRules
     from lcollision_core.meshes import FileStamp
+    from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.model import (
         MirroredPose,
         NamedPose,
@@ -278,9 +279,12 @@ class PoseDocument(LiveEditing):
             changed.emit()
         self._tell_modified()
 
-    def open_model(self, name_or_path: str | Path, up: int | None = None) -> None:
-        """Read a model, or a rigged character with an up axis, in the long worker and load it."""
-        work = partial(jobs.open_model, name_or_path, up=up)
+    def open_model(self, name_or_path: str | Path, read: SceneDocument | None = None) -> None:
+        """Read a model or a rigged character in the long worker and load it.
+
+        `read` is what is read already of the file.
+        """
+        work = partial(jobs.open_model, name_or_path, read=read)
         self._bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
 
     def turn_upright(self) -> None:
@@ -296,17 +300,19 @@ class PoseDocument(LiveEditing):
     def look_into(
         self,
         path: Path,
-        done: Callable[[bool], None],
+        done: Callable[[SceneDocument | None], None],
         failed: Callable[[Failure], None] | None = None,
     ) -> None:
-        """Find in the long worker whether a file is a character's: `done` is called with that.
+        """Read in the long worker a file that may be a rigged character's.
+
+        `done` is called with what was read of it, None for another.
 
         Parameters
         ----------
         path : of any file
         done, failed : called in this thread, see `LongWork.start`
         """
-        work = partial(jobs.is_character, path)
+        work = partial(jobs.read_if_rigged, path)
         start = partial(self._long.start, f"Opening {path.name}", work, done, failed)
         if self.incoming and not self.has_model:
             # The first body stays wanted: what becomes of the file may need it.

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from app.editing.settings import Settings
     from app.view.viewport import Viewport
     from lcollision_core.errors import WrongScaleError
+    from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.model import OtherModelError
 
 POSES_SUFFIX = ".json"
@@ -240,12 +241,12 @@ class FileActions(QObject):
                 where=path.name,
             )
 
-    def _open_looked_into(self, path: Path, is_character: bool) -> None:
+    def _open_looked_into(self, path: Path, read: SceneDocument | None) -> None:
         """Open a rigged file as a body, another as a mesh of the one that is open."""
-        if not is_character:
+        if read is None:
             self._attempt(partial(self._import_mesh, path))
         elif self._attempt(self.may_lose_changes):
-            self._document.open_model(path)
+            self._document.open_model(path, read)
             self.settings["last_folder"] = str(path.resolve().parent)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from app.window.main_window import MainWindow
     from app.work.threads import Failure
+    from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.model import NamedPose, PosableBody
 
 _log = logging.getLogger(__name__)
@@ -61,13 +62,16 @@ class StartUp(QObject):
         if path is None or path.suffix.lower() in (MODEL_SUFFIX, POSES_SUFFIX):
             self._open_model(path is not None and path.suffix.lower() == MODEL_SUFFIX)
         else:
-            self._document.look_into(path, self._open_model, self._open_without_path)
+            self._document.look_into(path, self._open_rigged, self._open_without_path)
 
-    def _open_model(self, is_in_path: bool) -> None:
+    def _open_rigged(self, read: SceneDocument | None) -> None:
+        self._open_model(read is not None, read)
+
+    def _open_model(self, is_in_path: bool, read: SceneDocument | None = None) -> None:
         """Open the body that the path leads to, or the one that was used last."""
         if is_in_path and self._path is not None:
             self._model, self._path = self._path, None
-        self._document.open_model(self._model)
+        self._document.open_model(self._model, read)
 
     def _open_without_path(self, failure: Failure) -> None:
         """Begin as without a file, as the one that there is cannot be read."""

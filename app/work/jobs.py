@@ -19,8 +19,10 @@ from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
+    from lcollision_core.characters import Character
     from lcollision_core.contact import ContactRules, ProposedPair, RuleCounts
     from lcollision_core.meshes import FileStamp, RigidTransform
+    from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.model import (
         MirroredPose,
         NamedPose,
@@ -112,19 +114,26 @@ class ExportStyle:
 
 
 def open_model(
-    name_or_path: str | Path, _: Progress, cancel: CancelToken, up: int | None = None
+    name_or_path: str | Path,
+    _: Progress,
+    cancel: CancelToken,
+    up: int | None = None,
+    read: SceneDocument | Character | None = None,
 ) -> OpenedModel:
-    """Read a model and use it once, so that nothing is left to compile before the first frame."""
+    """Read a model and use it once, so that nothing is left to compile before the first frame.
+
+    `read` is what is read already of the file.
+    """
     from lcollision_core.model import RigModel, find_model, open_body, remember_file, remember_up
 
     path = find_model(name_or_path).absolute()
-    model = open_body(path, up)
+    model = open_body(path if read is None else read, up)
     cancel.raise_if_cancelled()
     if isinstance(model, RigModel):
         try:
             remember_file(model, path)
             if up is not None:
-                remember_up(path, up)
+                remember_up(model, up)
         except ModelFileError as error:
             model = model.noted(error.headline)
     warm_up(model)
@@ -154,11 +163,11 @@ def _drag_once(model: PosableBody) -> None:
     dragger.move(model.reference[0])
 
 
-def is_character(path: Path, _: Progress, __: CancelToken) -> bool:
-    """Whether a file shows something that joints move, so that it opens as a body."""
-    from lcollision_core.meshes.scene_files import is_character
+def read_if_rigged(path: Path, _: Progress, __: CancelToken) -> SceneDocument | None:
+    """Read a file, if it shows something that joints move, so that it opens as a body."""
+    from lcollision_core.meshes.scene_files import open_rigged
 
-    return is_character(path)
+    return open_rigged(path)
 
 
 def prepare(model: PosableBody, _: Progress, __: CancelToken) -> PosableBody:
@@ -422,6 +431,7 @@ def say_role(
 
     if isinstance(model, RigModel):
         remember_roles(model, {joint: role})
+        return open_model(model_file, progress, cancel, read=model.character)
     return open_model(model_file, progress, cancel)
 
 
@@ -429,11 +439,11 @@ def turn_upright(
     model: PosableBody, model_file: str, progress: Progress, cancel: CancelToken
 ) -> OpenedModel:
     """Turn a body so that its next axis is up; a model is changed in its file, and then read."""
-    from lcollision_core.model import PoseModel, change_model
+    from lcollision_core.model import PoseModel, RigModel, change_model
 
     axis = (model.up_axis + 1) % 3
-    if not isinstance(model, PoseModel):
-        return open_model(model_file, progress, cancel, up=axis)
+    if isinstance(model, RigModel):
+        return open_model(model_file, progress, cancel, up=axis, read=model.character)
 
     def change(held: PoseModel) -> PoseModel:
         _require_same(held, model, model_file, "its up axis")

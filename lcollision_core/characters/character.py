@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.characters.character_file import CharacterFile
 from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.scene_files import one_sentence
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 NO_JOINTS = "has no joints to pose it by"
@@ -98,9 +100,9 @@ class Character:
     rig : None for one without joints
     clips : lengths in seconds of its animations, by their names
     sample : (clip, fps) to its frames; None for the clip's own key frames at at most 30 a second
-    look : reads how it looks, which takes long; to None where its file does not say that
     notes : sentences on what was changed on reading
     no_rig : what is wrong with the file where `rig` is None
+    file : what was read of it; None for one that is not from a file
     """
 
     name: str
@@ -116,5 +118,17 @@ class Character:
     clips: Mapping[str, float]
     sample: Callable[[str, float | None], ClipFrames]
     notes: tuple[str, ...] = ()
-    look: Callable[[], Appearance | None] = lambda: None
     no_rig: str = NO_JOINTS
+    file: CharacterFile | None = None
+
+    def look(self) -> Appearance | None:
+        """Read how it looks, which takes long the first time; None where no file says that.
+
+        Raises
+        ------
+        MeshFileError : the file is damaged.
+        """
+        if self.file is None:
+            return None
+        with one_sentence(self.source):
+            return self.file.appearance

@@ -6,10 +6,8 @@ that the pose has changed, so that the source, which may be elsewhere, can be re
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,14 +17,11 @@ from lcollision_core.characters.reading import character_of
 from lcollision_core.errors import MeshFileError
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.contact_rules import ContactRules
-from lcollision_core.meshes.formats import gltf
 from lcollision_core.meshes.formats.gltf_document import GltfDocument
-from lcollision_core.meshes.formats.gltf_patch import GltfPatch
-from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
+from lcollision_core.meshes.formats.gltf_scene import read_shown
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.scene_files import one_sentence, scene_of
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.regular_files import read_regular
 
 _KEY, _VERSION = "lcollision", 1
 _LONGEST_NAME = 100
@@ -36,7 +31,7 @@ _CHANGED = ("nodes", "meshes", "skins", "scenes", "scene")
 
 
 def sign(
-    patch: GltfPatch,
+    patch: GltfDocument,
     source: dict[str, Any],
     character: Character,
     shown_by: Sequence[int],
@@ -111,27 +106,26 @@ class OwnFile:
     roles: dict[str, str]
 
 
-def read_own_file(path: Path) -> OwnFile | None:
+def read_own_file(document: GltfDocument) -> OwnFile | None:
     """Read a file that this program wrote with a pose in it; None for any other.
 
     Raises
     ------
     MeshFileError : it was changed since, by another program, or is of a later version.
     """
+    path = document.path
     with one_sentence(path, "can't be checked by the rules that it was exported with"):
-        document = GltfDocument(read_regular(path, MAX_FILE_BYTES), path)
         asset = document.description.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None
         held = extras.get(_KEY) if isinstance(extras, dict) else None
         if not isinstance(held, dict):
             return None
-        patch = GltfPatch(document, path)
         version = held.get("format_version")
         if version != _VERSION:
             raise MeshFileError.must_be(
                 "its version", _VERSION, quoted(version), "update LCollision"
             )
-        if held.get("digest") != patch.digest(_KEY):
+        if held.get("digest") != document.digest(_KEY):
             raise MeshFileError("another program has changed it since", "export it again")
         shown_by, source, name = held.get("shown_by"), held.get("source"), held.get("character")
         roles = held.get("roles")
@@ -145,12 +139,10 @@ def read_own_file(path: Path) -> OwnFile | None:
         ):
             raise MeshFileError("what it says of its source is damaged", "export it again")
         rules = ContactRules.from_json(held.get("rules"))
-        posed = gltf.read_scene(io.BytesIO(patch.encoded()), path)
-        patch.description |= {key: source[key] for key in (*_CHANGED, _CLIPS) if key in source}
-        patch.description = {
-            k: value for k, value in patch.description.items() if value is not None
-        }
-        character = character_of(scene_of(io.BytesIO(patch.encoded()), path), path)
+        posed = read_shown(document)
+        before = {key: source[key] for key in (*_CHANGED, _CLIPS) if key in source}
+        source_document = document.described(document.description | before)
+        character = character_of(scene_of(source_document), path)
         shown = "".join(filter(str.isprintable, name))[:_LONGEST_NAME]
         character = replace(character, name=shown or character.name, clips={})
         mesh = join_parts(posed)

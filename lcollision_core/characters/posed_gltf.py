@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +14,23 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters.character import Character, Rig
+from lcollision_core.characters.character_file import (
+    IDENTITY,
+    PARTS,
+    CharacterFile,
+    blended,
+    stored_parts,
+    unit,
+)
 from lcollision_core.characters.own_files import sign
 from lcollision_core.errors import MeshFileError, ShapeError, UnwritablePoseError
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules
-from lcollision_core.meshes.formats.gltf_document import GltfDocument, as_float
-from lcollision_core.meshes.formats.gltf_patch import VERTEX_DATA, GltfPatch
-from lcollision_core.meshes.formats.gltf_scene import ShownPrimitive, read_shown, shown_primitives
-from lcollision_core.meshes.formats.hidden_parts import shown_scene
+from lcollision_core.meshes.formats.gltf_document import VERTEX_DATA, GltfDocument
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
-from lcollision_core.meshes.formats.scene import (
-    Part,
-    ScenePoses,
-    parents_first,
-)
-from lcollision_core.meshes.formats.transforms import compose, decompose, is_regular
+from lcollision_core.meshes.formats.scene import Primitive, ScenePoses, parents_first
+from lcollision_core.meshes.formats.transforms import compose, decompose
 from lcollision_core.meshes.joined import join_parts
-from lcollision_core.meshes.normals import moved_normals
-from lcollision_core.meshes.scene_files import one_sentence
+from lcollision_core.meshes.scene_files import one_sentence, scene_of
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import body_size
 from lcollision_core.regular_files import read_regular
@@ -46,10 +46,6 @@ _SAME_TRANSFORM = 1e-9
 
 _SAME_NUMBER = 1e-6
 """Of a joint's translation or scale: what changes less keeps its text."""
-
-_IDENTITY = np.eye(4)
-_PARTS = ("translation", "rotation", "scale")
-_DEFAULTS = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0))
 
 _OTHER_FORM = "write a point cache (.pc2), or each pose in a file of its own"
 
@@ -90,7 +86,6 @@ def posed_gltf(
     vertices: npt.NDArray[Any],
     form: CharacterForm,
     transforms: FloatArray | None = None,
-    file: CharacterFile | None = None,
     rules: ContactRules = STRICT,
 ) -> PosedFile:
     """Put a pose into the character's own .glb, .gltf or .vrm file.
@@ -105,7 +100,6 @@ def posed_gltf(
     vertices : (V, 3) finite array, in its frame and unit
     form : how the file holds the pose
     transforms : (J, 4, 4) global transforms of the joints, for the form of joints
-    file : the character's, where it is read already
     rules : the character's, which the file keeps: see `read_own_file`
 
     Returns
@@ -127,11 +121,11 @@ def posed_gltf(
         raise ShapeError.must_be(f"vertices of {character.name}", expected, vertices.shape)
     if form is CharacterForm.JOINTS and (character.rig is None or transforms is None):
         raise ShapeError.must_be("a pose in joints", "of a rig, with transforms", "none")
-    file = file or CharacterFile(character)
+    file = _file_of(character)
     pose = np.asarray(vertices, dtype=np.float64)
     notes: list[str] = []
     with one_sentence(character.source, "cannot be written with this pose"):
-        source = _Source(file)
+        source = _Source(character, file)
         try:
             if (
                 form is CharacterForm.JOINTS
@@ -145,7 +139,7 @@ def posed_gltf(
                 stored = source.bake(pose)
             source.require_near(stored, pose)
         except UnwritablePoseError as error:
-            source = _Source(file)
+            source = _Source(character, file)
             stored = source.bake(pose)
             notes.append(f"{error.what}, so it is written as a static mesh")
         clips = source.drop_clips()
@@ -184,9 +178,9 @@ def animated_gltf(
         raise ShapeError.must_be(
             f"frames of {character.name}", f"of a rig, of shape {shape}", vertices.shape
         )
-    file = CharacterFile(character)
+    file = _file_of(character)
     with one_sentence(character.source, "cannot be written with these poses"):
-        source = _Source(file)
+        source = _Source(character, file)
         clips = source.drop_clips()
         frames = source.animate(character.rig, transforms, fps)
         for stored, wanted in zip(frames, vertices, strict=True):
@@ -196,103 +190,28 @@ def animated_gltf(
     return tuple(PosedFile(data, stored, notes) for stored in frames)
 
 
-class CharacterFile:
-    """The file of a character, read once to be written with many poses.
-
-    Parameters
-    ----------
-    character : read from a .glb, .gltf or .vrm file
+def _file_of(character: Character) -> CharacterFile:
+    """Return what is written: what was read of the file, or is there now if that is as good.
 
     Raises
     ------
-    MeshFileError : the file cannot be read, or has changed since the character was.
+    MeshFileError : the file cannot be read, or has another shape than the character.
     """
-
-    def __init__(self, character: Character) -> None:
-        path = Path(character.source)
-        with one_sentence(path):
-            data = read_regular(path, MAX_FILE_BYTES)
-            self.document = GltfDocument(data, path)
-            whole = read_shown(self.document)
-            shown_parts = shown_scene(whole)
-            self.scene = scene = shown_parts.scene
-            self.patch = GltfPatch(self.document, path)
-            self._place(shown_parts.revealed)
-            self.mesh = join_parts(scene)
-            self.rest = self.mesh.posed(scene.rest)[0]
+    path, file = Path(character.source), character.file
+    with one_sentence(path):
+        data = read_regular(path, MAX_FILE_BYTES)
+        if file is None or file.document.sha256 != hashlib.sha256(data).digest():
+            scene = scene_of(GltfDocument(data, path))
+            file = CharacterFile(scene, join_parts(scene))
             if not (
-                np.array_equal(self.mesh.joined, character.joined)
-                and np.array_equal(self.rest, character.rest_vertices)
+                np.array_equal(file.mesh.joined, character.joined)
+                and np.array_equal(file.rest, character.rest_vertices)
             ):
                 raise MeshFileError(
                     "it is not the file that the character was read from", "open it again"
                 )
-            self.locals = [_stored_transform(node) for node in self.patch.description["nodes"]]
-            shown, _ = shown_primitives(self.document, scene.parents)
-            ends = np.cumsum([len(part.points) for part in scene.parts]).tolist()
-            rows = [
-                slice(end - len(part.points), end)
-                for part, end in zip(scene.parts, ends, strict=True)
-            ]
-            shown = [shown[number] for number in shown_parts.kept]
-            self.parts = list(zip(scene.parts, shown, rows, strict=True))
-        self.character = character
-
-    def _place(self, nodes: Sequence[int]) -> None:
-        """Write where the rest pose has nodes that the file's rest pose hides by scale."""
-        rest = self.scene.rest.transforms[0]
-        for number in nodes:
-            parent = int(self.scene.parents[number])
-            above = rest[parent] if parent >= 0 else _IDENTITY
-            if is_regular(above):
-                node = self.patch.description["nodes"][number]
-                node.pop("matrix", None)
-                held = decompose(np.linalg.solve(above, rest[number]))
-                node |= {name: part.tolist() for name, part in zip(_PARTS, held, strict=True)}
-
-    @cached_property
-    def stored_normals(self) -> list[FloatArray | None]:
-        """The normals that the file stores for the vertices of each part, (n, 3)."""
-        found: list[FloatArray | None] = []
-        with one_sentence(self.character.source):
-            for _, shown, _ in self.parts:
-                mesh = self.document.objects("meshes")[shown.mesh]
-                number = mesh["primitives"][shown.primitive]["attributes"].get("NORMAL")
-                what = f"the normals of mesh {shown.mesh}"
-                found.append(
-                    None
-                    if number is None
-                    else np.tile(
-                        as_float(self.document.array(number, what, ("VEC3",), shown.n_vertices)),
-                        (shown.n_instances, 1),
-                    )
-                )
-        return found
-
-    def normals(self, vertices: FloatArray) -> FloatArray:
-        """Return the unit normals of the file's W vertices in a pose; 0 where it has none."""
-        return moved_normals(*self._normals_at_rest, self.rest, vertices)
-
-    @cached_property
-    def _normals_at_rest(
-        self,
-    ) -> tuple[FloatArray, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        joined = self.character.joined
-        rest = np.zeros((len(joined), 3))
-        transforms = self.scene.rest.transforms[0]
-        for (part, _, rows), stored in zip(self.parts, self.stored_normals, strict=True):
-            if stored is not None:
-                turns = np.linalg.pinv(_blended(part, transforms)[:, :, :3])
-                rest[rows] = _unit(np.einsum("vij,vi->vj", turns, stored))
-        # All triangles of the joined vertex, so that the copies at a seam move alike.
-        faces = self.character.topology.faces.astype(np.int64)
-        corners = np.concatenate([np.roll(faces, -side, axis=1) for side in range(3)])
-        corners = corners[np.argsort(corners[:, 0], kind="stable")]
-        first = np.searchsorted(corners[:, 0], np.arange(len(self.rest) + 1))
-        counts = np.diff(first)[joined]
-        owners = np.repeat(np.arange(len(counts)), counts)
-        within = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
-        return rest, owners, corners[np.repeat(first[joined], counts) + within]
+        _ = file.editable, file.stored_normals
+    return file
 
 
 class _Source:
@@ -304,9 +223,9 @@ class _Source:
     size : body size
     """
 
-    def __init__(self, file: CharacterFile) -> None:
-        self._file, character = file, file.character
-        self.patch = file.patch.copy()
+    def __init__(self, character: Character, file: CharacterFile) -> None:
+        self._character, self._file = character, file
+        self.patch = file.editable.copy()
         self.size = body_size(character.rest_vertices, character.topology)
         self._nodes: list[dict[str, Any]] = self.patch.description["nodes"]
         self._scene, self._rest, self._joined = file.scene, file.rest, character.joined
@@ -315,7 +234,7 @@ class _Source:
 
     def signed(self, rules: ContactRules) -> bytes:
         """Return the bytes of the file, which says what it was made of; see `own_files`."""
-        character, source = self._file.character, self._file.patch.description
+        character, source = self._character, self._file.editable.description
         if character.rig is not None:
             sign(self.patch, source, character, self._shown_by, rules)
         return self.patch.encoded()
@@ -335,7 +254,7 @@ class _Source:
 
         def hold(number: int, local: FloatArray) -> FloatArray:
             node, held = self._nodes[number], _held(self._nodes[number], local)
-            for name, stored, new in zip(_PARTS, _stored_parts(node), held, strict=True):
+            for name, stored, new in zip(PARTS, stored_parts(node), held, strict=True):
                 if "matrix" in node or not np.array_equal(stored, new):
                     node[name] = new.tolist()
             node.pop("matrix", None)
@@ -358,7 +277,7 @@ class _Source:
                 node = self._nodes[number]
                 if number not in keys:
                     keys[number] = [
-                        np.tile(part, (len(transforms), 1)) for part in _stored_parts(node)
+                        np.tile(part, (len(transforms), 1)) for part in stored_parts(node)
                     ]
                 held = _held(node, local)
                 for key, part in zip(keys[number], held, strict=True):
@@ -371,7 +290,7 @@ class _Source:
         channels: list[dict[str, Any]] = []
         for number, tracks in keys.items():
             node = self._nodes[number]
-            for name, stored, values in zip(_PARTS, _stored_parts(node), tracks, strict=True):
+            for name, stored, values in zip(PARTS, stored_parts(node), tracks, strict=True):
                 if "matrix" not in node and (values == stored).all():
                     continue
                 if name == "rotation":
@@ -385,9 +304,7 @@ class _Source:
                 samplers.append({**sampler, "interpolation": "LINEAR"})
             if node.pop("matrix", None) is not None:
                 # What is animated has no matrix.
-                node |= {
-                    part: track[0].tolist() for part, track in zip(_PARTS, tracks, strict=True)
-                }
+                node |= {part: track[0].tolist() for part, track in zip(PARTS, tracks, strict=True)}
         if channels:
             animation = {"name": _CLIP, "samplers": samplers, "channels": channels}
             self.patch.description.setdefault("animations", []).insert(0, animation)
@@ -412,7 +329,7 @@ class _Source:
         for number in parents_first(parents):
             parent, local = int(parents[number]), self._file.locals[number]
             above, wanted_above = (
-                (placed[parent], wanted[parent]) if parent >= 0 else (_IDENTITY, _IDENTITY)
+                (placed[parent], wanted[parent]) if parent >= 0 else (IDENTITY, IDENTITY)
             )
             if number in joints:
                 new = _relative(wanted_above, wanted[number])
@@ -493,7 +410,7 @@ class _Source:
         for (part, shown, rows), weights, own_normals in zip(
             self._parts, self._scene.rest.weights, self._file.stored_normals, strict=True
         ):
-            turns = _blended(part, rest)
+            turns = blended(part, rest)
             base = part.points + np.tensordot(weights[0], part.morphs, axes=1)
             wanted = vertices[self._joined[rows]] - turns[:, :, 3]
             try:
@@ -504,13 +421,13 @@ class _Source:
                 ) from error
             deltas = (own - base).astype(np.float32)
             stored[self._joined[rows]] = _moved(turns, base + deltas)
-            held = self._file.patch.description["meshes"][shown.mesh]
+            held = self._file.editable.description["meshes"][shown.mesh]
             primitive = self._own_mesh(shown)["primitives"][shown.primitive]
             target = {"POSITION": self._vectors(deltas, has_bounds=True)}
             if own_normals is not None:
                 # A reader turns normals by the inverse transpose.
                 turned = np.einsum("vij,vi->vj", turns[:, :, :3], normals[rows])
-                target["NORMAL"] = self._vectors(_unit(turned) - own_normals)
+                target["NORMAL"] = self._vectors(unit(turned) - own_normals)
             most = max(len(primitive.get("targets", ())) for primitive in held["primitives"])
             self._fill_targets(primitive, most)
             primitive["targets"].append(target)
@@ -570,7 +487,7 @@ class _Source:
     def _vectors(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
         return self.patch.add_array(values, has_bounds=has_bounds, target=VERTEX_DATA)
 
-    def _own_mesh(self, shown: ShownPrimitive) -> dict[str, Any]:
+    def _own_mesh(self, shown: Primitive) -> dict[str, Any]:
         """Return the mesh of a node, after copying it where other nodes show it too."""
         meshes: list[dict[str, Any]] = self.patch.description["meshes"]
         node = self._nodes[shown.node]
@@ -591,7 +508,7 @@ class _Source:
         node = self._nodes[number]
         node.pop("skin", None)
         node.pop("weights", None)
-        if np.array_equal(self._scene.rest.transforms[0, number], _IDENTITY):
+        if np.array_equal(self._scene.rest.transforms[0, number], IDENTITY):
             return
         description = self.patch.description
         if not node.keys() <= {
@@ -630,31 +547,12 @@ def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
         raise UnwritablePoseError("a joint's parent has zero scale", _OTHER_FORM) from error
 
 
-def _stored_transform(node: dict[str, Any]) -> FloatArray:
-    """Return the (4, 4) local transform of a node of the file."""
-    if "matrix" in node:
-        # Column by column.
-        return np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
-    return compose(*_stored_parts(node))
-
-
-def _stored_parts(node: dict[str, Any]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the translation, rotation and scale of a node of the file."""
-    if "matrix" in node:
-        return decompose(_stored_transform(node))
-    translation, rotation, scale = (
-        np.array(node.get(name, default), np.float64)
-        for name, default in zip(_PARTS, _DEFAULTS, strict=True)
-    )
-    return translation, rotation, scale
-
-
 def _held(node: dict[str, Any], local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the translation, rotation and scale that a file holds of a node's local transform.
 
     A translation or a scale that stays, as where a joint only turns, is the one of the node.
     """
-    old_translation, _, old_scale = _stored_parts(node)
+    old_translation, _, old_scale = stored_parts(node)
     # The axes that the node reflects, where it reflects some.
     signs = np.where(old_scale < 0.0, -1.0, 1.0)
     translation, rotation, scale = decompose(local * np.append(signs, 1.0))
@@ -671,22 +569,6 @@ def _kept(old: FloatArray, new: FloatArray) -> FloatArray:
     return new.astype(np.float32).astype(np.float64)
 
 
-def _blended(part: Part, transforms: FloatArray) -> FloatArray:
-    """Return the (n, 3, 4) affine map of each vertex of a part, for (nodes, 4, 4) transforms."""
-    turns = (transforms[part.bones] @ part.bind)[:, :3]
-    blended = np.zeros((len(part.points), 3, 4))
-    for bone, weight in zip(part.bone_of.T, part.weights.T, strict=True):
-        blended += weight[:, None, None] * turns[bone]
-    return blended
-
-
 def _moved(turns: FloatArray, points: FloatArray) -> FloatArray:
     moved: FloatArray = np.einsum("vij,vj->vi", turns[:, :, :3], points) + turns[:, :, 3]
     return moved
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    unit = np.zeros_like(vectors)
-    np.divide(vectors, lengths, out=unit, where=lengths > 0.0)
-    return unit

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from lcollision_core.characters.character import NO_JOINTS, Character, ClipFrames, Rig
+from lcollision_core.characters.character_file import CharacterFile
 from lcollision_core.errors import ShapeError
-from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.formats.scene import Scene, parents_first
 from lcollision_core.meshes.formats.transforms import is_regular
-from lcollision_core.meshes.joined import JoinedMesh, join_parts, look_of, sample_clip
+from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.numbered_names import numbered_where_equal
-from lcollision_core.meshes.scene_files import one_sentence, read_scene
+from lcollision_core.meshes.scene_files import (
+    SceneDocument,
+    one_sentence,
+    open_scene,
+    read_scene,
+)
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.meshes.upright import guess_up
 
@@ -23,7 +29,7 @@ _EVEN = 1e-6
 
 
 def read_character(
-    path: str | os.PathLike[str],
+    source: str | os.PathLike[str] | SceneDocument,
     up: int | str | None = None,
     topology: Topology | None = None,
 ) -> Character:
@@ -31,7 +37,7 @@ def read_character(
 
     Parameters
     ----------
-    path : a .glb, .gltf, .vrm or .fbx file
+    source : a .glb, .gltf, .vrm or .fbx file, or what `open_scene` read of it
     up : the up axis where the file is wrong about it: 0, 1, 2, "x", "y" or "z"
     topology : of a model of the character, as which polygons are cut
 
@@ -42,19 +48,39 @@ def read_character(
     MissingExtraError : the extra `fbx`, which reads FBX, is not installed.
     ShapeError : `up` is no axis.
     """
-    return character_of(read_scene(path), Path(path), None if up is None else _axis(up), topology)
+    document = source if isinstance(source, SceneDocument) else open_scene(source)
+    character = character_of(read_scene(document), document.path, topology)
+    return character if up is None else turned(character, _axis(up))
 
 
-def character_of(
-    scene: Scene, path: Path, axis: int | None = None, topology: Topology | None = None
-) -> Character:
+def turned(character: Character, axis: int) -> Character:
+    """Return a character whose axis 0, 1 or 2 is up, whatever its file says."""
+    return replace(character, up=np.eye(3)[axis], up_is_sure=True)
+
+
+def as_read(character: Character) -> Character:
+    """Return a character as its file has it, without what was chosen for it."""
+    if character.file is None or character.rig is None:
+        return character
+    up, is_sure = _up(character.file.scene, character.file.mesh, character.rest_vertices)
+    return replace(character, up=up, up_is_sure=is_sure, rig=replace(character.rig, chosen={}))
+
+
+def _up(scene: Scene, mesh: JoinedMesh, rest_vertices: FloatArray) -> tuple[FloatArray, bool]:
+    """Return `Character.up` and `Character.up_is_sure`."""
+    if scene.up is not None:
+        return scene.up, True
+    guess = guess_up(mesh.topology, rest_vertices[None])
+    return np.eye(3)[guess.axis], guess.is_sure
+
+
+def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> Character:
     """Make a character of what a file shows.
 
     Parameters
     ----------
     scene : without scenery
     path : of the file
-    axis : 0, 1 or 2, the up axis where the file is wrong about it
     topology : of a model of the character, as which polygons are cut
 
     Raises
@@ -79,32 +105,21 @@ def character_of(
         transforms = None if rig is None else poses.transforms[:, rig.nodes]
         return ClipFrames(clip, names, times, transforms, skin)
 
-    def look() -> Appearance | None:
-        with one_sentence(path):
-            return look_of(scene, mesh)
-
-    up_direction, is_sure = scene.up, True
-    if axis is not None:
-        up_direction = np.eye(3)[axis]
-    elif up_direction is None:
-        guess = guess_up(mesh.topology, rest[None])
-        up_direction, is_sure = np.eye(3)[guess.axis], guess.is_sure
     return Character(
         path.stem,
         path,
         mesh.topology,
         rest,
         mesh.joined,
-        up_direction,
-        is_sure,
+        *_up(scene, mesh, rest),
         scene.metres,
         mesh.groups,
         rig,
         lengths,
         sample,
         mesh.notes + notes,
-        look,
         NO_JOINTS if rig is not None or not notes else f"cannot be posed by its rig: {notes[0]}",
+        CharacterFile(scene, mesh),
     )
 
 

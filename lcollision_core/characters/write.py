@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from lcollision_core.characters.character import Character
 from lcollision_core.characters.posed_gltf import (
-    CharacterFile,
     CharacterForm,
     PosedFile,
     animated_gltf,
@@ -33,7 +32,6 @@ def write_character(
     vertices: npt.NDArray[Any],
     form: CharacterForm | str,
     transforms: FloatArray | None = None,
-    file: CharacterFile | None = None,
     rules: ContactRules = STRICT,
 ) -> PosedFile:
     """Write a character's file with a pose in it, whole or not at all: see `posed_gltf`.
@@ -41,7 +39,7 @@ def write_character(
     Parameters
     ----------
     path : a .glb file, or a .vrm file for a character of one
-    character, vertices, form, transforms, file, rules : as of `posed_gltf`
+    character, vertices, form, transforms, rules : as of `posed_gltf`
 
     Returns
     -------
@@ -53,7 +51,7 @@ def write_character(
     ShapeError : as of `posed_gltf`.
     """
     _require_written(path, character)
-    posed = posed_gltf(character, vertices, CharacterForm(form), transforms, file, rules)
+    posed = posed_gltf(character, vertices, CharacterForm(form), transforms, rules)
     with atomic_write(path) as out:
         out.write(posed.data)
     return posed

@@ -12,7 +12,7 @@ from lcollision_core.characters import read_character
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, is_character
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
 from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
 from lcollision_core.model.known_characters import with_remembered
 
@@ -64,7 +64,9 @@ def gather_poses(
     if not paths:
         raise LCollisionError("there is nothing to read poses from", "name a file or a folder")
     files = [Path(path) for path in paths]
-    characters = {file: read_character(file, up) for file in files if _has_rig(file)}
+    # What is missing is refused when it is read.
+    opened = {file: open_rigged(file) for file in files if file.is_file()}
+    characters = {file: read_character(one, up) for file, one in opened.items() if one is not None}
     rigged = next(iter(characters), None)
     files.sort(key=lambda file: file != rigged)
     character = None if rigged is None else characters[rigged]
@@ -119,8 +121,3 @@ def gather_poses(
         notes = tuple(dict.fromkeys((*poses.notes, *body.notes)))
         poses = replace(poses, rules=body.rules, groups=body.groups, notes=notes)
     return poses if up is None else replace(poses, up_axis=up)
-
-
-def _has_rig(path: Path) -> bool:
-    """Whether it is a file of a rigged character; what is missing is refused when it is read."""
-    return path.is_file() and is_character(path)

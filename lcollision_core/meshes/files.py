@@ -19,7 +19,12 @@ from lcollision_core.meshes.formats.scene import Scene
 from lcollision_core.meshes.formats.triangulation import triangulate
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.precision import as_stored, can_hold, rounding_step
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, one_sentence, scene_of
+from lcollision_core.meshes.scene_files import (
+    SCENE_SUFFIXES,
+    document_of,
+    one_sentence,
+    scene_of,
+)
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.regular_files import open_regular
 
@@ -142,7 +147,7 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
             return off.read(file)
         if suffix == ".stl":
             return stl.read(file, size, topology)
-        return _rest_pose(scene_of(file, path), topology)
+        return _rest_pose(scene_of(document_of(file, path)), topology)
 
 
 def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:

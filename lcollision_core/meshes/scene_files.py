@@ -7,12 +7,15 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeAlias
 
 from lcollision_core.errors import MeshFileError, PoseSetError
 from lcollision_core.jobs import CancelToken
-from lcollision_core.meshes.formats import fbx, gltf
+from lcollision_core.meshes.formats import fbx, gltf_scene
+from lcollision_core.meshes.formats.fbx import FbxDocument
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.meshes.formats.hidden_parts import shown_scene
+from lcollision_core.meshes.formats.polygons import read_rest
 from lcollision_core.meshes.formats.scene import Scene
 from lcollision_core.regular_files import open_regular
 
@@ -20,8 +23,12 @@ SCENE_SUFFIXES = (".glb", ".gltf", ".vrm", ".fbx")
 """Extensions that `read_scene` reads, in lower case."""
 
 
-def read_scene(path: str | os.PathLike[str], cancel: CancelToken | None = None) -> Scene:
-    """Read what a file shows, without scenery about its characters; its extension says the format.
+SceneDocument: TypeAlias = GltfDocument | FbxDocument
+"""A file of a scene as it was read once, of which its scene, clips and looks are made."""
+
+
+def open_scene(path: str | os.PathLike[str], cancel: CancelToken | None = None) -> SceneDocument:
+    """Read a file without making its scene; its extension says the format.
 
     Parameters
     ----------
@@ -30,28 +37,38 @@ def read_scene(path: str | os.PathLike[str], cancel: CancelToken | None = None) 
 
     Raises
     ------
-    CancelledError : `cancel` was set.
-    MeshFileError : the file is missing, damaged, compressed, too large, or shows no triangles. The
-        sentence names the file.
+    MeshFileError : the file is missing, damaged or too large. The sentence names the file.
     """
     with one_sentence(path), _opened(path) as file:
-        return scene_of(file, Path(path), cancel)
+        return document_of(file, Path(path), cancel)
 
 
-def has_skin(path: str | os.PathLike[str]) -> bool:
-    """Whether a file shows something that joints move.
+def read_scene(
+    source: str | os.PathLike[str] | SceneDocument, cancel: CancelToken | None = None
+) -> Scene:
+    """Read what a file shows, without scenery about its characters.
+
+    Parameters
+    ----------
+    source : the file, or what `open_scene` returned
+    cancel : see `open_scene`
 
     Raises
     ------
-    MeshFileError : as of `read_scene`, as far as the file's description tells.
+    CancelledError : `cancel` was set.
+    MeshFileError : as of `open_scene`, or the file is compressed, or shows no triangles.
     """
-    with one_sentence(path), _opened(path) as file:
-        return fbx.has_skin(file) if _is_fbx(path) else gltf.has_skin(file, Path(path))
+    document = source if isinstance(source, SceneDocument) else open_scene(source, cancel)
+    with one_sentence(document.path):
+        return scene_of(document)
 
 
-def is_character(path: str | os.PathLike[str]) -> bool:
-    """Whether a file of any kind shows something that joints move; see `has_skin`."""
-    return Path(path).suffix.lower() in SCENE_SUFFIXES and has_skin(path)
+def open_rigged(path: str | os.PathLike[str]) -> SceneDocument | None:
+    """Read a file of any kind, as `open_scene`, if it shows something that joints move."""
+    if Path(path).suffix.lower() not in SCENE_SUFFIXES:
+        return None
+    document = open_scene(path)
+    return document if document.has_skin else None
 
 
 @contextmanager
@@ -68,14 +85,18 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         yield file
 
 
-def scene_of(file: BinaryIO, path: Path, cancel: CancelToken | None = None) -> Scene:
-    """Read an open file at its start, as `read_scene`; the sentence does not name it."""
-    scene = fbx.read_scene(file, path, cancel) if _is_fbx(path) else gltf.read_scene(file, path)
-    return shown_scene(scene).scene
+def document_of(file: BinaryIO, path: Path, cancel: CancelToken | None = None) -> SceneDocument:
+    """Read an open file at its start, as `open_scene`; the sentence does not name it."""
+    if path.suffix.lower() == ".fbx":
+        return FbxDocument(read_rest(file), path, cancel)
+    return GltfDocument(read_rest(file), path)
 
 
-def _is_fbx(path: str | os.PathLike[str]) -> bool:
-    return Path(path).suffix.lower() == ".fbx"
+def scene_of(document: SceneDocument) -> Scene:
+    """Make the scene of a file, as `read_scene`; the sentence does not name it."""
+    if isinstance(document, FbxDocument):
+        return shown_scene(fbx.read_shown(document))
+    return shown_scene(gltf_scene.read_shown(document))
 
 
 @contextmanager

@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters import PATCHED_SUFFIXES, read_character, read_own_file
+from lcollision_core.characters import Character, as_read, read_character, read_own_file, turned
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError, ShapeError
 from lcollision_core.json_values import from_json, parse_json, quoted
 from lcollision_core.meshes import ContactRules, Mesh, Topology, locked
 from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, has_skin
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, SceneDocument, open_scene
 from lcollision_core.model.model_store import ListedModel
 from lcollision_core.model.rig_model import RigModel
 from lcollision_core.regular_files import read_regular
@@ -113,7 +114,10 @@ def find_character(fingerprint: str) -> ListedModel | None:
 
 
 def open_character(
-    path: str | os.PathLike[str], up: int | None = None, *, clips: bool = True
+    source: str | os.PathLike[str] | SceneDocument | Character,
+    up: int | None = None,
+    *,
+    clips: bool = True,
 ) -> RigModel:
     """Read a character, with the axis, joints, rules and body parts that the user chose for it.
 
@@ -121,7 +125,7 @@ def open_character(
 
     Parameters
     ----------
-    path : its file
+    source : its file, what `open_scene` read of that, or the character, whose file is not read
     up : the axis that is up now, whatever was chosen
     clips : whether their frames are wanted, which take long
 
@@ -130,16 +134,14 @@ def open_character(
     MeshFileError : see `read_character`.
     LCollisionError : the character has no rig.
     """
-
-    def read(axis: int | None) -> RigModel:
-        character = read_character(path, axis)
-        return RigModel.of(character if clips else replace(character, clips={}))
-
-    model = read(up)
+    character = as_read(source) if isinstance(source, Character) else read_character(source)
+    if not clips:
+        character = replace(character, clips={})
+    model = RigModel.of(character if up is None else turned(character, up))
     try:
         known = known_character(model.fingerprint) if up is None else None
         if known is not None and known.up_axis is not None:
-            model = read(known.up_axis)
+            model = RigModel.of(turned(character, known.up_axis))
             known = known_character(model.fingerprint)
         known = known or known_character(model.fingerprint)
         if known is not None and known.roles is not None:
@@ -195,11 +197,12 @@ def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigModel, FloatArray] | N
     LCollisionError : the character, which was opened before, cannot be opened now.
     """
     suffix = path.suffix.lower()
-    own = read_own_file(path) if suffix in PATCHED_SUFFIXES else None
+    document = open_scene(path) if suffix in SCENE_SUFFIXES else None
+    own = read_own_file(document) if isinstance(document, GltfDocument) else None
     if own is not None:
         return RigModel.of(own.character).with_roles(own.roles).with_rules(own.rules), own.vertices
-    if suffix in SCENE_SUFFIXES and has_skin(path):
-        body = open_character(path, clips=False)
+    if document is not None and document.has_skin:
+        body = open_character(document, clips=False)
         if known_character(body.fingerprint) is not None and mesh.topology == body.topology:
             return body, mesh.vertices
     digest = _digest(mesh.topology)
@@ -237,20 +240,18 @@ def remember_file(model: RigModel, file: str | os.PathLike[str]) -> None:
     _change(model, lambda known: replace(known, file=path))
 
 
-def remember_up(file: str | os.PathLike[str], up: int) -> None:
+def remember_up(model: RigModel, up: int) -> None:
     """Keep which axis is up for a character whose file is wrong about it.
 
     Parameters
     ----------
-    file : its file
     up : 0, 1 or 2; what the file says is not remembered
 
     Raises
     ------
     ModelFileError : it cannot be kept.
-    MeshFileError : see `read_character`.
     """
-    own = RigModel.of(read_character(file))
+    own = RigModel.of(as_read(model.character))
     chosen = None if up == own.up_axis else up
     _change(own, lambda known: replace(known, up_axis=chosen))
 

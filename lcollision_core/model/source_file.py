@@ -15,7 +15,6 @@ import numpy.typing as npt
 from lcollision_core.characters import (
     PATCHED_SUFFIXES,
     Character,
-    CharacterFile,
     CharacterForm,
     read_character,
     write_character,
@@ -34,7 +33,7 @@ from lcollision_core.meshes import (
 )
 from lcollision_core.meshes.formats.obj_rewrite import rewrite_obj
 from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, write_point_cache
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.model.export import export_frame, export_mesh
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.rig_model import RigModel
@@ -195,7 +194,6 @@ class SourceFile:
         self.path = Path(path)
         self._body = body
         self._character: Character | None = None
-        self._file: CharacterFile | None = None
         suffix = self.path.suffix.lower()
         own = body.character if isinstance(body, RigModel) else None
         is_own = own is not None and _is_same_file(own.source, self.path)
@@ -284,12 +282,8 @@ class SourceFile:
         transforms = None
         if form.needs_rig and isinstance(self._body, RigModel):
             transforms = _placed(self._body.space.transforms(latent), placement)
-        # One read for all poses.
-        if self._file is None and self.path.suffix.lower() in PATCHED_SUFFIXES:
-            self._file = CharacterFile(self._character)
-        rules = self._body.rules
         posed = write_character(
-            path, self._character, vertices, form.key, transforms, self._file, rules
+            path, self._character, vertices, form.key, transforms, self._body.rules
         )
         return posed.vertices, posed.notes
 
@@ -332,9 +326,9 @@ class SourceFile:
 
         Those are vertices of the body, in the file's order.
         """
-        if self._character is None:
+        if self._character is None or self._character.file is None:
             return [("", np.arange(self._body.n_vertices))]
-        scene = read_scene(self.path)
+        scene = self._character.file.scene
         found: dict[int, list[npt.NDArray[np.integer]]] = {}
         start = 0
         for part in scene.parts:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,6 @@ from lcollision_core.meshes.formats.gltf_document import MAX_NUMBERS
 from lcollision_core.meshes.formats.polygons import (
     MAX_FACES,
     Polygons,
-    read_rest,
     require_plausible_count,
 )
 from lcollision_core.meshes.formats.scene import (
@@ -52,21 +51,20 @@ _UNKNOWN_AXIS = 6
 _MOST_FRAMES = 1_000_000
 
 
-def read_scene(file: BinaryIO, path: Path, cancel: CancelToken | None = None) -> Scene:
+def read_shown(source: FbxDocument) -> Scene:
     """Read what the file shows.
 
     Vertices are the file's control points, in its order of nodes. A clip's own frames are those of
-    the file's frame rate. `cancel` is polled here and where clips are sampled.
+    the file's frame rate.
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : `source.cancel` was set.
     MissingExtraError : the extra `fbx` is not installed.
     MeshFileError : the file is damaged or too large, or shows no faces.
     """
-    source = _FbxFile(read_rest(file), cancel)
     held = source.asked()
-    looks = FbxLooks(partial(source.asked, looks=True), path)
+    looks = FbxLooks(partial(source.asked, looks=True), source.path)
     unseen = held["unseen"].tolist()
     why = "left out, as its file hides it or shows a finer level of detail"
     notes = [left_out_note(why, unseen)] if unseen else []
@@ -98,17 +96,25 @@ def read_scene(file: BinaryIO, path: Path, cancel: CancelToken | None = None) ->
     )
 
 
-def has_skin(file: BinaryIO) -> bool:
-    """Whether the file names clusters of a skin; the names of its objects are never compressed."""
-    return b"Cluster" in read_rest(file)
-
-
 @dataclass(frozen=True, eq=False)
-class _FbxFile:
-    """The bytes of a file, and what ufbx says of them, until `cancel` is set."""
+class FbxDocument:
+    """The bytes of a file, and what ufbx says of them, until `cancel` is set.
+
+    Attributes
+    ----------
+    data : of the file
+    path : where it is; images may lie beside it
+    cancel : polled while it is read, and its clips sampled
+    """
 
     data: bytes
-    cancel: CancelToken | None
+    path: Path
+    cancel: CancelToken | None = None
+
+    @property
+    def has_skin(self) -> bool:
+        """Whether it names clusters of a skin; the names of its objects are never compressed."""
+        return b"Cluster" in self.data
 
     def asked(
         self, clip: int | None = None, times: FloatArray | None = None, looks: bool = False
@@ -175,7 +181,7 @@ class _FbxFile:
 class _FbxClip:
     """Samples an animation of a file; `parts` are those of its meshes that have faces."""
 
-    source: _FbxFile
+    source: FbxDocument
     clip: int
     parts: tuple[int, ...]
 
@@ -186,7 +192,7 @@ class _FbxClip:
         return ScenePoses(held["transforms"], weights)
 
 
-def _clips(source: _FbxFile, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
+def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
     fps = float(held["fps"]) if 0.0 < float(held["fps"]) < np.inf else 24.0
     names = numbered_where_equal([name or "clip" for name in held["clips"].tolist()])
     clips = []

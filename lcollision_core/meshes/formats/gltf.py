@@ -1,38 +1,11 @@
-"""glTF 2.0, as .glb, .gltf or .vrm."""
+"""Meshes as glTF 2.0 in its binary form, .glb."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
-from lcollision_core.meshes.formats.gltf_document import GltfDocument
-from lcollision_core.meshes.formats.gltf_scene import read_shown
-from lcollision_core.meshes.formats.polygons import read_rest
-from lcollision_core.meshes.formats.scene import Scene
-
-
-def read_scene(file: BinaryIO, path: Path) -> Scene:
-    """Read what the file shows.
-
-    Parameters
-    ----------
-    file : open binary file at its start
-    path : where it is; a .gltf may name buffer files beside it
-
-    Raises
-    ------
-    MeshFileError : the file is damaged or compressed, or shows no triangles.
-    """
-    return read_shown(GltfDocument(read_rest(file), path))
-
-
-def has_skin(file: BinaryIO, path: Path) -> bool:
-    """Whether a node of the file shows a mesh that a skin moves; for the rest as `read_scene`."""
-    nodes = GltfDocument(read_rest(file), path).objects("nodes")
-    return any("skin" in node and "mesh" in node for node in nodes)
 
 
 def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:

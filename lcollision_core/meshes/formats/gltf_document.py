@@ -1,12 +1,16 @@
-"""The description of a glTF 2.0 file, as .glb, .gltf or .vrm, and the arrays that it points to."""
+"""A glTF 2.0 file, as .glb, .gltf or .vrm, from reading it to writing it with changes."""
 
 from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
+import json
+import struct
 from collections.abc import Sequence
+from copy import copy, deepcopy
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
@@ -20,7 +24,14 @@ from lcollision_core.regular_files import read_regular
 MAX_NUMBERS = 1 << 27
 """The most numbers that are read of all arrays of a file together: 1 GiB as float64."""
 
+VERTEX_DATA = 34962
+"""The target of a buffer view whose numbers are of the vertices of a mesh."""
+
 _GLB_MAGIC = b"glTF"
+_MOST_BYTES = (1 << 32) - 1
+_FLOAT = 5126
+_TYPES = ("SCALAR", "VEC2", "VEC3", "VEC4")
+_MEDIA_TYPES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp"}
 _JSON, _BINARY = b"JSON", b"BIN\0"
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _N_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -58,10 +69,14 @@ _KINDS = {dict: "object", str: "text", int: "whole number", float: "number"}
 _FREE = ("extras", "extensions")
 """Keys whose values may be anything."""
 
+_CHANGED = ("nodes", "meshes", "scenes", "images", "extensions")
+"""Parts of a description that an editable copy may change in any way."""
+
 _LARGEST = 1e100
 """Largest number of the description; products of a few are finite."""
 
 T = TypeVar("T")
+_Bytes: TypeAlias = bytes | memoryview
 
 
 class GltfDocument:
@@ -74,8 +89,11 @@ class GltfDocument:
 
     Attributes
     ----------
+    path : as given
+    sha256 : of `data`
     description : the file's JSON, whose objects and lists are where glTF has them; single values
         are unchecked, and a null is none
+    notes : sentences on what an editable copy lacks
 
     Raises
     ------
@@ -85,10 +103,78 @@ class GltfDocument:
     def __init__(self, data: bytes, path: Path) -> None:
         # Before a mark the text would not begin with its brace.
         text, self._blob = _chunks(data.removeprefix(b"\xef\xbb\xbf"))
-        self._path = path
-        self._buffers: dict[int, bytes] = {}
+        self.path = path
+        self.sha256 = hashlib.sha256(data).digest()
+        self.notes: tuple[str, ...] = ()
+        self._buffers: dict[int, _Bytes] = {}
         self._left = MAX_NUMBERS
         self.description = _parsed(text)
+        # Of an editable copy, the data in the order in which it is written.
+        self._pieces: list[_Bytes] = []
+
+    @property
+    def has_skin(self) -> bool:
+        """Whether a node of the file shows a mesh that a skin moves."""
+        return any("skin" in node and "mesh" in node for node in self.objects("nodes"))
+
+    def editable(self) -> GltfDocument:
+        """Return a copy to be written as GLB: all its data, and images beside it, are one buffer.
+
+        Arrays are read from the original alone. An image that is missing stays named as it was.
+
+        Raises
+        ------
+        MeshFileError : the file is damaged where reading it does not look.
+        """
+        other = self.copy()
+        description = other.description
+        _without_compression(description)
+        _require_complete(self)
+        starts = [
+            other._append(self.buffer(number, f"buffer {number}"))
+            for number in range(len(self.objects("buffers")))
+        ]
+        views = description.get("bufferViews", [])
+        for number, view in enumerate(views):
+            what = f"of buffer view {number}"
+            start = starts[whole(view.get("buffer"), f"the buffer {what}", 0, len(starts) - 1)]
+            offset = whole(view.get("byteOffset", 0), f"the offset {what}", 0, MAX_FILE_BYTES)
+            views[number] = {**view, "buffer": 0, "byteOffset": start + offset}
+        if starts:
+            first = {**description["buffers"][0]}
+            first.pop("uri", None)
+            description["buffers"] = [first]
+        for image in description.get("images", []):
+            other._embed(image)
+        return other
+
+    def copy(self) -> GltfDocument:
+        """Return the same, to be changed on its own.
+
+        In any way are its nodes, meshes, scenes and extensions, of its other lists only which
+        objects are in them.
+        """
+        other = copy(self)
+        # As deeply as it is changed: most of a file may be its animations.
+        other.description = {
+            name: deepcopy(held) if name in _CHANGED else copy(held)
+            for name, held in self.description.items()
+        }
+        other._pieces = self._pieces.copy()
+        return other
+
+    def described(self, description: dict[str, Any]) -> GltfDocument:
+        """Return the same data with another description.
+
+        Raises
+        ------
+        MeshFileError : it has not the structure of glTF.
+        """
+        _remove_nulls(description)
+        _require_kind(description, _STRUCTURE, "")
+        other = copy(self)
+        other.description = description
+        return other
 
     def objects(self, kind: str) -> list[dict[str, Any]]:
         """Return a list of the description, such as "nodes"; empty where the file has none."""
@@ -176,7 +262,7 @@ class GltfDocument:
         strides = (stride, dtype.itemsize)
         return np.ndarray((n, width), dtype, buffer if n else b"", at, strides)
 
-    def buffer(self, index: object, what: str) -> bytes:
+    def buffer(self, index: object, what: str) -> _Bytes:
         """Return the bytes of a buffer, which may be a file beside this one.
 
         Parameters
@@ -194,7 +280,7 @@ class GltfDocument:
             buffer = buffers[number]
             if "uri" in buffer:
                 held = sum(map(len, self._buffers.values()))
-                self._buffers[number] = resource(buffer["uri"], self._path, MAX_FILE_BYTES - held)
+                self._buffers[number] = resource(buffer["uri"], self.path, MAX_FILE_BYTES - held)
             elif number == 0 and self._blob is not None:
                 self._buffers[number] = self._blob
             else:
@@ -216,11 +302,112 @@ class GltfDocument:
         MeshFileError : it is missing, too large, or not beside this file.
         """
         if "uri" in described:
-            return resource(described["uri"], self._path, MAX_FILE_BYTES, what)
+            return resource(described["uri"], self.path, MAX_FILE_BYTES, what)
         views, index = self.objects("bufferViews"), described.get("bufferView")
         view = element(views, index, f"for {what} the buffer view")
         length = whole(view.get("byteLength"), f"the length of {what}", 0, MAX_FILE_BYTES)
         return self._view(described, what, length, 1, np.dtype("u1")).tobytes()
+
+    def _embed(self, image: dict[str, Any]) -> None:
+        uri = image.get("uri")
+        if not isinstance(uri, str) or uri.startswith("data:"):
+            return
+        try:
+            content = resource(uri, self.path, MAX_FILE_BYTES - self._size)
+        except MeshFileError:
+            # Missing beside the source, or elsewhere: it is no more missing afterwards.
+            content = b""
+        media_type = next(
+            (t for magic, t in _MEDIA_TYPES.items() if content.startswith(magic)), None
+        )
+        if media_type is None:
+            self.notes += (f"texture {quoted(uri)} was not embedded; keep it beside the export",)
+            return
+        del image["uri"]
+        image["bufferView"] = self._add_view(content)
+        image["mimeType"] = media_type
+
+    @property
+    def _size(self) -> int:
+        return sum(map(len, self._pieces))
+
+    def _append(self, content: _Bytes) -> int:
+        start = self._size
+        self._pieces += [content, bytes(-len(content) % 4)]
+        return start
+
+    def _add_view(self, content: bytes, **fields: int) -> int:
+        views = self.description.setdefault("bufferViews", [])
+        start = self._append(content)
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(content), **fields})
+        return len(views) - 1
+
+    def add_array(
+        self, values: npt.NDArray[Any], *, has_bounds: bool = False, target: int | None = None
+    ) -> int:
+        """Add to an editable document an accessor of (n, k) float32 numbers, k from 1 to 4.
+
+        Parameters
+        ----------
+        has_bounds : whether it says its least and greatest numbers, as positions and times have to
+        target : `VERTEX_DATA` for what the vertices of a mesh have
+
+        Returns
+        -------
+        its number
+        """
+        stored = values.astype("<f4")
+        fields = {} if target is None else {"target": target}
+        accessor: dict[str, Any] = {
+            "bufferView": self._add_view(stored.tobytes(), **fields),
+            "componentType": _FLOAT,
+            "count": len(stored),
+            "type": _TYPES[stored.shape[1] - 1],
+        }
+        if has_bounds and len(stored):
+            accessor["min"] = stored.min(axis=0).tolist()
+            accessor["max"] = stored.max(axis=0).tolist()
+        accessors = self.description.setdefault("accessors", [])
+        accessors.append(accessor)
+        return len(accessors) - 1
+
+    def digest(self, key: str) -> str:
+        """Return 64 hexadecimal digits of all but the entry `key` of the extras of its asset.
+
+        They are those of an editable document, and of the file that was written of it.
+        """
+        asset = self.description["asset"]
+        extras = {name: value for name, value in asset["extras"].items() if name != key}
+        held = self.description | {"asset": asset | {"extras": extras}, "buffers": []}
+        digest = hashlib.sha256(json.dumps(held, sort_keys=True).encode())
+        for piece in self._pieces or ([] if self._blob is None else [self._blob]):
+            digest.update(piece)
+        return digest.hexdigest()
+
+    def encoded(self) -> bytes:
+        """Return an editable document as the bytes of a GLB file.
+
+        Raises
+        ------
+        MeshFileError : it is larger than GLB files can be.
+        """
+        n_bytes = self._size
+        first = self.description.get("buffers", [{}])[0]
+        self.description["buffers"] = [{**first, "byteLength": n_bytes}]
+        text = json.dumps(self.description, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        size = 12 + 8 + len(text) + 8 + n_bytes
+        if size > _MOST_BYTES:
+            raise MeshFileError(f"it would have {size} bytes, GLB files have less than 4 GiB")
+        return b"".join(
+            (
+                struct.pack("<4sII", _GLB_MAGIC, 2, size),
+                struct.pack("<I4s", len(text), _JSON),
+                text,
+                struct.pack("<I4s", n_bytes, _BINARY),
+                *self._pieces,
+            )
+        )
 
 
 def compressed(extension: str) -> MeshFileError:
@@ -269,21 +456,21 @@ def _dtype(code: object, what: str) -> np.dtype[Any]:
     return np.dtype(_DTYPES[code])
 
 
-def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
-    """Return the text and the binary part of a file."""
+def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
+    """Return the text and the binary part of a file, which is not copied."""
     if not data.startswith(_GLB_MAGIC):
         return data, None
-    found: dict[bytes, bytes] = {}
+    found: dict[bytes, memoryview] = {}
     at = 12
     while at + 8 <= len(data):
         length = int.from_bytes(data[at : at + 4], "little")
         if at + 8 + length > len(data):
             raise MeshFileError("it is a truncated GLB file")
-        found.setdefault(data[at + 4 : at + 8], data[at + 8 : at + 8 + length])
+        found.setdefault(data[at + 4 : at + 8], memoryview(data)[at + 8 : at + 8 + length])
         at += 8 + length
     if not found.get(_JSON):
         raise MeshFileError("it is a truncated GLB file")
-    return found[_JSON], found.get(_BINARY)
+    return bytes(found[_JSON]), found.get(_BINARY)
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
@@ -352,3 +539,43 @@ def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer")
     except (OSError, ValueError, binascii.Error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise MeshFileError.unreadable(f"{what} {quoted(uri)}", reason) from error
+
+
+def _require_complete(document: GltfDocument) -> None:
+    """Refuse what reading passes over and writing needs.
+
+    Raises
+    ------
+    MeshFileError : primitives without attributes, channels without target, or an unknown scene.
+    """
+    for kind, one, held, name in (
+        ("meshes", "mesh", "primitives", "attributes"),
+        ("animations", "animation", "channels", "target"),
+    ):
+        for number, holder in enumerate(document.objects(kind)):
+            if not all(name in item for item in holder.get(held, ())):
+                raise MeshFileError(f"has {held} without {name}", where=f"{one} {number}")
+    last = max(len(document.objects("scenes")) - 1, 0)
+    whole(document.description.get("scene", 0), "the scene", 0, last)
+
+
+def _without_compression(description: dict[str, Any]) -> None:
+    """Remove compressed copies of what a description holds plainly, before that is changed."""
+    for holder in (description, *description.get("meshes", ())):
+        for kind in ("bufferViews", "buffers", "primitives"):
+            if kind in holder:
+                holder[kind] = [_plain(one) for one in holder[kind]]
+    used = [name for name in description.get("extensionsUsed", ()) if name not in COMPRESSIONS]
+    if used:
+        description["extensionsUsed"] = used
+    else:
+        description.pop("extensionsUsed", None)
+
+
+def _plain(holder: dict[str, Any]) -> dict[str, Any]:
+    extensions = holder.get("extensions")
+    if not isinstance(extensions, dict) or extensions.keys().isdisjoint(COMPRESSIONS):
+        return holder
+    kept = {name: one for name, one in extensions.items() if name not in COMPRESSIONS}
+    others = {name: one for name, one in holder.items() if name != "extensions"}
+    return others | {"extensions": kept} if kept else others

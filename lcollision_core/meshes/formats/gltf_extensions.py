@@ -191,28 +191,6 @@ def _called(document: GltfDocument, kind: str, number: int) -> str:
     return str(named or f"{'node' if kind == 'nodes' else 'mesh'} {number}")
 
 
-def without_compression(description: dict[str, Any]) -> None:
-    """Remove compressed copies of what a description holds plainly, before that is changed."""
-    for holder in (description, *description.get("meshes", ())):
-        for kind in ("bufferViews", "buffers", "primitives"):
-            if kind in holder:
-                holder[kind] = [_plain(one) for one in holder[kind]]
-    used = [name for name in description.get("extensionsUsed", ()) if name not in COMPRESSIONS]
-    if used:
-        description["extensionsUsed"] = used
-    else:
-        description.pop("extensionsUsed", None)
-
-
-def _plain(holder: dict[str, Any]) -> dict[str, Any]:
-    extensions = holder.get("extensions")
-    if not isinstance(extensions, dict) or extensions.keys().isdisjoint(COMPRESSIONS):
-        return holder
-    kept = {name: one for name, one in extensions.items() if name not in COMPRESSIONS}
-    others = {name: one for name, one in holder.items() if name != "extensions"}
-    return others | {"extensions": kept} if kept else others
-
-
 def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:
     """Return an extension of an object; empty where it has none."""
     extensions = holder.get("extensions")

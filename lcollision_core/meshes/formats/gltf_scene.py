@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -31,6 +30,7 @@ from lcollision_core.meshes.formats.polygons import MAX_FACES, require_plausible
 from lcollision_core.meshes.formats.scene import (
     NO_MESH,
     Part,
+    Primitive,
     Scene,
     ScenePoses,
     is_mirrored,
@@ -40,17 +40,6 @@ from lcollision_core.meshes.formats.transforms import compose, global_transforms
 from lcollision_core.meshes.topology import FloatArray
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-
-
-@dataclass(frozen=True)
-class ShownPrimitive:
-    """A primitive that a node shows: numbers in the file, and how many there are."""
-
-    node: int
-    mesh: int
-    primitive: int
-    n_vertices: int
-    n_instances: int = 1
 
 
 def read_shown(document: GltfDocument) -> Scene:
@@ -66,7 +55,7 @@ def read_shown(document: GltfDocument) -> Scene:
     order = parents_first(parents)
     local = _local_transforms(nodes)
     rest = global_transforms(local[None], parents, order)
-    shown, notes = shown_primitives(document, parents)
+    shown, notes = _shown_primitives(document, parents)
     if not shown:
         n_meshes = len(document.objects("meshes"))
         if not n_meshes and document.objects("animations"):
@@ -90,12 +79,13 @@ def read_shown(document: GltfDocument) -> Scene:
         up=np.array([0.0, 1.0, 0.0]),
         metres=1.0,
         notes=notes,
+        document=document,
     )
 
 
-def shown_primitives(
+def _shown_primitives(
     document: GltfDocument, parents: npt.NDArray[np.int64]
-) -> tuple[list[ShownPrimitive], tuple[str, ...]]:
+) -> tuple[list[Primitive], tuple[str, ...]]:
     """Return the primitives with triangles that the default scene shows, and notes on others.
 
     They are in the order of the meshes, for each mesh of the nodes that show it, and for each node
@@ -109,7 +99,7 @@ def shown_primitives(
         for i, node in enumerate(document.objects("nodes"))
         if "mesh" in node and i in visible
     ]
-    shown: list[ShownPrimitive] = []
+    shown: list[Primitive] = []
     n_vertices = n_others = 0
     for mesh, node in sorted(showing):
         placed = instances(document, node)
@@ -127,7 +117,7 @@ def shown_primitives(
                 continue
             n_vertices += count * n_instances
             require_plausible_count(n_vertices, "vertices")
-            shown.append(ShownPrimitive(node, mesh, number, count, n_instances))
+            shown.append(Primitive(node, mesh, number, count, n_instances))
     if n_others:
         were = "1 part {} was" if n_others == 1 else f"{n_others} parts {{}} were"
         notes.append(f"{were.format('without triangles (points, lines)')} left out")
@@ -202,9 +192,7 @@ def _local_transforms(nodes: list[dict[str, Any]]) -> FloatArray:
     return local
 
 
-def _part(
-    document: GltfDocument, shown: ShownPrimitive, rest: FloatArray, looks: GltfLooks
-) -> Part:
+def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: GltfLooks) -> Part:
     mesh = document.objects("meshes")[shown.mesh]
     primitive = mesh["primitives"][shown.primitive]
     attributes = primitive["attributes"]
@@ -259,6 +247,7 @@ def _part(
         morphs,
         is_single=stored.dtype == np.float32,
         look=partial(looks.appearance, primitive, faces, n, len(points) // n, where),
+        primitive=shown,
     )
 
 
@@ -382,7 +371,7 @@ def _morphs(
     return morphs
 
 
-def _default_weights(document: GltfDocument, shown: ShownPrimitive, part: Part) -> FloatArray:
+def _default_weights(document: GltfDocument, shown: Primitive, part: Part) -> FloatArray:
     """Return the (M,) weights of the morph targets that the file stores for a node's mesh."""
     mesh = document.objects("meshes")[shown.mesh]
     stored = document.objects("nodes")[shown.node].get("weights") or mesh.get("weights")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,38 +29,17 @@ _INVISIBLE = 1e-5
 _MOST_FRAMES = 1000
 
 
-@dataclass(frozen=True, eq=False)
-class ShownScene:
-    """A scene with what its clips show, and without what none of them does.
-
-    Attributes
-    ----------
-    scene : with the parts of its characters that are seen, in the rest pose or in a clip
-    kept : the numbers that its parts have in the file
-    revealed : nodes that its rest pose has elsewhere than the file's, parents first
-    """
-
-    scene: Scene
-    kept: list[int]
-    revealed: list[int]
-
-
-def shown_scene(scene: Scene) -> ShownScene:
+def shown_scene(scene: Scene) -> Scene:
     """Show at rest what a clip shows, and leave out scenery and what is never seen; notes say so.
 
     Faces of a part that is scaled to nothing have no area, so its rest pose could not be checked.
     """
-    revealed: list[int] = []
     carriers = _carriers(scene)
     for node in parents_first(scene.parents):
-        if node in carriers and node not in revealed:
-            scene, more = _revealed(scene, node)
-            revealed += more
-    kept = character_parts(scene)
-    scene = with_parts(scene, kept, "as no joint carries it")
-    seen = _seen_parts(scene)
-    scene = with_parts(scene, seen, "as its scale is zero")
-    return ShownScene(scene, [kept[number] for number in seen], revealed)
+        if node in carriers and node not in scene.revealed:
+            scene = _revealed(scene, node)
+    scene = with_parts(scene, character_parts(scene), "as no joint carries it")
+    return with_parts(scene, _seen_parts(scene), "as its scale is zero")
 
 
 def _carriers(scene: Scene) -> set[int]:
@@ -74,14 +53,14 @@ def _carriers(scene: Scene) -> set[int]:
     return found
 
 
-def _revealed(scene: Scene, node: int) -> tuple[Scene, list[int]]:
+def _revealed(scene: Scene, node: int) -> Scene:
     """Place a node as a clip does, with all below it, if the rest pose alone hides it by scale."""
     rest = scene.rest.transforms
     parent = int(scene.parents[node])
     above = np.eye(4) if parent < 0 else rest[0, parent]
     least = _least_scale(rest, node, parent)[0]
     if not least < _HIDDEN or not is_regular(above):
-        return scene, []
+        return scene
     frames: list[tuple[float, str, FloatArray]] = []
     for clip in scene.clips:
         if node in clip.moved:
@@ -91,7 +70,7 @@ def _revealed(scene: Scene, node: int) -> tuple[Scene, list[int]]:
             frames += zip(scales, [clip.name] * len(scales), transforms, strict=True)
     greatest = max((scale for scale, _, _ in frames), default=0.0)
     if not least < _HIDDEN * greatest:
-        return scene, []
+        return scene
     # Not one of those in which it just grows, or beyond its size.
     shown = sorted(
         (frame for frame in frames if frame[0] >= 0.5 * greatest), key=lambda one: one[0]
@@ -116,7 +95,8 @@ def _revealed(scene: Scene, node: int) -> tuple[Scene, list[int]]:
         rest=ScenePoses(placed, scene.rest.weights),
         parts=parts,
         notes=(*scene.notes, left_out_note(note, names)),
-    ), below
+        revealed=(*scene.revealed, *below),
+    )
 
 
 def _ancestors(scene: Scene, node: int) -> list[int]:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.appearance import Appearance
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.meshes.topology import FloatArray
 
 MAX_FRAME_NUMBERS = 1 << 28
@@ -44,6 +45,17 @@ class ScenePoses:
     weights: tuple[FloatArray, ...]
 
 
+@dataclass(frozen=True)
+class Primitive:
+    """What a part is in a glTF file: numbers of its description, and how many there are."""
+
+    node: int
+    mesh: int
+    primitive: int
+    n_vertices: int
+    n_instances: int = 1
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """Triangles of one mesh, moved by nodes.
@@ -71,6 +83,7 @@ class Part:
     look : reads how it looks, which takes long; None where its file does not say that
     cut_of : (F,) int64 array, ascending, the polygon that each face was cut from; None where each
         is one
+    primitive : that it is in a glTF file; None in another
     """
 
     mesh: str
@@ -89,6 +102,7 @@ class Part:
     dual: FloatArray | None = None
     look: Callable[[], Appearance] | None = None
     cut_of: npt.NDArray[np.int64] | None = None
+    primitive: Primitive | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +186,8 @@ class Scene:
     metres : length of the file's unit
     notes : sentences on what was left out
     unscaled : nodes that their parents' scale does not reach, as by Maya's segment scale compensate
+    revealed : nodes that the rest pose has elsewhere than the file's, parents first
+    document : the glTF file; None for another
     """
 
     node_names: tuple[str, ...]
@@ -183,6 +199,8 @@ class Scene:
     metres: float
     notes: tuple[str, ...] = ()
     unscaled: frozenset[int] = frozenset()
+    revealed: tuple[int, ...] = ()
+    document: GltfDocument | None = None
 
 
 def character_parts(scene: Scene) -> list[int]:

@@ -10,7 +10,7 @@ import pytest
 from lcollision_core.characters import Character, Rig, RigPoseSpace, joint_parts, read_character
 from lcollision_core.characters.joint_roles import Role, joint_roles
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
-from lcollision_core.meshes.scene_files import has_skin
+from lcollision_core.meshes.scene_files import open_scene
 from tests.core.gltf_builder import arm, moved, rotation, tube
 
 
@@ -181,10 +181,10 @@ def test_a_character_without_joints_has_no_rig(tmp_path: Path) -> None:
     builder = arm()
     del builder.description["nodes"][4]["skin"]
     path = builder.write(tmp_path / "arm.glb")
-    assert not has_skin(path)
+    assert not open_scene(path).has_skin
     assert read_character(path).rig is None
     assert read_character(path).sample("wave", None).transforms is None
-    assert has_skin(arm().write(path))
+    assert open_scene(arm().write(path)).has_skin
 
 
 def test_what_a_joint_scaled_to_nothing_moves_is_part_of_its_parent(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import (
     Character,
-    CharacterFile,
     CharacterForm,
     PosedFile,
     RigPoseSpace,
@@ -267,11 +267,10 @@ def test_a_file_that_is_read_once_is_written_alike(
 ) -> None:
     path = tmp_path / "posed.glb"
     vertices, transforms = _pose(character)
-    file = CharacterFile(character)
     rest = _space(character).rig.rest
-    write_character(path, character, character.rest_vertices, form, rest, file)
-    again = write_character(path, character, vertices, form, transforms, file)
-    alone = write_character(path, character, vertices, form, transforms)
+    write_character(path, character, character.rest_vertices, form, rest)
+    again = write_character(path, character, vertices, form, transforms)
+    alone = write_character(path, replace(character, file=None), vertices, form, transforms)
     assert again.data == alone.data
     assert again.notes == alone.notes
 

@@ -15,7 +15,7 @@ from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes import read_mesh, read_pose_set
 from lcollision_core.meshes.formats import fbx
 from lcollision_core.meshes.formats.point_cache import write_point_cache
-from lcollision_core.meshes.scene_files import has_skin, read_scene
+from lcollision_core.meshes.scene_files import open_scene, read_scene
 from tests.core.fbx_builder import arm_fbx, ufbx_frames
 from tests.core.gltf_builder import tube
 
@@ -116,7 +116,7 @@ def test_a_character_of_fbx_has_its_rig_parts_and_clips(tmp_path: Path) -> None:
     assert np.allclose(frames.times, np.arange(31) / 30.0)
     turns = frames.transforms[0] @ np.linalg.inv(rig.rest)
     assert np.abs(turns[1] - np.eye(4)).max() > 0.1
-    assert has_skin(path)
+    assert open_scene(path).has_skin
 
 
 def test_the_poses_of_fbx_know_their_axis(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 from lcollision_core.characters.joint_roles import Role
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.meshes import ContactRules
+from lcollision_core.meshes.scene_files import open_rigged
 from lcollision_core.model import (
     NamedPose,
     OtherModelError,
@@ -20,6 +21,7 @@ from lcollision_core.model import (
     remember_choices,
     remember_file,
     remember_roles,
+    remember_up,
     write_poses,
 )
 from lcollision_core.model.known_characters import find_character, user_characters_folder
@@ -90,6 +92,29 @@ def test_what_the_user_says_of_a_joint_comes_back_and_keeps_the_rules(path: Path
         remember_roles(again, {joint: "fin"})
     remember_roles(again, {joint: None})
     assert opened(path).fingerprint == before.fingerprint
+
+
+def test_a_file_is_read_once_whatever_is_chosen_for_it(path: Path) -> None:
+    document = open_rigged(path)
+    assert document is not None
+    path.unlink()
+    body = open_body(document)
+    assert isinstance(body, RigModel)
+    assert body.up_axis == 1
+    remember_up(body, 2)
+    turned = open_body(body.character)
+    assert isinstance(turned, RigModel)
+    assert turned.up_axis == 2
+    remember_roles(turned, {turned.space.rig.joint_names[-1]: "knee-left"})
+    again = open_body(turned.character)
+    assert isinstance(again, RigModel)
+    assert again.up_axis == 2
+    assert again.space.roles[-1] is Role.SHIN
+    assert open_body(again.character, 0).up_axis == 0
+    assert again.character.file is body.character.file
+    # What the file says is not remembered.
+    remember_up(again, 1)
+    assert open_body(again.character).up_axis == 1
 
 
 def test_another_rig_gets_nothing_of_it(path: Path) -> None:
