@@ -137,7 +137,7 @@ def check_mesh(
         "deepest": [
             {"faces": faces, "depth": depth}
             for faces, depth in zip(
-                found.deepest_pairs.tolist(), found.deepest_depth.tolist(), strict=True
+                found.pairs.tolist(), found.penetration_depth.tolist(), strict=True
             )
         ],
         "energy": found.energy,

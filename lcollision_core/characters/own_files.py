@@ -20,7 +20,7 @@ from lcollision_core.meshes.contact_rules import ContactRules
 from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.meshes.formats.gltf_scene import read_shown
 from lcollision_core.meshes.joined import join_parts
-from lcollision_core.meshes.scene_files import one_sentence, scene_of
+from lcollision_core.meshes.scene_files import SceneDocument, one_sentence, scene_of
 from lcollision_core.meshes.topology import FloatArray
 
 _KEY, _VERSION = "lcollision", 1
@@ -106,13 +106,15 @@ class OwnFile:
     roles: dict[str, str]
 
 
-def read_own_file(document: GltfDocument) -> OwnFile | None:
+def read_own_file(document: SceneDocument) -> OwnFile | None:
     """Read a file that this program wrote with a pose in it; None for any other.
 
     Raises
     ------
     MeshFileError : it was changed since, by another program, or is of a later version.
     """
+    if not isinstance(document, GltfDocument):
+        return None
     path = document.path
     with one_sentence(path, "can't be checked by the rules that it was exported with"):
         asset = document.description.get("asset")

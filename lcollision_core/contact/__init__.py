@@ -11,7 +11,6 @@ from lcollision_core.contact.detector import (
     DEPTH_TOLERANCE,
     BatchCollisions,
     CollisionDetector,
-    CollisionSummary,
     SelfCollisions,
 )
 from lcollision_core.contact.energy import domain_energy

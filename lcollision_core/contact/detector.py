@@ -58,35 +58,39 @@ _TASKS_PER_THREAD = 4
 
 @dataclass(frozen=True, slots=True)
 class SelfCollisions:
-    """All colliding pairs of one pose; lengths are normalised, that is, divided by the body size.
+    """What is found in one pose; lengths are normalised, that is, divided by the body size.
 
     Attributes
     ----------
-    pairs : (P, 2) int32, face indices, the smaller first, rows in ascending order
+    pairs : (P, 2) int32, face indices of the colliding pairs, the smaller first, rows in ascending
+        order; by `CollisionDetector.summarise` the deepest alone, the deepest first
     penetration_depth : (P,) float64, PD of each pair, > 1e-9
-    excluded_pairs, excluded_depth : (Q, 2) and (Q,), the same of the pairs that a contact rule
-        excludes: they count neither for the verdict nor for the energy
-    excluded_rule : (Q,) uint8, by which rule: 1 for the first of `RuleCounts` and so on; Q is 0
-        where only pairs that count were asked for
     vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
+    n_pairs : colliding pairs, whether they are in `pairs` or not
+    excluded : pairs that each contact rule excludes: they count neither for the verdict nor for the
+        energy; 0 where only pairs that count were asked for
+    excluded_pairs, excluded_depth : (Q, 2) and (Q,), the same of those; of a summary none
+    excluded_rule : (Q,) uint8, by which rule: 1 for the first of `RuleCounts` and so on
+    n_coincident_pairs : in a summary, pairs of faces that share no vertex, lie in one plane and
+        overlap there: their depth is 0, so they do not collide
+    counted_only : whether only pairs that count were asked for
     """
 
     pairs: IntArray
     penetration_depth: FloatArray
+    vertex_energy: FloatArray
+    n_pairs: int
+    excluded: RuleCounts
     excluded_pairs: IntArray
     excluded_depth: FloatArray
     excluded_rule: npt.NDArray[np.uint8]
-    vertex_energy: FloatArray
+    n_coincident_pairs: int = 0
+    counted_only: bool = False
 
     @property
     def colliding(self) -> bool:
         """Whether the pose intersects itself."""
-        return len(self.pairs) > 0
-
-    @property
-    def excluded(self) -> RuleCounts:
-        """How many pairs each rule excludes."""
-        return RuleCounts.of(self.excluded_rule)
+        return self.n_pairs > 0
 
     @property
     def near_pairs(self) -> IntArray:
@@ -130,40 +134,6 @@ class BatchCollisions:
     def colliding(self) -> npt.NDArray[np.bool_]:
         """(B,) whether each pose intersects itself."""
         return self.n_pairs > 0
-
-
-@dataclass(frozen=True, slots=True)
-class CollisionSummary:
-    """What `CollisionDetector.summarise` finds in one pose; lengths are normalised.
-
-    Attributes
-    ----------
-    n_pairs : colliding pairs
-    excluded : pairs that each rule excludes
-    deepest_pairs : (P, 2) int32, face indices of the deepest colliding pairs, the deepest first,
-        the smaller index first
-    deepest_depth : (P,) float64, their penetration depths
-    n_coincident_pairs : pairs of faces that share no vertex, lie in one plane and overlap there:
-        their depth is 0, so they do not collide
-    vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
-    """
-
-    n_pairs: int
-    excluded: RuleCounts
-    deepest_pairs: IntArray
-    deepest_depth: FloatArray
-    n_coincident_pairs: int
-    vertex_energy: FloatArray
-
-    @property
-    def colliding(self) -> bool:
-        """Whether the pose intersects itself."""
-        return self.n_pairs > 0
-
-    @property
-    def energy(self) -> float:
-        """PDe-sum, the penetration energy of the pose, in normalised length squared."""
-        return float(self.vertex_energy.sum())
 
 
 class CollisionDetector:
@@ -292,12 +262,15 @@ class CollisionDetector:
         # Without all of them, which are found depends on how far the tables are.
         excluded = np.zeros(len(rule), dtype=np.bool_) if counted_only else ~counts
         return SelfCollisions(
-            pairs=pairs[counts],
-            penetration_depth=depth[counts],
-            excluded_pairs=pairs[excluded],
-            excluded_depth=depth[excluded],
-            excluded_rule=rule[excluded],
-            vertex_energy=vertex_energy,
+            pairs[counts],
+            depth[counts],
+            vertex_energy,
+            int(counts.sum()),
+            RuleCounts.of(rule[excluded]),
+            pairs[excluded],
+            depth[excluded],
+            rule[excluded],
+            counted_only=counted_only,
         )
 
     def summarise(
@@ -307,7 +280,7 @@ class CollisionDetector:
         n_deepest: int = 100,
         progress: Progress = no_progress,
         cancel: CancelToken | None = None,
-    ) -> CollisionSummary:
+    ) -> SelfCollisions:
         """Count the colliding pairs of one pose and keep the deepest, however many there are.
 
         Parameters
@@ -345,8 +318,16 @@ class CollisionDetector:
                 pairs, depth = pairs[order], depth[order]
                 progress(int(_SHARES * searcher.share_done), _SHARES)
         n_pairs, *n_excluded, n_coincident = n_by_rule.tolist()
-        return CollisionSummary(
-            n_pairs, RuleCounts(*n_excluded), pairs, depth, n_coincident, vertex_energy
+        return SelfCollisions(
+            pairs,
+            depth,
+            vertex_energy,
+            n_pairs,
+            RuleCounts(*n_excluded),
+            pairs[:0],
+            depth[:0],
+            np.empty(0, dtype=np.uint8),
+            n_coincident,
         )
 
     def detect_batch(

@@ -22,7 +22,6 @@ from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileErro
 from lcollision_core.json_values import from_json, parse_json, quoted
 from lcollision_core.meshes import ContactRules, Mesh, Topology, locked
 from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, SceneDocument, open_scene
 from lcollision_core.model.model_store import ListedModel
 from lcollision_core.model.rig_model import RigModel
@@ -198,7 +197,7 @@ def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigModel, FloatArray] | N
     """
     suffix = path.suffix.lower()
     document = open_scene(path) if suffix in SCENE_SUFFIXES else None
-    own = read_own_file(document) if isinstance(document, GltfDocument) else None
+    own = None if document is None else read_own_file(document)
     if own is not None:
         return RigModel.of(own.character).with_roles(own.roles).with_rules(own.rules), own.vertices
     if document is not None and document.has_skin:

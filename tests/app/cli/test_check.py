@@ -15,6 +15,7 @@ import pytest
 
 from lcollision_core.characters import read_own_file
 from lcollision_core.meshes import ContactRules, write_mesh
+from lcollision_core.meshes.scene_files import open_scene
 from lcollision_core.model import NamedPose, open_body, write_poses
 from tests.app.support import STABBED, Lcollision
 from tests.core.character_file import described, figure
@@ -415,7 +416,7 @@ def test_parts_in_another_order_and_scenery_do_not_confuse_what_is_checked(
     for form in ("joints", "mesh", "morph"):
         words = ("decode", own, tmp_path / "poses.json", "-o", out, "--form", form)
         assert lcollision(*words).exit_code == 0
-        found = read_own_file(out)
+        found = read_own_file(open_scene(out))
         assert found is not None
         assert found.rules == model.rules
         assert found.character.topology == model.topology

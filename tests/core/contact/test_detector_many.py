@@ -32,8 +32,8 @@ def test_a_summary_counts_all_pairs_and_keeps_the_deepest(
     assert np.array_equal(summary.vertex_energy, found.vertex_energy)
     assert summary.energy == found.energy
     order = np.argsort(-found.penetration_depth, kind="stable")[:50]
-    assert np.array_equal(summary.deepest_pairs, found.pairs[order])
-    assert np.array_equal(summary.deepest_depth, found.penetration_depth[order])
+    assert np.array_equal(summary.pairs, found.pairs[order])
+    assert np.array_equal(summary.penetration_depth, found.penetration_depth[order])
     shares = [done / total for done, total in told]
     assert len(shares) >= 3
     assert 0.0 < shares[0] < 0.9
@@ -62,7 +62,7 @@ def test_no_pair_at_all_is_a_summary_too() -> None:
     mesh = sphere()
     summary = detector_for(mesh).summarise(mesh.vertices)
     assert (summary.n_pairs, summary.colliding, summary.energy) == (0, False, 0.0)
-    assert summary.deepest_pairs.shape == (0, 2)
+    assert summary.pairs.shape == (0, 2)
     assert summary.n_coincident_pairs == 0
 
 
