@@ -205,7 +205,9 @@ def test_a_root_scaled_to_nothing_leaves_no_rig_and_a_sentence(tmp_path: Path) -
     character = read_character(builder.write(tmp_path / "arm.glb"))
     assert character.rig is None
     assert "joint rig:LeftArm has zero scale in its rest pose" in character.notes
-    with pytest.raises(LCollisionError, match="be posed by its rig: joint rig:LeftArm has zero scale"):
+    with pytest.raises(
+        LCollisionError, match="be posed by its rig: joint rig:LeftArm has zero scale"
+    ):
         RigPoseSpace(character)
     assert np.isfinite(character.sample("wave", None).vertices).all()
 
