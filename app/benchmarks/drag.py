@@ -134,7 +134,7 @@ def _scripted(
     generator: np.random.Generator,
 ) -> list[_Drag]:
     places = _places(model, vertices)
-    grips = {name: make_grip(model.pose_space, vertex) for name, vertex in places.items()}
+    grips = {name: make_grip(model.space, vertex) for name, vertex in places.items()}
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     drags = []
     for name, grip in grips.items():
@@ -165,7 +165,7 @@ def _places(model: PosableBody, vertices: FloatArray) -> dict[str, int]:
     if isinstance(model, RigModel):
         return _places_on_rig(model)
     up = np.eye(3)[model.up_axis]
-    graph = model.pose_space.surface_graph
+    graph = model.space.surface_graph
 
     def along(vertex: int) -> FloatArray:
         found = csgraph.dijkstra(graph, directed=False, indices=vertex)
@@ -255,15 +255,15 @@ def _time_mode(
         reach = np.linalg.norm(model.reference - model.reference[drag.grip.vertex], axis=1)
         moved = np.linalg.norm(after - before, axis=1)[reach > _REST * size]
         rest.append(float(moved.mean()) / size)
-        for limb in _other_limbs(model.pose_space.limbs, drag.grip):
+        for limb in _other_limbs(model.space.limbs, drag.grip):
             others.append(float(np.linalg.norm(after[limb] - before[limb], axis=1).mean()))
             rotation, translation = fit_rigid(before[limb], after[limb])
             left = before[limb] @ rotation.T + translation - after[limb]
             bent.append(float(np.sqrt((left**2).sum(axis=1).mean())))
-        longest = model.pose_space.longest_edges
+        longest = model.space.longest_edges
         stretch.append(largest_stretch(after / size, model.topology.edges, longest))
         for pin in drag.pins:
-            there = make_grip(model.pose_space, pin.vertex, pin.radius).position(after)
+            there = make_grip(model.space, pin.vertex, pin.radius).position(after)
             drifts.append((drag.kind, float(np.linalg.norm(there - pin.position)) / size))
         progress(done + number + 1, 2 * len(drags))
     reachable = np.array([drag.kind == "reachable" for drag in drags])

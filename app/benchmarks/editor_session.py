@@ -275,7 +275,7 @@ class Session(QObject):
             chance.choice([document.end_drag, document.end_drag, document.cancel_drag])()
 
         def load() -> None:
-            document.load_pose(document.training_pose(chance.randrange(len(model.pose_names))))
+            document.load_pose(document.training_pose(chance.randrange(len(model.card.pose_names))))
 
         def resolve() -> None:
             if document.can_resolve:

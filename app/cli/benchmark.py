@@ -173,7 +173,7 @@ def resolve(
             draw_histograms(run, figure)
         note(f"saved {2 * len(runs)} histograms to {figure}")
     if as_json:
-        print_json([row | {"near_exclusion": model.near_exclusion} for row in rows])
+        print_json([row | {"near_exclusion": model.rules.near_exclusion} for row in rows])
         return
     print_table(rows)
     note_rules(model)
@@ -201,7 +201,10 @@ def drag(
         rows = time_drags(model, n_targets, progress=progress, cancel=cancel)
     if as_json:
         print_json(
-            [{"model": model.name, "near_exclusion": model.near_exclusion} | row for row in rows]
+            [
+                {"model": model.name, "near_exclusion": model.rules.near_exclusion} | row
+                for row in rows
+            ]
         )
         return
     print_table(rows)

@@ -78,5 +78,5 @@ def _row(model: PosableBody, source: str, output: Path, mirrored: MirroredPose) 
         **{name: getattr(mirrored, name) for name in (*names, *pairs)},
         "exactly_free": mirrored.pairs_after == 0,
         "resolved": mirrored.pairs_after == 0 < mirrored.pairs_mirrored,
-        "near_exclusion": model.near_exclusion,
+        "near_exclusion": model.rules.near_exclusion,
     }

@@ -221,7 +221,7 @@ def describe(model: PosableBody) -> dict[str, Any]:
     from lcollision_core.model_file import FORMAT_VERSION
 
     trained = model if isinstance(model, PoseModel) else None
-    metrics = trained and trained.metrics
+    metrics = trained and trained.embedding.metrics
     groups = model.latent_space.groups[1:]
     owned = np.bincount(model.attention_mask.argmax(axis=0), minlength=len(groups))
     return {
@@ -230,7 +230,7 @@ def describe(model: PosableBody) -> dict[str, Any]:
         "fingerprint": model.fingerprint,
         "vertices": model.n_vertices,
         "faces": len(model.faces),
-        "poses": len(model.pose_names),
+        "poses": len(model.card.pose_names),
         "domains": [
             {
                 "name": group.name,
@@ -245,7 +245,7 @@ def describe(model: PosableBody) -> dict[str, Any]:
         "acap": metrics and {"mean": metrics.acap_mean, "max": metrics.acap_max},
         "masks": metrics and {name: getattr(metrics, name) for name in _MASKS},
         "predictor": trained and _describe_predictor(trained),
-        "near_exclusion": model.near_exclusion,
+        "near_exclusion": model.rules.near_exclusion,
         **rules_json(model),
         "up_axis": "xyz"[model.up_axis],
         "height": model.body_size,
@@ -262,7 +262,7 @@ def measured_model(model: PoseModel) -> dict[str, Any]:
         "model": model.name,
         "level1_codes": first,
         "domain_codes": others,
-        "near_exclusion": model.near_exclusion,
+        "near_exclusion": model.rules.near_exclusion,
     }
 
 
@@ -273,7 +273,7 @@ def measured_model_sentence(model: PoseModel) -> str:
     first, *others = model.embedding.group_sizes
     least, most = min(others), max(others)
     each = f"{least}" if least == most else f"{least} to {most}"
-    near = model.near_exclusion
+    near = model.rules.near_exclusion
     rule = f"near exclusion {near:g}" if near else "no near exclusion"
     if model.rules != replace(STRICT, near_exclusion=near):
         rule = f"not counted: {model.rules.described()}"

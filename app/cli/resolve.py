@@ -203,7 +203,9 @@ def resolve(
             note(f"{request.source}: {result.note}")
         row = {"source": request.source, "output": str(file.path), **_facts(result)}
         del row["converged"], row["note"]
-        rows.append(row | {"near_exclusion": model.near_exclusion, "excluded_at_rest": at_rest})
+        rows.append(
+            row | {"near_exclusion": model.rules.near_exclusion, "excluded_at_rest": at_rest}
+        )
         if not as_json:
             tell(f"{request.source}: {_sentence(request, result, mesh is not None)}")
     if as_json:
@@ -212,7 +214,7 @@ def resolve(
         note_rules(model)
     if sequence:
         before = np.array([request.pose.latent for request in requests])
-        change = largest_correction_change(model.pose_space.decode, before, results)
+        change = largest_correction_change(model.space.decode, before, results)
         note(
             f"from frame to frame the correction changes by at most {100.0 * change:.3f} % of "
             f"the body size, averaged over the vertices"
@@ -323,7 +325,7 @@ def _depends_on(
         "poses": [fingerprint_of_pose(pose.latent, pose.placement) for pose in poses],
         "predictor": metadata,
         "height": model.body_size,
-        "near_exclusion": model.near_exclusion,
+        "near_exclusion": model.rules.near_exclusion,
         "rules": model.rules.to_json(),
         "ignored_faces": ignored_faces_digest(model.rules, model.groups),
         "sequence": sequence,

@@ -115,7 +115,7 @@ class CodeEditing(PoseHistory):
 
     def reset_domain(self, domain: int) -> None:
         """Set all numbers of a domain to 0: its own, and its entry of the whole body."""
-        codes = self.model.pose_space.codes_of([domain])
+        codes = self.model.space.codes_of([domain])
         self._set_codes(f"Reset {self.model.domain_names[domain]}", codes, 0.0)
 
     def _set_codes(self, label: str, codes: Any, value: float, run: int | None = None) -> None:
@@ -148,7 +148,7 @@ class CodeEditing(PoseHistory):
         """Return a training pose of the model by its number, from 0."""
         from lcollision_core.model import NamedPose
 
-        return NamedPose(self.model.pose_names[number], self.model.training_latent[number])
+        return NamedPose(self.model.card.pose_names[number], self.model.training_latent[number])
 
     @property
     def starter_poses(self) -> list[NamedPose]:
@@ -170,4 +170,4 @@ class CodeEditing(PoseHistory):
 
     def _with_locked(self, latent: FloatArray) -> FloatArray:
         """Return the latent with the current codes of locked domains."""
-        return np.where(self.model.pose_space.codes_of(self.locked_domains), self.latent, latent)
+        return np.where(self.model.space.codes_of(self.locked_domains), self.latent, latent)

@@ -122,7 +122,7 @@ class LiveEditing(CodeEditing):
 
         held = self._last_grip
         if held is None or (held.vertex, held.radius) != (vertex, self.grip_radius):
-            held = self._last_grip = make_grip(self.model.pose_space, vertex, self.grip_radius)
+            held = self._last_grip = make_grip(self.model.space, vertex, self.grip_radius)
         return held
 
     @property
@@ -153,7 +153,7 @@ class LiveEditing(CodeEditing):
 
         pins = self.pose.pins
         pin = pins[index]
-        grip = make_grip(self.model.pose_space, pin.vertex, pin.radius)
+        grip = make_grip(self.model.space, pin.vertex, pin.radius)
         self.begin_gesture(f"Move pin on {self.part_name(pin.vertex)}")
         self._drag = self._begun(grip, pins[:index] + pins[index + 1 :], whole_body)
         self._drag.pin = index, grip
@@ -300,7 +300,7 @@ class LiveEditing(CodeEditing):
             return
         is_late = frame.latent is not self.latent
         vertices = self.model.decode(self.latent, n_threads=1) if is_late else frame.vertices
-        space = self.model.pose_space
+        space = self.model.space
         added = {
             grip.vertex: Pin.of(grip, vertices, frame_round(space, grip.vertex) if oriented else ())
             for grip in grips
@@ -344,7 +344,7 @@ class LiveEditing(CodeEditing):
 
     def domain_of(self, vertex: int) -> int:
         """Return the body part that leads a vertex, from 0."""
-        return int(self.model.pose_space.vertex_domain[vertex])
+        return int(self.model.space.vertex_domain[vertex])
 
     def part_name(self, vertex: int) -> str:
         """Return the name of the body part that leads a vertex."""

@@ -50,7 +50,7 @@ def draw_masks(model: PosableBody, path: str | os.PathLike[str]) -> None:
     -----
     After figure 2 of Tan et al. 2021.
     """
-    names, colours = model.domain_names, model.domain_colours
+    names, colours = model.domain_names, model.card.domain_colours
     n_columns = min((2 * _VIEW_WIDTH - 2 * _MARGIN) // _LEGEND_COLUMN, len(names))
     n_rows = -(-len(names) // n_columns)
     height = _VIEW_HEIGHT + n_rows * _LEGEND_ROW + 2 * _MARGIN
@@ -83,7 +83,7 @@ def _paste_sides(
 
     scene, vertices = renderer.scene, model.reference.astype(np.float32)
     normals = vertex_normals(vertices, model.faces)
-    scene.show(vertices, normals, mask_colours(model.attention_mask, model.domain_colours))
+    scene.show(vertices, normals, mask_colours(model.attention_mask, model.card.domain_colours))
     for index, side in enumerate(("Front", "Back")):
         scene.view = preset_view(side, vertices, model.up_axis, model.front, width / height)
         picture.paste(renderer.drawn(), (index * width, 0))

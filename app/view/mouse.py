@@ -185,7 +185,7 @@ class Mouse(QObject):
 
     def _mark_pins(self, scene: Scene) -> None:
         document, pins = self._document, self._document.pins
-        colours = document.model.domain_colours
+        colours = document.model.card.domain_colours
         scene.marks.show_pins(
             np.array([pin.position for pin in pins]).reshape(-1, 3),
             [colours[document.domain_of(pin.vertex)] for pin in pins],
@@ -289,7 +289,7 @@ class Mouse(QObject):
             document.begin_drag(grip, f"Drag {document.part_name(vertex)}", whole_body)
         self._grip = grip
         self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
-        limbs = document.model.pose_space.limbs
+        limbs = document.model.space.limbs
         moving = limbs.carried(limbs.holding(grip.vertices, grip.weights), 2.0 * grip.radius)
         body_size = document.model.body_size
         depth = DragDepth(
@@ -344,9 +344,7 @@ class Mouse(QObject):
 
         document, domain = self._document, self._document.domain_of(vertex)
         self._grip = None
-        inside = np.asarray(scene.surface.vertices)[
-            document.model.pose_space.vertex_domain == domain
-        ]
+        inside = np.asarray(scene.surface.vertices)[document.model.space.vertex_domain == domain]
         direction = turn_about(long_axis(inside.astype(np.float64)), scene.view)
         document.begin_drag(Twist(domain), f"Twist {document.part_name(vertex)}")
         self._canvas.setCursor(Qt.CursorShape.SizeHorCursor)

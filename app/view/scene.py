@@ -82,7 +82,7 @@ class Scene:
         ):
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)
-        self._patch = Patch(model.pose_space)
+        self._patch = Patch(model.space)
         self._patch.lie_on(self.surface.polydata)
         self._patch.paint_on(self.body)
         self.marks = Marks(self._renderer, model.body_size, np.eye(3)[model.up_axis])

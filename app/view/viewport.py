@@ -444,7 +444,7 @@ class Viewport(QWidget):
 
     def _new_shader(self) -> Shader:
         model = self._document.model
-        return Shader(model.attention_mask, model.domain_colours, current_theme().skin)
+        return Shader(model.attention_mask, model.card.domain_colours, current_theme().skin)
 
     def _known_of(self, frame: LiveFrame) -> Known:
         document = self._document
@@ -534,7 +534,7 @@ class Viewport(QWidget):
         else:
             model = self._document.model
             name = heading(model.domain_names[domain])
-            self._tag.point_at(position, name, model.domain_colours[domain])
+            self._tag.point_at(position, name, model.card.domain_colours[domain])
         if domain != self.hovered_domain:
             self.hovered_domain = domain
             self.domain_hovered.emit(domain)

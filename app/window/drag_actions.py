@@ -126,6 +126,6 @@ class DragActions(QObject):
         from lcollision_core.posing import far_end
 
         document = self._document
-        space = document.model.pose_space
+        space = document.model.space
         grips = [document.grip_at(far_end(space, domain)) for domain in self._domains(key)]
         document.pin_grips(grips, f"Pin {_LIMBS[key][0]}", oriented=True)

@@ -212,7 +212,7 @@ class LibraryActions(QObject):
 
     def _export_motion(self) -> None:
         model, poses = self._document.model, self._panel.chosen_poses
-        of_clips = set(model.pose_names[1:])
+        of_clips = set(model.card.pose_names[1:])
         rate = model.frame_rate if any(pose.name in of_clips for pose in poses) else None
         form = MotionDialog(self._files.settings, self._window, model, rate)
         accepted = form.exec() == QDialog.DialogCode.Accepted

@@ -146,7 +146,7 @@ def opening_pose(model: PosableBody) -> NamedPose:
         except LCollisionError as error:
             # A user's own model may have a bundled one's name.
             _log.info("no opening pose: %s", error)
-    names = model.pose_names
+    names = model.card.pose_names
     if not model.is_trained:
         return NamedPose(names[0], model.training_latent[0])
     number = next((names.index(name) for name in _LIVELY if name in names), len(names) - 1)

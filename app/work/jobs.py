@@ -159,7 +159,7 @@ def _drag_once(model: PosableBody) -> None:
     from lcollision_core.posing import make_grip
 
     dragger = model.dragger()
-    dragger.begin(np.zeros(model.latent_size), make_grip(model.pose_space, 0))
+    dragger.begin(np.zeros(model.latent_size), make_grip(model.space, 0))
     dragger.move(model.reference[0])
 
 

@@ -55,7 +55,7 @@ def card_of(model: PoseModel, path: str) -> LearnedCard:
     ------
     ValueError : it has no predictor, or was not measured.
     """
-    record, metrics = model.predictor_record, model.metrics
+    record, metrics = model.predictor_record, model.embedding.metrics
     if record is None or record.metrics is None or metrics is None:
         raise ValueError(f"{path} was not trained to its end")
     scores = record.metrics
@@ -64,7 +64,7 @@ def card_of(model: PoseModel, path: str) -> LearnedCard:
         model=path,
         name=model.name,
         vertices=model.n_vertices,
-        poses=len(model.pose_names),
+        poses=len(model.card.pose_names),
         parts=len(model.domain_names),
         error_mean=metrics.mean,
         error_max=metrics.max,

@@ -91,7 +91,7 @@ class PosableBody(ABC):
 
     @property
     @abstractmethod
-    def pose_space(self) -> PoseSpace:
+    def space(self) -> PoseSpace:
         """The poses as dragging and Resolve see them."""
 
     @property
@@ -168,7 +168,6 @@ class PosableBody(ABC):
         ModelFileError : the body has no predictor, or a damaged one.
         """
 
-    @abstractmethod
     def resolve(
         self,
         latent: npt.ArrayLike,
@@ -195,6 +194,7 @@ class PosableBody(ABC):
             one.
         CancelledError : `cancel` was set.
         """
+        return self.resolver.resolve(latent, options, progress, cancel, placement)
 
     @abstractmethod
     def _fit(
@@ -212,7 +212,7 @@ class PosableBody(ABC):
         vertices = np.empty((len(codes), self.n_vertices, 3))
 
         def fill(start: int, stop: int) -> None:
-            vertices[start:stop] = self.pose_space.decode(codes[start:stop])
+            vertices[start:stop] = self.space.decode(codes[start:stop])
 
         for_blocks(fill, len(codes), 1, n_threads)
         return vertices
@@ -256,7 +256,7 @@ class PosableBody(ABC):
         """Return the exact check of poses placed for export."""
         from lcollision_core.posing import ExactCheck
 
-        return ExactCheck(self.pose_space, self.detector, self.body_size, placement)
+        return ExactCheck(self.space, self.detector, self.body_size, placement)
 
     def dragger(self, placement: RigidTransform | None = None) -> PoseDragger:
         """Return what drags poses placed for export by hand; for one thread at a time."""
@@ -365,7 +365,7 @@ class PosableBody(ABC):
         ModelFileError : there is no such domain, a name cannot be or is another domain's, or a
             colour or an order is invalid.
         """
-        renamed, coloured = list(self.domain_names), list(self.domain_colours)
+        renamed, coloured = list(self.domain_names), list(self.card.domain_colours)
         for values, changes in ((renamed, names or {}), (coloured, colours or {})):
             for domain, value in changes.items():
                 if not 0 <= domain < len(values):
@@ -472,9 +472,12 @@ class PosableBody(ABC):
     @cached_property
     def latent_space(self) -> LatentSpace:
         """The groups, names, colours and ranges of the latent's codes."""
-        space = self.pose_space
+        space = self.space
         groups, start = [], 0
-        labels = ((WHOLE_BODY, None), *zip(self.domain_names, self.domain_colours, strict=True))
+        labels = (
+            (WHOLE_BODY, None),
+            *zip(self.domain_names, self.card.domain_colours, strict=True),
+        )
         for (name, colour), size in zip(labels, space.group_sizes, strict=True):
             code_names = (
                 self.domain_names
@@ -494,7 +497,7 @@ class PosableBody(ABC):
     @cached_property
     def code_names(self) -> tuple[str, ...]:
         """D names of the codes by effect, unique within each group: "left thigh forward"."""
-        return code_names(self.code_effects, self.domain_names, self.pose_space.group_sizes)
+        return code_names(self.code_effects, self.domain_names, self.space.group_sizes)
 
     @cached_property
     def code_words(self) -> tuple[str, ...]:
@@ -528,7 +531,7 @@ class PosableBody(ABC):
     @property
     def latent_size(self) -> int:
         """D, the number of a latent pose's codes."""
-        return len(self.pose_space.low)
+        return len(self.space.low)
 
     @property
     def body_size(self) -> float:
@@ -580,29 +583,14 @@ class PosableBody(ABC):
         return None
 
     @property
-    def near_exclusion(self) -> float:
-        """Normalised length along the surface within which pairs of faces are folds of the skin."""
-        return self.rules.near_exclusion
-
-    @property
     def domain_names(self) -> tuple[str, ...]:
         """K different names."""
         return self.card.domain_names
 
     @property
-    def domain_colours(self) -> tuple[str, ...]:
-        """K colours "#rrggbb"."""
-        return self.card.domain_colours
-
-    @property
     def domain_order(self) -> tuple[int, ...]:
         """All K domains, indices from 0, in listing order."""
         return self.card.domain_order or tuple(range(len(self.domain_names)))
-
-    @property
-    def pose_names(self) -> tuple[str, ...]:
-        """N names of the training poses, whose codes are `training_latent`, (N, D)."""
-        return self.card.pose_names
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:

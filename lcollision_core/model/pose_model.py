@@ -13,13 +13,11 @@ import numpy.typing as npt
 
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.fitting import LatentFit
-from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.errors import ModelFileError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import (
     ContactRules,
     PoseSet,
-    RigidTransform,
     body_size,
 )
 from lcollision_core.model.card import ModelCard
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
     from lcollision_core.labels import Labeller
     from lcollision_core.posing import LatentPoseSpace
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
-    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
+    from lcollision_core.resolve import PoseResolver
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -191,7 +189,7 @@ class PoseModel(PosableBody):
         write_model_file(path, sections)
 
     @cached_property
-    def pose_space(self) -> LatentPoseSpace:
+    def space(self) -> LatentPoseSpace:
         """The latent poses as dragging and Resolve see them."""
         from lcollision_core.posing import LatentPoseSpace
 
@@ -206,17 +204,6 @@ class PoseModel(PosableBody):
     def predict(self, latent: npt.ArrayLike) -> Prediction:
         """Evaluate the predictor: see `PosableBody.predict`."""
         return self.require_predictor().predict(np.atleast_2d(np.asarray(latent, np.float64)))
-
-    def resolve(
-        self,
-        latent: npt.ArrayLike,
-        options: ResolveOptions | None = None,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
-        placement: RigidTransform | None = None,
-    ) -> ResolveResult:
-        """Solve the paper's problem for a pose: see `PosableBody.resolve`."""
-        return self.resolver.resolve(latent, options, progress, cancel, placement)
 
     @property
     def prediction_needs_torch(self) -> bool:
@@ -369,8 +356,3 @@ class PoseModel(PosableBody):
             self.up_axis,
             self.front,
         )
-
-    @property
-    def metrics(self) -> EmbeddingMetrics | None:
-        """What training measured, lengths normalised."""
-        return self.embedding.metrics

@@ -24,8 +24,8 @@ from lcollision_core.characters.random_poses import random_codes
 from lcollision_core.characters.rig_space import ROOT_CODES
 from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import ContactRules, RigidTransform, part_groups
+from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes import ContactRules, part_groups
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect, with_regions
@@ -43,7 +43,7 @@ from lcollision_core.model_file import digest_of
 if TYPE_CHECKING:
     from lcollision_core.meshes.appearance import Appearance
     from lcollision_core.predictor import Prediction
-    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
+    from lcollision_core.resolve import PoseResolver
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -181,13 +181,8 @@ class RigModel(PosableBody):
         return self.character.look()
 
     @property
-    def pose_space(self) -> RigPoseSpace:
-        """The rig's poses as dragging and Resolve see them."""
-        return self._space
-
-    @property
     def space(self) -> RigPoseSpace:
-        """The same: `pose_space`, with what only rigs have."""
+        """The rig's poses as dragging and Resolve see them."""
         return self._space
 
     @cached_property
@@ -247,17 +242,6 @@ class RigModel(PosableBody):
         from lcollision_core.resolve import PoseResolver
 
         return PoseResolver(self.exact_check(), None, self.free_latent)
-
-    def resolve(
-        self,
-        latent: npt.ArrayLike,
-        options: ResolveOptions | None = None,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
-        placement: RigidTransform | None = None,
-    ) -> ResolveResult:
-        """Step from free poses towards a colliding one: see `PosableBody.resolve`."""
-        return self.resolver.resolve(latent, options, progress, cancel, placement)
 
     def _fit(
         self, vertices: FloatArray, cancel: CancelToken | None, *, in_place: bool

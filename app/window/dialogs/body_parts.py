@@ -69,7 +69,7 @@ class BodyPartsDialog(QDialog):
             item.setData(_DOMAIN, domain)
             item.setSizeHint(QSize(0, ROW_HEIGHT + 2))
             self.list.addItem(item)
-            self._put_colour(item, model.domain_colours[domain])
+            self._put_colour(item, model.card.domain_colours[domain])
         self.list.setCurrentRow(0)
         self.rename, self.colour, self.up, self.down = sides = [
             QPushButton(text) for text in ("Rename", "Colour…", "Move up", "Move down")
@@ -143,7 +143,7 @@ class BodyPartsDialog(QDialog):
         order = tuple(item.data(_DOMAIN) for item in items)
         return PartEdits(
             {k: name for k, name in named.items() if name != model.domain_names[k]},
-            {k: colour for k, colour in coloured.items() if colour != model.domain_colours[k]},
+            {k: colour for k, colour in coloured.items() if colour != model.card.domain_colours[k]},
             order if order != model.domain_order else None,
             self.copy_name.text().strip() if self._copies else None,
         )

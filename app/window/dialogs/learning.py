@@ -371,7 +371,7 @@ class LearnedCardView(QWidget):
             self.facts.addWidget(words, row, 1)
         model = learned.model
         for index, (name, colour) in enumerate(
-            zip(model.domain_names, model.domain_colours, strict=True)
+            zip(model.domain_names, model.card.domain_colours, strict=True)
         ):
             sign, text = QLabel(), labelled(with_capital(one_line(name)), "aside")
             sign.setPixmap(swatch(colour, SWATCH, self.devicePixelRatioF()).pixmap(SWATCH, SWATCH))

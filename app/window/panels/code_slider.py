@@ -199,7 +199,9 @@ class CodeRow(HoverRow):
         # Its end tells what the part does.
         label = ElidedLabel(name, Qt.TextElideMode.ElideMiddle)
         label.setMaximumWidth(name_width)
-        self.slider = CodeSlider(low, high, float(space.shown[code]), model.domain_colours[moved])
+        self.slider = CodeSlider(
+            low, high, float(space.shown[code]), model.card.domain_colours[moved]
+        )
         self._explained: tuple[bool, bool] | None = None
         beyond = _BEYOND * (high - low)
         self._limits = self._field_limits = low - beyond, high + beyond

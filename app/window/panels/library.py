@@ -227,7 +227,7 @@ class LibraryPanel(QWidget):
             return
         current, chosen = self.chosen, {pose.name for pose in self.chosen_poses}
         if self.source is Source.TRAINING:
-            numbers = range(len(document.model.pose_names))
+            numbers = range(len(document.model.card.pose_names))
             self._poses = [document.training_pose(number) for number in numbers]
         elif self.source is Source.STARTER:
             self._poses = document.starter_poses

@@ -118,7 +118,7 @@ class DomainRow(HoverRow):
     """
 
     def __init__(self, document: PoseDocument, domain: int, name_width: int) -> None:
-        colour = document.model.domain_colours[domain]
+        colour = document.model.card.domain_colours[domain]
         super().__init__(domain, colour, TIGHT)
         self._name = heading(document.model.domain_names[domain])
         self.bar = QProgressBar(textVisible=False, maximum=_BAR_STEPS)

@@ -60,8 +60,8 @@ def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
     result = lcollision("new", file, "-o", "hero", *arguments)
     assert result.exit_code == 0, result.stderr
     model = PoseModel.load("hero")
-    assert model.pose_names[0] == "rest"
-    assert sum("rig" in name for name in model.pose_names) == 20
+    assert model.card.pose_names[0] == "rest"
+    assert sum("rig" in name for name in model.card.pose_names) == 20
     assert model.rules.ignored == (("Head", "Torso"),)
     # Beside that it is posed by the rules by which its rig is.
     assert replace(model.rules, ignored=()) == open_body(file).rules

@@ -579,7 +579,7 @@ def test_reset_all_is_one_step_that_takes_the_pins_and_says_what_stays(
     with qtbot.waitSignal(solid.message) as told:
         solid.reset_all()
     assert told.args == ["Everything was reset except 1 locked body part: see Edit > Unlock all"]
-    locked = solid.model.pose_space.codes_of([0])
+    locked = solid.model.space.codes_of([0])
     # Also with Solid on, there is no way on which something could stop it.
     assert not solid.moving
     assert not solid.latent[~locked].any()

@@ -37,7 +37,7 @@ def test_the_patch_is_painted_where_it_is_and_nowhere_else(
     viewport.set_shading(shading)
     before = steady_pixels(qtbot, viewport)
     vertex = seen_vertex(viewport, 1)
-    grip = make_grip(viewport._document.model.pose_space, vertex, 0.08)
+    grip = make_grip(viewport._document.model.space, vertex, 0.08)
     assert scene.show_grip(grip)
     assert not scene.show_grip(grip)
     canvas.redraw()

@@ -107,7 +107,7 @@ def test_a_character_without_predictor_lacks_nothing(
     assert window.library.training.text() == "Clips"
     listed = window.library.list
     names = [listed.item(row).text() for row in range(listed.count())]
-    assert names == list(model.pose_names)
+    assert names == list(model.card.pose_names)
     shadings = [a for a in window.menus["&View"].actions() if isinstance(a.data(), Shading)]
     enabled = {action.data(): action.isEnabled() for action in shadings}
     assert enabled == {shading: shading is not Shading.PREDICTED for shading in Shading}

@@ -146,7 +146,7 @@ def test_the_menu_of_the_body_pins_and_chooses_the_patch(qtbot: QtBot, window: M
 
 def test_feet_and_hands_are_pinned_in_one_step(qtbot: QtBot, body_window: MainWindow) -> None:
     document = body_window.document
-    names, space = document.model.domain_names, document.model.pose_space
+    names, space = document.model.domain_names, document.model.space
     for key, word in (("pin_feet", "foot"), ("pin_hands", "hand")):
         body_window.actions_by_key[key].trigger()
         pinned = {names[space.vertex_domain[pin.vertex]] for pin in document.pins}
@@ -240,7 +240,7 @@ def test_a_part_is_mirrored_to_the_other_side_by_the_menu(
     menu = body_window._body_menus.part_menu(left, None)
     (mirror,) = (a for a in menu.actions() if "irror to" in a.text().replace("&", ""))
     # An edit that still moves the pose ends where it is.
-    assert document.model.pose_space.metric.any()
+    assert document.model.space.metric.any()
     document.randomise(1.0, 3)
     qtbot.waitUntil(lambda: document.latent is not before)
     assert document.moving

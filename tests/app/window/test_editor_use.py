@@ -315,7 +315,7 @@ def test_the_window_takes_on_both_themes(window: MainWindow) -> None:
         for x, y in places:
             seen = picture.pixelColor(int(x * ratio), int(y * ratio))
             assert contrast(seen, QColor(theme.window)) < 1.1
-        lit = [luminance(visible_colour(c)) for c in window.document.model.domain_colours]
+        lit = [luminance(visible_colour(c)) for c in window.document.model.card.domain_colours]
         if theme.is_dark:
             assert min(lit) > luminance(QColor(theme.track))
     assert window.settings["theme"] == "dark"

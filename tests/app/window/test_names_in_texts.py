@@ -150,7 +150,7 @@ def test_a_swatch_has_the_colour_of_the_body_in_both_themes(window: MainWindow) 
         (row, *_) = window.collision.findChildren(DomainRow)
         picture = row.grab().toImage()
         assert picture.pixelColor(10, row.height() // 2) == QColor(dark_blue)
-        for group, colour in zip(window.sliders.groups[1:], model.domain_colours, strict=True):
+        for group, colour in zip(window.sliders.groups[1:], model.card.domain_colours, strict=True):
             picture = group.header.grab().toImage()
             assert picture.pixelColor(32, group.header.height() // 2) == QColor(colour)
         # It is edged where it is hardly seen.

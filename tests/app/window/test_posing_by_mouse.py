@@ -162,7 +162,7 @@ def test_a_pose_is_made_by_mouse_alone(
     document, model = body_window.document, body_window.document.model
     document.set_solid(True)
     hand = Hand(qtbot, body_window)
-    names, domains = model.domain_names, model.pose_space.vertex_domain
+    names, domains = model.domain_names, model.space.vertex_domain
     aim = int(np.linalg.norm(shown(body_window) - np.array(recipe.aim), axis=1).argmin())
     take_picture(body_window, f"{recipe.name}, before")
     hand.choose_in_bar("Pose", "Pin feet")
@@ -246,7 +246,7 @@ class Puppeteer(Hand):
         """Return which vertices a body part leads: (V,)."""
         model = self._document.model
         (domain,) = (k for k, n in enumerate(model.domain_names) if n.casefold() == name)
-        inside: npt.NDArray[np.bool_] = model.pose_space.vertex_domain == domain
+        inside: npt.NDArray[np.bool_] = model.space.vertex_domain == domain
         return inside
 
     def _places(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
@@ -273,7 +273,7 @@ class Studio:
 
     def __init__(self, qtbot: QtBot, window: MainWindow) -> None:
         self._qtbot, self._window, self._document = qtbot, window, window.document
-        model, space = window.document.model, window.document.model.pose_space
+        model, space = window.document.model, window.document.model.space
         self.size, self.up, self.front = model.body_size, space.up, space.front
         self.left = np.cross(self.up, self.front)
         self.hips = space.origins[space.joint_of_code[0]]

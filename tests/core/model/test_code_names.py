@@ -168,7 +168,7 @@ def test_edited_parts_come_back_and_what_is_learnt_stays(
 ) -> None:
     edited = tube_model.edit_domains({0: "knee"}, {1: "#ABCDEF"}, [1, 0])
     assert edited.domain_names == ("knee", tube_model.domain_names[1])
-    assert edited.domain_colours == (tube_model.domain_colours[0], "#abcdef")
+    assert edited.card.domain_colours == (tube_model.card.domain_colours[0], "#abcdef")
     assert edited.domain_order == (1, 0)
     assert tube_model.domain_order == (0, 1)
     assert edited.fingerprint == tube_model.fingerprint
@@ -220,5 +220,5 @@ def test_edits_of_two_commands_are_both_kept(tube_model: PoseModel, tmp_path: Pa
     change_model(path, lambda model: model.edit_domains(colours={1: "#123456"}, order=[1, 0]))
     held = PoseModel.load(path)
     assert held.domain_names[0] == "knee"
-    assert held.domain_colours[1] == "#123456"
+    assert held.card.domain_colours[1] == "#123456"
     assert held.domain_order == (1, 0)

@@ -220,8 +220,8 @@ def test_a_model_of_far_poses_lies_about_the_origin(tube_poses: PoseSet) -> None
     )
     model = PoseModel.from_training("far", train_embedding(poses, config), poses)
     assert np.abs(model.reference).max() < LENGTH_IN_FILES
-    assert model.metrics is not None
-    assert model.metrics.mean < 0.01
+    assert model.embedding.metrics is not None
+    assert model.embedding.metrics.mean < 0.01
     fit = model.encode(poses.vertices[3])
     again = fit.placement.apply(model.decode(fit.latent))
     assert np.linalg.norm(again - poses.vertices[3], axis=1).max() < 0.05 * LENGTH_IN_FILES

@@ -135,11 +135,11 @@ def test_a_mirror_image_lies_where_the_mirror_shows_it(
 @pytest.mark.parametrize("name", ["right side lunge", "twist right", "rest"])
 def test_mirrored_poses_are_as_near_as_unseen_ones(body: PoseModel, name: str) -> None:
     """In their place, where the held-out error is of poses that were turned to fit best."""
-    metrics = body.metrics
+    metrics = body.embedding.metrics
     assert metrics is not None
     assert metrics.held_out_mean is not None
     assert metrics.held_out_max is not None
-    latent = body.training_latent[body.pose_names.index(name)]
+    latent = body.training_latent[body.card.pose_names.index(name)]
     mirrored = body.mirror(latent)
     assert mirrored.fit_error_mean < 1.5 * metrics.held_out_mean
     assert mirrored.fit_error_max < metrics.held_out_max
@@ -307,7 +307,7 @@ def test_a_file_of_poses_remembers_what_they_were_mirrored_from(
 
 def test_pins_are_mirrored_to_the_other_side(body: PoseModel, samples: np.ndarray) -> None:
     symmetry, vertices = body.pose_mirror.symmetry, body.decode(samples[0])
-    grips = [make_grip(body.pose_space, vertex) for vertex in (5, 1200)]
+    grips = [make_grip(body.space, vertex) for vertex in (5, 1200)]
     pose = NamedPose(
         "pinned", samples[0], pins=tuple(Pin.of(grip, vertices, [7]) for grip in grips)
     )
@@ -315,7 +315,7 @@ def test_pins_are_mirrored_to_the_other_side(body: PoseModel, samples: np.ndarra
     assert {pin.frame[0][0] for pin in image.pins} == {int(symmetry.partner[7])}
     reflected = symmetry.image(vertices)
     for pin, grip in zip(image.pins, grips, strict=True):
-        partner = make_grip(body.pose_space, pin.vertex, pin.radius)
+        partner = make_grip(body.space, pin.vertex, pin.radius)
         assert pin.vertex == symmetry.partner[grip.vertex] != grip.vertex
         np.testing.assert_allclose(
             pin.position, partner.position(reflected), atol=1e-3 * body.body_size
@@ -368,7 +368,7 @@ def test_a_part_on_the_other_side_becomes_like_the_mirror_image(body: PoseModel)
     changed = after != pose
     assert changed.any()
     assert not changed[~body.embedding.codes_of([right])].any()
-    inside = body.pose_space.vertex_domain == right
+    inside = body.space.vertex_domain == right
     image = mirror.symmetry.image(body.decode(pose))
     shapes = [vertices[inside] for vertices in (body.decode(pose), body.decode(after), image)]
     before, now, wanted = (shape - shape.mean(axis=0) for shape in shapes)

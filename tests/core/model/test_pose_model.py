@@ -59,7 +59,7 @@ def test_no_pose_is_a_batch_too(model: PoseModel) -> None:
 
 
 def test_decoded_training_poses_are_the_training_poses(model: PoseModel, poses: PoseSet) -> None:
-    metrics = model.metrics
+    metrics = model.embedding.metrics
     assert metrics is not None
     assert metrics.mean < 0.003
     errors = []
@@ -154,7 +154,7 @@ def test_shapes_and_numbers_that_do_not_fit_are_refused(model: PoseModel) -> Non
 def test_latent_space_names_every_code_and_straddles_zero(model: PoseModel) -> None:
     space = model.latent_space
     assert [group.name for group in space.groups] == ["Whole body", *model.domain_names]
-    assert [group.colour for group in space.groups] == [None, *model.domain_colours]
+    assert [group.colour for group in space.groups] == [None, *model.card.domain_colours]
     covered = np.concatenate([np.arange(space.size)[group.codes] for group in space.groups])
     assert np.array_equal(covered, np.arange(model.latent_size))
     for group in space.groups:
@@ -211,7 +211,7 @@ def test_file_holds_all_that_a_front_end_needs(model: PoseModel, path: Path) -> 
     mesh = model.decode(latent[0]) + 1.0
     assert np.array_equal(loaded.encode(mesh).latent, model.encode(mesh).latent)
     assert loaded.card == model.card
-    assert loaded.metrics == model.metrics
+    assert loaded.embedding.metrics == model.embedding.metrics
     assert loaded.name == "tube"
     assert loaded.fingerprint == model.fingerprint
     assert loaded.topology == model.topology

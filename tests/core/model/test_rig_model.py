@@ -49,8 +49,8 @@ def test_it_is_a_body(model: RigModel) -> None:
     assert body.body_size == pytest.approx(1.8 * SCALE, rel=0.05)
     np.testing.assert_array_equal(body.front, [0.0, -1.0, 0.0])
     assert (body.has_predictor, body.can_resolve) == (False, True)
-    assert body.pose_names[:2] == ("rest", "moves 0")
-    assert body.training_latent.shape == (len(body.pose_names), body.latent_size)
+    assert body.card.pose_names[:2] == ("rest", "moves 0")
+    assert body.training_latent.shape == (len(body.card.pose_names), body.latent_size)
     np.testing.assert_allclose(body.decode(body.training_latent[0]), body.reference, atol=1e-9)
     assert body.latent_space.size == body.latent_size
     assert body.latent_space.groups[0].name == "Whole body"
@@ -85,7 +85,7 @@ def test_its_codes_have_names(model: RigModel) -> None:
 
 def test_names_are_those_of_the_motion(model: RigModel) -> None:
     hands = {
-        side: make_grip(model.pose_space, int(np.argmax(sign * model.reference[:, 0])))
+        side: make_grip(model.space, int(np.argmax(sign * model.reference[:, 0])))
         for side, sign in (("Left", 1.0), ("Right", -1.0))
     }
     ways = {"up": (2, 1.0), "down": (2, -1.0), "forward": (1, -1.0)}
@@ -135,10 +135,8 @@ def test_other_characters_are_told_apart() -> None:
 
 def test_a_body_part_without_codes_of_its_own_can_be_locked_and_twisted(model: RigModel) -> None:
     hips = model.domain_names.index("Hips")
-    assert model.pose_space.group_sizes[1 + hips] == 0
-    np.testing.assert_array_equal(
-        model.pose_space.codes_of([hips]), np.arange(model.latent_size) < 6
-    )
+    assert model.space.group_sizes[1 + hips] == 0
+    np.testing.assert_array_equal(model.space.codes_of([hips]), np.arange(model.latent_size) < 6)
     dragger = model.dragger()
     dragger.begin(
         np.zeros(model.latent_size), Twist(hips), (), DragOptions(solid=False, standing=False)
@@ -154,7 +152,7 @@ def test_a_hand_is_dragged_while_the_feet_stay(model: RigModel) -> None:
         int(np.argmax(model.reference @ np.array(way)))
         for way in ((1.0, 0.0, 0.0), (0.01, -1.0, -1.0))
     )
-    grip, pinned = make_grip(model.pose_space, hand), make_grip(model.pose_space, foot)
+    grip, pinned = make_grip(model.space, hand), make_grip(model.space, foot)
     pin = Pin.of(pinned, model.reference)
     dragger = model.dragger()
     dragger.begin(np.zeros(model.latent_size), grip, [pin], DragOptions(solid=True))
@@ -240,7 +238,7 @@ def test_locked_parts_stay_while_others_are_resolved(model: RigModel) -> None:
     assert not model.exact_check().is_free(latent)
     result = model.resolve(latent, ResolveOptions(locked_domains=frozenset({leg})))
     assert result.exactly_free
-    own = model.pose_space.codes_of([leg])
+    own = model.space.codes_of([leg])
     np.testing.assert_array_equal(result.latent[own], latent[own])
 
 
@@ -380,7 +378,7 @@ def test_joints_are_paired_by_their_names(spelling: str) -> None:
 
 def test_a_mesh_of_the_character_is_encoded_wherever_it_lies(model: RigModel) -> None:
     generator = np.random.default_rng(3)
-    latent = 0.35 * generator.uniform(model.pose_space.low, model.pose_space.high)
+    latent = 0.35 * generator.uniform(model.space.low, model.space.high)
     latent[:6] = 0.0
     placed = RigidTransform(random_rotation(generator), np.array([10.0, -20.0, 5.0]))
     mesh = placed.apply(model.decode(latent))
@@ -415,10 +413,10 @@ def test_frames_are_spread_over_clips_of_any_length(tmp_path: Path) -> None:
     body = open_body(builder.write(tmp_path / "dancer.glb"))
     assert isinstance(body, RigModel)
     assert body.character.clips == {"wave": 1.0, "short": 2.0, "dance": 600.0}
-    assert 290 <= len(body.pose_names) <= 301
+    assert 290 <= len(body.card.pose_names) <= 301
     assert body.frame_rate == pytest.approx(297 / 603)
     # The last frame of the longest clip is among them, and that its vertices were not made.
-    assert body.pose_names[-1] == "dance 295"
+    assert body.card.pose_names[-1] == "dance 295"
     bend = body.training_latent[-1]
     assert np.abs(bend).max() == pytest.approx(1.0, abs=0.1)
     frames = body.character.sample("dance", body.frame_rate)
@@ -434,7 +432,7 @@ def test_a_character_file_is_opened_as_a_body(tmp_path: Path) -> None:
     assert (body.name, body.up_axis, body.body_size) == ("walker", 1, pytest.approx(1.8, rel=0.05))
     np.testing.assert_allclose(body.front, [0.0, 0.0, 1.0])
     assert set(body.domain_names) == set(RigModel.of(made).domain_names)
-    assert body.pose_names[0] == "rest"
+    assert body.card.pose_names[0] == "rest"
     frames = body.character.sample("moves", None)
     assert frames.transforms is not None
     codes = body.space.codes_of_transforms(frames.transforms)

@@ -48,9 +48,11 @@ def test_training_and_encoding_take_no_notice_of_strays(
     stray_model: PoseModel, tube_model: PoseModel, tube_poses: PoseSet
 ) -> None:
     assert stray_model.body_size == tube_model.body_size
-    assert stray_model.metrics is not None
-    assert tube_model.metrics is not None
-    assert stray_model.metrics.mean == pytest.approx(tube_model.metrics.mean, rel=0.2)
+    assert stray_model.embedding.metrics is not None
+    assert tube_model.embedding.metrics is not None
+    assert stray_model.embedding.metrics.mean == pytest.approx(
+        tube_model.embedding.metrics.mean, rel=0.2
+    )
     assert stray_model.detector.body_size == stray_model.body_size
     mesh = with_strays(tube_poses).vertices[5].copy()
     encoded = stray_model.encode(mesh)

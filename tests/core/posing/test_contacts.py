@@ -126,7 +126,7 @@ def test_contacts_get_shallower_against_their_slopes(
 def test_the_displacement_metric_measures_vertices(tube_model: PoseModel) -> None:
     """Its distance predicts the mean squared vertex motion; the plain one knows nothing of it."""
     embedding = tube_model.embedding
-    metric = tube_model.pose_space.metric
+    metric = tube_model.space.metric
     generator = np.random.default_rng(2)
     latents = tube_model.latent_space.sample(40, generator)
     steps = 0.05 * generator.normal(size=latents.shape) * embedding.latent_deviation

@@ -35,13 +35,13 @@ def free(tube_model: PoseModel) -> FloatArray:
 @pytest.fixture(scope="module")
 def tip(tube_model: PoseModel) -> Grip:
     along = tube_model.reference[:, tube_model.up_axis]
-    return make_grip(tube_model.pose_space, int(along.argmax()), 0.05)
+    return make_grip(tube_model.space, int(along.argmax()), 0.05)
 
 
 @pytest.fixture(scope="module")
 def foot(tube_model: PoseModel) -> Grip:
     along = tube_model.reference[:, tube_model.up_axis]
-    return make_grip(tube_model.pose_space, int(along.argmin()), 0.05)
+    return make_grip(tube_model.space, int(along.argmin()), 0.05)
 
 
 def settled(dragger: PoseDragger, target: FloatArray, events: int = 200) -> DragStep:
@@ -69,16 +69,16 @@ def test_a_patch_goes_where_another_pose_has_it(
 
 
 def test_weights_of_a_patch_fall_along_the_surface(tube_model: PoseModel) -> None:
-    grip = make_grip(tube_model.pose_space, 40, 0.1)
+    grip = make_grip(tube_model.space, 40, 0.1)
     assert grip.weights.sum() == pytest.approx(1.0)
     assert grip.vertices[grip.weights.argmax()] == 40
     assert 1 < len(grip.vertices) < tube_model.n_vertices
     away = np.linalg.norm(tube_model.reference - tube_model.reference[40], axis=1)
     assert (away[grip.vertices] < 0.1 * tube_model.body_size).all()
-    assert make_grip(tube_model.pose_space, 40, 9.0).radius == LARGEST_RADIUS
+    assert make_grip(tube_model.space, 40, 9.0).radius == LARGEST_RADIUS
     for vertex in (-1, tube_model.n_vertices):
         with pytest.raises(LCollisionError, match=r"must be 0 to \d+, got"):
-            make_grip(tube_model.pose_space, vertex)
+            make_grip(tube_model.space, vertex)
 
 
 def test_pins_stay_while_the_tip_moves(
@@ -128,7 +128,7 @@ def test_many_random_solid_events_never_collide(
     for _ in range(250):
         vertices = tube_model.decode(latent)
         vertex = int(generator.integers(tube_model.n_vertices))
-        grip = [make_grip(tube_model.pose_space, vertex), Twist(int(generator.integers(2))), None][
+        grip = [make_grip(tube_model.space, vertex), Twist(int(generator.integers(2))), None][
             generator.choice(3, p=[0.6, 0.2, 0.2])
         ]
         pins = [Pin.of(one, vertices) for one in (tip, foot) if generator.random() < 0.3]
@@ -180,7 +180,7 @@ def test_a_colliding_pose_is_not_made_worse(tube_model: PoseModel, tip: Grip) ->
 
 def test_codes_that_the_target_leaves_do_not_move(tube_model: PoseModel, free: FloatArray) -> None:
     """As for one slider: it stops at contact, and the others stay."""
-    dragger, low, high = tube_model.dragger(), tube_model.pose_space.low, tube_model.pose_space.high
+    dragger, low, high = tube_model.dragger(), tube_model.space.low, tube_model.space.high
     stopped = 0
     for code in range(tube_model.latent_size):
         for end in (low[code], high[code]):
@@ -204,7 +204,7 @@ def test_a_twist_turns_a_limb_about_its_long_axis() -> None:
     dragger = body.dragger()
     before = dragger.begin(start, Twist(thigh)).vertices.astype(np.float64)
     step = settled(dragger, np.array([0.5]))
-    inside = body.pose_space.vertex_domain == thigh
+    inside = body.space.vertex_domain == thigh
     now = step.vertices[inside].astype(np.float64)
     before = before[inside] - before[inside].mean(axis=0)
     # A rigid fit turns about the limb, by about what was asked for.
@@ -217,7 +217,7 @@ def test_a_twist_turns_a_limb_about_its_long_axis() -> None:
 def test_slopes_of_goals_are_those_of_differences(
     tube_model: PoseModel, free: FloatArray, tip: Grip, foot: Grip
 ) -> None:
-    space = tube_model.pose_space
+    space = tube_model.space
     start = space.decode(free[None])[0]
     pins = [Held(foot, foot.position(start) + 0.004)]
     goals = [

@@ -190,7 +190,7 @@ def test_the_knees_of_a_real_character_take_up_a_drag_of_its_hips(
 
 def test_domains_of_a_learned_model_hang_on_its_trunk() -> None:
     model = PoseModel.load("body")
-    limbs, names = model.pose_space.limbs, model.domain_names
+    limbs, names = model.space.limbs, model.domain_names
     on = {names[k]: names[parent] if parent >= 0 else "" for k, parent in enumerate(limbs.parents)}
     assert on["belly & chest"] == ""
     assert on["right hand"] == "right upper arm"
@@ -202,7 +202,7 @@ def test_a_hand_of_a_learned_model_leaves_the_codes_of_other_limbs() -> None:
     model = PoseModel.load("body")
     start = model.training_latent[0].astype(np.float64)
     names = model.domain_names
-    grip = make_grip(model.pose_space, far_end(model.pose_space, names.index("right hand")))
+    grip = make_grip(model.space, far_end(model.space, names.index("right hand")))
     step = dragged(model, grip, np.array([0.0, -0.1, 0.1]), start=start)
     assert step.miss < 0.005
     own = {names.index("right hand"), names.index("right upper arm")}
@@ -210,4 +210,4 @@ def test_a_hand_of_a_learned_model_leaves_the_codes_of_other_limbs() -> None:
     np.testing.assert_array_equal(step.latent[others], start[others])
     away = np.linalg.norm(step.vertices - model.decode(start), axis=1) / model.body_size
     for part in ("left hand & forearm", "left shin & foot", "right shin & foot"):
-        assert away[model.pose_space.vertex_domain == names.index(part)].mean() < 0.005
+        assert away[model.space.vertex_domain == names.index(part)].mean() < 0.005

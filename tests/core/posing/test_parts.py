@@ -24,7 +24,7 @@ def test_the_long_axis_is_that_of_a_box_however_it_lies() -> None:
 
 def test_feet_are_low_and_hands_far_out() -> None:
     body = PoseModel.load("body")
-    space, names = body.pose_space, body.domain_names
+    space, names = body.space, body.domain_names
     rest, up = space.rest_vertices, body.up_axis
     height = np.ptp(rest[:, up])
     for name in ("left shin & foot", "right shin & foot"):

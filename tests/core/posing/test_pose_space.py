@@ -18,7 +18,7 @@ def patches(model: PoseModel) -> FloatArray:
 
 
 def test_mean_slopes_are_those_of_vertices(tube_model: PoseModel) -> None:
-    space, weights = tube_model.pose_space, patches(tube_model)
+    space, weights = tube_model.space, patches(tube_model)
     slopes = space.mean_slopes(csr_matrix(weights))
     rows = (weights[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(12, -1, 3)
     others = np.random.default_rng(1).normal(size=(2, tube_model.n_vertices, 3))
@@ -33,7 +33,7 @@ def test_mean_slopes_are_those_of_vertices(tube_model: PoseModel) -> None:
 def test_mean_slopes_are_those_of_differences(tube_model: PoseModel) -> None:
     # The decoder's features are float32, so the step must be far above their rounding.
     step = 1e-2
-    space, weights = tube_model.pose_space, patches(tube_model)
+    space, weights = tube_model.space, patches(tube_model)
     codes = sample_poses(tube_model, 1, seed=4)[0]
     slopes = space.mean_slopes(csr_matrix(weights))(codes, np.empty((0, tube_model.n_vertices, 3)))
     differences = np.empty_like(slopes)
@@ -48,7 +48,7 @@ def test_mean_slopes_are_those_of_differences(tube_model: PoseModel) -> None:
 
 def test_a_pose_does_not_depend_on_the_one_before(tube_model: PoseModel) -> None:
     """The features of the last codes are kept, and codes may be changed in their place."""
-    space, poses = tube_model.pose_space, sample_poses(tube_model, 2, seed=4)
+    space, poses = tube_model.space, sample_poses(tube_model, 2, seed=4)
     slopes = space.mean_slopes(csr_matrix(patches(tube_model)))
     none = np.empty((0, tube_model.n_vertices, 3))
     together = space.decode(poses)

@@ -594,7 +594,7 @@ def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
     tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray
 ) -> None:
     resolver = PoseResolver(tube_model.exact_check(), None, free_latents)
-    locked = tube_model.pose_space.codes_of([1])
+    locked = tube_model.space.codes_of([1])
     result = resolver.resolve(deep, ResolveOptions(locked_domains=frozenset({1})))
     assert np.array_equal(result.latent[locked], deep[locked])
     if result.exactly_free:

@@ -96,7 +96,7 @@ def test_parts_of_an_own_model_are_edited_in_its_file_and_the_pose_stays(
     written = PoseModel.load(file)
     second = written.domain_names[1]
     assert written.domain_names[0] == "knee & <b>shin</b>"
-    assert written.domain_colours[0] == "#00ff7f"
+    assert written.card.domain_colours[0] == "#00ff7f"
     assert written.domain_order == (1, 0)
     assert headings(own) == [second[:1].upper() + second[1:], "Knee & <b>shin</b>"]
     assert rows(own) == headings(own)

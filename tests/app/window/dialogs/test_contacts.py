@@ -181,7 +181,7 @@ def test_rules_of_a_model_without_predictor_are_kept_in_its_file(
     qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
     kept = PoseModel.load(path).rules
     assert kept == document.model.rules
-    assert (kept.tolerated_depth, kept.near_exclusion) == (0.015, editor_model.near_exclusion)
+    assert (kept.tolerated_depth, kept.near_exclusion) == (0.015, editor_model.rules.near_exclusion)
     dialog.close()
 
 

@@ -259,7 +259,7 @@ def test_selected_poses_are_the_frames_of_a_point_cache(
     timers.append(chooser(change, path, timers))
     with qtbot.waitSignal(window.document.message, timeout=PATIENCE):
         window.actions_by_key["export_motion"].trigger()
-    assert len(read_point_cache(path)) == len(arm_model.pose_names)
+    assert len(read_point_cache(path)) == len(arm_model.card.pose_names)
     assert window.settings["export_rate"] == 25
 
 

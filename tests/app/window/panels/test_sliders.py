@@ -57,7 +57,7 @@ def test_remove_and_rename_spare_a_pose_that_a_training_pose_is_called_as(
     window: MainWindow,
 ) -> None:
     document, library = window.document, window.library
-    shared = document.model.pose_names[2]
+    shared = document.model.card.pose_names[2]
     document.add_pose_to_library(shared)
     QTest.mouseClick(library.own, LEFT)
     choose(window, shared)
@@ -85,7 +85,7 @@ def test_a_kept_pose_is_chosen_and_stays_so_when_others_go(window: MainWindow) -
         window.actions_by_key["keep"].trigger()
         assert not asked.isActive()
 
-    choose(window, document.model.pose_names[0])
+    choose(window, document.model.card.pose_names[0])
     for name in ("first", "second"):
         name_it(name)
         assert library.chosen_own is not None
@@ -347,7 +347,7 @@ def test_a_blend_tells_its_share_and_leaves_locked_parts_alone(
     qtbot: QtBot, window: MainWindow
 ) -> None:
     document, library = window.document, window.library
-    choose(window, document.model.pose_names[4])
+    choose(window, document.model.card.pose_names[4])
     assert library.chosen is not None
     name, target = library.chosen.name, library.chosen.latent
     QTest.mouseClick(window.collision.prediction.rows[1].lock, LEFT)
@@ -407,7 +407,7 @@ def test_escape_ends_the_drag_of_a_slider_and_no_work(
     qtbot: QtBot, window: MainWindow, of_library: bool
 ) -> None:
     document = window.document
-    choose(window, document.model.pose_names[4])
+    choose(window, document.model.card.pose_names[4])
     slider = window.library.blend if of_library else window.sliders.row_of(1).slider
     before, value = document.latent, slider.value()
     going = Event()
