@@ -42,7 +42,7 @@ from lcollision_core.jobs import CancelToken
 
 if TYPE_CHECKING:
     from app.cli.console import Told
-    from lcollision_core.embedding.run import TrainingStatus
+    from lcollision_core.embedding.training_run import TrainingStatus
     from lcollision_core.meshes import PoseSet
     from lcollision_core.predictor import PredictorStatus
 

@@ -9,7 +9,7 @@ from PySide6.QtCore import QObject, QPoint, Qt
 from PySide6.QtWidgets import QWidget
 
 from app.view.shading import Shading
-from app.window.dialogs.contacts import ContactsDialog
+from app.window.dialogs.contact_rules import ContactsDialog
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

@@ -13,6 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork, UncountedNodes
+from lcollision_core.contact.exclusions import (
+    exclusions_of,
+    require_room,
+    rules_of,
+    with_other_rules,
+)
 from lcollision_core.contact.kernels import (
     COINCIDENT,
     COUNTED,
@@ -22,7 +28,6 @@ from lcollision_core.contact.kernels import (
     add_vertex_energy,
     search_pose,
 )
-from lcollision_core.contact.rules import exclusions_of, require_room, rules_of, with_other_rules
 from lcollision_core.contact.tree import allocate_work, build_tree
 from lcollision_core.contact.uncounted import NOTHING_KNOWN, UncountedTables
 from lcollision_core.errors import ShapeError

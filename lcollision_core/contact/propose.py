@@ -11,9 +11,9 @@ import numpy.typing as npt
 from scipy import sparse
 
 from lcollision_core.contact.detector import CollisionDetector
+from lcollision_core.contact.exclusions import require_room
 from lcollision_core.contact.kernels import NEAR
 from lcollision_core.contact.reach import Lists, faces_within, surface_of
-from lcollision_core.contact.rules import require_room
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.contact_rules import MAX_TOUCHING, STRICT
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, require_groups

@@ -8,5 +8,5 @@ from lcollision_core.embedding.fitting import LatentFit
 from lcollision_core.embedding.latent_box import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.embedding.masks import MaskQuality, attention_mask, judge_masks
 from lcollision_core.embedding.metrics import EmbeddingMetrics
-from lcollision_core.embedding.run import TrainingStatus
 from lcollision_core.embedding.training import train_embedding
+from lcollision_core.embedding.training_run import TrainingStatus

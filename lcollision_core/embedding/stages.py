@@ -25,8 +25,6 @@ from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.decoder import Float32Array
 from lcollision_core.embedding.latent_box import LatentBox
 from lcollision_core.embedding.masks import attention_mask, keep_one_patch
-from lcollision_core.embedding.network import TiedAutoencoder, decode_features, ring_mean
-from lcollision_core.embedding.run import Run
 from lcollision_core.embedding.seeding import (
     domain_distances,
     initial_components,
@@ -35,6 +33,8 @@ from lcollision_core.embedding.seeding import (
     radius_of_overlap,
     vertex_areas,
 )
+from lcollision_core.embedding.tied_autoencoder import TiedAutoencoder, decode_features, ring_mean
+from lcollision_core.embedding.training_run import Run
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
 

@@ -20,7 +20,7 @@ from lcollision_core.embedding.fitting import Decoder, LatentFit, fit_latent
 from lcollision_core.embedding.latent_box import LatentBox
 from lcollision_core.embedding.masks import judge_masks
 from lcollision_core.embedding.metrics import EmbeddingMetrics, feature_pca, vertex_distances
-from lcollision_core.embedding.run import Run, StatusCallback
+from lcollision_core.embedding.training_run import Run, StatusCallback
 from lcollision_core.errors import PoseSetError
 from lcollision_core.jobs import CancelToken, available_cores, no_progress
 from lcollision_core.meshes.alignment import align_rigid

@@ -2,5 +2,5 @@
 
 from lcollision_core.labels.identity import StoreIdentity, is_held_out
 from lcollision_core.labels.labeller import Labeller, LabelRows
-from lcollision_core.labels.run import LabelStatus, StatusCallback, label_poses
+from lcollision_core.labels.labelling_run import LabelStatus, StatusCallback, label_poses
 from lcollision_core.labels.store import ROWS_PER_CHUNK, LabelStore

@@ -3,8 +3,8 @@
 from lcollision_core.learning.card import LearnedCard, card_of
 from lcollision_core.learning.effort import EFFORTS, Effort, Quality
 from lcollision_core.learning.estimate import estimated_seconds
+from lcollision_core.learning.learning_run import learn_model
 from lcollision_core.learning.request import LearningRequest
-from lcollision_core.learning.run import learn_model
 from lcollision_core.learning.sources import ENOUGH_POSES, gather_poses
 from lcollision_core.learning.status import STAGES, LearningStatus, Stage
 from lcollision_core.learning.work_folder import WorkFolder, WorkState, WorkStatus, list_work

@@ -30,7 +30,7 @@ from lcollision_core.meshes.files import (
 )
 from lcollision_core.meshes.npz import MAX_ITEMS, read_npz, write_npz
 from lcollision_core.meshes.outliers import outlier_poses
-from lcollision_core.meshes.stored_rules import (
+from lcollision_core.meshes.rules_as_arrays import (
     RULE_ARRAYS,
     groups_from_arrays,
     groups_to_arrays,

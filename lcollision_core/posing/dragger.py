@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.contacts import ContactRegions, Contacts, least_step
+from lcollision_core.posing.contact_constraints import ContactRegions, Contacts, least_step
 from lcollision_core.posing.exact import ExactCheck, exported_vertices
 from lcollision_core.posing.goals import (
     STANDING_WEIGHT,

@@ -19,12 +19,12 @@ from lcollision_core.labels import LabelRows, StoreIdentity
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
-from lcollision_core.predictor.inference.network import CompiledNetwork
+from lcollision_core.predictor.inference.compiled_network import CompiledNetwork
 from lcollision_core.predictor.metrics import PredictorMetrics, measure
 from lcollision_core.predictor.stored_network import require_network
 
 if TYPE_CHECKING:
-    from lcollision_core.predictor.network import PredictorNetwork
+    from lcollision_core.predictor.network_base import PredictorNetwork
 
 BATCH_ROWS = 500
 """Rows that are predicted at a time: their hidden layers stay in the caches."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import ExactCheck
-from lcollision_core.posing.contacts import Contacts
+from lcollision_core.posing.contact_constraints import Contacts
 from lcollision_core.resolve.problem import ResolveProblem
 
 POLISH_ROUNDS = 6

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.contacts import Contacts, nearest_within
+from lcollision_core.posing.contact_constraints import Contacts, nearest_within
 
 
 class CollisionModel(Protocol):

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import ExactCheck
-from lcollision_core.posing.contacts import Contacts
+from lcollision_core.posing.contact_constraints import Contacts
 from lcollision_core.resolve.problem import ResolveProblem
 
 FIRST_HALVINGS, FURTHER_HALVINGS = 3, 5

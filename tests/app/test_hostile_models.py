@@ -24,8 +24,8 @@ from lcollision_core.predictor import (
     TrainingFacts,
     evaluate_predictor,
 )
-from lcollision_core.predictor.geometric.network import GeometricNetwork
-from lcollision_core.predictor.paper.network import PaperNetwork
+from lcollision_core.predictor.geometric.geometric_network import GeometricNetwork
+from lcollision_core.predictor.paper.paper_network import PaperNetwork
 from tests.app.support import Lcollision
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import made_up_rows

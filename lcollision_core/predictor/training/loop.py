@@ -24,7 +24,7 @@ from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows
 from lcollision_core.meshes import STRICT, FaceGroup
 from lcollision_core.predictor.config import PredictorConfig
-from lcollision_core.predictor.network import PredictorNetwork, Targets
+from lcollision_core.predictor.network_base import PredictorNetwork, Targets
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
 from lcollision_core.predictor.presets import NETWORKS
 from lcollision_core.predictor.training.patch_labels import PatchLabeller

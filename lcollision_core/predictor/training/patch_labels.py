@@ -12,7 +12,7 @@ from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.labels import LabelRows
 from lcollision_core.meshes import ContactRules, FaceGroup
 from lcollision_core.predictor.geometric.folds import FoldDetector
-from lcollision_core.predictor.network import SkinCells
+from lcollision_core.predictor.network_base import SkinCells
 
 _ROWS_PER_BLOCK = 32
 _PATCH_FRACTION, _FOLD_FRACTION = 0.05, 0.005

@@ -27,7 +27,7 @@ BARS = {
     ),
     "embedding": (
         "from app.cli.train import told_of_embedding as told_of\n"
-        "from lcollision_core.embedding.run import TrainingStatus\n"
+        "from lcollision_core.embedding.training_run import TrainingStatus\n"
         "status = TrainingStatus('held out', 'level 2', 40, 100, 0.04, 0.01)\n"
         "rows = False",
         ("held out: learning level 2", "40%", "error level 1 4.00 %, both levels 1.00 %"),

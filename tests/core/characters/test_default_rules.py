@@ -11,7 +11,7 @@ import pytest
 
 from lcollision_core.characters import Character, default_rules, read_character
 from lcollision_core.contact import CollisionDetector, ContactRules
-from lcollision_core.contact.rules import near_pairs_estimate
+from lcollision_core.contact.exclusions import near_pairs_estimate
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import grid
 from tests.independent_check import IndependentRules, crossing_pairs

@@ -16,7 +16,7 @@ from lcollision_core.embedding.autoencoders import (
     run_encoders,
 )
 from lcollision_core.embedding.decoder import DecoderGroup, FeatureDecoder
-from lcollision_core.embedding.network import TiedAutoencoder, decode_features, ring_mean
+from lcollision_core.embedding.tied_autoencoder import TiedAutoencoder, decode_features, ring_mean
 from tests.core.embedding.strips import strip
 from tests.core.shapes import Mesh, sphere
 

@@ -10,7 +10,7 @@ import pytest
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import LCollisionError
 from lcollision_core.learning import LearningRequest
-from lcollision_core.learning.contacts import with_proposed_rules
+from lcollision_core.learning.rules_of_poses import with_proposed_rules
 from lcollision_core.meshes import ContactRules, PoseSet, Topology
 from tests.bending_tube import (
     LENGTH_IN_FILES,

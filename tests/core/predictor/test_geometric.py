@@ -22,7 +22,7 @@ from lcollision_core.predictor.geometric.folds import (
     N_SITES,
     find_fold_sites,
 )
-from lcollision_core.predictor.geometric.network import GeometricNetwork, _Auxiliary
+from lcollision_core.predictor.geometric.geometric_network import GeometricNetwork, _Auxiliary
 from lcollision_core.predictor.inference.field_kernels import BLOCK, FULL, RADII, SOME, in_blocks
 from lcollision_core.predictor.inference.points import (
     body_points,
@@ -32,7 +32,7 @@ from lcollision_core.predictor.inference.points import (
     skin_graph,
     tangent_frames,
 )
-from lcollision_core.predictor.network import NetworkOutput, SkinCells, Targets
+from lcollision_core.predictor.network_base import NetworkOutput, SkinCells, Targets
 from lcollision_core.predictor.training import patch_labels
 from lcollision_core.predictor.training.patch_labels import PatchLabeller
 from tests.core.labelled import labeller_of

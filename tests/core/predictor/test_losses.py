@@ -11,9 +11,9 @@ import torch
 
 from lcollision_core.predictor import PRESETS
 from lcollision_core.predictor.metrics import mean_difference, measure
-from lcollision_core.predictor.network import NetworkOutput, Targets
+from lcollision_core.predictor.network_base import NetworkOutput, Targets
 from lcollision_core.predictor.paper.losses import depth_loss, rank_loss, ranked_pairs
-from lcollision_core.predictor.paper.network import PaperNetwork
+from lcollision_core.predictor.paper.paper_network import PaperNetwork
 
 
 def _double(*values: object) -> torch.Tensor:

@@ -31,7 +31,7 @@ from lcollision_core.predictor import (
     PredictorStatus,
     train_predictor,
 )
-from lcollision_core.predictor.network import PredictorNetwork
+from lcollision_core.predictor.network_base import PredictorNetwork
 from lcollision_core.predictor.predictor import BATCH_ROWS
 from lcollision_core.predictor.training import loop
 from lcollision_core.predictor.training.loop import rate_at

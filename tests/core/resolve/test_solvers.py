@@ -11,7 +11,7 @@ import pytest
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.contacts import nearest_within
+from lcollision_core.posing.contact_constraints import nearest_within
 from lcollision_core.resolve import ResolveOptions, Solver
 from lcollision_core.resolve.nlopt_solvers import solve_nlopt
 from lcollision_core.resolve.problem import Deadline, ResolveProblem, SolverOutcome

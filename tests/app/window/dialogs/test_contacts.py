@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 
 from app.view.shading import Shading
 from app.window.dialogs.body_parts import BodyPartsDialog
-from app.window.dialogs.contacts import ContactsDialog
+from app.window.dialogs.contact_rules import ContactsDialog
 from app.window.main_window import MainWindow
 from app.work.jobs import PartEdits, contacts_at_rest
 from lcollision_core.contact import propose_by_kind

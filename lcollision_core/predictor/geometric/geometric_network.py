@@ -29,11 +29,11 @@ from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
 from lcollision_core.predictor.geometric.field import ContactField
 from lcollision_core.predictor.geometric.folds import N_MEMBERS, find_fold_sites
 from lcollision_core.predictor.geometric.reduced_body import ReducedBody
+from lcollision_core.predictor.inference.compiled_network import SQUASHED
 from lcollision_core.predictor.inference.field_kernels import UNITS
-from lcollision_core.predictor.inference.network import SQUASHED
 from lcollision_core.predictor.inference.points import N_POINTS, skin_cells
 from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
-from lcollision_core.predictor.network import (
+from lcollision_core.predictor.network_base import (
     NetworkOutput,
     PredictorNetwork,
     SeededLinear,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lcollision_core.characters.default_rules import MOST_NEAR_PAIRS
 from lcollision_core.contact import CollisionDetector, ContactRules, touching_patches
-from lcollision_core.contact.rules import near_pairs_estimate
+from lcollision_core.contact.exclusions import near_pairs_estimate
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.learning.request import LearningRequest
 from lcollision_core.meshes import (

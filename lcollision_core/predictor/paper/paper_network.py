@@ -13,7 +13,7 @@ from lcollision_core.embedding import Embedding
 from lcollision_core.labels import LabelRows
 from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
 from lcollision_core.predictor.config import PredictorConfig
-from lcollision_core.predictor.network import (
+from lcollision_core.predictor.network_base import (
     NetworkOutput,
     PredictorNetwork,
     SeededLinear,

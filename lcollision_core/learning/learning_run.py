@@ -16,9 +16,9 @@ import numpy as np
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.learning.card import LearnedCard, card_of
-from lcollision_core.learning.contacts import with_proposed_rules
 from lcollision_core.learning.effort import EFFORTS, Effort, Quality
 from lcollision_core.learning.estimate import estimated_seconds
+from lcollision_core.learning.rules_of_poses import with_proposed_rules
 from lcollision_core.learning.sources import gather_poses
 from lcollision_core.learning.status import STAGES, LearningStatus, Pace, Stage, StatusCallback
 from lcollision_core.learning.work_folder import WorkFolder, WorkState, WorkStatus
@@ -26,7 +26,7 @@ from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
 from lcollision_core.model import PoseModel, save_trained
 
 if TYPE_CHECKING:
-    from lcollision_core.embedding.run import TrainingStatus
+    from lcollision_core.embedding.training_run import TrainingStatus
     from lcollision_core.labels import LabelStatus
     from lcollision_core.predictor import PredictorStatus
 
