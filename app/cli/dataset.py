@@ -227,7 +227,7 @@ def make(
     kind = _BODIES.get(sources[0])
     if kind is not None:
         _require_only_body(sources, clip=clip, fps=fps, up=up, by_rig=by_rig)
-        from lcollision_core.meshes.body import make_body
+        from lcollision_core.built_in_body import make_body
 
         with progress_bar("Posing the body") as progress:
             poses = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)

@@ -37,7 +37,7 @@ def test_importing_the_core_loads_nothing_heavy() -> None:
 
 
 def test_contact_and_meshes_load_neither_torch_nor_a_front_end() -> None:
-    loaded = _loaded_modules("import lcollision_core.contact, lcollision_core.meshes.body")
+    loaded = _loaded_modules("import lcollision_core.contact, lcollision_core.built_in_body")
     assert "numba" in loaded
     assert loaded & {"torch", "anny", "vtkmodules", "pyvista", "PySide6"} == set()
 

@@ -10,8 +10,8 @@ import json
 from functools import cache
 from typing import Any
 
+from lcollision_core.built_in_body.figure import Arm, Figure, Foot, Leg
 from lcollision_core.bundled import bundled_file
-from lcollision_core.meshes.body.figure import Arm, Figure, Foot, Leg
 
 _LIMBS = {"arm": Arm, "leg": Leg, "foot": Foot}
 

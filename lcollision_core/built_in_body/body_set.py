@@ -9,14 +9,14 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.built_in_body.figure import Arm, Figure, Foot, Leg
+from lcollision_core.built_in_body.motions import jump_motion, swing_motion
+from lcollision_core.built_in_body.poses import authored_poses
+from lcollision_core.built_in_body.skeleton import BONES, Skeleton, limits_of
+from lcollision_core.built_in_body.skinning import Skin
+from lcollision_core.built_in_body.template import build_template
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import Progress, no_progress
-from lcollision_core.meshes.body.figure import Arm, Figure, Foot, Leg
-from lcollision_core.meshes.body.motions import jump_motion, swing_motion
-from lcollision_core.meshes.body.poses import authored_poses
-from lcollision_core.meshes.body.skeleton import BONES, Skeleton, limits_of
-from lcollision_core.meshes.body.skinning import Skin
-from lcollision_core.meshes.body.template import build_template
 from lcollision_core.meshes.pose_set import PoseSet
 from lcollision_core.meshes.topology import Topology
 

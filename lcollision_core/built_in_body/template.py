@@ -15,15 +15,15 @@ import numpy.typing as npt
 from scipy import ndimage, sparse
 from trimesh.triangles import points_to_barycentric
 
-from lcollision_core.errors import MissingExtraError
-from lcollision_core.meshes.body.decimate import HalfMesh, flip_edges, mirror_whole, relax
-from lcollision_core.meshes.body.skeleton import (
+from lcollision_core.built_in_body.decimate import HalfMesh, flip_edges, mirror_whole, relax
+from lcollision_core.built_in_body.skeleton import (
     BONES,
     OTHER_SIDE,
     Skeleton,
     bone_of_anny,
     rotation_about,
 )
+from lcollision_core.errors import MissingExtraError
 from lcollision_core.meshes.topology import Topology
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
-from lcollision_core.meshes.body.figure import Arm, Figure, Foot, straight_rise
-from lcollision_core.meshes.body.skeleton import Skeleton
+from lcollision_core.built_in_body.figure import Arm, Figure, Foot, straight_rise
+from lcollision_core.built_in_body.skeleton import Skeleton
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.meshes.body.template import Template, neighbour_average
+from lcollision_core.built_in_body.template import Template, neighbour_average
 from lcollision_core.meshes.normals import vertex_normals
 
 FloatArray = npt.NDArray[np.float64]

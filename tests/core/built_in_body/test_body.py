@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from lcollision_core.built_in_body import BodyKind, body_set, make_body
+from lcollision_core.built_in_body.decimate import HalfMesh, mirror_whole
+from lcollision_core.built_in_body.figure import Arm, Figure, Foot, Leg
+from lcollision_core.built_in_body.poses import authored_poses
+from lcollision_core.built_in_body.skeleton import BONES, Skeleton, limits_of, turn_z
+from lcollision_core.built_in_body.skinning import Skin
+from lcollision_core.built_in_body.template import Template, build_template
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MissingExtraError, ShapeError
 from lcollision_core.meshes import PoseSet, Topology, body_size
-from lcollision_core.meshes.body import BodyKind, body_set, make_body
-from lcollision_core.meshes.body.decimate import HalfMesh, mirror_whole
-from lcollision_core.meshes.body.figure import Arm, Figure, Foot, Leg
-from lcollision_core.meshes.body.poses import authored_poses
-from lcollision_core.meshes.body.skeleton import BONES, Skeleton, limits_of, turn_z
-from lcollision_core.meshes.body.skinning import Skin
-from lcollision_core.meshes.body.template import Template, build_template
 
 MAX_COLLIDING = 5
 MIN_DIFFERENCE = 0.015
@@ -399,7 +399,7 @@ def test_missing_extra_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_importing_the_body_loads_nothing_heavy() -> None:
     code = (
-        "import sys, lcollision_core.meshes.body; "
+        "import sys, lcollision_core.built_in_body; "
         "print([m for m in ('anny', 'torch', 'pyvista', 'vtk') if m in sys.modules])"
     )
     result = subprocess.run(
@@ -418,7 +418,7 @@ def test_reading_the_source_shapes_leaves_standard_output_in_its_place() -> None
     code = (
         "import io, sys\n"
         "import anny\n"
-        "from lcollision_core.meshes.body.template import _read_anny\n"
+        "from lcollision_core.built_in_body.template import _read_anny\n"
         "read = anny.Anny\n"
         "def read_as_the_first_time(**options):\n"
         "    import anny.utils.warp_mesh_utils\n"

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.meshes.body.skeleton import (
+from lcollision_core.built_in_body.skeleton import (
     BONES,
     MIRROR,
     TRUNK_ANGLES,
