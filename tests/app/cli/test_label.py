@@ -156,8 +156,7 @@ def test_ctrl_c_keeps_what_is_there_and_says_so(model: Path, tmp_path: Path) -> 
     n_rows = LabelStore.open(store).n_rows
     assert n_rows >= ROWS_PER_CHUNK
     assert stderr == (
-        f"lcollision: stopped; {store} keeps {n_rows} rows, run the same command again to "
-        f"continue\n"
+        f"lcollision: stopped; {store} has {n_rows} rows; run the same command again to continue\n"
     )
 
 

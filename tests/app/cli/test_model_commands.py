@@ -163,7 +163,7 @@ def test_commands_apply_the_rules_that_were_chosen_for_a_character_and_say_so(
     assert json.loads(lcollision("info", file, "--json").stdout)["rules"]["tolerated_depth"] == 0.5
     sampled = lcollision("sample", file, "-n", "1", "-o", tmp_path / "poses.json")
     assert sampled.exit_code == 0
-    chosen = "the contact rules of hero are those that you chose"
+    chosen = "hero uses the contact rules that you chose"
     assert (
         chosen
         in lcollision("mirror", file, tmp_path / "poses.json", "-o", tmp_path / "m.json").stderr
@@ -175,7 +175,7 @@ def test_contact_rules_of_a_character_are_shown_proposed_and_chosen(
 ) -> None:
     file = write_gltf(head_in_torso(30), tmp_path / "hero.glb")
     strict = lcollision("contacts", file, "--near-exclusion", 0, "--tolerated-depth", 1e-6)
-    assert "the contact rules of hero are changed" in strict.stderr
+    assert "the contact rules of hero have changed" in strict.stderr
     body = open_body(file)
     assert isinstance(body, RigModel)
     remember_choices(body.with_rules(ContactRules()))

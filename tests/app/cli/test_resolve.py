@@ -218,7 +218,7 @@ def test_a_folder_takes_several(
     assert [row["output"] for row in json.loads(result.stdout)] == [
         str(out / name) for name in names
     ]
-    told = f"lcollision: wrote 5 poses to {out}, in place of 1 file of the same name"
+    told = f"lcollision: wrote 5 poses to {out}, replacing 1 file of the same name"
     assert told in result.stderr.splitlines()
     assert {file.name for file in out.iterdir()} == set(names)
     for file in out.iterdir():
