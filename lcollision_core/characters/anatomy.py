@@ -10,41 +10,17 @@ import numpy.typing as npt
 
 from lcollision_core.characters import joint_roles
 from lcollision_core.characters.character import Character, Rig
-from lcollision_core.characters.joint_roles import Role, Side
 from lcollision_core.characters.skeletons import FINGERS, TRUNK, Person, Skeleton
 from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes.joint_kinds import JOINT_KINDS, Role, Side
 from lcollision_core.meshes.part_names import joint_labels, part_labels, part_names
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import front_direction
 
-_SIDED = {
-    "collarbone": Role.SHOULDER,
-    "shoulder": Role.UPPER_ARM,
-    "elbow": Role.FOREARM,
-    "wrist": Role.HAND,
-    "palm": Role.PALM,
-    "thumb": Role.THUMB,
-    "finger": Role.FINGER,
-    "hip": Role.THIGH,
-    "knee": Role.SHIN,
-    "ankle": Role.FOOT,
-    "toes": Role.TOE,
-}
-_SINGLE = {
-    "spine": Role.SPINE,
-    "neck": Role.NECK,
-    "head": Role.HEAD,
-    "face": Role.FACE,
-    "twist": Role.TWIST,
-    "unknown": Role.OTHER,
-}
 ROLE_NAMES: Mapping[str, tuple[Role, Side]] = {
-    **{
-        f"{name}-{side.value}": (role, side)
-        for name, role in _SIDED.items()
-        for side in (Side.LEFT, Side.RIGHT)
-    },
-    **{name: (role, Side.MIDDLE) for name, role in _SINGLE.items()},
+    f"{kind.called}-{side.value}" if kind.is_paired else kind.called: (role, side)
+    for role, kind in JOINT_KINDS.items()
+    for side in ((Side.LEFT, Side.RIGHT) if kind.is_paired else (Side.MIDDLE,))
 }
 """What a user can say that a joint is."""
 
@@ -61,19 +37,7 @@ def role_name(role: Role, side: Side) -> str:
     )
 
 
-_PARTS = {
-    Role.SHOULDER: "shoulder",
-    Role.UPPER_ARM: "upper arm",
-    Role.FOREARM: "forearm",
-    **dict.fromkeys((Role.HAND, *FINGERS), "hand"),
-    Role.THIGH: "thigh",
-    Role.SHIN: "shin",
-    **dict.fromkeys((Role.FOOT, Role.TOE), "foot"),
-    Role.SPINE: "torso",
-    Role.NECK: "neck",
-    **dict.fromkeys((Role.HEAD, Role.FACE), "head"),
-}
-_LIMBS = frozenset(_PARTS) - {*TRUNK, Role.FACE}
+_LIMBS = frozenset(role for role, kind in JOINT_KINDS.items() if kind.part) - {*TRUNK, Role.FACE}
 _BONES = frozenset((Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN))
 _ONE_OF_A_LIMB = _LIMBS - {Role.TOE, *FINGERS} | {Role.HEAD}
 
@@ -178,7 +142,7 @@ def anatomy_of(character: Character) -> Anatomy:
 
 
 def _part(role: Role, side: Side) -> str | None:
-    part = _PARTS.get(role)
+    part = JOINT_KINDS[role].part
     return None if part is None else f"{side.value} {part}".strip().capitalize()
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Sequence
-from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters.character import Rig
+from lcollision_core.meshes.joint_kinds import JOINT_KINDS, Role, Side
 from lcollision_core.meshes.part_names import part_names
 from lcollision_core.meshes.topology import FloatArray
 
@@ -28,63 +28,6 @@ _MIDDLE = 0.02
 
 _SHORT = 1e-6
 """Of the size of the rig: a bone of this length has no direction."""
-
-
-class Role(Enum):
-    """What a joint is in a body; values are patterns of its name in small letters and digits.
-
-    They are of English names, and of MMD's. The first that is found counts. What has none and
-    belongs to the head is of its face.
-    """
-
-    TWIST = "twist|roll(?!er)|(shoulder|elbow|hip|knee)part[0-9]|捩|キャンセル|肩[pc]"
-    PALM = "palm|carpal"
-    THUMB = "thumb|^bip[0-9]*[lr]finger0|親指"
-    FINGER = "finger|index|middle|(?<!sp)(?<!st)ring|pinky|pinkie|little|[人中薬小][指差]"
-    TOE = "toe|(?<!eye)ball|metatarsal|つま先|爪先|足先|足指"
-    FOOT = "foot|ankle|paw|hoof|足首"
-    HAND = "hand|wrist|手首"
-    FOREARM = "forearm|lowerarm|lowarm|loarm|armlower|elbow|ひじ|肘"
-    SHOULDER = "shoulder|clavicle|collar|scapula|肩"
-    UPPER_ARM = "arm(?!atu|or)|shldr|腕"
-    THIGH = "thigh|upleg|upperleg|legupper|足(?!.*ik)"
-    SHIN = "shin|calf|knee|leg|ひざ|膝"
-    NECK = "neck|首"
-    HEAD = "(?<!fore)head|skull|頭"
-    SPINE = "spine|chest|torso|waist|abdomen|belly|上半身|胸"
-    OTHER = ""
-    FACE = "$^"
-
-
-class Side(Enum):
-    """On which side of the body a joint is, as the body itself says it."""
-
-    LEFT = "left"
-    RIGHT = "right"
-    MIDDLE = ""
-
-
-_LIMITS: dict[Role, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
-    Role.TWIST: ((0, 0), (-60, 60), (0, 0)),
-    Role.PALM: ((-20, 20), (0, 0), (-15, 15)),
-    Role.THUMB: ((-30, 60), (-20, 20), (-30, 30)),
-    Role.FINGER: ((-20, 95), (0, 0), (-15, 15)),
-    Role.TOE: ((-45, 45), (0, 0), (0, 0)),
-    Role.FOOT: ((-50, 50), (-30, 30), (-30, 30)),
-    Role.HAND: ((-80, 80), (-40, 40), (-40, 40)),
-    Role.FOREARM: ((-5, 150), (-90, 90), (-5, 5)),
-    Role.SHOULDER: ((-30, 30), (-15, 15), (-30, 30)),
-    Role.UPPER_ARM: ((-100, 140), (-90, 90), (-120, 120)),
-    Role.THIGH: ((-45, 130), (-50, 50), (-70, 70)),
-    Role.SHIN: ((-5, 150), (-20, 20), (-5, 5)),
-    Role.NECK: ((-40, 40), (-50, 50), (-35, 35)),
-    Role.HEAD: ((-40, 40), (-60, 60), (-35, 35)),
-    Role.SPINE: ((-25, 40), (-35, 35), (-30, 30)),
-    Role.OTHER: ((-75, 75), (-75, 75), (-75, 75)),
-    Role.FACE: ((-75, 75), (-75, 75), (-75, 75)),
-}
-"""Degrees of bend, twist and sideways turn from the rest pose. They are wider than a person's, as
-rest poses differ, and a hinge hardly bends backwards."""
 
 
 _BONES = {
@@ -109,7 +52,9 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
         re.sub(r"[\W_]", "", unicodedata.normalize("NFKC", re.split("[:|]", name)[-1]).lower())
         for name in rig.joint_names
     ]
-    named = [next(role for role in Role if re.search(role.value, name)) for name in plain]
+    named = [
+        next(role for role in Role if re.search(JOINT_KINDS[role].words, name)) for name in plain
+    ]
     parts = part_names(rig.joint_names)
     for joint, role in enumerate(named):
         above = rig.parents[joint]
@@ -307,7 +252,7 @@ def joint_limits(rig: Rig, roles: tuple[Role, ...]) -> tuple[FloatArray, FloatAr
 
     Both are 0 where a joint does not turn.
     """
-    bounds = np.radians(np.array([_LIMITS[role] for role in roles], dtype=np.float64))
+    bounds = np.radians(np.array([JOINT_KINDS[role].limits for role in roles], dtype=np.float64))
     for joint, (role, parent) in enumerate(zip(roles, rig.parents, strict=True)):
         # Only the first joint of a finger turns sideways.
         if role is Role.FINGER and parent >= 0 and roles[parent] is Role.FINGER:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters.joint_roles import Role
 from lcollision_core.characters.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.topology import FloatArray
 
 _Range = tuple[float, float]

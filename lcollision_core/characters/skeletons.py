@@ -9,7 +9,7 @@ from itertools import combinations, permutations
 import numpy as np
 
 from lcollision_core.characters.character import Rig
-from lcollision_core.characters.joint_roles import Role
+from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.topology import FloatArray
 
 LEG = (Role.THIGH, Role.SHIN, Role.FOOT, Role.TOE)

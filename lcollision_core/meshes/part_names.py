@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.meshes.joint_kinds import JOINT_KINDS, Role
 from lcollision_core.meshes.topology import FloatArray
 
 _SIDES = {
@@ -21,10 +22,6 @@ _PREFIXES = frozenset(
 )
 """Words that say nothing of the part."""
 
-_HAND = (
-    r"thumb|index|middle|(?<!sp)(?<!st)(?<!ear)ring|pink(y|ie)|little|finger|metacarpal|carpal|"
-    r"palm|hand|wrist"
-)
 _FACE = frozenset(
     ("eye", "eyes", "eyeball", "eyelid", "eyebrow", "brow", "ear", "earring", "lip", "lips", "jaw")
     + ("chin", "hair", "nose", "face", "cheek", "tongue", "teeth")
@@ -32,15 +29,15 @@ _FACE = frozenset(
 """Words that are too short to be sought inside others."""
 
 _PAIRED = (
-    (r"toe|ball|foot|feet|ankle|(?<!w)heel|tarsal|hallux|paw|hoof|hooves|pastern|fetlock", "foot"),
-    (_HAND, "hand"),
-    (r"forearm|lowerarm|lowarm|armlower|elbow|ulna|forearmbend", "forearm"),
-    (r"upperarm|uparm|armupper|bicep|humerus|shldr", "upper arm"),
-    (r"shoulder|clavicle|collar|scapula", "shoulder"),
-    (r"upleg|upperleg|legupper|thigh|femur", "thigh"),
-    (r"lowerleg|lowleg|leglower|calf|shin|knee|tibia|cannon|(?<!s)hock", "shin"),
+    Role.FOOT,
+    Role.HAND,
+    Role.FOREARM,
+    Role.UPPER_ARM,
+    Role.SHOULDER,
+    Role.THIGH,
+    Role.SHIN,
 )
-"""Parts of which a body has two, by a pattern that a name without blanks contains."""
+"""Joints whose parts a body has twice, in the order in which their words count."""
 
 _PAIRED_WORDS = {"arm": ("upper arm", "forearm"), "leg": ("shin", "thigh")}
 """A word that is a part of a limb where the rig names the other part, else the limb."""
@@ -55,11 +52,11 @@ _ENDS = {
 """Which legs of an animal with four, by a word."""
 
 _SINGLE = (
-    (r"head|skull", "Head"),
-    (r"neck", "Neck"),
-    (r"chest|thorax|rib|breast|pectoral|bust", "Chest"),
-    (r"spine|torso|abdomen|waist|belly|stomach|lumbar", "Torso"),
-    (r"pelvis|hips?$|butt(ock)?", "Hips"),
+    (JOINT_KINDS[Role.HEAD].part_words, "Head"),
+    (JOINT_KINDS[Role.NECK].part_words, "Neck"),
+    ("chest|thorax|rib|breast|pectoral|bust", "Chest"),
+    (JOINT_KINDS[Role.SPINE].part_words, "Torso"),
+    ("pelvis|hips?$|butt(ock)?", "Hips"),
 )
 
 
@@ -175,9 +172,9 @@ def _words(name: str) -> tuple[str, tuple[str, ...]]:
 def _part(side: str, words: tuple[str, ...]) -> str | None:
     joined = "".join(words)
     if side and not _FACE.intersection(words):
-        for pattern, part in _PAIRED:
-            if re.search(pattern, joined):
-                return f"{side} {part}"
+        for kind in (JOINT_KINDS[role] for role in _PAIRED):
+            if re.search(kind.part_words, joined):
+                return f"{side} {kind.part}"
         if joined in ("hip", "hipjoint"):
             return f"{side} thigh"
     for pattern, part in _SINGLE:

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import RigPoseSpace
-from lcollision_core.characters.joint_roles import Role, Side
 from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.model.mirror import PoseMirror
 
 FloatArray = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from lcollision_core.characters import RigPoseSpace
-from lcollision_core.characters.joint_roles import Role, Side
+from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.model.code_names import way_in_words
 
 _WHOLE_BODY = ("move left", "move up", "move forward", "tilt forward", "turn left", "lean right")

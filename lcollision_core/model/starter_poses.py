@@ -14,8 +14,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import RigPoseSpace
-from lcollision_core.characters.joint_roles import Role, Side, next_in_limb
+from lcollision_core.characters.joint_roles import next_in_limb
 from lcollision_core.characters.rig_space import ROOT_CODES
+from lcollision_core.meshes.joint_kinds import Role, Side
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import Character, RigPoseSpace, read_character
 from lcollision_core.characters.anatomy import anatomy_of
-from lcollision_core.characters.joint_roles import Role
 from lcollision_core.characters.random_poses import HumanDraws, random_codes
+from lcollision_core.meshes.joint_kinds import Role
 from tests.skeletons import HORSE, PERSON, SNAKE, character_from
 
 FloatArray = npt.NDArray[np.float64]

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lcollision_core.characters.joint_roles import Role, joint_limits, joint_roles
+from lcollision_core.characters.joint_roles import joint_limits, joint_roles
+from lcollision_core.meshes.joint_kinds import Role
 from tests.rigged_shapes import rigged_tube
 
 ARM = (Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.HAND, Role.THUMB, Role.FINGER, Role.FINGER)

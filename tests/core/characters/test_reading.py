@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from lcollision_core.characters import Character, Rig, RigPoseSpace, joint_parts, read_character
-from lcollision_core.characters.joint_roles import Role, joint_roles
+from lcollision_core.characters.joint_roles import joint_roles
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
+from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.scene_files import open_scene
 from tests.core.gltf_builder import arm, moved, rotation, tube
 

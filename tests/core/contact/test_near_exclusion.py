@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.contact import DEPTH_TOLERANCE, CollisionDetector, ContactRules
-from lcollision_core.contact import rules as rules_module
+from lcollision_core.contact import DEPTH_TOLERANCE, CollisionDetector, ContactRules, exclusions
 from lcollision_core.errors import ShapeError
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import Mesh, grid, join, random_rotation, soup, strip
@@ -195,8 +194,8 @@ def test_a_limit_that_is_no_length_is_refused(near_exclusion: float) -> None:
 def test_a_table_beyond_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = grid(30)
     all_pairs = len(mesh.vertices) * (len(mesh.vertices) - 1) // 2
-    monkeypatch.setattr(rules_module, "MAX_EXCLUDED", all_pairs)
+    monkeypatch.setattr(exclusions, "MAX_EXCLUDED", all_pairs)
     CollisionDetector(mesh.topology, mesh.vertices, rules=ContactRules(10.0))
-    monkeypatch.setattr(rules_module, "MAX_EXCLUDED", all_pairs - 1)
+    monkeypatch.setattr(exclusions, "MAX_EXCLUDED", all_pairs - 1)
     with pytest.raises(ShapeError, match=r"near exclusion .* make it smaller"):
         CollisionDetector(mesh.topology, mesh.vertices, rules=ContactRules(10.0))

@@ -15,8 +15,8 @@ from lcollision_core.contact import (
     ContactRules,
     RuleCounts,
     SelfCollisions,
+    exclusions,
 )
-from lcollision_core.contact import rules as rules_module
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import FaceGroup, Topology
 from lcollision_core.meshes.face_groups import without_joints
@@ -217,7 +217,7 @@ def test_more_touching_pairs_than_memory_holds_are_refused(
     blades = soup([FLOOR, *(np.add(BLADE, [0.01 * n, 0, 0]) for n in range(5))])
     detector = CollisionDetector(blades.topology, blades.vertices, rules)
     n_touching = detector.detect(blades.vertices).excluded.rest
-    monkeypatch.setattr(rules_module, "MAX_EXCLUDED", n_touching - 1)
+    monkeypatch.setattr(exclusions, "MAX_EXCLUDED", n_touching - 1)
     with pytest.raises(ShapeError, match="the rest exclusion excludes more than"):
         CollisionDetector(blades.topology, blades.vertices, rules)
 

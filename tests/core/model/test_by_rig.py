@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from lcollision_core import jobs
-from lcollision_core.characters.joint_roles import Role
 from lcollision_core.characters.random_poses import HUMAN, HumanDraws, random_codes
 from lcollision_core.errors import CancelledError, LCollisionError, PoseSetError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import PoseSet
+from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
 from tests.rigged_shapes import rigged_body, rigged_tube
 

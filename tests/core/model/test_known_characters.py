@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.characters.joint_roles import Role
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.meshes import ContactRules
+from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.scene_files import open_rigged
 from lcollision_core.model import (
     NamedPose,
