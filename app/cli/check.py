@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import (
-    IgnoreOption,
-    LeaveOutOption,
-    NearExclusionOption,
-    NoRulesOption,
-    RestExclusionOption,
-    RestOption,
-    RuleOptions,
-    ToleratedDepthOption,
-)
+from app.cli.contact_options import NoRulesOption, RestOption, ruled
 from app.cli.inputs import MeshesArgument, expanded
+from app.cli.options import takes_options
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
+from lcollision_core.options.contacts import RuleOptions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,16 +30,13 @@ _DEEPEST = 100
 """Most pairs of faces that are listed one by one."""
 
 
+@takes_options
 def check(
     meshes: MeshesArgument,
-    as_json: JsonOption = False,
-    near_exclusion: NearExclusionOption = None,
+    options: RuleOptions,
     rest: RestOption = None,
-    rest_exclusion: RestExclusionOption = None,
-    ignore: IgnoreOption = None,
-    leave_out: LeaveOutOption = None,
-    tolerated_depth: ToleratedDepthOption = None,
     no_rules: NoRulesOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Find the exact self-collisions of any triangle mesh.
 
@@ -55,14 +46,11 @@ def check(
     from lcollision_core.meshes import read_mesh
     from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 
-    if rest_exclusion is not None and rest is None:
+    if options.rest_exclusion is not None and rest is None:
         raise LCollisionError("--rest-exclusion needs a rest pose", "give one with --rest MESH")
     rest_mesh = None if rest is None else read_mesh(rest)
-    if rest is not None and rest_exclusion is None:
-        rest_exclusion = CHARACTER_REST_EXCLUSION
-    options = RuleOptions(
-        near_exclusion, rest_exclusion, ignore, tolerated_depth, leave_out=leave_out
-    )
+    if rest is not None and options.rest_exclusion is None:
+        options = replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
     reports: list[dict[str, Any]] = []
     failed = False
     for path in expanded(meshes):
@@ -106,11 +94,11 @@ def check_mesh(
     known = None if no_rules or rest is not None else _known(path, mesh)
     try:
         if known is not None:
-            body, vertices = options.applied_to(known[0]), known[1]
+            body, vertices = ruled(known[0], options), known[1]
             rules, detector, topology = body.rules, body.detector, body.topology
         else:
             vertices, topology = mesh.vertices, mesh.topology
-            groups = _groups(path, topology) if options.leave_out or options.ignore else ()
+            groups = _groups(path, topology) if options.name_groups else ()
             rules, groups = options.applied(STRICT, groups, topology)
             reference = vertices if rest is None else rest.vertices
             detector = CollisionDetector(topology, reference, rules, groups)

@@ -2,43 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from app.cli.console import note
-from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from lcollision_core.meshes import ContactRules, FaceGroup, Topology
+    from lcollision_core.meshes import ContactRules
     from lcollision_core.model import PosableBody
+    from lcollision_core.options.contacts import RuleOptions
 
-NearExclusionOption = Annotated[
-    float | None,
-    typer.Option(
-        min=0.0,
-        max=1.0,
-        metavar="X",
-        help="Count pairs within X body sizes along the surface separately. Default: what the "
-        "character's own rules say, else 0.",
-    ),
-]
-RestExclusionOption = Annotated[
-    float | None,
-    typer.Option(
-        min=0.0,
-        max=1.0,
-        metavar="R",
-        help="Do not count pairs that touch in the rest pose, or within R body sizes of such a "
-        "pair along the surface. 0: those pairs only.",
-    ),
-]
 RestOption = Annotated[
     Path | None,
     typer.Option(
@@ -48,111 +23,23 @@ RestOption = Annotated[
         "that touch in it are not counted.",
     ),
 ]
-IgnoreOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="A:B",
-        help="Do not count pairs between these two groups of faces: meshes, materials, body "
-        "parts or components, as in 'component 1:component 2' (component 1 has the most "
-        "faces). May be repeated.",
-    ),
-]
-LeaveOutOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME",
-        help="Leave a mesh, material, body part or component out of the check, such as a weapon "
-        "that has a stand-in. It is still posed and exported. May be repeated.",
-    ),
-]
-JointExclusionOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--joint-exclusion/--no-joint-exclusion",
-        help="Do not count pairs of parts linked by a joint where both faces are within a limb's "
-        "thickness of it. On by default for a character with joints.",
-    ),
-]
-ToleratedDepthOption = Annotated[
-    float | None,
-    typer.Option(min=0.0, max=1.0, metavar="D", help="Do not count pairs up to D body sizes deep."),
-]
 NoRulesOption = Annotated[
     bool, typer.Option("--no-rules", help="Count all pairs and ignore the character's rules.")
 ]
 
 
-@dataclass(frozen=True)
-class RuleOptions:
-    """What the options say; None leaves the rule as it is."""
+def ruled(body: PosableBody, options: RuleOptions) -> PosableBody:
+    """Return a body with these options added to its rules.
 
-    near_exclusion: float | None = None
-    rest_exclusion: float | None = None
-    ignore: Sequence[str] | None = None
-    tolerated_depth: float | None = None
-    joint_exclusion: bool | None = None
-    leave_out: Sequence[str] | None = None
-
-    def applied(
-        self,
-        rules: ContactRules,
-        groups: tuple[FaceGroup, ...],
-        topology: Topology,
-        vertex_labels: npt.NDArray[np.str_] | None = None,
-    ) -> tuple[ContactRules, tuple[FaceGroup, ...]]:
-        """Return the rules with these options, and the groups with those that they name.
-
-        Parameters
-        ----------
-        rules, groups : of the mesh or pose set
-        vertex_labels : (V,) names of body parts, where they are known
-
-        Raises
-        ------
-        LCollisionError : an ignored pair is not two names of groups, or an unknown one is left out.
-        """
-        from lcollision_core.meshes import groups_by_kind, with_named_groups
-
-        names_groups = self.ignore or self.leave_out
-        kinds = groups_by_kind(groups, topology, vertex_labels) if names_groups else {}
-        names = {group.name for kind in kinds.values() for group in kind}
-        changed = self._changed(rules, names)
-        return changed, with_named_groups(groups, kinds, changed.named_groups)
-
-    def applied_to(self, body: PosableBody) -> PosableBody:
-        """Return a body with these options added to its rules.
-
-        Raises
-        ------
-        LCollisionError : an ignored or left out group is unknown, it has no joints to leave
-            out pairs at, or a predictor depends on its rules.
-        """
-        if self.joint_exclusion and not body.has_joints:
-            what = "has no joints, which --joint-exclusion needs"
-            next_step = "leave the option out, or learn the model again from a rigged character"
-            raise LCollisionError(what, next_step, where=body.name)
-        groups = body.groups_by_kind.values() if self.ignore or self.leave_out else ()
-        rules = self._changed(body.rules, {group.name for kind in groups for group in kind})
-        return body if rules == body.rules else body.with_rules(rules)
-
-    def _changed(self, rules: ContactRules, names: Collection[str]) -> ContactRules:
-        from lcollision_core.meshes import named_group, named_pair
-
-        options = {
-            "near_exclusion": self.near_exclusion,
-            "rest_exclusion": self.rest_exclusion,
-            "joint_exclusion": self.joint_exclusion,
-            "tolerated_depth": self.tolerated_depth,
-        }
-        chosen: dict[str, Any] = {name: to for name, to in options.items() if to is not None}
-        pairs = (named_pair(entry, names) for entry in self.ignore or ())
-        left_out = (named_group(entry, names) for entry in self.leave_out or ())
-        return replace(
-            rules,
-            **chosen,
-            ignored=tuple(dict.fromkeys((*rules.ignored, *pairs))),
-            left_out=tuple(dict.fromkeys((*rules.left_out, *left_out))),
-        )
+    Raises
+    ------
+    LCollisionError : an ignored or left out group is unknown, it has no joints to leave out pairs
+        at, or a predictor depends on its rules.
+    """
+    groups = body.groups_by_kind.values() if options.name_groups else ()
+    names = {group.name for kind in groups for group in kind}
+    rules = options.changed(body.rules, names, body.has_joints, body.name)
+    return body if rules == body.rules else body.with_rules(rules)
 
 
 def note_rules(body: PosableBody) -> None:

@@ -7,33 +7,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import (
-    IgnoreOption,
-    JointExclusionOption,
-    LeaveOutOption,
-    NearExclusionOption,
-    RestExclusionOption,
-    RuleOptions,
-    ToleratedDepthOption,
-    excluded_at_rest,
-    rules_json,
-    rules_sentence,
-)
+from app.cli.contact_options import excluded_at_rest, ruled, rules_json, rules_sentence
 from app.cli.models import ModelArgument, changed_body
+from app.cli.options import takes_options
 from app.wording import counted
+from lcollision_core.options.contacts import RuleOptions
 
 if TYPE_CHECKING:
     from lcollision_core.model import ProposedRules
 
 
+@takes_options
 def contacts(
     model_name: ModelArgument,
-    near_exclusion: NearExclusionOption = None,
-    rest_exclusion: RestExclusionOption = None,
-    joint_exclusion: JointExclusionOption = None,
-    ignore: IgnoreOption = None,
-    leave_out: LeaveOutOption = None,
-    tolerated_depth: ToleratedDepthOption = None,
+    options: RuleOptions,
     ignore_proposed: Annotated[
         bool,
         typer.Option(
@@ -57,10 +44,7 @@ def contacts(
 
     before = open_body(model_name)
     body = before.with_rules(before.own_rules) if defaults else before
-    options = RuleOptions(
-        near_exclusion, rest_exclusion, ignore, tolerated_depth, joint_exclusion, leave_out
-    )
-    body = options.applied_to(body)
+    body = ruled(body, options)
     proposed = None
     if not body.has_predictor:
         with progress_bar("Looking for pairs in contact") as progress:

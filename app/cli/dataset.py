@@ -8,18 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import (
-    IgnoreOption,
-    LeaveOutOption,
-    NearExclusionOption,
-    RestExclusionOption,
-    RuleOptions,
-    ToleratedDepthOption,
-    rules_sentence,
-)
+from app.cli.contact_options import rules_sentence
 from app.cli.inputs import Axis, PoseSetArgument, up_sentence, with_rules_of_character
+from app.cli.options import takes_options
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
+from lcollision_core.options.contacts import RuleOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,15 +38,8 @@ app = typer.Typer(
 
 
 @app.command("check")
-def check(
-    path: PoseSetArgument,
-    as_json: JsonOption = False,
-    near_exclusion: NearExclusionOption = None,
-    rest_exclusion: RestExclusionOption = None,
-    ignore: IgnoreOption = None,
-    leave_out: LeaveOutOption = None,
-    tolerated_depth: ToleratedDepthOption = None,
-) -> None:
+@takes_options
+def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = False) -> None:
     """Report the topology, size, defects and self-collisions of a pose set.
 
     Exits with 1 if the set cannot be trained on: a pose is unusable, or a face of the first has
@@ -70,9 +57,6 @@ def check(
     for remark in poses.notes:
         note(f"{path}: {remark}")
     poses = with_rules_of_character(poses, path)
-    options = RuleOptions(
-        near_exclusion, rest_exclusion, ignore, tolerated_depth, leave_out=leave_out
-    )
     try:
         rules, groups = options.applied(
             poses.rules, poses.groups, poses.topology, poses.vertex_labels

@@ -2,48 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from app.cli.console import JsonOption, note, print_json, status_bar, tell
-from app.cli.contact_options import (
-    IgnoreOption,
-    LeaveOutOption,
-    NearExclusionOption,
-    RestExclusionOption,
-    ToleratedDepthOption,
-    note_rules,
-)
-from app.cli.inputs import Axis
+from app.cli.contact_options import note_rules
 from app.cli.interrupt import cancel_on_interrupt
+from app.cli.options import takes_options
 from app.wording import duration_text, error_rates, spent_text
 from lcollision_core.errors import CancelledError, LCollisionError
+from lcollision_core.options.learning import LearningRequest
 
 if TYPE_CHECKING:
     from app.cli.console import Told
     from lcollision_core.learning import LearnedCard, LearningStatus
 
 
-_QUALITY = (
-    "Time spent against accuracy: quick, 100 poses of a rig and 20 000 samples; good, 150 and "
-    "50 000, "
-    "with errors of poses left out; best, 300 and 300 000, with three times the epochs of level 2."
-)
-
-
+@takes_options
 def new(
-    sources: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE...",
-            readable=False,
-            help="Files of one character (GLB, glTF, VRM, FBX), folders of meshes, point caches "
-            "beside their mesh, .npz files.",
-        ),
-    ],
+    request: LearningRequest,
     output: Annotated[
         str,
         typer.Option(
@@ -53,38 +33,6 @@ def new(
             help="A name, to store the model with yours, or a .safetensors file.",
         ),
     ],
-    quality: Annotated[Literal["quick", "good", "best"], typer.Option(help=_QUALITY)] = "good",
-    by_rig: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            max=10_000,
-            metavar="N",
-            help="Number of random poses made by the rig. Default: as many as the clips lack.",
-        ),
-    ] = None,
-    clip: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The animation to read. Default: all.")
-    ] = None,
-    fps: Annotated[
-        float | None,
-        typer.Option(metavar="X", help="Frames per second. Default: the animation's keys."),
-    ] = None,
-    up: Annotated[
-        Axis | None, typer.Option(help="The up axis. Default: what the files say, else a guess.")
-    ] = None,
-    scale: Annotated[
-        float, typer.Option(metavar="S", help="Factor from the files' unit to the model's.")
-    ] = 1.0,
-    near_exclusion: NearExclusionOption = None,
-    rest_exclusion: RestExclusionOption = None,
-    ignore: IgnoreOption = None,
-    leave_out: LeaveOutOption = None,
-    tolerated_depth: ToleratedDepthOption = None,
-    seed: Annotated[
-        int, typer.Option(min=0, metavar="S", help="The same seed gives the same models.")
-    ] = 0,
-    licence: Annotated[str, typer.Option(help="Licence of the model.")] = "unknown",
     as_json: JsonOption = False,
 ) -> None:
     """Make a model of a character or of a body's poses: poses, latent space, labels, predictor.
@@ -93,26 +41,12 @@ def new(
     time; the same command resumes.
     """
     from app.work.learner import STOP, obeying
-    from lcollision_core.learning import LearningRequest, WorkFolder, learn_model
+    from lcollision_core.learning import WorkFolder, learn_model
     from lcollision_core.meshes import unused_name
     from lcollision_core.model import PoseModel, model_destination
 
-    request = LearningRequest(
-        tuple(str(source.absolute()) for source in sources),
-        quality,
-        by_rig,
-        clip,
-        fps,
-        None if up is None else "xyz".index(up),
-        scale,
-        near_exclusion,
-        rest_exclusion,
-        tolerated_depth,
-        None if ignore is None else tuple(ignore),
-        seed,
-        licence,
-        left_out=tuple(leave_out or ()),
-    )
+    sources = tuple(str(Path(source).absolute()) for source in request.sources)
+    request = replace(request, sources=sources)
     work = WorkFolder(model_destination(output))
     work.prepare(request)
     # What a window asked of an earlier process.

@@ -8,28 +8,25 @@ from typing import Annotated
 import typer
 
 from app.cli.console import note, progress_bar, tell
+from app.cli.contact_options import ruled
 from app.cli.inputs import MeshesArgument, PosesArgument, ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
+from app.cli.options import takes_options
 from app.cli.partial_output import unfinished_poses
 from app.cli.results import (
-    AxesOption,
-    FormatOption,
     FormOutput,
-    FpsOption,
-    LikeOption,
-    MeshStyle,
-    PoseFormOption,
     PosesOutput,
-    UnitOption,
     output_named,
-    require_mesh_style,
+    require_codes_alone,
     require_output,
-    require_style,
+    require_request,
     write_result,
 )
 from app.wording import fit_error
 from lcollision_core.errors import PoseSetError
+from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options.export import ExportRequest
 
 
 def encode(
@@ -81,16 +78,13 @@ def encode(
         tell(f"{pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}")
 
 
+@takes_options
 def decode(
     model_name: ModelArgument,
     poses: PosesArgument,
     output: FormOutput,
-    mesh_format: FormatOption = None,
-    axes: AxesOption = "model",
-    scale: UnitOption = None,
-    like: LikeOption = None,
-    form: PoseFormOption = None,
-    fps: FpsOption = 30.0,
+    request: ExportRequest,
+    rules: RuleOptions,
 ) -> None:
     """Turn latent poses into meshes; an imported pose returns to its placement.
 
@@ -104,16 +98,15 @@ def decode(
     """
     from lcollision_core.model import open_body, read_poses
 
-    destination = output_named(output, form)
-    style = MeshStyle(mesh_format, axes, scale, like, form, fps)
-    if destination.form == "poses":
-        require_mesh_style(destination, style)
-    model = open_body(model_name)
+    destination = output_named(output, request.form)
+    require_codes_alone(destination, request)
+    model = ruled(open_body(model_name), rules)
     named = read_poses(poses, model)
-    source = require_style(destination, model, named, style)
-    write_result(destination, model, named, style, source=source)
+    source = require_request(destination, model, named, request)
+    write_result(destination, model, named, request, source=source)
 
 
+@takes_options
 def sample(
     model_name: ModelArgument,
     count: Annotated[int, typer.Option("-n", min=1, max=1_000_000, help="Number of poses.")],
@@ -122,6 +115,8 @@ def sample(
         bool | None,
         typer.Option("--colliding/--free", help="Keep only such poses, by the exact check."),
     ] = None,
+    *,
+    rules: RuleOptions,
     seed: Annotated[
         int, typer.Option(min=0, metavar="S", help="The same seed gives the same poses.")
     ] = 0,
@@ -130,7 +125,7 @@ def sample(
     from lcollision_core.model import NamedPose, open_body, sample_poses
 
     destination = require_output(output, ".json")
-    model = open_body(model_name)
+    model = ruled(open_body(model_name), rules)
     for remark in model.notes:
         note(remark)
     with progress_bar("Drawing poses") as progress:

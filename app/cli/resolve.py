@@ -10,33 +10,31 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import excluded_at_rest, note_rules
+from app.cli.contact_options import excluded_at_rest, note_rules, ruled
 from app.cli.inputs import ScaleOption, ThreadsOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
+from app.cli.options import Without, takes_options
 from app.cli.partial_output import UnfinishedPoses, unfinished_poses
 from app.cli.results import (
-    FormatOption,
     FormOutput,
-    FpsOption,
-    LikeOption,
-    MeshStyle,
-    PoseFormOption,
-    WrittenFile,
     output_named,
     require_one_mesh,
-    require_style,
+    require_request,
     write_result,
 )
 from app.wording import counted, fit_error
 from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options.export import ExportRequest
+from lcollision_core.options.resolve import ResolveOptions
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.model import NamedPose, PosableBody
-    from lcollision_core.resolve import ResolveOptions, ResolveResult
+    from lcollision_core.model import NamedPose, PosableBody, WrittenPose
+    from lcollision_core.resolve import ResolveResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +46,7 @@ class _Request:
     mesh: npt.NDArray[np.float64] | None = None
 
 
+@takes_options
 def resolve(
     model_name: ModelArgument,
     inputs: Annotated[
@@ -59,23 +58,9 @@ def resolve(
         ),
     ],
     output: FormOutput,
-    solver: Annotated[
-        str, typer.Option(metavar="NAME", help="sqp, auglag (the paper's), slsqp or ccsaq.")
-    ] = "sqp",
-    metric: Annotated[
-        str,
-        typer.Option(metavar="eye|latent", help="Distance to minimise: of vertices, or of codes."),
-    ] = "eye",
-    threshold: Annotated[
-        float,
-        typer.Option(
-            metavar="P", help="Decision threshold: up to this probability a pose is predicted free."
-        ),
-    ] = 0.5,
-    margin: Annotated[
-        float | None,
-        typer.Option(metavar="X", help="How far below the threshold's logit the first step aims."),
-    ] = None,
+    options: ResolveOptions,
+    request: Annotated[ExportRequest, Without({"axes", "scale"})],
+    rules: RuleOptions,
     lock: Annotated[
         list[str] | None,
         typer.Option(
@@ -94,23 +79,7 @@ def resolve(
         typer.Option("--keep-detail", help="Restore the detail that encoding lost, if still free."),
     ] = False,
     scale: ScaleOption = 1.0,
-    no_verify: Annotated[
-        bool, typer.Option("--no-verify", help="Return the solver's answer, unchecked.")
-    ] = False,
-    time_budget: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS", help="Search time per pose; after that, a known free pose is used."
-        ),
-    ] = None,
     workers: ThreadsOption = None,
-    seed: Annotated[
-        int, typer.Option(min=0, metavar="S", help="Seed of the solver's restarts.")
-    ] = 0,
-    mesh_format: FormatOption = None,
-    like: LikeOption = None,
-    form: PoseFormOption = None,
-    fps: FpsOption = 30.0,
     as_json: JsonOption = False,
 ) -> None:
     """Move poses to the nearest ones that are free of self-collisions.
@@ -129,23 +98,16 @@ def resolve(
     import numpy as np
 
     from lcollision_core.model import open_body
-    from lcollision_core.resolve import ResolveOptions, largest_correction_change
+    from lcollision_core.resolve import largest_correction_change
 
-    model = open_body(model_name)
-    options = ResolveOptions(
-        solver=solver,
-        metric=metric,
-        threshold=threshold,
-        margin=margin,
+    model = ruled(open_body(model_name), rules)
+    options = replace(
+        options,
         locked_domains=frozenset(_domain(model, name) for name in lock or ()),
         group_weights=_group_weights(model, weight or ()),
-        time_budget=time_budget,
-        verify=not no_verify,
-        seed=seed,
     )
     resolver = model.resolver
-    target = output_named(output, form)
-    style = MeshStyle(mesh_format, like=like, form=form, fps=fps)
+    target = output_named(output, request.form)
     if keep_detail and target.form == "poses":
         raise LCollisionError(
             "would contain codes; --keep-detail applies only to meshes",
@@ -159,7 +121,7 @@ def resolve(
     if not requests:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     require_one_mesh(target, len(requests))
-    source = require_style(target, model, [request.pose for request in requests], style)
+    source = require_request(target, model, [held.pose for held in requests], request)
     with (
         unfinished_poses(
             target.path, model, *_depends_on(model, requests, options, sequence), len(requests)
@@ -174,12 +136,12 @@ def resolve(
 
         with progress_bar("Resolving poses") as progress:
             results = resolver.resolve_many(
-                np.array([request.pose.latent for request in requests]),
+                np.array([held.pose.latent for held in requests]),
                 options,
                 workers,
                 progress,
                 cancel,
-                placements=[request.pose.placement for request in requests],
+                placements=[held.pose.placement for held in requests],
                 sequence=sequence,
                 done=finished,
                 keep=keep,
@@ -189,7 +151,7 @@ def resolve(
             target,
             model,
             [replace(r.pose, latent=f.latent) for r, f in zip(requests, results, strict=True)],
-            style,
+            request,
             [
                 result.vertices if mesh is None else mesh
                 for result, mesh in zip(results, detailed, strict=True)
@@ -198,22 +160,22 @@ def resolve(
         )
     rows: list[dict[str, Any]] = []
     at_rest = excluded_at_rest(model)
-    for request, result, file, mesh in zip(requests, results, written, detailed, strict=True):
+    for held, result, file, mesh in zip(requests, results, written, detailed, strict=True):
         if result.note:
-            note(f"{request.source}: {result.note}")
-        row = {"source": request.source, "output": str(file.path), **_facts(result)}
+            note(f"{held.source}: {result.note}")
+        row = {"source": held.source, "output": str(file.path), **_facts(result)}
         del row["converged"], row["note"]
         rows.append(
             row | {"near_exclusion": model.rules.near_exclusion, "excluded_at_rest": at_rest}
         )
         if not as_json:
-            tell(f"{request.source}: {_sentence(request, result, mesh is not None)}")
+            tell(f"{held.source}: {_sentence(held, result, mesh is not None)}")
     if as_json:
         print_json(rows)
     else:
         note_rules(model)
     if sequence:
-        before = np.array([request.pose.latent for request in requests])
+        before = np.array([held.pose.latent for held in requests])
         change = largest_correction_change(model.space.decode, before, results)
         note(
             f"from frame to frame the correction changes by at most {100.0 * change:.3f} % of "
@@ -378,13 +340,13 @@ def _stay_free(
     model: PosableBody,
     requests: Sequence[_Request],
     results: Sequence[ResolveResult],
-    written: Sequence[WrittenFile],
+    written: Sequence[WrittenPose],
 ) -> bool:
     """Check free poses as the user's own file holds them, and say where rounding made contact."""
     stay_free = True
     for request, result, file in zip(requests, results, written, strict=True):
-        if result.exactly_free and file.mesh is not None:
-            n_pairs = len(file.mesh.checked(model).pairs)
+        if result.exactly_free and file.vertices is not None:
+            n_pairs = len(file.checked(model).pairs)
             if n_pairs:
                 stay_free = False
                 pairs = counted(n_pairs, "pair of faces collides", "pairs of faces collide")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,6 +12,7 @@ import typer
 from app.cli.console import note
 from app.wording import counted
 from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.options.export import MODELS_OWN, ExportAxes, ExportRequest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,12 +23,6 @@ if TYPE_CHECKING:
     from lcollision_core.meshes import FileStamp
     from lcollision_core.model import NamedPose, PosableBody, SourceFile, WrittenPose
 
-
-MeshFormat = Literal["obj", "ply", "off", "stl", "glb"]
-MeshAxes = Literal["model", "y-up", "blender", "maya", "unreal"]
-"""The axes that a mesh may be written in: `ExportAxes`, which takes long to import."""
-PoseForm = Literal["joints", "mesh", "morph", "clip"]
-"""How a character's file holds a pose: `CharacterForm`, which takes long to import."""
 
 PosesOutput = Annotated[
     Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
@@ -42,95 +37,6 @@ FormOutput = Annotated[
         "frames, or a .json file.",
     ),
 ]
-FormatOption = Annotated[
-    MeshFormat | None,
-    typer.Option(
-        "--format",
-        help="Format of the meshes in a folder. Default: obj; glb with --like and for a character.",
-    ),
-]
-LikeOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--like",
-        metavar="FILE",
-        readable=False,
-        help="Your own OBJ, GLB or VRM file of this body: the output is that file in another "
-        "pose, or point caches of its meshes. Default for a character: its own file.",
-    ),
-]
-PoseFormOption = Annotated[
-    PoseForm | None,
-    typer.Option(
-        "--form",
-        help="How a GLB stores the pose: turned joints, a static mesh or a morph target; or all "
-        "poses as the frames of a clip. Default: joints if the pose came from joints, else "
-        "mesh.",
-    ),
-]
-AxesOption = Annotated[
-    MeshAxes, typer.Option(help="Use this program's axes, and its unit if the model is in metres.")
-]
-UnitOption = Annotated[
-    float | None,
-    typer.Option(
-        "--scale",
-        min=1e-6,
-        max=1e6,
-        metavar="X",
-        help="File units per model unit. Default: 100 for maya and unreal, else 1.",
-    ),
-]
-FpsOption = Annotated[
-    float,
-    typer.Option(
-        min=0.01, max=1000.0, metavar="N", help="Frames per second of a clip or an .mdd file."
-    ),
-]
-
-
-@dataclass(frozen=True)
-class MeshStyle:
-    """How meshes are written.
-
-    Attributes
-    ----------
-    mesh_format : of the meshes in a folder, None for that of `like` or of a character, else obj
-    axes, scale : see `export_frame`
-    like : the user's file whose form they keep
-    form : how a character's file holds a pose
-    fps : frames a second of a point cache
-    """
-
-    mesh_format: MeshFormat | None = None
-    axes: MeshAxes = "model"
-    scale: float | None = None
-    like: Path | None = None
-    form: PoseForm | None = None
-    fps: float = 30.0
-
-    def suffix(self, output: Output, model: PosableBody) -> str:
-        """Return the extension of the files that an output of meshes of a model gets."""
-        from lcollision_core.characters import PATCHED_SUFFIXES
-        from lcollision_core.model import RigModel
-
-        if output.form != "folder":
-            return output.path.suffix.lower()
-        like = self.like
-        # A GLB file has axes and a unit of its own.
-        is_as_stored = self.axes == "model" and self.scale is None
-        if like is None and is_as_stored and isinstance(model, RigModel):
-            like = model.character.source
-        is_like_glb = like is not None and like.suffix.lower() in PATCHED_SUFFIXES
-        return f".{self.mesh_format or ('glb' if is_like_glb else 'obj')}"
-
-
-@dataclass(frozen=True, eq=False)
-class WrittenFile:
-    """Where a pose was written, and what a mesh file holds of it."""
-
-    path: Path
-    mesh: WrittenPose | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +55,22 @@ class Output:
     before: FileStamp | None
 
 
+def suffix_of(output: Output, model: PosableBody, request: ExportRequest) -> str:
+    """Return the extension of the files that an output of meshes of a model gets."""
+    from lcollision_core.characters import PATCHED_SUFFIXES
+    from lcollision_core.model import RigModel
+
+    if output.form != "folder":
+        return output.path.suffix.lower()
+    like = request.like
+    # A GLB file has axes and a unit of its own.
+    is_as_stored = request.axes == ExportAxes.MODEL and request.scale is None
+    if like is None and is_as_stored and isinstance(model, RigModel):
+        like = model.character.source
+    is_like_glb = like is not None and like.suffix.lower() in PATCHED_SUFFIXES
+    return f".{request.mesh_format or ('glb' if is_like_glb else 'obj')}"
+
+
 def require_output(path: Path, suffix: str) -> Output:
     """Refuse an output that is not one file of a format, before the work for it is done.
 
@@ -164,7 +86,7 @@ def require_output(path: Path, suffix: str) -> Output:
     return Output(path, "poses", file_stamp(path))
 
 
-def output_named(name: str, pose_form: PoseForm | None = None) -> Output:
+def output_named(name: str, pose_form: str | None = None) -> Output:
     """Determine the form of an output, before the work for it is done.
 
     An existing folder and what ends in a slash are folders whatever they are called; else the
@@ -226,14 +148,15 @@ def require_one_mesh(output: Output, n_poses: int) -> None:
         )
 
 
-def require_mesh_style(output: Output, style: MeshStyle) -> None:
+def require_codes_alone(output: Output, request: ExportRequest) -> None:
     """Refuse options of meshes where the output holds codes.
 
     Raises
     ------
     LCollisionError : one is given.
     """
-    if output.form == "poses" and style != MeshStyle(style.mesh_format, fps=style.fps):
+    for_any = ExportRequest(mesh_format=request.mesh_format, fps=request.fps)
+    if output.form == "poses" and request != for_any:
         raise LCollisionError(
             "would contain codes; --axes, --scale, --like and --form apply only to meshes",
             "name a mesh or a folder",
@@ -241,10 +164,10 @@ def require_mesh_style(output: Output, style: MeshStyle) -> None:
         )
 
 
-def require_style(
-    output: Output, model: PosableBody, poses: Sequence[NamedPose], style: MeshStyle
+def require_request(
+    output: Output, model: PosableBody, poses: Sequence[NamedPose], request: ExportRequest
 ) -> SourceFile | None:
-    """Refuse a style that the output or the poses cannot have, before the work for it is done.
+    """Refuse a request that the output or the poses cannot have, before the work for it is done.
 
     Returns
     -------
@@ -260,18 +183,19 @@ def require_style(
     from lcollision_core.meshes import as_stored
     from lcollision_core.model import source_for
 
-    require_mesh_style(output, style)
+    require_codes_alone(output, request)
     if output.form == "poses":
         return None
-    suffix = style.suffix(output, model)
-    source = source_for(suffix, model, style.like)
+    suffix = suffix_of(output, model, request)
+    source = source_for(suffix, model, request.like)
     if source is not None:
-        source.require_form(f"{output.path}{suffix if output.form == 'folder' else ''}", style.form)
+        path = f"{output.path}{suffix if output.form == 'folder' else ''}"
+        source.require_form(path, request.form)
     for pose in poses:
         if pose.placement is not None:
             name = f"{pose.name}{suffix}"
-            path = output.path / name if output.form == "folder" else output.path
-            as_stored(path, pose.placement.apply(model.reference), model.topology)
+            file = output.path / name if output.form == "folder" else output.path
+            as_stored(file, pose.placement.apply(model.reference), model.topology)
     return source
 
 
@@ -279,10 +203,10 @@ def write_result(
     output: Output,
     model: PosableBody,
     poses: Sequence[NamedPose],
-    style: MeshStyle | None = None,
+    request: ExportRequest = MODELS_OWN,
     vertices: Sequence[npt.NDArray[np.floating]] | None = None,
     source: SourceFile | None = None,
-) -> list[WrittenFile]:
+) -> list[WrittenPose]:
     """Write poses as a .json file, meshes or frames, and say so.
 
     One pose is a mesh, several are meshes in a folder: all of them come there, or none. A file
@@ -293,51 +217,46 @@ def write_result(
     output : a folder is made where there is none
     model : of the poses
     poses : a pose with a placement returns to it
-    style : of meshes
+    request : of meshes
     vertices : of each pose, (V, 3) to write; what the poses decode to where None
-    source : the user's file whose form is kept, by `require_style`
+    source : the user's file whose form is kept, by `require_request`
 
     Returns
     -------
-    files : of each pose; one file may have several
+    written : of each pose; one file may have several
 
     Raises
     ------
     LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
     from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, unused_name
-    from lcollision_core.model import sequence_files, write_pose, write_poses, write_sequence
+    from lcollision_core.model import (
+        WrittenPose,
+        sequence_files,
+        write_pose,
+        write_poses,
+        write_sequence,
+    )
 
     require_one_mesh(output, len(poses))
-    style = style or MeshStyle()
     decoded = (model.exported_vertices(pose.latent, pose.placement) for pose in poses)
 
     def write(files: Sequence[Path]) -> list[WrittenPose]:
         return [
-            write_pose(
-                file,
-                model,
-                pose.latent,
-                mesh,
-                pose.placement,
-                source=source,
-                form=style.form,
-                axes=style.axes,
-                scale=style.scale,
-            )
+            write_pose(file, model, pose.latent, mesh, pose.placement, request, source=source)
             for file, pose, mesh in zip(files, poses, vertices or decoded, strict=True)
         ]
 
     path = output.path
     if output.form == "folder":
-        suffix = style.suffix(output, model)
+        suffix = suffix_of(output, model, request)
         names = [f"{stem}{suffix}" for stem in file_stems(pose.name for pose in poses)]
         n_replaced = sum((path / name).exists() for name in names)
         with atomic_files(path) as unfinished:
             in_folder = write([unfinished / name for name in names])
         _tell_written(path, len(poses), n_replaced, in_folder)
         _remember(model, output)
-        return [WrittenFile(path / name, mesh) for name, mesh in zip(names, in_folder, strict=True)]
+        return [replace(pose, path=path / pose.path.name) for pose in in_folder]
     with locked(path):
         n_replaced = int(path.exists())
         if n_replaced and file_stamp(path) != output.before:
@@ -349,6 +268,7 @@ def write_result(
         meshes: list[WrittenPose] = []
         if output.form == "poses":
             write_poses(path, model, poses)
+            meshes = [WrittenPose(path)] * len(poses)
         elif output.form == "frames":
             targets = sequence_files(path, model, source)
             n_replaced = sum(target.exists() for target in targets)
@@ -357,10 +277,8 @@ def write_result(
                 model,
                 [pose.latent for pose in poses],
                 list(vertices or decoded),
+                request,
                 source=source,
-                axes=style.axes,
-                scale=style.scale,
-                fps=style.fps,
             )
             path = files[0]
             for file in files[1:]:
@@ -369,9 +287,7 @@ def write_result(
             meshes = write([path])
     _tell_written(path, len(poses), n_replaced, meshes)
     _remember(model, output)
-    if output.form == "poses":
-        return [WrittenFile(path)] * len(poses)
-    return [WrittenFile(path, mesh) for mesh in meshes]
+    return meshes
 
 
 def _remember(model: PosableBody, output: Output) -> None:

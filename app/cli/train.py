@@ -12,14 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from app.cli.console import note, status_bar
-from app.cli.contact_options import (
-    IgnoreOption,
-    LeaveOutOption,
-    NearExclusionOption,
-    RestExclusionOption,
-    RuleOptions,
-    ToleratedDepthOption,
-)
 from app.cli.evaluate import StoreArgument, open_store, scores_sentence
 from app.cli.inputs import (
     Axis,
@@ -36,9 +28,11 @@ from app.cli.models import (
     measured_model_sentence,
     note_if_beside,
 )
+from app.cli.options import takes_options
 from app.wording import error_rates
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken
+from lcollision_core.options.contacts import RuleOptions
 
 if TYPE_CHECKING:
     from app.cli.console import Told
@@ -60,6 +54,7 @@ OutputOption = Annotated[
 
 
 @app.command("embedding")
+@takes_options
 def embedding(
     dataset: PoseSetArgument,
     output: OutputOption,
@@ -72,11 +67,8 @@ def embedding(
             "--domain-codes", min=1, max=64, metavar="k", help="Number of codes per domain."
         ),
     ] = 10,
-    near_exclusion: NearExclusionOption = None,
-    rest_exclusion: RestExclusionOption = None,
-    ignore: IgnoreOption = None,
-    leave_out: LeaveOutOption = None,
-    tolerated_depth: ToleratedDepthOption = None,
+    *,
+    options: RuleOptions,
     up: Annotated[
         Axis | None,
         typer.Option(help="The up axis. Default: what the set says, else a guess."),
@@ -115,9 +107,6 @@ def embedding(
     poses = replace(poses, up_axis=guess.axis if up is None else "xyz".index(up))
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
-    options = RuleOptions(
-        near_exclusion, rest_exclusion, ignore, tolerated_depth, leave_out=leave_out
-    )
     rules, groups = options.applied(poses.rules, poses.groups, poses.topology, poses.vertex_labels)
     poses = replace(poses, rules=rules, groups=groups)
     config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)

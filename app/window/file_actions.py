@@ -310,7 +310,7 @@ class FileActions(QObject):
         export = partial(jobs.export, document.model, document.pose, document.outcome)
         form = ExportDialog(self.settings, self._window, document.model)
         accepted = form.exec() == QDialog.DialogCode.Accepted
-        kinds, style = form.kinds, form.export_style
+        kinds, style = form.kinds, form.export_request
         form.deleteLater()
         path = self.ask_save("Export mesh", self._name, kinds) if accepted else None
         if path is not None:

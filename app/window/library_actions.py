@@ -216,7 +216,7 @@ class LibraryActions(QObject):
         rate = model.frame_rate if any(pose.name in of_clips for pose in poses) else None
         form = MotionDialog(self._files.settings, self._window, model, rate)
         accepted = form.exec() == QDialog.DialogCode.Accepted
-        kinds, style = form.kinds, form.export_style
+        kinds, style = form.kinds, form.export_request
         form.deleteLater()
         path = self._files.ask_save("Export motion", poses[0].name, kinds) if accepted else None
         if path is None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from lcollision_core.meshes import FileStamp, RigidTransform
     from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.model import (
+        ExportRequest,
         MirroredPose,
         NamedPose,
         OtherModelError,
@@ -92,25 +93,6 @@ class PartEdits:
     colours: dict[int, str]
     order: tuple[int, ...] | None = None
     copy_name: str | None = None
-
-
-@dataclass(frozen=True)
-class ExportStyle:
-    """How poses are written as meshes.
-
-    Attributes
-    ----------
-    axes, scale : see `export_frame`
-    like : the user's file whose form is kept; None for a character's own where that can be written
-    form : the key of one of the forms that it offers; None for the best
-    fps : frames a second of a motion
-    """
-
-    axes: str = "model"
-    scale: float | None = None
-    like: Path | None = None
-    form: str | None = None
-    fps: float = 30.0
 
 
 def open_model(
@@ -249,7 +231,7 @@ def export(
     pose: NamedPose,
     outcome: ResolveResult | None,
     path: Path,
-    style: ExportStyle,
+    request: ExportRequest,
     _: Progress,
     __: CancelToken,
 ) -> str:
@@ -271,10 +253,8 @@ def export(
         pose.latent,
         vertices,
         placement,
-        source=source_for(path.suffix, model, style.like),
-        form=style.form,
-        axes=style.axes,
-        scale=style.scale,
+        request,
+        source=source_for(path.suffix, model, request.like),
     )
     found = written.checked(model)
     n_pairs = len(found.pairs)
@@ -285,19 +265,19 @@ def export(
 
 
 def motion_files(
-    model: PosableBody, path: Path, style: ExportStyle, _: Progress, __: CancelToken
+    model: PosableBody, path: Path, request: ExportRequest, _: Progress, __: CancelToken
 ) -> list[Path]:
     """Return the files that `export_motion` writes: one for each mesh of the user's file."""
     from lcollision_core.model import sequence_files, source_for
 
-    return list(sequence_files(path, model, source_for(path.suffix, model, style.like)))
+    return list(sequence_files(path, model, source_for(path.suffix, model, request.like)))
 
 
 def export_motion(
     model: PosableBody,
     poses: Sequence[NamedPose],
     path: Path,
-    style: ExportStyle,
+    request: ExportRequest,
     progress: Progress,
     cancel: CancelToken,
 ) -> str:
@@ -316,10 +296,8 @@ def export_motion(
         model,
         [pose.latent for pose in poses],
         frames,
-        source=source_for(path.suffix, model, style.like),
-        axes=style.axes,
-        scale=style.scale,
-        fps=style.fps,
+        request,
+        source=source_for(path.suffix, model, request.like),
     )
     n_colliding = 0
     for done, frame in enumerate(written, 1):

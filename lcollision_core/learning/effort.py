@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.options.learning import Quality
 from lcollision_core.predictor import PRESETS, PredictorConfig
-
-
-class Quality(StrEnum):
-    """How much time is spent for how good a model."""
-
-    QUICK = "quick"
-    GOOD = "good"
-    BEST = "best"
 
 
 @dataclass(frozen=True)

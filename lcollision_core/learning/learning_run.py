@@ -15,8 +15,9 @@ import numpy as np
 
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.json_values import to_json
 from lcollision_core.learning.card import LearnedCard, card_of
-from lcollision_core.learning.effort import EFFORTS, Effort, Quality
+from lcollision_core.learning.effort import EFFORTS, Effort
 from lcollision_core.learning.estimate import estimated_seconds
 from lcollision_core.learning.rules_of_poses import with_proposed_rules
 from lcollision_core.learning.sources import gather_poses
@@ -24,6 +25,7 @@ from lcollision_core.learning.status import STAGES, LearningStatus, Pace, Stage,
 from lcollision_core.learning.work_folder import WorkFolder, WorkState, WorkStatus
 from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
 from lcollision_core.model import PoseModel, save_trained
+from lcollision_core.options.learning import Quality
 
 if TYPE_CHECKING:
     from lcollision_core.embedding.training_run import TrainingStatus
@@ -185,7 +187,7 @@ class _Learner:
                 "notes": list(poses.notes),
                 "program": f"lcollision {version('lcollision')}",
                 "command": "new",
-                "request": request.to_json(),
+                "request": to_json(request),
                 "poses_sha256": hashlib.sha256(
                     np.ascontiguousarray(poses.vertices).tobytes()
                 ).hexdigest(),

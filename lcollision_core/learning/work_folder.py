@@ -10,7 +10,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,13 @@ from lcollision_core.errors import (
     MeshFileError,
     ModelFileError,
 )
-from lcollision_core.json_values import from_json, parse_json
-from lcollision_core.learning.request import LearningRequest
+from lcollision_core.json_values import from_json, parse_json, to_json
 from lcollision_core.learning.status import LearningStatus, Stage
-from lcollision_core.meshes import atomic_write, locked
+from lcollision_core.meshes import atomic_write, file_stamp, locked
 from lcollision_core.model import PoseModel, list_models, user_models_folder
 from lcollision_core.model.model_store import MODEL_SUFFIX, WORK_SUFFIX, work_path
+from lcollision_core.model_file import digest_of
+from lcollision_core.options.learning import LearningRequest
 from lcollision_core.regular_files import read_regular
 
 _VERSION = 1
@@ -141,7 +142,7 @@ class WorkFolder:
         ModelFileError : there is a model of that name, or another is being learned.
         MeshFileError : it cannot be written.
         """
-        request = request.stamped()
+        request = stamped(request)
         names = {model.name for model in list_models() if model.bundled}
         is_listed = self.destination.parent == user_models_folder()
         if not self.path.is_dir() and (
@@ -165,7 +166,7 @@ class WorkFolder:
                         f"choose another name, or remove {self.path}",
                     )
                 (self.path / "status.json").unlink(missing_ok=True)
-            self._write("request.json", request.to_json())
+            self._write("request.json", to_json(request))
 
     def made(self, request: LearningRequest) -> PoseModel | None:
         """Return the model that came of a request, None if there is none of that name.
@@ -177,7 +178,11 @@ class WorkFolder:
         if not self.destination.exists():
             return None
         model = PoseModel.load(self.destination)
-        if model.card.provenance.get("request") != request.to_json():
+        try:
+            held = from_json(LearningRequest, model.card.provenance.get("request"), "request")
+        except (ValueError, LCollisionError) as error:
+            raise self._taken() from error
+        if held != request:
             raise self._taken()
         return model
 
@@ -199,7 +204,7 @@ class WorkFolder:
         """
         path = self.path / "request.json"
         try:
-            return LearningRequest.of_json(self._read(path))
+            return from_json(LearningRequest, self._read(path), "request")
         except (OSError, ValueError, LCollisionError) as error:
             raise ModelFileError.unreadable(path, error, f"remove {self.path}") from error
 
@@ -276,6 +281,18 @@ class WorkFolder:
         content = json.dumps({"version": _VERSION, **values}, indent=1)
         with atomic_write(self.path / name) as file:
             file.write(content.encode())
+
+
+def stamped(request: LearningRequest) -> LearningRequest:
+    """Return the same request with the sizes and times of its sources as they are now."""
+    return replace(request, stamps=tuple(_stamp(Path(source)) for source in request.sources))
+
+
+def _stamp(path: Path) -> str:
+    """Return what changes with a file, or with the files of a folder; "" if there is none."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    found = [(file.name, *(file_stamp(file) or ())[2:]) for file in files]
+    return digest_of(json.dumps(found), {})[:16] if path.exists() else ""
 
 
 def list_work() -> tuple[WorkFolder, ...]:

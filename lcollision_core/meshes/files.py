@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.mesh_formats import MESH_FORMATS
 from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.formats import gltf, obj, off, ply, stl
 from lcollision_core.meshes.formats.polygons import MAX_FACES, Polygons, with_order_of
 from lcollision_core.meshes.formats.scene import Scene
 from lcollision_core.meshes.formats.triangulation import triangulate
@@ -28,18 +28,11 @@ from lcollision_core.meshes.scene_files import (
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.regular_files import open_regular
 
-READABLE_SUFFIXES = (".obj", ".ply", ".off", ".stl", *SCENE_SUFFIXES)
-"""Extensions that `read_mesh` reads, in lower case."""
-
-_ENCODERS: dict[str, Callable[[npt.NDArray[Any], npt.NDArray[np.int32]], bytes]] = {
-    ".obj": obj.encode,
-    ".ply": ply.encode,
-    ".off": off.encode,
-    ".stl": stl.encode,
-    ".glb": gltf.encode,
-}
-WRITABLE_SUFFIXES = tuple(_ENCODERS)
+WRITABLE_SUFFIXES = tuple(f".{name}" for name in MESH_FORMATS)
 """Extensions that `write_mesh` writes, in lower case."""
+
+READABLE_SUFFIXES = (*(s for s in WRITABLE_SUFFIXES if s not in SCENE_SUFFIXES), *SCENE_SUFFIXES)
+"""Extensions that `read_mesh` reads, in lower case."""
 
 _REORDERED = "vertices that had been split were put back into the set's vertex order"
 
@@ -136,18 +129,18 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
                 f"{suffix or 'a name without extension'} is not a known mesh format",
                 f"use one of {', '.join(READABLE_SUFFIXES)}",
             )
-        size = os.fstat(file.fileno()).st_size
-        if size == 0:
+        if os.fstat(file.fileno()).st_size == 0:
             raise MeshFileError("it is empty")
-        if suffix == ".obj":
-            return obj.read(file)
-        if suffix == ".ply":
-            return ply.read(file)
-        if suffix == ".off":
-            return off.read(file)
-        if suffix == ".stl":
-            return stl.read(file, size, topology)
-        return _rest_pose(scene_of(document_of(file, path)), topology)
+        if suffix in SCENE_SUFFIXES:
+            return _rest_pose(scene_of(document_of(file, path)), topology)
+        polygons: Polygons = _module_of(suffix).read(file, topology)
+        return polygons
+
+
+def _module_of(suffix: str) -> Any:
+    """Return the module of a format: its `read` and `encode`."""
+    name = suffix.removeprefix(".")
+    return import_module(f"lcollision_core.meshes.formats.{MESH_FORMATS[name].module or name}")
 
 
 def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
@@ -234,7 +227,7 @@ def write_mesh(
         the format cannot hold the mesh: see `as_stored`.
     """
     suffix = Path(path).suffix.lower()
-    if suffix not in _ENCODERS:
+    if suffix not in WRITABLE_SUFFIXES:
         raise MeshFileError.unwritable(
             path,
             f"{suffix or 'a name without extension'} is not a known mesh format",
@@ -255,7 +248,7 @@ def write_mesh(
     points = as_stored(path, points, topology)
     if suffix == ".glb" and up is not None:
         points = points @ _turn_to_y(up).astype(points.dtype).T
-    data = _ENCODERS[suffix](points, topology.faces)
+    data = _module_of(suffix).encode(points, topology.faces)
     with atomic_write(path) as file:
         file.write(data)
 

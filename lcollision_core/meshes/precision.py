@@ -10,9 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.mesh_formats import MESH_FORMATS
 from lcollision_core.meshes.topology import Topology
 
-SINGLE_PRECISION = (".stl", ".glb", ".vrm", ".pc2", ".mdd")
+SINGLE_PRECISION = (
+    *(f".{name}" for name, held in MESH_FORMATS.items() if held.is_single),
+    *(".vrm", ".pc2", ".mdd"),
+)
 """Formats that hold only float32; the others hold either precision."""
 
 LARGEST_RATIO = 0.01

@@ -5,8 +5,6 @@ from lcollision_core.model.card import ModelCard
 from lcollision_core.model.encode import encode_mesh, read_model_mesh, with_detail
 from lcollision_core.model.encoded_pose import EncodedPose
 from lcollision_core.model.export import (
-    ExportAxes,
-    ExportFrame,
     export_frame,
     export_mesh,
     export_scale,
@@ -62,3 +60,4 @@ from lcollision_core.model.source_file import (
     write_pose,
     write_sequence,
 )
+from lcollision_core.options.export import ExportAxes, ExportRequest

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +11,10 @@ import numpy.typing as npt
 
 from lcollision_core.meshes import RigidTransform, as_stored, write_mesh
 from lcollision_core.model.posable_body import PosableBody
+from lcollision_core.options.export import ExportAxes
 
 _AXES = np.eye(3)
 _X, _Y, _Z = _AXES
-
-
-class ExportAxes(StrEnum):
-    """For which program a mesh is written: its axes, and its unit.
-
-    Each is what the program's own importer, with its default settings, puts upright and facing
-    its front: Blender's turns an OBJ file from y up to z up and leaves PLY and STL unchanged;
-    Maya takes y up and centimetres; Unreal takes centimetres and z up, x forward, and itself
-    turns y round, as its axes are left-handed.
-    """
-
-    MODEL = "model"
-    Y_UP = "y-up"
-    BLENDER = "blender"
-    MAYA = "maya"
-    UNREAL = "unreal"
 
 
 _UNITS_IN_A_METRE = {
@@ -42,28 +25,6 @@ _UNITS_IN_A_METRE = {
 
 _ALREADY_FIXED = (".glb", ".vrm")
 """glTF's own axes and unit are y up, z forward and the metre."""
-
-
-@dataclass(frozen=True, eq=False)
-class ExportFrame:
-    """Axes and unit of a file, relative to those of the model.
-
-    Attributes
-    ----------
-    turn : (3, 3) float64 array, by right angles
-    scale : the file's units in one of the model's
-    """
-
-    turn: npt.NDArray[np.float64]
-    scale: float
-
-    def apply(self, vertices: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-        """Bring (..., 3) vertices into the file's axes and unit.
-
-        A scale of few digits is exact for float32 vertices.
-        """
-        turned: npt.NDArray[np.float64] = np.asarray(vertices, np.float64) @ self.turn.T
-        return turned * self.scale
 
 
 def export_scale(model: PosableBody, axes: str) -> float:
@@ -78,8 +39,8 @@ def export_frame(
     path: str | os.PathLike[str],
     scale: float | None = None,
     placement: RigidTransform | None = None,
-) -> ExportFrame:
-    """Return the axes and the unit that a file gets.
+) -> RigidTransform:
+    """Return what brings a mesh into the axes, by right angles, and the unit that its file gets.
 
     Parameters
     ----------
@@ -92,10 +53,12 @@ def export_frame(
     chosen = ExportAxes(axes)
     suffix = Path(path).suffix.lower()
     if suffix in _ALREADY_FIXED:
-        return ExportFrame(np.eye(3), model.card.metres if placement is None else 1.0)
+        return RigidTransform(
+            np.eye(3), np.zeros(3), model.card.metres if placement is None else 1.0
+        )
     factor = export_scale(model, axes) if scale is None else scale
     if chosen is ExportAxes.MODEL:
-        return ExportFrame(np.eye(3), factor)
+        return RigidTransform(np.eye(3), np.zeros(3), factor)
     up, front = _Y, _Z
     if chosen is ExportAxes.UNREAL:
         up, front = _Z, _X
@@ -105,7 +68,7 @@ def export_frame(
     own = np.stack([own_up, own_front, np.cross(own_up, own_front)])
     turn = np.stack([up, front, np.cross(up, front)]).T @ own
     # Adding 0 leaves no -0 behind.
-    return ExportFrame(turn + 0.0, factor)
+    return RigidTransform(turn + 0.0, np.zeros(3), factor)
 
 
 def export_mesh(
@@ -113,7 +76,7 @@ def export_mesh(
     model: PosableBody,
     vertices: npt.NDArray[Any],
     placement: RigidTransform | None = None,
-    frame: ExportFrame | None = None,
+    frame: RigidTransform | None = None,
 ) -> npt.NDArray[Any]:
     """Write a pose's mesh, upright where the format says which way is up, unless it has a place.
 

@@ -37,6 +37,7 @@ from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.model.export import export_frame, export_mesh
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.rig_model import RigModel
+from lcollision_core.options.export import MODELS_OWN, ExportRequest
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -153,21 +154,24 @@ def offered_forms(
 
 @dataclass(frozen=True, eq=False)
 class WrittenPose:
-    """What readers of a file get of a pose, to be checked as that.
+    """Where a pose was written, and what readers of the file get of it, to be checked as that.
 
     Attributes
     ----------
-    vertices : (V, 3) array, in the axes and the unit of the file
+    path : of the file
+    vertices : (V, 3) array, in the axes and the unit of the file; None of a file of codes
     unit : the body's units in one of the file's
     notes : sentences on what was left out of the file
     """
 
-    vertices: npt.NDArray[Any]
-    unit: float
+    path: Path
+    vertices: npt.NDArray[Any] | None = None
+    unit: float = 1.0
     notes: tuple[str, ...] = ()
 
     def checked(self, body: PosableBody) -> SelfCollisions:
-        """Return what the exact check finds in what the file holds, by the body's rules."""
+        """Return what the exact check finds in a mesh as the file holds it, by the body's rules."""
+        assert self.vertices is not None
         return body.detector.detect(self.vertices, unit=self.unit)
 
 
@@ -393,11 +397,9 @@ def write_pose(
     latent: npt.NDArray[Any],
     vertices: npt.NDArray[Any],
     placement: RigidTransform | None = None,
+    request: ExportRequest = MODELS_OWN,
     *,
     source: SourceFile | None = None,
-    form: str | None = None,
-    axes: str = "model",
-    scale: float | None = None,
 ) -> WrittenPose:
     """Write one pose as a mesh or in the user's own file, whole or not at all.
 
@@ -408,26 +410,26 @@ def write_pose(
     latent : (D,) its codes
     vertices : (V, 3) array, in the body's unit, placed for export
     placement : that was applied to them
+    request : axes, scale and form
     source : the user's file, by `source_for`; None for a mesh of the body's own
-    form : the key of one of the source's forms; None for the best
-    axes, scale : see `export_frame`
 
     Raises
     ------
     MeshFileError : the file cannot be written, or cannot hold the pose there or in that form.
     """
-    frame = export_frame(body, axes, path, scale, placement)
+    form, target = request.form, Path(path)
+    frame = export_frame(body, request.axes, path, request.scale, placement)
     unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
     if source is None:
         if form is not None:
             raise MeshFileError.unwritable(
                 path, f"the form {form} applies only to a character's file", "name one with --like"
             )
-        return WrittenPose(export_mesh(path, body, vertices, placement, frame), unit)
+        return WrittenPose(target, export_mesh(path, body, vertices, placement, frame), unit)
     chosen = source.require_form(path, form)
     placed = as_stored(path, frame.apply(vertices), body.topology)
     stored, notes = source.write(path, chosen, placed, latent, placement)
-    return WrittenPose(stored, unit, notes)
+    return WrittenPose(target, stored, unit, notes)
 
 
 def write_sequence(
@@ -435,11 +437,9 @@ def write_sequence(
     body: PosableBody,
     latents: Sequence[npt.NDArray[Any]],
     vertices: Sequence[npt.NDArray[Any]],
+    request: ExportRequest = MODELS_OWN,
     *,
     source: SourceFile | None = None,
-    axes: str = "model",
-    scale: float | None = None,
-    fps: float = 30.0,
 ) -> tuple[list[Path], list[WrittenPose]]:
     """Write poses as the frames of one file, in the vertex order of the user's mesh.
 
@@ -452,9 +452,8 @@ def write_sequence(
     body : of the poses
     latents : N poses' (D,) codes
     vertices : of N poses, each (V, 3), in the body's unit and coordinates
+    request : axes, scale and frames a second
     source : the user's file, by `source_for`; the body's own vertex order if None
-    axes, scale : see `export_frame`
-    fps : frames a second
 
     Returns
     -------
@@ -468,17 +467,18 @@ def write_sequence(
     files = sequence_files(path, body, source)
     if source is not None and source.require_form(path, None).suffix == ".glb":
         frames = np.stack([as_stored(path, pose, body.topology) for pose in vertices])
-        clip = source.write_clip(path, frames, latents, fps)
-        return list(files), [WrittenPose(stored, 1.0, notes) for stored, notes in clip]
-    frame = export_frame(body, axes, path, scale)
+        clip = source.write_clip(path, frames, latents, request.fps)
+        return list(files), [WrittenPose(Path(path), stored, 1.0, notes) for stored, notes in clip]
+    frame = export_frame(body, request.axes, path, request.scale)
     stored = np.stack([as_stored(path, frame.apply(pose), body.topology) for pose in vertices])
-    written = [WrittenPose(pose, 1.0 / frame.scale) for pose in stored]
+    first = next(iter(files))
+    written = [WrittenPose(first, pose, 1.0 / frame.scale) for pose in stored]
     if len(files) == 1:
-        write_point_cache(path, stored[:, files[Path(path)]], fps)
+        write_point_cache(path, stored[:, files[first]], request.fps)
         return list(files), written
     with atomic_files(Path(path).parent) as folder:
         for file, rows in files.items():
-            write_point_cache(folder / file.name, stored[:, rows], fps)
+            write_point_cache(folder / file.name, stored[:, rows], request.fps)
     return list(files), written
 
 

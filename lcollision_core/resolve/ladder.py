@@ -12,11 +12,12 @@ import numpy as np
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.jobs import Progress
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.options.resolve import ResolveOptions, Solver
 from lcollision_core.posing import ExactCheck
-from lcollision_core.resolve.options import ResolveOptions, ResolveResult, Solver, Step
 from lcollision_core.resolve.polish import polish
 from lcollision_core.resolve.problem import ResolveProblem, SolverOutcome
 from lcollision_core.resolve.pull_back import fall_back, pull_back
+from lcollision_core.resolve.result import ResolveResult, Step
 from lcollision_core.resolve.sqp import SqpBatch
 from lcollision_core.resolve.towards import step_towards
 

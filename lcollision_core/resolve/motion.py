@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.resolve.options import ResolveResult
+from lcollision_core.resolve.result import ResolveResult
 
 
 def largest_correction_change(

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import CancelledError
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.resolve.options import Solver
+from lcollision_core.options.resolve import Solver
 from lcollision_core.resolve.problem import FEASIBLE, ResolveProblem, SolverOutcome, rank
 
 MAX_EVALUATIONS = 200

@@ -15,10 +15,11 @@ from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.options.resolve import Metric, ResolveOptions
 from lcollision_core.posing import ExactCheck
 from lcollision_core.resolve.ladder import Ladder
-from lcollision_core.resolve.options import Metric, ResolveOptions, ResolveResult
 from lcollision_core.resolve.problem import CollisionModel, Deadline, ResolveProblem
+from lcollision_core.resolve.result import ResolveResult
 from lcollision_core.resolve.threads import single_torch_thread
 
 

@@ -10,6 +10,7 @@ from typer.testing import Result
 
 from app.editing.document import PoseDocument
 from app.work import jobs
+from lcollision_core.model import ExportRequest
 
 STABBED = """\
 v 0 0 0
@@ -30,7 +31,7 @@ class Lcollision(Protocol):
     def __call__(self, *arguments: object) -> Result: ...
 
 
-def export_pose(document: PoseDocument, path: Path, style: jobs.ExportStyle | None = None) -> None:
+def export_pose(document: PoseDocument, path: Path, request: ExportRequest | None = None) -> None:
     """Write the pose on the screen, as the window does."""
     work = partial(
         jobs.export,
@@ -38,6 +39,6 @@ def export_pose(document: PoseDocument, path: Path, style: jobs.ExportStyle | No
         document.pose,
         document.outcome,
         path,
-        style or jobs.ExportStyle(),
+        request or ExportRequest(),
     )
     document.write(f"Exporting {path.name}", work)

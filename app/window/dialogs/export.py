@@ -12,7 +12,8 @@ from app.editing.settings import Settings
 from app.window.dialogs.forms import Form
 from app.window.number_box import NumberBox
 from app.wording import menu_text
-from app.work.jobs import ExportStyle
+from lcollision_core.mesh_formats import MESH_FORMATS
+from lcollision_core.options.export import ExportRequest
 
 if TYPE_CHECKING:
     from lcollision_core.model import ExportForm, PosableBody
@@ -29,7 +30,7 @@ EXPORT_NAMES = {
 MESH = "mesh-alone"
 """The form of a mesh of the body's own: no file of the user's is kept."""
 
-_MESHES = {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
+_MESHES = {name.upper(): f".{name}" for name, held in MESH_FORMATS.items() if held.is_offered}
 _FOLLOWS = "As OBJ, PLY or STL: faces and positions alone."
 _STAY = "Axes and unit stay as in that file."
 
@@ -111,12 +112,12 @@ class ExportDialog(_FrameForm):
         return {kind: suffix for kind, suffix in _MESHES.items() if suffix not in taken}
 
     @property
-    def export_style(self) -> ExportStyle:
+    def export_request(self) -> ExportRequest:
         """What the fields say."""
         form = self._forms.get(self.form.currentData())
         key = None if form is None else form.key
         like = None if form is None else self.like
-        return ExportStyle(self.axes.currentData(), self._scale.value(), like, key)
+        return ExportRequest(self.axes.currentData(), self._scale.value(), like, key)
 
     @Slot()
     def _ask_for_source(self) -> None:
@@ -225,9 +226,9 @@ class MotionDialog(_FrameForm):
         return {suffix.removeprefix(".").upper(): suffix}
 
     @property
-    def export_style(self) -> ExportStyle:
+    def export_request(self) -> ExportRequest:
         """What the fields say."""
-        return ExportStyle(self.axes.currentData(), self._scale.value(), fps=self.rate.value())
+        return ExportRequest(self.axes.currentData(), self._scale.value(), fps=self.rate.value())
 
     def _remembered_rate(self) -> float:
         """Return the rate for poses of no motion, which that of a clip does not change."""

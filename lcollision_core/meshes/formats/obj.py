@@ -32,7 +32,7 @@ _SHORTEST_LINE = len(b"f 1 2 3\n")
 _NORMAL_OF_CORNER = re.compile(rb"[^\s/]+(?:/[^\s/]*)?(?:/([^\s/]*))?")
 
 
-def read(file: BinaryIO) -> Polygons:
+def read(file: BinaryIO, _: object = None) -> Polygons:
     """Read `v` and `f` lines; texture coordinates, normals, groups and materials are passed over.
 
     Parameters

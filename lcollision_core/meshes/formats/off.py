@@ -27,7 +27,7 @@ _COUNTS = re.compile(rb"\s*(-?\d+)\s+(-?\d+)[^\n]*\n")
 _HEAD_BYTES = 1 << 16
 
 
-def read(file: BinaryIO) -> Polygons:
+def read(file: BinaryIO, _: object = None) -> Polygons:
     """Read the vertices and faces; colours, normals and texture coordinates are passed over.
 
     Parameters

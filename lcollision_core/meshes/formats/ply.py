@@ -46,7 +46,7 @@ _Column = tuple[npt.NDArray[Any], npt.NDArray[np.int64] | None]
 """All values of a property, lists joined, and the length of each row's list; None without lists."""
 
 
-def read(file: BinaryIO) -> Polygons:
+def read(file: BinaryIO, _: object = None) -> Polygons:
     """Read the vertices' x, y, z, the faces and triangle strips; all else is passed over.
 
     Parameters

@@ -6,6 +6,7 @@ binary one with something after its triangles.
 
 from __future__ import annotations
 
+import os
 import re
 from typing import Any, BinaryIO
 
@@ -30,13 +31,12 @@ _JOINED = "STL stores no shared vertices; corners at equal coordinates were join
 _REORDERED = "STL stores no shared vertices; corners were put back into the set's vertex order"
 
 
-def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygons:
+def read(file: BinaryIO, topology: Topology | None = None) -> Polygons:
     """Read the triangles and give them shared vertices.
 
     Parameters
     ----------
     file : open binary file at its start
-    size : its size in bytes
     topology : the connectivity that the triangles are expected to have, in its order of faces.
         When all corners that it calls one vertex agree, its vertex order is restored. Otherwise
         vertices are numbered as they first appear, equal coordinates being one vertex.
@@ -49,6 +49,7 @@ def read(file: BinaryIO, size: int, topology: Topology | None = None) -> Polygon
     ------
     MeshFileError : the file is truncated or no STL.
     """
+    size = os.fstat(file.fileno()).st_size
     head = file.read(_HEADER_BYTES)
     n_triangles = int.from_bytes(head[80:], "little") if len(head) == _HEADER_BYTES else -1
     is_text = head.lstrip()[:5].lower() == b"solid"

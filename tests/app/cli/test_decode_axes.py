@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 
-from app.cli.results import MeshAxes
 from lcollision_core.meshes import read_mesh
-from lcollision_core.model import ExportAxes, NamedPose, PoseModel, write_poses
+from lcollision_core.model import NamedPose, PoseModel, write_poses
 from tests.app.support import Lcollision
 
 
@@ -25,10 +23,6 @@ def poses(body: PoseModel, tmp_path: Path) -> Path:
     named = [NamedPose(f"pose {n}", body.training_latent[n]) for n in range(2)]
     write_poses(path, body, named)
     return path
-
-
-def test_the_command_knows_all_axes() -> None:
-    assert get_args(MeshAxes) == tuple(ExportAxes)
 
 
 def test_a_folder_is_written_for_maya(

@@ -19,8 +19,14 @@ from app.window.actions import ACTIONS
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
-from app.work.jobs import ExportStyle
-from lcollision_core.model import NamedPose, PoseModel, RigModel, open_body, write_poses
+from lcollision_core.model import (
+    ExportRequest,
+    NamedPose,
+    PoseModel,
+    RigModel,
+    open_body,
+    write_poses,
+)
 from tests.app.support import export_pose
 from tests.app.windows import (
     PATIENCE,
@@ -124,7 +130,7 @@ def test_a_file_without_rig_is_a_mesh_of_the_character(
     model, document = dropped(qtbot, window, arm_file), window.document
     posed = model.training_latent[2]
     document.blend_towards(posed, 1.0)
-    export_pose(document, tmp_path / "posed.glb", ExportStyle(form="mesh"))
+    export_pose(document, tmp_path / "posed.glb", ExportRequest(form="mesh"))
     qtbot.waitUntil(lambda: not document.n_exports, timeout=PATIENCE)
     document.reset_all()
     with qtbot.waitSignal(document.imported, timeout=PATIENCE):

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.work.jobs import ExportStyle, export, export_motion
+from app.work.jobs import export, export_motion
 from lcollision_core.characters import read_character
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes.formats.point_cache import read_point_cache
-from lcollision_core.model import NamedPose, PoseModel, RigModel, sample_poses
+from lcollision_core.model import ExportRequest, NamedPose, PoseModel, RigModel, sample_poses
 from tests.core.character_file import figure
 
 
@@ -37,7 +37,7 @@ def test_a_pose_goes_into_the_character_s_own_file(
         NamedPose("bow", latent),
         None,
         path,
-        ExportStyle(form=form),
+        ExportRequest(form=form),
         no_progress,
         CancelToken(),
     )
@@ -66,7 +66,7 @@ def test_a_motion_says_how_many_of_its_frames_collide(body: PoseModel, tmp_path:
             body,
             poses,
             tmp_path / name,
-            ExportStyle("maya", fps=10.0),
+            ExportRequest("maya", fps=10.0),
             lambda done, all_of_them: steps.append((done, all_of_them)),
             CancelToken(),
         )
@@ -84,7 +84,9 @@ def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
     folded = np.where(character.space.joint_of_code > 0, character.space.high, 0.0)
     poses = [NamedPose("rest", 0.0 * folded), NamedPose("folded", folded)]
     caches, clip = (
-        export_motion(character, poses, tmp_path / name, ExportStyle(), no_progress, CancelToken())
+        export_motion(
+            character, poses, tmp_path / name, ExportRequest(), no_progress, CancelToken()
+        )
         for name in ("run.pc2", "run.glb")
     )
     assert caches == "Exported run Body.pc2, run Core.pc2, run Hat.pc2: 1 of 2 frames collide"
@@ -100,5 +102,5 @@ def test_a_cancelled_motion_leaves_nothing(body: PoseModel, tmp_path: Path) -> N
     cancel.cancel()
     poses = [NamedPose("rest", body.training_latent[0])]
     with pytest.raises(CancelledError):
-        export_motion(body, poses, tmp_path / "run.pc2", ExportStyle(), no_progress, cancel)
+        export_motion(body, poses, tmp_path / "run.pc2", ExportRequest(), no_progress, cancel)
     assert not list(tmp_path.iterdir())

@@ -29,6 +29,7 @@ from lcollision_core.learning import (
     WorkState,
     learn_model,
 )
+from lcollision_core.learning.work_folder import stamped
 from lcollision_core.meshes import PoseSet, write_pose_set
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.predictor import PRESETS
@@ -237,7 +238,7 @@ def test_what_cannot_be_learned_from_is_said_and_kept(tmp_path: Path) -> None:
 
 def test_damaged_status_and_request(tmp_path: Path, request_for_tube: LearningRequest) -> None:
     work = work_in(tmp_path, request_for_tube)
-    assert work.request == request_for_tube.stamped()
+    assert work.request == stamped(request_for_tube)
     (work.path / "status.json").write_text("{")
     assert work.status.state == WorkState.STOPPED
     (work.path / "request.json").write_text('{"version": 99}')

@@ -10,6 +10,7 @@ import pytest
 from lcollision_core.meshes import RigidTransform, front_direction, read_mesh
 from lcollision_core.model import (
     ExportAxes,
+    ExportRequest,
     PoseModel,
     RigModel,
     export_frame,
@@ -89,7 +90,7 @@ def test_a_body_in_centimetres_is_written_in_the_unit_of_each_program(tmp_path: 
     # glTF counts in metres, by its standard.
     for name, expected in (("arm.glb", 0.01 * size), ("arm.ply", 0.01 * size), ("a.obj", size)):
         axes = "blender" if name == "arm.ply" else "maya"
-        written = write_pose(tmp_path / name, body, latent, vertices, axes=axes)
+        written = write_pose(tmp_path / name, body, latent, vertices, None, ExportRequest(axes))
         read = read_mesh(tmp_path / name).vertices
         assert np.ptp(read, axis=0).max() == pytest.approx(expected, rel=1e-5)
         assert written.unit * np.ptp(written.vertices, axis=0).max() == pytest.approx(size)
@@ -146,7 +147,7 @@ def test_every_turn_is_a_rotation_by_right_angles(body: PoseModel, up_axis: int)
 
     for axes in ExportAxes:
         for name in ("a.obj", "a.stl"):
-            turn = export_frame(Turned(), axes, name, 1.0).turn  # type: ignore[arg-type]
+            turn = export_frame(Turned(), axes, name, 1.0).rotation  # type: ignore[arg-type]
             assert set(np.abs(turn).ravel()) <= {0.0, 1.0}
             np.testing.assert_array_equal(turn @ turn.T, np.eye(3))
             assert np.linalg.det(turn) == pytest.approx(1.0)

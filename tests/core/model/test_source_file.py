@@ -14,6 +14,7 @@ from lcollision_core.meshes.formats.point_cache import read_point_cache
 from lcollision_core.meshes.scene_files import read_scene
 from lcollision_core.model import (
     EXPORT_FORMS,
+    ExportRequest,
     RigModel,
     SourceFile,
     export_frame,
@@ -67,7 +68,9 @@ def test_a_pose_of_the_rig_goes_back_into_its_file(
     source = source_for(".glb", model)
     path = tmp_path / "posed.glb"
     vertices = model.exported_vertices(latent, placement)
-    written = write_pose(path, model, latent, vertices, placement, source=source, form=key)
+    written = write_pose(
+        path, model, latent, vertices, placement, ExportRequest(form=key), source=source
+    )
     assert np.abs(written.vertices - vertices).max() < 1e-5 * model.body_size
     again = read_character(path)
     in_file = again.rest_vertices[again.joined]
@@ -98,7 +101,7 @@ def test_a_file_of_the_same_body_has_no_joints_to_turn(
     path = tmp_path / "posed.glb"
     vertices = model.exported_vertices(latent)
     with pytest.raises(MeshFileError, match=r"with the form joints; choose .* mesh \(\.glb\)"):
-        write_pose(path, model, latent, vertices, source=other, form="joints")
+        write_pose(path, model, latent, vertices, None, ExportRequest(form="joints"), source=other)
     assert not path.exists()
     written = write_pose(path, model, latent, vertices, source=other)
     assert np.array_equal(written.vertices, vertices)
@@ -116,7 +119,9 @@ def test_a_character_s_own_file_is_the_source_where_it_can_be(
     written = write_pose(tmp_path / "a.stl", model, latent, model.exported_vertices(latent))
     np.testing.assert_array_equal(written.vertices, model.exported_vertices(latent))
     with pytest.raises(MeshFileError, match="the form morph applies only to a character's file"):
-        write_pose(tmp_path / "a.obj", model, latent, model.reference, form="morph")
+        write_pose(
+            tmp_path / "a.obj", model, latent, model.reference, None, ExportRequest(form="morph")
+        )
 
 
 def test_vrm_is_written_as_vrm(tmp_path: Path) -> None:
@@ -151,7 +156,9 @@ def test_an_obj_file_keeps_its_form_in_any_axes(
     frame = export_frame(model, axes, path, scale=100.0)
     assert source.require_form(path, None).has_axes
     vertices = model.exported_vertices(latent)
-    written = write_pose(path, model, latent, vertices, source=source, axes=axes, scale=100.0)
+    written = write_pose(
+        path, model, latent, vertices, request=ExportRequest(axes, 100.0), source=source
+    )
     assert written.unit == 0.01
     np.testing.assert_array_equal(read_mesh(path).vertices, written.vertices)
     np.testing.assert_array_equal(written.vertices, frame.apply(vertices))
@@ -171,7 +178,7 @@ def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
     assert not any(file.exists() for file in wanted)
     frame = export_frame(model, "unreal", path)
     files, written = write_sequence(
-        path, model, latents, poses, source=source, axes="unreal", fps=24.0
+        path, model, latents, poses, ExportRequest("unreal", fps=24.0), source=source
     )
     stored = np.stack([pose.vertices for pose in written])
     assert {pose.unit for pose in written} == {0.01}
@@ -202,7 +209,9 @@ def test_a_motion_of_the_rig_becomes_a_clip_of_its_file(
     poses = [model.exported_vertices(codes) for codes in latents]
     path = tmp_path / "run.glb"
     source = source_for(".glb", model)
-    files, written = write_sequence(path, model, latents, poses, source=source, fps=24.0)
+    files, written = write_sequence(
+        path, model, latents, poses, ExportRequest(fps=24.0), source=source
+    )
     assert files == [path]
     again = read_character(path)
     assert list(again.clips) == ["poses", "orbit"]
@@ -249,14 +258,16 @@ def test_characters_of_artists_come_back_as_vtk_reads_them(
         for codes in (np.zeros_like(latent), latent):
             vertices = model.exported_vertices(codes)
             source = source_for(".glb", model)
-            write_pose(path, model, codes, vertices, source=source, form=form)
+            write_pose(path, model, codes, vertices, None, ExportRequest(form=form), source=source)
             seen = vtk_corners(path)
             expected = vertices[model.character.joined][corners]
             assert np.abs(seen - expected).max() < 1e-6 * model.body_size
             assert _texture_coordinates(path) == _texture_coordinates(own)
     latents = [np.zeros_like(latent), latent]
     poses = [model.exported_vertices(codes) for codes in latents]
-    write_sequence(path, model, latents, poses, source=source_for(".glb", model), fps=10.0)
+    write_sequence(
+        path, model, latents, poses, ExportRequest(fps=10.0), source=source_for(".glb", model)
+    )
     for frame, vertices in enumerate(poses):
         seen = vtk_corners(path, 0, 0.1 * frame)
         expected = vertices[model.character.joined][corners]

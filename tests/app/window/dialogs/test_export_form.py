@@ -173,9 +173,9 @@ def test_a_model_keeps_the_form_of_a_file_that_is_named(
     assert form.source.text() == "mine.obj"
     assert (form.form.currentData(), form.kinds) == ("obj", {"OBJ": ".obj"})
     assert form.axes.isEnabled()
-    assert (form.export_style.like, form.export_style.form) == (mine, "obj")
+    assert (form.export_request.like, form.export_request.form) == (mine, "obj")
     form.accept()
-    export_pose(window.document, tmp_path / "out.obj", form.export_style)
+    export_pose(window.document, tmp_path / "out.obj", form.export_request)
     qtbot.waitUntil(lambda: not window.document.n_exports, timeout=PATIENCE)
     assert (tmp_path / "out.obj").read_text().startswith("# mine\n")
 
@@ -195,10 +195,10 @@ def test_a_model_keeps_the_form_of_the_file_that_it_was_learned_from(
     form = ExportDialog(window.settings, window, learned)
     qtbot.addWidget(form)
     assert form.source.text() == mine.name
-    assert form.export_style.like == mine
+    assert form.export_request.like == mine
     assert list(form.kinds.values()) == [suffix]
     form.form.setCurrentIndex(form.form.findData(MESH))
-    assert form.export_style.like is None
+    assert form.export_request.like is None
     assert set(form.kinds.values()) == {".obj", ".ply", ".stl", ".glb"} - {suffix}
 
 
@@ -323,7 +323,7 @@ def test_poses_of_no_motion_keep_the_rate_and_form_that_were_chosen(
     qtbot.addWidget(form)
     assert [form.form.itemData(row) for row in range(form.form.count())] == ["pc2", "mdd"]
     assert (form.rate.value(), form.rate.text()) == (29.97, "29.97")
-    assert form.export_style.fps == 29.97
+    assert form.export_request.fps == 29.97
     form.rate.setValue(30.0)
     assert form.rate.text() == "30"
     form.rate.setValue(23.976)

@@ -1,15 +1,14 @@
-"""Options and result of Resolve."""
+"""Options of Resolve."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum
-
-import numpy as np
-import numpy.typing as npt
+from typing import Annotated
 
 from lcollision_core.errors import LCollisionError
+from lcollision_core.options.field import Option
 
 
 class Solver(StrEnum):
@@ -26,23 +25,6 @@ class Metric(StrEnum):
 
     DISPLACEMENT = "eye"
     LATENT = "latent"
-
-
-class Step(StrEnum):
-    """The step of the ladder that a result comes from.
-
-    After each the pose is pulled back towards the target: see `pull_back`.
-    """
-
-    UNCHANGED = "unchanged"
-    NEIGHBOUR = "neighbour"
-    SOLVER = "solver"
-    MARGIN = "margin"
-    POLISH = "polish"
-    RESTART = "start"
-    TOWARDS = "towards"
-    FALL_BACK = "walk-back"
-    NONE = "none"
 
 
 @dataclass(frozen=True)
@@ -70,15 +52,34 @@ class ResolveOptions:
     LCollisionError : there is no such solver or metric, or a number is out of its range.
     """
 
-    solver: str = Solver.SQP
-    metric: str = Metric.DISPLACEMENT
-    threshold: float = 0.5
-    margin: float | None = None
+    solver: Annotated[str, Option("sqp, auglag (the paper's), slsqp or ccsaq.", metavar="NAME")] = (
+        Solver.SQP
+    )
+    metric: Annotated[
+        str, Option("Distance to minimise: of vertices, or of codes.", metavar="eye|latent")
+    ] = Metric.DISPLACEMENT
+    threshold: Annotated[
+        float,
+        Option("Decision threshold: up to this probability a pose is predicted free.", metavar="P"),
+    ] = 0.5
+    margin: Annotated[
+        float | None,
+        Option("How far below the threshold's logit the first step aims.", metavar="X"),
+    ] = None
     locked_domains: frozenset[int] = field(default_factory=frozenset)
     group_weights: tuple[float, ...] | None = None
-    time_budget: float | None = None
-    verify: bool = True
-    seed: int = 0
+    time_budget: Annotated[
+        float | None,
+        Option("Search time per pose; after that, a known free pose is used.", metavar="SECONDS"),
+    ] = None
+    verify: Annotated[
+        bool,
+        Option(
+            "Check the solver's answer exactly, and take further steps if it collides.",
+            ("--verify/--no-verify",),
+        ),
+    ] = True
+    seed: Annotated[int, Option("Seed of the solver's restarts.", metavar="S", low=0)] = 0
 
     def __post_init__(self) -> None:
         for name, kind in (("solver", Solver), ("metric", Metric)):
@@ -106,54 +107,3 @@ class ResolveOptions:
     def threshold_logit(self) -> float:
         """The logit of `threshold`, 0 for 0.5."""
         return math.log(self.threshold) - math.log1p(-self.threshold)
-
-
-@dataclass(frozen=True, eq=False)
-class ResolveResult:
-    """Where Resolve ended. Lengths are normalised, energies in squared normalised length.
-
-    Three facts are kept separately: that the solver converged, that the predictor calls the pose
-    free, and that it is free by the exact check.
-
-    Attributes
-    ----------
-    latent : (D,) float64 array, read-only
-    vertices : (V, 3) array, read-only, in the data's unit: what the exact check saw, and what is to
-        be written; float32 in the model's coordinates, or float64 where the pose is placed
-    solver_status : the status of the solver of the paper's problem at its least margin, "not run"
-        where none ran, "no predictor" where the steps did without
-    converged : that it ended by its own tolerances
-    predicted_free : the collision probability of `latent` is at most the threshold; None of a body
-        without a predictor
-    exactly_free : by the exact check of the vertices rounded to float32; None without `verify`
-    step : of the ladder, the one that resolved the collisions
-    energy_before, energy_after : exact penetration energy; None without `verify`
-    pairs_before, pairs_after : exact number of colliding pairs; None without `verify`
-    latent_distance : ||Z - Z*|| / ||Z*||, or ||Z - Z*|| where Z* is the zero pose; 0 for a pose
-        that did not move
-    vertex_distance_mean, vertex_distance_max : from the decoded target
-    iterations : of the solver at its least margin, for those of NLopt its evaluations; further
-        margins and restarts do not count
-    evaluations : poses for which the predictor was evaluated
-    seconds : spent
-    note : a sentence for the user, None if there is nothing to say
-    """
-
-    latent: npt.NDArray[np.float64]
-    vertices: npt.NDArray[np.floating]
-    solver_status: str
-    converged: bool
-    predicted_free: bool | None
-    exactly_free: bool | None
-    step: Step
-    energy_before: float | None
-    energy_after: float | None
-    pairs_before: int | None
-    pairs_after: int | None
-    latent_distance: float
-    vertex_distance_mean: float
-    vertex_distance_max: float
-    iterations: int
-    evaluations: int
-    seconds: float
-    note: str | None = None

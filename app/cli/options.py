@@ -1,0 +1,97 @@
+"""Commands that take dataclasses of options: each field becomes an option of the command line."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, Field, fields, is_dataclass
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import typer
+
+from lcollision_core.options.field import Option, options_of
+
+_BY_NAME = inspect.Parameter.KEYWORD_ONLY
+
+
+class Without(frozenset[str]):
+    """In the `Annotated` of a command's parameter: fields that are no options of that command."""
+
+
+def takes_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command take dataclasses, whose fields with an `Option` people give one by one.
+
+    Fields without an option keep their defaults; those without a default are arguments.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, tuple[type[Any], list[Field[Any]]]] = {}
+    parameters: list[inspect.Parameter] = []
+    for parameter in inspect.signature(command).parameters.values():
+        hint = hints[parameter.name]
+        kind, *extras = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        if not is_dataclass(kind):
+            parameters.append(parameter.replace(annotation=hint, kind=_BY_NAME))
+            continue
+        left_out = next((extra for extra in extras if isinstance(extra, Without)), Without())
+        known = options_of(kind)
+        offered = [f for f in fields(kind) if f.name in known and f.name not in left_out]
+        offered.sort(key=lambda field: field.kw_only)
+        groups[parameter.name] = kind, offered
+        parameters += [_parameter(field, *known[field.name]) for field in offered]
+    parameters.sort(key=lambda parameter: parameter.default is not inspect.Parameter.empty)
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        for name, (kind, offered) in groups.items():
+            known = options_of(kind)
+            taken = {field.name: values.pop(field.name) for field in offered}
+            values[name] = kind(
+                **{
+                    field: _read(value, *known[field])
+                    for field, value in taken.items()
+                    if value is not None
+                }
+            )
+        command(**values)
+
+    hinted: Any = run
+    hinted.__signature__ = inspect.Signature(parameters)
+    hinted.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+def _parameter(field: Field[Any], kind: Any, option: Option) -> inspect.Parameter:
+    """Return the parameter of a command that stands for a field."""
+    default = inspect.Parameter.empty if field.default is MISSING else field.default
+    given: dict[str, Any] = {"help": option.help, "metavar": option.metavar, "readable": False}
+    if tuple in _origins(kind):
+        kind, default = list[str], default or None
+        kind = kind if default is inspect.Parameter.empty else kind | None
+    elif option.words or option.choices:
+        kind = Literal[option.words or option.choices]
+        kind = kind | None if default is None else kind
+    else:
+        given |= {"min": option.low, "max": option.below if option.high is None else option.high}
+    is_argument = default is inspect.Parameter.empty
+    described = typer.Argument(**given) if is_argument else typer.Option(*option.names, **given)
+    return inspect.Parameter(
+        field.name,
+        _BY_NAME,
+        default=default,
+        annotation=Annotated[kind, described],
+    )
+
+
+def _origins(kind: Any) -> set[Any]:
+    """Return the type itself, or those of a union, without what they hold."""
+    kinds = get_args(kind) if NoneType in get_args(kind) else (kind,)
+    return {get_origin(one) or one for one in kinds}
+
+
+def _read(value: Any, kind: Any, option: Option) -> Any:
+    """Return a value of the command line as the field keeps it."""
+    if option.words:
+        return option.words.index(value)
+    return tuple(value) if tuple in _origins(kind) else value
